@@ -1,0 +1,60 @@
+"""Connectivity of triangle meshes: edges, hinges, boundaries. NumPy only."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+IntArray = NDArray[np.int64]
+
+
+def _half_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """All directed edges ``(3F, 2)`` of the faces and the vertex opposite to each ``(3F,)``."""
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
+    return directed, opposite
+
+
+def unique_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Undirected edges, each once, and how many faces share each.
+
+    Args:
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+
+    Returns:
+        Edges with the smaller index first, sorted, *shape* ``(E, 2)``; number of faces, *shape* ``(E,)``.
+    """
+    directed, _ = _half_edges(faces)
+    return np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
+
+
+def hinges(faces: IntArray) -> IntArray:
+    """Interior edges with the two vertices opposite to them.
+
+    An edge of one face has no dihedral angle, an edge of three or more has no single one: neither gives a hinge.
+
+    Args:
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+
+    Returns:
+        Rows ``(i, j, k, l)``: the edge ``ij`` and the opposite vertices ``k`` and ``l`` of its two triangles. Where
+        the winding is consistent, the triangles are ``(i, j, k)`` and ``(j, i, l)``. *Shape:* ``(H, 4)``.
+    """
+    directed, opposite = _half_edges(faces)
+    edge_ids, counts = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)[1:]
+    order = np.argsort(edge_ids.reshape(-1), kind="stable")
+    order = order[(counts == 2)[edge_ids.reshape(-1)[order]]].reshape(-1, 2)
+    first, second = order[:, 0], order[:, 1]
+    return np.concatenate([directed[first], opposite[first, None], opposite[second, None]], axis=1)
+
+
+def boundary_edges(faces: IntArray) -> IntArray:
+    """Edges of exactly one face. *Shape:* ``(·, 2)``."""
+    edges, counts = unique_edges(faces)
+    return edges[counts == 1]
+
+
+def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
+    """A third of the area of the faces around each vertex. *Shape:* ``(V,)``."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(normals, axis=1)
+    return np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(vertices))
