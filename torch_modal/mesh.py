@@ -52,9 +52,39 @@ def boundary_edges(faces: IntArray) -> IntArray:
     return edges[counts == 1]
 
 
+def boundary_loops(faces: IntArray) -> IntArray:
+    """Boundary edges in the direction of their face. *Shape:* ``(·, 2)``."""
+    directed, _ = _half_edges(faces)
+    _, index, counts = np.unique(np.sort(directed, axis=1), axis=0, return_index=True, return_counts=True)
+    return directed[index[counts == 1]]
+
+
+def edge_index(edges: IntArray, i: IntArray, j: IntArray) -> IntArray:
+    """Which of the sorted edges of `unique_edges` joins ``i`` and ``j``. *Shape:* ``(n,), (n,) -> (n,)``."""
+    n = int(edges.max()) + 1
+    keys = edges[:, 0] * n + edges[:, 1]
+    return np.searchsorted(keys, np.minimum(i, j) * n + np.maximum(i, j)).astype(np.int64)
+
+
+def face_index(faces: IntArray, i: IntArray, j: IntArray, k: IntArray) -> tuple[IntArray, NDArray[np.float64]]:
+    """Which face has the corners ``i, j, k``, and +1 or -1 for their order in it. *Shape:* ``(n,)`` each."""
+    n = int(faces.max()) + 1
+    sorted_corners = np.sort(faces, axis=1)
+    keys = (sorted_corners[:, 0] * n + sorted_corners[:, 1]) * n + sorted_corners[:, 2]
+    order = np.argsort(keys)
+    a, b, c = np.sort(np.stack([i, j, k]), axis=0)
+    index = order[np.searchsorted(keys, (a * n + b) * n + c, sorter=order)]
+    corners = faces[index]
+    place = (corners == i[:, None]).argmax(1)
+    follows = np.take_along_axis(corners, ((place + 1) % 3)[:, None], axis=1)[:, 0] == j
+    return index, np.where(follows, 1.0, -1.0)
+
+
 def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
     """A third of the area of the faces around each vertex. *Shape:* ``(V,)``."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(normals, axis=1)
-    return np.bincount(faces.reshape(-1), np.repeat(area / 3, 3), minlength=len(vertices))
+    areas = np.zeros(len(vertices))
+    np.add.at(areas, faces.reshape(-1), np.repeat(area / 3, 3))
+    return areas

@@ -1,0 +1,9 @@
+"""What the border raises and warns with."""
+
+
+class MeshWarning(UserWarning):
+    """Input that works, but not in every respect as its owner may expect."""
+
+
+class MeshError(ValueError):
+    """Input that cannot work: a file, an array or a mesh."""

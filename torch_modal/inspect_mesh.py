@@ -1,0 +1,102 @@
+"""What can be wrong with triangles or with the shapes on them: findings and repairs. NumPy and SciPy only.
+
+Nothing here raises or warns: `keyframes.py` decides what a finding means.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+
+class Winding(NamedTuple):
+    """Faces with one winding per connected piece, where there is one."""
+
+    faces: IntArray
+    flipped: IntArray
+    """Faces that were turned over."""
+    non_orientable: IntArray
+    """Faces of pieces without any consistent winding (a Moebius strip); they are left as they were."""
+
+
+def degenerate_faces(faces: IntArray) -> BoolArray:
+    """Faces that use a vertex twice. *Shape:* ``(F,)``."""
+    a, b, c = faces.T
+    return (a == b) | (b == c) | (c == a)
+
+
+def repeated_faces(faces: IntArray) -> BoolArray:
+    """Faces whose three vertices have been used by an earlier face, in any order. *Shape:* ``(F,)``."""
+    corners = np.sort(faces, axis=1)
+    order = np.lexsort(corners.T)  # stable: among equal faces the earliest comes first
+    repeated = np.zeros(len(faces), dtype=bool)
+    repeated[order[1:]] = (corners[order[1:]] == corners[order[:-1]]).all(axis=1)
+    return repeated
+
+
+def consistent_winding(faces: IntArray) -> Winding:
+    """Turn the fewest faces over, so that the two faces of each edge run through it in opposite directions.
+
+    Every face stands in a graph twice, as it is and turned over. Neighbours that agree are joined like to
+    like, neighbours that disagree crosswise. A piece that can be oriented falls apart into two mirror copies
+    in this graph; one that cannot stays whole. Edges of three or more faces join nothing.
+    """
+    n_faces = len(faces)
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    owner = np.tile(np.arange(n_faces), 3)
+    forward = directed[:, 0] < directed[:, 1]
+    low, high = np.sort(directed, axis=1).T
+    order = np.lexsort((high, low))
+    new_edge = np.ones(len(order), dtype=bool)
+    new_edge[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
+    start = np.flatnonzero(new_edge)
+    start = start[np.diff(np.append(start, len(order))) == 2]
+    one, two = order[start], order[start + 1]
+    crossed = (forward[one] == forward[two]) * n_faces
+
+    rows = np.concatenate([owner[one], owner[one] + n_faces])
+    columns = np.concatenate([owner[two] + crossed, owner[two] + n_faces - crossed])
+    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(2 * n_faces, 2 * n_faces))
+    _, label = connected_components(graph, directed=False)
+    as_is, turned = label[:n_faces], label[n_faces:]
+    non_orientable = as_is == turned
+
+    # Of the two copies, keep the one with more faces as they were; on a tie, the one with the first face.
+    size = np.bincount(as_is, minlength=label.max() + 1)
+    fewer, equal = size[as_is] < size[turned], size[as_is] == size[turned]
+    flip = ~non_orientable & (fewer | (equal & (as_is > turned)))
+    repaired = np.where(flip[:, None], faces[:, ::-1], faces)
+    return Winding(repaired, np.flatnonzero(flip), np.flatnonzero(non_orientable))
+
+
+def unreferenced_vertices(faces: IntArray, n_vertices: int) -> IntArray:
+    """Vertices of no face. *Shape:* ``(·,)``."""
+    return np.flatnonzero(np.bincount(faces.reshape(-1), minlength=n_vertices) == 0)
+
+
+def diagonals(keyframes: FloatArray) -> FloatArray:
+    """Bounding-box diagonal of each shape. *Shape:* ``(K, V, 3)`` to ``(K,)``."""
+    extent = keyframes.max(axis=1) - keyframes.min(axis=1)
+    largest = extent.max(axis=1)
+    # The largest extent is taken out first, so that no square of it leaves the number range.
+    return largest * np.linalg.norm(extent / np.where(largest > 0, largest, 1)[:, None], axis=1)
+
+
+def flat_faces(vertices: FloatArray, faces: IntArray, tolerance: float) -> BoolArray:
+    """Faces with an altitude below ``tolerance`` times their longest edge. *Shape:* ``(F,)``."""
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.einsum("fi,fi->f", e, e) for e in (b - a, c - b, a - c)], axis=0)
+    return double_area <= tolerance * longest
+
+
+def signed_volume(vertices: FloatArray, faces: IntArray) -> float:
+    """Enclosed volume of a closed mesh, positive if its faces wind counterclockwise seen from outside."""
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)

@@ -1,0 +1,113 @@
+"""Rigid motions between shapes: best fit, and the geodesic along which they are interpolated."""
+
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
+from torch import Tensor
+
+
+class RigidMotion(NamedTuple):
+    """``x -> (x - source) rotation^T + target``: a rotation about a centroid, then a move of that centroid."""
+
+    rotation: Tensor
+    """*Shape:* ``(..., 3, 3)``."""
+    source: Tensor
+    """Centroid before. *Shape:* ``(..., 3)``."""
+    target: Tensor
+    """Centroid after. *Shape:* ``(..., 3)``."""
+
+    def apply(self, x: Tensor) -> Tensor:
+        """Move a shape. *Shape:* ``(..., V, 3) -> (..., V, 3)``."""
+        return (x - self.source[..., None, :]) @ self.rotation.mT + self.target[..., None, :]
+
+    def inverse(self) -> "RigidMotion":
+        """The way back."""
+        return RigidMotion(self.rotation.mT, self.target, self.source)
+
+    def fraction(self, t: Tensor) -> "RigidMotion":
+        """The motion at the time ``t`` of the geodesic from rest (0) to this motion (1).
+
+        The rotation turns at constant speed about its axis, the centroid moves on a straight line. At half a turn
+        either sense is a shortest way: the one is taken whose axis follows from kornia's quaternion of the rotation.
+
+        Args:
+            t: Time, broadcast against the motion's leading dimensions. *Shape:* ``(...,)``.
+        """
+        t = t[..., None]
+        axis_angle = _flat(rotation_matrix_to_axis_angle, self.rotation, 2)
+        rotation = _flat(axis_angle_to_rotation_matrix, t * axis_angle, 1)
+        return RigidMotion(rotation, self.source, self.source + t * (self.target - self.source))
+
+
+def _flat(function, x: Tensor, item_dims: int) -> Tensor:  # type: ignore[no-untyped-def]
+    """Apply a function of one batch dimension to any number of them."""
+    lead = x.shape[: x.dim() - item_dims]
+    y = function(x.reshape(-1, *x.shape[x.dim() - item_dims :]))
+    return y.reshape(*lead, *y.shape[1:])
+
+
+def centroid(x: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean of the vertices. *Shape:* ``(..., V, 3), (V,) -> (..., 3)``."""
+    return (weights[:, None] * x).sum(-2) / weights.sum()
+
+
+def best_rotation(covariance: Tensor) -> Tensor:
+    """The rotation ``R`` that maximises ``tr(R^T A)``, differentiable to second order.
+
+    The singular value decomposition gives the value alone: its derivative divides by differences of singular values
+    and fails on symmetric shapes, where the rotation itself is smooth. The derivatives come from two Newton steps
+    that start at the solution, each of which makes them exact to a higher order.
+
+    Args:
+        covariance: ``A = sum_v w_v y_v x_v^T``. *Shape:* ``(..., 3, 3)``.
+
+    Returns:
+        *Shape:* ``(..., 3, 3)``, determinant one.
+    """
+    u, _, vh = torch.linalg.svd(covariance.detach())
+    sign = torch.ones_like(u[..., 0])
+    sign[..., 2] = torch.linalg.det(u @ vh)
+    rotation = (u * sign[..., None, :]) @ vh
+    if not (torch.is_grad_enabled() and covariance.requires_grad):
+        return rotation
+    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    for _ in range(2):
+        p = rotation.mT @ covariance
+        torque = torch.stack(
+            [p[..., 2, 1] - p[..., 1, 2], p[..., 0, 2] - p[..., 2, 0], p[..., 1, 0] - p[..., 0, 1]], -1
+        )
+        trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        stiffness = trace * eye - 0.5 * (p + p.mT)
+        # Two vanishing singular values (all vertices on a line) leave a rotation free: the floor holds it still.
+        stiffness = stiffness + torch.finfo(p.dtype).eps * (trace.abs() + torch.finfo(p.dtype).tiny) * eye
+        turn = torch.linalg.solve(stiffness, torque)
+        rotation = rotation @ _flat(axis_angle_to_rotation_matrix, turn, 1)
+    return rotation
+
+
+def best_fit(x: Tensor, y: Tensor, weights: Tensor) -> RigidMotion:
+    """The rigid motion that carries ``x`` closest to ``y`` (weighted Kabsch).
+
+    Args:
+        x: Vertex positions. *Shape:* ``(..., V, 3)``.
+        y: Vertex positions. *Shape:* ``(..., V, 3)``.
+        weights: Weight of each vertex, for example its area. *Shape:* ``(V,)``.
+    """
+    source, target = centroid(x, weights), centroid(y, weights)
+    centred_x = x - source[..., None, :]
+    centred_y = (y - target[..., None, :]) * weights[:, None]
+    return RigidMotion(best_rotation(centred_y.mT @ centred_x), source, target)
+
+
+def blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
+    """Between two shapes: linear in the shape, along the geodesic in the rigid motion.
+
+    Args:
+        x: Vertex positions at 0. *Shape:* ``(..., V, 3)``.
+        y: Vertex positions at 1. *Shape:* ``(..., V, 3)``.
+        t: Times. *Shape:* ``(...,)``.
+        weights: Weight of each vertex in the alignment. *Shape:* ``(V,)``.
+    """
+    back = best_fit(y, x, weights)
+    return back.inverse().fraction(t).apply(torch.lerp(x, back.apply(y), t[..., None, None]))
