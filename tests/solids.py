@@ -1,0 +1,41 @@
+"""Tetrahedral boxes made without the mesher: the same in every run, with known truth."""
+
+import itertools
+
+import numpy as np
+
+from torch_modal.precompute.tetrahedra import Tetrahedra
+
+
+def box(cells: tuple[int, int, int], size: tuple[float, float, float], jitter: float = 0.0) -> Tetrahedra:
+    """A box of cubes cut into six tetrahedra each, vertices moved by the fraction ``jitter`` of a cell."""
+    counts = np.array(cells) + 1
+    grid = np.stack(np.meshgrid(*(np.arange(c) for c in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    corner = np.stack(np.meshgrid(*(np.arange(c) for c in cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.array([counts[1] * counts[2], counts[2], 1])
+    tets = []
+    for order in itertools.permutations(range(3)):  # the six monotone paths from one corner to the opposite one
+        steps = np.zeros((4, 3), dtype=np.int64)
+        for i, axis in enumerate(order):
+            steps[i + 1 :, axis] += 1
+        path = (corner[:, None] + steps) @ number
+        odd = np.linalg.det(np.diff(steps, axis=0)) < 0
+        tets.append(path[:, [1, 0, 2, 3]] if odd else path)
+    moved = grid + jitter * np.random.default_rng(0).uniform(-1, 1, grid.shape)
+    return Tetrahedra(moved * (np.array(size) / np.array(cells)), np.concatenate(tets))
+
+
+def together(*solids: Tetrahedra) -> Tetrahedra:
+    """Several meshes as one, not connected."""
+    starts = np.cumsum([0] + [len(solid.vertices) for solid in solids])
+    return Tetrahedra(
+        np.concatenate([solid.vertices for solid in solids]),
+        np.concatenate([solid.tets + start for solid, start in zip(solids, starts, strict=False)]),
+    )
+
+
+def surface(solid: Tetrahedra) -> np.ndarray:
+    """Faces of one tetrahedron only, wound counterclockwise seen from outside. *Shape:* ``(F, 3)``."""
+    faces = np.concatenate([solid.tets[:, c] for c in ([1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1])])
+    _, first, counts = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[counts == 1]]

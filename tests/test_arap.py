@@ -1,0 +1,118 @@
+"""Stiffness and mass against the energies they are the Hessians of."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+from solids import box, together
+
+from torch_modal.precompute.arap import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, lumped_mass
+from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+
+
+@pytest.fixture
+def solid() -> Tetrahedra:
+    return box((3, 2, 2), (1.5, 1.0, 0.8), jitter=0.2)
+
+
+def element_energy(u: torch.Tensor, solid: Tetrahedra) -> torch.Tensor:
+    """sum_t vol_t |sym grad u|², the gradient from the edges before and after."""
+    x, tets = torch.from_numpy(solid.vertices), torch.from_numpy(solid.tets)
+    rest = (x[tets[:, 1:]] - x[tets[:, :1]]).mT
+    moved = (u[tets[:, 1:]] - u[tets[:, :1]]).mT
+    gradient = moved @ torch.linalg.inv(rest)
+    strain = (gradient + gradient.mT) / 2
+    return (torch.linalg.det(rest).abs() / 6 * (strain**2).sum(dim=(1, 2))).sum()
+
+
+def test_element_form_is_the_hessian_of_its_energy(solid: Tetrahedra) -> None:
+    n = len(solid.vertices)
+    u = torch.randn(3 * n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    by_autograd = torch.autograd.functional.hessian(lambda u: element_energy(u.reshape(n, 3), solid), u)
+    np.testing.assert_allclose(arap_hessian(solid).toarray(), by_autograd.numpy(), atol=1e-12)
+
+
+def cotangent_weights(solid: Tetrahedra) -> dict[tuple[int, int], float]:
+    """A sixth of the opposite edge's length times the cotangent of its dihedral angle, over tetrahedra."""
+    weights: dict[tuple[int, int], float] = {}
+    for tet in solid.tets:
+        for a, b, c, d in (
+            (0, 1, 2, 3),
+            (0, 2, 1, 3),
+            (0, 3, 1, 2),
+            (1, 2, 0, 3),
+            (1, 3, 0, 2),
+            (2, 3, 0, 1),
+        ):
+            i, j, k, m = solid.vertices[tet[[a, b, c, d]]]
+            along = (m - k) / np.linalg.norm(m - k)
+            p, q = ((v - k) - along * np.dot(v - k, along) for v in (i, j))  # the two faces, seen along the edge
+            cotangent = np.dot(p, q) / np.linalg.norm(np.cross(p, q))
+            key = tuple(sorted((int(tet[a]), int(tet[b]))))
+            weights[key] = weights.get(key, 0.0) + np.linalg.norm(m - k) * cotangent / 6
+    return weights
+
+
+def test_vertex_form_is_the_energy_with_the_best_rotations(solid: Tetrahedra) -> None:
+    n = len(solid.vertices)
+    raw = cotangent_weights(solid)
+    floor = WEIGHT_FLOOR * np.mean(np.abs(list(raw.values())))
+    assert min(raw.values()) < -1e-3, "the mesh has to have weights that are clamped"
+    u = np.random.default_rng(1).standard_normal((n, 3))
+    best = 0.0
+    for i in range(n):
+        ring = [(j, max(c, floor)) for (a, b), c in raw.items() for s, j in ((a, b), (b, a)) if s == i]
+        rows, right = [], []
+        for j, c in ring:
+            e = solid.vertices[i] - solid.vertices[j]
+            rows.append(np.sqrt(c) * np.cross(np.eye(3), e).T)  # columns: (unit vector) × e
+            right.append(np.sqrt(c) * (u[i] - u[j]))
+        w = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+        best += 0.5 * np.sum((np.concatenate(right) - np.concatenate(rows) @ w) ** 2)
+    k = arap_hessian(solid, "vertex")
+    assert 0.5 * u.reshape(-1) @ (k @ u.reshape(-1)) == pytest.approx(best, rel=1e-12)
+
+
+@pytest.mark.parametrize("form", HESSIAN_FORMS)
+def test_symmetric_positive_semidefinite_with_rigid_null_space(form: str, capsule_tetrahedra: Tetrahedra) -> None:
+    k = arap_hessian(capsule_tetrahedra, form)
+    assert abs(k - k.T).max() == 0
+    x = capsule_tetrahedra.vertices
+    scale = abs(k).max()
+    for axis in np.eye(3):
+        for motion in (np.broadcast_to(axis, x.shape), np.cross(axis, x)):
+            assert np.abs(k @ motion.reshape(-1)).max() < 1e-11 * scale
+    masses = np.repeat(lumped_mass(capsule_tetrahedra), 3)
+    lowest = scipy.linalg.eigh(k.toarray(), np.diag(masses), eigvals_only=True, subset_by_index=(0, 6))
+    assert np.abs(lowest[:6]).max() < 1e-8 * lowest[6]  # six zeros, nothing below them, and no seventh
+
+
+def test_forms_agree_on_a_pure_stretch_and_on_modes() -> None:
+    fine = box((16, 4, 4), (4.0, 1.0, 1.0))
+    stretch = fine.vertices * (1.0, 0.0, 0.0)  # sym grad = diag(1, 0, 0): energy = volume
+    for form, tolerance in (("element", 1e-12), ("vertex", 0.02)):
+        energy = 0.5 * stretch.reshape(-1) @ (arap_hessian(fine, form) @ stretch.reshape(-1))
+        assert energy == pytest.approx(4.0, rel=tolerance)
+
+
+def test_inverted_tetrahedra_count_with_their_magnitude(solid: Tetrahedra) -> None:
+    turned = Tetrahedra(solid.vertices, solid.tets.copy())
+    turned.tets[::3] = turned.tets[::3][:, [1, 0, 2, 3]]
+    np.testing.assert_allclose(lumped_mass(turned), lumped_mass(solid))
+    for form in HESSIAN_FORMS:
+        np.testing.assert_allclose(
+            arap_hessian(turned, form).toarray(), arap_hessian(solid, form).toarray(), atol=1e-12
+        )
+
+
+def test_mass_is_the_volume() -> None:
+    two = together(box((2, 3, 2), (1.0, 2.0, 3.0)), box((1, 1, 1), (0.5, 0.5, 0.5)))
+    assert (tet_volumes(two) > 0).all()
+    mass = lumped_mass(two)
+    assert mass.sum() == pytest.approx(6.125)
+    assert (mass > 0).all()
+
+
+def test_unknown_form(solid: Tetrahedra) -> None:
+    with pytest.raises(ValueError, match="'spokes'; give 'element' or 'vertex'"):
+        arap_hessian(solid, "spokes")

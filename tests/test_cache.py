@@ -1,0 +1,151 @@
+"""The cache returns what was computed, or computes it."""
+
+import os
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_modal.files import write_atomically
+from torch_modal.precompute import cache as cache_module
+from torch_modal.precompute.cache import Cache, CacheWarning, content_key, default_cache_dir
+
+POINTS = np.arange(6.0).reshape(2, 3)
+RESULT = {"values": np.linspace(0, 1, 50), "index": np.arange(8).reshape(2, 4)}
+
+
+class Counted:
+    """A computation that counts its calls."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self) -> dict[str, np.ndarray]:
+        self.calls += 1
+        return RESULT
+
+
+def get(folder: Path | None, compute: Counted, points: np.ndarray = POINTS, **parameters: float):
+    return Cache(folder).get("thing", {"points": points}, parameters, compute)
+
+
+def assert_right(found: dict[str, np.ndarray]) -> None:
+    assert found.keys() == RESULT.keys()
+    for name, array in RESULT.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+def test_computed_once(tmp_path: Path) -> None:
+    compute = Counted()
+    for _ in range(3):
+        assert_right(get(tmp_path / "new" / "folder", compute, k=3))
+    assert compute.calls == 1
+    assert [path.suffix for path in (tmp_path / "new" / "folder").iterdir()] == [".safetensors"]
+
+
+def test_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_MODAL_CACHE", str(tmp_path))
+    compute = Counted()
+    off = Cache.at(enabled=False)
+    for _ in range(2):
+        assert_right(off.get("thing", {}, {}, compute))
+    assert compute.calls == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = [
+        content_key("thing", {"points": POINTS}, {"k": 3}),
+        content_key("other", {"points": POINTS}, {"k": 3}),
+        content_key("thing", {"points": POINTS}, {"k": 4}),
+        content_key("thing", {"points": POINTS}, {"k": 3, "form": "x"}),
+        content_key("thing", {"points": POINTS + np.spacing(5.0)}, {"k": 3}),
+        content_key("thing", {"points": POINTS.reshape(3, 2)}, {"k": 3}),
+        content_key("thing", {"points": POINTS.view(np.int64)}, {"k": 3}),
+        content_key("thing", {"faces": POINTS}, {"k": 3}),
+    ]
+    monkeypatch.setattr(cache_module, "CACHE_VERSION", cache_module.CACHE_VERSION + 1)
+    keys.append(content_key("thing", {"points": POINTS}, {"k": 3}))
+    assert len(set(keys)) == len(keys)
+    assert content_key("thing", {"points": np.asfortranarray(POINTS)}, {"k": 3}) == keys[-1]
+
+
+def test_stale_version_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compute = Counted()
+    get(tmp_path, compute)
+    monkeypatch.setattr(cache_module, "CACHE_VERSION", cache_module.CACHE_VERSION + 1)
+    assert_right(get(tmp_path, compute))
+    assert compute.calls == 2
+
+
+def test_any_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    compute = Counted()
+    get(tmp_path, compute)
+    (entry,) = tmp_path.iterdir()
+    good = entry.read_bytes()
+    random = np.random.default_rng(0)
+    places = {0, 7, 8, 20, len(good) - 1, *random.integers(0, len(good), 150).tolist()}
+    for place in places:
+        bad = bytearray(good)
+        bad[place] ^= 1 << int(random.integers(8))
+        entry.write_bytes(bad)
+        assert_right(get(tmp_path, compute))
+        assert entry.read_bytes() == good, f"the entry with byte {place} changed was replaced"
+
+
+@pytest.mark.parametrize("length", [0, 5, 100, 0.5, -1])
+def test_truncated_entry_is_replaced(tmp_path: Path, length: float) -> None:
+    compute = Counted()
+    get(tmp_path, compute)
+    (entry,) = tmp_path.iterdir()
+    good = entry.read_bytes()
+    entry.write_bytes(good[: int(length * len(good)) if 0 < length < 1 else int(length)])
+    assert_right(get(tmp_path, compute))
+    assert compute.calls == 2
+    assert entry.read_bytes() == good
+
+
+def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    compute = Counted()
+    with pytest.warns(CacheWarning, match="TORCH_MODAL_CACHE or cache_dir"):
+        assert_right(get(tmp_path / "file" / "folder", compute))
+
+
+def test_many_at_once(tmp_path: Path) -> None:
+    compute = Counted()
+    with ThreadPoolExecutor(8) as pool, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for found in pool.map(lambda i: get(tmp_path, compute, k=i % 2), range(64)):
+            assert_right(found)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_default_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_MODAL_CACHE", os.path.join("~", "there"))
+    assert default_cache_dir() == Path.home() / "there"
+    monkeypatch.delenv("TORCH_MODAL_CACHE")
+    monkeypatch.setattr(cache_module.sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", os.path.join(os.sep, "xdg"))
+    assert default_cache_dir() == Path(os.sep, "xdg", "torch_modal")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert default_cache_dir() == Path.home() / ".cache" / "torch_modal"
+    monkeypatch.setattr(cache_module.sys, "platform", "darwin")
+    assert default_cache_dir() == Path.home() / "Library" / "Caches" / "torch_modal"
+
+
+def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+
+    def fail(source: object, target: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, b"new")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert path.read_bytes() == b"old"

@@ -1,0 +1,269 @@
+"""Modes: the eigenproblem against independent truth, and the way from key-frames to bases."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+import torch
+from conftest import COARSE
+from solids import box, surface, together
+
+from torch_modal.keyframes import MeshError, MeshWarning
+from torch_modal.precompute import eigen, modes
+from torch_modal.precompute.arap import HESSIAN_FORMS, arap_hessian, lumped_mass
+from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
+from torch_modal.precompute.modes import extract_bases, extract_modes
+from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
+
+Mesh = tuple[np.ndarray, np.ndarray]
+BOX = box((6, 3, 2), (3.0, 1.5, 1.0), jitter=0.1)
+
+
+def solve(solid: Tetrahedra, n_modes: int, form: str = "element") -> VolumeModes:
+    return lowest_modes(arap_hessian(solid, form), lumped_mass(solid), solid.vertices, n_modes)
+
+
+# ------------------------------------------------------------------------------------------- the eigenproblem
+
+
+@pytest.mark.parametrize("form", HESSIAN_FORMS)
+def test_modes_of_a_meshed_surface(form: str, capsule_tetrahedra: Tetrahedra) -> None:
+    """The numbers that everything later leans on, on the mesher's own tetrahedra."""
+    result = solve(capsule_tetrahedra, 20, form)
+    k, m = arap_hessian(capsule_tetrahedra, form), np.repeat(lumped_mass(capsule_tetrahedra), 3)
+    assert len(m) > eigen.DENSE_BELOW
+    phi, lam = result.modes, result.eigenvalues
+    assert np.abs(result.rigid_eigenvalues).max() < 1e-8 * lam[0]
+    assert result.n_zero == 6
+    np.testing.assert_allclose(phi.T @ (m[:, None] * phi), np.eye(20), atol=1e-12)
+    inertia = m[:, None] * phi * lam
+    residual = np.linalg.norm(k @ phi - inertia, axis=0) / np.linalg.norm(inertia, axis=0)
+    assert residual.max() < 1e-8
+    assert result.residual == pytest.approx(residual.max(), rel=0.1)
+    assert (np.diff(lam) >= 0).all()
+    x = capsule_tetrahedra.vertices
+    for axis in np.eye(3):
+        for motion in (np.broadcast_to(axis, x.shape), np.cross(axis, x)):
+            momentum = (m * motion.reshape(-1)) @ phi
+            assert np.abs(momentum).max() < 1e-12 * np.sqrt(m @ motion.reshape(-1) ** 2)
+
+
+@pytest.mark.parametrize("form", HESSIAN_FORMS)
+@pytest.mark.parametrize("cells", [(4, 3, 2), (10, 4, 4)])  # a dense and a sparse solve
+def test_agrees_with_dense_eigh(form: str, cells: tuple[int, int, int]) -> None:
+    # A square cross-section, so that bending modes come in pairs of equal eigenvalues.
+    solid = box(cells, (5.0, 1.0, 1.0))
+    k, m = arap_hessian(solid, form).toarray(), np.repeat(lumped_mass(solid), 3)
+    assert (len(m) > eigen.DENSE_BELOW) == (cells[0] == 10)
+    values, vectors = scipy.linalg.eigh(k, np.diag(m))
+    result = solve(solid, 25, form)
+    np.testing.assert_allclose(result.eigenvalues, values[6:31], rtol=1e-9)
+    # The same space, up to the last eigenvalue that stands alone.
+    last = int(np.flatnonzero(values[7:31] - values[6:30] > 1e-3 * values[30])[-1])
+    overlap = vectors[:, 6 : 7 + last].T @ (m[:, None] * result.modes[:, : last + 1])
+    np.testing.assert_allclose(np.linalg.svd(overlap)[1], 1, atol=1e-9)
+
+
+def test_vibrations_of_a_bar() -> None:
+    """Euler-Bernoulli and wave equation: Young's modulus 2, no lateral contraction, density 1."""
+    length, side = 10.0, 1.0
+    stretch_1 = 2 * (np.pi / length) ** 2
+    bend_1 = 2 * side**2 / 12 * (4.730041 / length) ** 4
+    ratios = []
+    for n in (2, 4):
+        bar = box((10 * n, n, n), (length, side, side))
+        m = np.repeat(lumped_mass(bar), 3)
+        result = solve(bar, 8)
+        # the two lowest bend it: hardly any motion along the axis, opposite at the middle and the ends
+        along = np.array([(m[::3] * phi[::3] ** 2).sum() for phi in result.modes.T])
+        assert (along[:2] < 0.1).all()
+        ratios.append(result.eigenvalues[0] / bend_1)
+        stretch = int(along.argmax())
+        assert along[stretch] > 0.95
+        assert result.eigenvalues[stretch] == pytest.approx(stretch_1, rel=0.02)
+        wave = np.cos(np.pi * bar.vertices[:, 0] / length)
+        assert abs((m[::3] * wave * result.modes[::3, stretch]).sum()) / np.sqrt((m[::3] * wave**2).sum()) > 0.99
+    # Linear tetrahedra are too stiff in bending; the excess falls with the square of their size.
+    assert 1.0 < ratios[1] < ratios[0]
+    extrapolated = (4 * ratios[1] - ratios[0]) / 3
+    assert extrapolated == pytest.approx(1.0, abs=0.1)
+
+
+def test_eigenvalues_and_modes_scale_with_the_unit() -> None:
+    solid = box((10, 4, 4), (5.0, 1.3, 1.0))
+    here = solve(solid, 6)
+    for factor in (1e-6, 1e9):
+        there = solve(Tetrahedra(solid.vertices * factor, solid.tets), 6)
+        np.testing.assert_allclose(there.eigenvalues * factor**2, here.eigenvalues, rtol=1e-8)
+        np.testing.assert_allclose(there.modes * factor**1.5, here.modes, atol=1e-6 * np.abs(here.modes).max())
+
+
+def test_deterministic_in_sign_too() -> None:
+    solid = box((10, 5, 3), (5.0, 1.3, 1.0), jitter=0.1)
+    first, second = solve(solid, 10), solve(solid, 10)
+    np.testing.assert_array_equal(first.modes, second.modes)
+    assert (np.take_along_axis(first.modes, np.abs(first.modes).argmax(axis=0)[None], axis=0) > 0).all()
+
+
+def test_pieces_add_zero_modes() -> None:
+    pieces = (box((3, 3, 3), (1.0, 1.0, 1.0)), box((4, 3, 3), (1.4, 1.0, 1.0)))
+    two = together(*pieces)
+    two.vertices[64:] += (3.0, 0.0, 0.0)
+    result = solve(two, 10)
+    assert result.n_zero == 12
+    assert np.abs(result.eigenvalues[:6]).max() < 1e-8 * result.eigenvalues[6]
+    each = np.sort(np.concatenate([solve(piece, 4).eigenvalues for piece in pieces]))
+    np.testing.assert_allclose(result.eigenvalues[6:], each[:4], rtol=1e-9)
+    with pytest.raises(ModalAnalysisError, match="loose pieces"):
+        solve(together(*[box((1, 1, 1), (1.0, 1.0, 1.0))] * 9), 5)
+
+
+def test_more_modes_than_there_are() -> None:
+    with pytest.raises(ValueError, match="50 modes asked for, but 8 tetrahedral vertices have 18 elastic modes"):
+        solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 50)
+    assert solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 18).modes.shape == (24, 18)
+
+
+def test_untrustworthy_problems_are_refused() -> None:
+    solid = box((4, 2, 2), (2.0, 1.0, 1.0))
+    k, mass = arap_hessian(solid), lumped_mass(solid)
+    anchored = k + sp.diags(np.r_[np.ones(3), np.zeros(k.shape[0] - 3)])
+    with pytest.raises(ModalAnalysisError, match="six rigid motions"):
+        lowest_modes(sp.csc_matrix(anchored), mass, solid.vertices, 4)
+    indefinite = k - 0.1 * sp.diags(np.repeat(mass, 3))
+    with pytest.raises(ModalAnalysisError):
+        lowest_modes(sp.csc_matrix(indefinite), mass, solid.vertices, 4)
+
+
+# -------------------------------------------------------------------------------- from key-frames to bases
+
+
+@pytest.fixture
+def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
+    """A box as a surface, and a mesher that fills it (the surface comes centred, with a diagonal of 100)."""
+    faces = surface(BOX)
+    low, high = BOX.vertices.min(axis=0), BOX.vertices.max(axis=0)
+    used, compact = np.unique(faces, return_inverse=True)
+
+    def fill(points: np.ndarray, *args: object, **kwargs: object) -> Tetrahedra:
+        return Tetrahedra((BOX.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BOX.tets)
+
+    monkeypatch.setattr(modes, "tetrahedralize", fill)
+    return BOX.vertices[used], compact.reshape(-1, 3)
+
+
+def test_modes_at_the_surface_in_the_callers_units(boxed: Mesh) -> None:
+    vertices, faces = boxed
+    basis = extract_modes(vertices, faces, 5, cache=False)
+    truth = solve(BOX, 5)
+    np.testing.assert_allclose(basis.eigenvalues, truth.eigenvalues, rtol=1e-9)
+    used = np.unique(surface(BOX))
+    at_surface = truth.modes.reshape(-1, 3, 5)[used].transpose(2, 0, 1)
+    # Moving least squares smooth a little on so coarse a mesh; a wrong unit or order is off by far more.
+    error = np.linalg.norm(basis.modes.numpy() - at_surface) / np.linalg.norm(at_surface)
+    assert error < 0.2
+    np.testing.assert_array_equal(basis.reference, vertices)
+    for factor in (1e-6, 4.0, 1e9):
+        scaled = extract_modes(vertices * factor + 10 * factor, faces, 5, cache=False)
+        np.testing.assert_allclose(scaled.eigenvalues * factor**2, basis.eigenvalues, rtol=1e-9)
+        np.testing.assert_allclose(scaled.modes * factor**1.5, basis.modes, atol=1e-7)
+
+
+def test_unreferenced_vertices_do_not_move(boxed: Mesh) -> None:
+    vertices, faces = boxed
+    with pytest.warns(MeshWarning, match="belong to no face"):
+        basis = extract_modes(np.concatenate([[[7.0, 7, 7]], vertices]), faces + 1, 4, cache=False)
+    assert (basis.modes[:, 0] == 0).all()
+    np.testing.assert_allclose(basis.modes[:, 1:], extract_modes(vertices, faces, 4, cache=False).modes)
+
+
+def test_tensors_arrays_and_single_precision(boxed: Mesh) -> None:
+    vertices, faces = boxed
+    wanted = extract_modes(vertices, faces, 4, cache=False)
+    tracked = torch.tensor(vertices, requires_grad=True)
+    for given in (tracked, tracked.detach().float(), vertices.tolist()):
+        basis = extract_modes(given, torch.from_numpy(faces).int(), 4, cache=False)
+        assert basis.modes.dtype == torch.float64
+        assert not basis.modes.requires_grad and not basis.reference.requires_grad
+        np.testing.assert_allclose(basis.modes, wanted.modes, atol=1e-5)
+
+
+def test_cached_modes_are_the_same_and_not_recomputed(
+    boxed: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyframes = np.stack([boxed[0], boxed[0] * (1.0, 1.0, 1.01)])
+    first = extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path))
+    assert len(list(tmp_path.iterdir())) == 4
+    monkeypatch.setattr(modes, "lowest_modes", None)
+    monkeypatch.setattr(modes, "tetrahedralize", None)
+    for basis, again in zip(first, extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path)), strict=True):
+        np.testing.assert_array_equal(basis.modes, again.modes)
+        np.testing.assert_array_equal(basis.eigenvalues, again.eigenvalues)
+    with pytest.raises(TypeError):  # another number of modes is another entry
+        extract_bases(keyframes, boxed[1], 5, cache_dir=str(tmp_path))
+
+
+def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    two = together(box((4, 2, 2), (2.0, 1.0, 1.0)), box((4, 2, 2), (2.0, 1.0, 1.0)))
+    two.vertices[45:, 2] += 3.0
+    center, scale = (1.0, 0.5, 2.0), 100 / np.linalg.norm([2.0, 1.0, 4.0])
+    monkeypatch.setattr(modes, "tetrahedralize", lambda *a, **k: Tetrahedra((two.vertices - center) * scale, two.tets))
+    faces = surface(two)
+    used, compact = np.unique(faces, return_inverse=True)
+    with pytest.warns(MeshWarning, match=r"has 2 loose pieces.* 6 of its first modes"):
+        basis = extract_modes(two.vertices[used], compact.reshape(-1, 3), 8, cache=False)
+    assert basis.eigenvalues[5] < 1e-8 * basis.eigenvalues[6]
+
+
+def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = boxed
+
+    def fail(*args: object, **kwargs: object) -> None:
+        raise TetrahedralizationError("no luck")
+
+    with pytest.raises(MeshError, match=r"key-frame 1: the surface is flat"):
+        extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, cache=False)
+    monkeypatch.setattr(modes, "tetrahedralize", fail)
+    with pytest.raises(TetrahedralizationError, match="key-frame 0: no luck"):
+        extract_bases(np.stack([vertices, vertices]), faces, 4, cache=False)
+    with pytest.raises(TetrahedralizationError, match=r"^no luck"):
+        extract_modes(vertices, faces, 4, cache=False)
+
+
+@pytest.mark.parametrize("n_modes", [0, -1, 2.5, True, 10_000])
+def test_impossible_numbers_of_modes(boxed: Mesh, n_modes: float) -> None:
+    with pytest.raises(ValueError, match=r"n_modes is|at most 216 ways"):
+        extract_modes(*boxed, n_modes, cache=False)  # type: ignore[arg-type]
+
+
+def test_unknown_form(boxed: Mesh) -> None:
+    with pytest.raises(ValueError, match="'spokes'"):
+        extract_modes(*boxed, 4, form="spokes")  # type: ignore[arg-type]
+
+
+def test_the_bar_shows_only_on_request(boxed: Mesh, capsys: pytest.CaptureFixture[str]) -> None:
+    extract_bases([boxed[0]], boxed[1], 4, cache=False)
+    assert capsys.readouterr().err == ""
+    extract_bases([boxed[0], boxed[0]], boxed[1], 4, cache=False, progress=True)
+    assert "key-frame 2/2: modes" in capsys.readouterr().err
+
+
+def test_with_the_real_mesher(capsule: Mesh) -> None:
+    """The whole way; the mesher is not deterministic, so only what does not depend on it is asked."""
+    vertices, faces = capsule
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        basis = extract_modes(vertices, faces, 12, settings=COARSE)
+    assert basis.rigid_eigenvalues.abs().max() < 1e-8 * basis.eigenvalues[0]
+    assert torch.isfinite(basis.modes).all()
+    # A body of revolution: its lowest two modes bend it, with equal eigenvalues (up to the meshing).
+    assert basis.eigenvalues[1] == pytest.approx(float(basis.eigenvalues[0]), rel=0.1)
+    along = (basis.modes[:2, :, 2] ** 2).sum(dim=1) / (basis.modes[:2] ** 2).sum(dim=(1, 2))
+    assert along.max() < 0.25
+    # Restricted and elastic modes stay independent of each other and of the rigid motions.
+    columns = torch.cat([basis.rigid_modes, basis.modes]).flatten(1)
+    columns = columns / columns.norm(dim=1, keepdim=True)
+    assert torch.linalg.svdvals(columns).min() > 0.05

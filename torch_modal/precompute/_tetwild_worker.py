@@ -1,0 +1,60 @@
+"""The child process that runs pytetwild: ``python _tetwild_worker.py JOB.npz RESULT.npz``.
+
+A script, never imported by the package: pytetwild may crash, hang, hold the GIL or replace signal handlers,
+and it does all that here. It imports no torch and nothing of torch_modal, so that it starts in well under a
+second.
+"""
+
+import sys
+
+# Running a script puts its folder first on the path, where this package's cache.py and others would shadow
+# modules that the libraries below import.
+del sys.path[0]
+
+import signal  # noqa: E402
+
+import numpy as np  # noqa: E402
+
+
+def main(job_path: str, result_path: str) -> None:
+    """Decimate the surface, fill it with tetrahedra, write ``vertices (N, 3)`` and ``tets (T, 4)``.
+
+    The job holds ``vertices (V, 3)`` centred with a bounding-box diagonal of 100, ``faces (F, 3)`` and the
+    scalars ``edge_length_fac``, ``epsilon``, ``stop_energy``, ``max_surface_faces``, ``timeout``.
+    """
+    with np.load(job_path) as job:
+        vertices, faces = job["vertices"].copy(), job["faces"].astype(np.int32)
+        edge_length_fac, epsilon, stop_energy, timeout = (
+            float(job[name]) for name in ("edge_length_fac", "epsilon", "stop_energy", "timeout")
+        )
+        max_surface_faces = int(job["max_surface_faces"])
+
+    if hasattr(signal, "alarm"):
+        # The parent keeps the time. This is for the case that the parent itself is killed: the default action
+        # of SIGALRM ends the process even while pytetwild holds the GIL, so that no orphan computes for
+        # hours.
+        signal.alarm(min(int(timeout) + 10, 2**31 - 1))
+
+    # Imported after the alarm is set, and one by one where needed: pytetwild takes most of a second.
+    if len(faces) > max_surface_faces:
+        import fast_simplification
+
+        # agg=7 are the quadrics' absolute thresholds, right for a diagonal of 100.
+        vertices, faces = fast_simplification.simplify(
+            np.ascontiguousarray(vertices), faces, target_count=max_surface_faces, agg=7
+        )
+
+    import pytetwild
+
+    points, tets = pytetwild.tetrahedralize(
+        np.ascontiguousarray(vertices, dtype=np.float64),
+        np.ascontiguousarray(faces, dtype=np.int32),
+        edge_length_fac=edge_length_fac,
+        epsilon=epsilon,
+        stop_energy=stop_energy,
+    )
+    np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2])

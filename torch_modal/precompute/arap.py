@@ -1,0 +1,132 @@
+"""Stiffness and mass of as-rigid-as-possible deformation on tetrahedra."""
+
+from typing import Literal
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+
+FloatArray = NDArray[np.float64]
+HessianForm = Literal["element", "vertex"]
+HESSIAN_FORMS: tuple[HessianForm, ...] = ("element", "vertex")
+
+WEIGHT_FLOOR = 1e-3
+"""Smallest edge weight of the vertex form, as a fraction of the mean magnitude."""
+
+
+def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "element") -> sp.csc_matrix:
+    """Hessian of the as-rigid-as-possible energy at rest, in the displacements ``u`` of the vertices.
+
+    Both forms measure ``min_W ∫ |∇u - W|²`` over infinitesimal rotations ``W`` (skew matrices), with one
+    rotation for each tetrahedron or one for each vertex; both are positive semi-definite, with the rigid
+    motions in the null space, and in the same units, so that their eigenvalues can be compared.
+
+    - ``"element"``: ``sum_t vol_t |sym ∇u|²``. Couples vertices that share a tetrahedron.
+    - ``"vertex"`` (Huang, Wicke, Adams and Guibas 2009): ``½ sum_i sum_{j in N(i)} c_ij |u_i - u_j - w_i ×
+      (x_i - x_j)|²`` with the rotations ``w_i`` eliminated, ``K = L ⊗ I - Bᵀ C⁻¹ B``. Couples vertices two
+      edges apart. The weights ``c_ij`` are the cotangent weights of the tetrahedra, **clamped from below** to
+      a small positive number: on the meshes of fTetWild the raw ones are negative on many edges, ``K`` is
+      then indefinite, and its lowest modes are spurious. The floor is not zero, so that no vertex loses its
+      neighbours.
+
+    Args:
+        tetrahedra: The mesh at rest. Inverted tetrahedra count with the magnitude of their volume.
+        form: Which of the two.
+
+    Returns:
+        Symmetric matrix; row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
+
+    Raises:
+        ValueError: ``form`` is neither.
+    """
+    if form == "element":
+        return _element_hessian(tetrahedra)
+    if form == "vertex":
+        return _vertex_hessian(tetrahedra)
+    raise ValueError(f"the Hessian form is {form!r}; give 'element' or 'vertex'")
+
+
+def lumped_mass(tetrahedra: Tetrahedra) -> FloatArray:
+    """Mass of each vertex: a quarter of the volumes around it, at a density of 1. *Shape:* ``(N,)``."""
+    volumes = np.abs(tet_volumes(tetrahedra))
+    quarters = np.repeat(volumes / 4, 4)
+    return np.bincount(tetrahedra.tets.reshape(-1), quarters, len(tetrahedra.vertices)).astype(np.float64)
+
+
+def hat_gradients(tetrahedra: Tetrahedra) -> FloatArray:
+    """Gradients of the four piecewise linear hat functions in each tetrahedron. *Shape:* ``(T, 4, 3)``."""
+    corners = tetrahedra.vertices[tetrahedra.tets]
+    edges = corners[:, 1:] - corners[:, :1]  # rows e_a with g_a · e_b = δ_ab
+    gradients = np.linalg.inv(edges).transpose(0, 2, 1)
+    return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
+
+
+def _element_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
+    """Blocks ``K_ab = vol ((g_a · g_b) I + g_b g_aᵀ)``.
+
+    They follow from ``|sym G|² = ½ (|G|² + tr G²)`` with ``G = ∇u = Σ u_a g_aᵀ`` and hat gradients ``g``.
+    """
+    g = hat_gradients(tetrahedra)
+    volumes = np.abs(tet_volumes(tetrahedra))
+    blocks = np.einsum("tbi,taj->tabij", g, g)
+    blocks += np.einsum("tak,tbk->tab", g, g)[..., None, None] * np.eye(3)
+    blocks *= volumes[:, None, None, None, None]
+    rows = np.broadcast_to(tetrahedra.tets[:, :, None], blocks.shape[:3])
+    columns = np.broadcast_to(tetrahedra.tets[:, None, :], blocks.shape[:3])
+    k = _from_blocks(blocks.reshape(-1, 3, 3), rows, columns, len(tetrahedra.vertices))
+    return sp.csc_matrix((k + k.T) / 2)  # symmetric to the last bit
+
+
+def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
+    """``K = 2 L ⊗ I - Bᵀ C⁻¹ B`` (each edge is seen from both its ends, hence the 2)."""
+    n = len(tetrahedra.vertices)
+    tail, head, weights = _directed_cotangents(tetrahedra)
+    edges = tetrahedra.vertices[tail] - tetrahedra.vertices[head]
+
+    # min over w_i of sum_j c |d - w × e|²: C_i = sum_j c (|e|² I - e eᵀ), right-hand side sum_j c e × d.
+    inertia = np.einsum("ei,ei->e", edges, edges)[:, None, None] * np.eye(3) - edges[:, :, None] * edges[:, None, :]
+    weighted = (weights[:, None, None] * inertia).reshape(-1, 9)
+    c = np.stack([np.bincount(tail, column, minlength=n) for column in weighted.T], axis=1).reshape(n, 3, 3)
+    cross = np.zeros((len(tail), 3, 3))  # the matrix of e ×
+    cross[:, [2, 0, 1], [1, 2, 0]] = edges[:, [0, 1, 2]]
+    cross[:, [1, 2, 0], [2, 0, 1]] = -edges[:, [0, 1, 2]]
+    cross *= weights[:, None, None]
+    b = _from_blocks(np.concatenate([cross, -cross]), np.concatenate([tail, tail]), np.concatenate([tail, head]), n)
+    c_inverse = np.linalg.inv(c)
+    own = np.arange(n)
+    eliminated = b.T @ _from_blocks((c_inverse + c_inverse.transpose(0, 2, 1)) / 2, own, own, n) @ b
+
+    laplacian = sp.coo_matrix((-weights, (tail, head)), shape=(n, n)).tocsc()
+    laplacian -= sp.diags(np.asarray(laplacian.sum(axis=1)).reshape(-1))
+    k = 2 * sp.kron(laplacian, sp.identity(3), format="csc") - eliminated
+    return sp.csc_matrix((k + k.T) / 2)
+
+
+def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Every edge in both directions with its clamped cotangent weight ``c_ij = -Σ_t vol_t g_i · g_j``."""
+    n = len(tetrahedra.vertices)
+    g = hat_gradients(tetrahedra)
+    stiffness = -np.einsum("tak,tbk->tab", g, g) * np.abs(tet_volumes(tetrahedra))[:, None, None]
+    rows = np.broadcast_to(tetrahedra.tets[:, :, None], stiffness.shape).reshape(-1)
+    columns = np.broadcast_to(tetrahedra.tets[:, None, :], stiffness.shape).reshape(-1)
+    off_diagonal = rows != columns
+    summed = sp.coo_matrix(
+        (stiffness.reshape(-1)[off_diagonal], (rows[off_diagonal], columns[off_diagonal])), shape=(n, n)
+    ).tocsr()
+    summed = ((summed + summed.T) / 2).tocoo()  # equal up to rounding; exactly equal from here on
+    return (
+        summed.row.astype(np.int64),
+        summed.col.astype(np.int64),
+        np.maximum(summed.data, WEIGHT_FLOOR * np.abs(summed.data).mean()),
+    )
+
+
+def _from_blocks(blocks: FloatArray, rows: NDArray, columns: NDArray, n: int) -> sp.csc_matrix:
+    """Sum of 3 by 3 blocks ``(·, 3, 3)`` at the block rows and columns. *Shape:* ``(3n, 3n)``."""
+    axis = np.arange(3)
+    row = (3 * rows.reshape(-1, 1, 1) + axis[:, None]) + 0 * axis
+    column = (3 * columns.reshape(-1, 1, 1) + axis) + 0 * axis[:, None]
+    entries = (blocks.reshape(-1), (row.reshape(-1), column.reshape(-1)))
+    return sp.coo_matrix(entries, shape=(3 * n, 3 * n)).tocsc()

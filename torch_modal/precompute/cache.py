@@ -1,0 +1,133 @@
+"""Results of the pre-computation, kept on disk under the hash of what they were computed from."""
+
+import hashlib
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from torch_modal.files import write_atomically
+
+CACHE_VERSION = 1
+"""Part of every key: raise it when an algorithm of the pre-computation changes, and old entries are left."""
+CACHE_VARIABLE = "TORCH_MODAL_CACHE"
+SUFFIX = ".safetensors"
+_DIGEST = "digest"
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class CacheWarning(UserWarning):
+    """The cache cannot be written; results are right, but will be computed again."""
+
+
+def default_cache_dir() -> Path:
+    """The folder named by ``TORCH_MODAL_CACHE``, or ``torch_modal`` in the user's cache folder."""
+    if named := os.environ.get(CACHE_VARIABLE):
+        return Path(named).expanduser()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "torch_modal"
+
+
+@dataclass(frozen=True)
+class Cache:
+    """A folder of safetensors files, one per result, each with a digest that every read verifies.
+
+    Damaged, truncated or foreign entries are computed again and replaced. Several processes may share the
+    folder: entries are moved into place whole.
+
+    Attributes:
+        folder: Where entries stand; it is made when the first is written. None keeps nothing.
+    """
+
+    folder: Path | None
+
+    @classmethod
+    def at(cls, cache_dir: str | os.PathLike[str] | None = None, *, enabled: bool = True) -> "Cache":
+        """The cache in a folder, by default in :func:`default_cache_dir`; or one that keeps nothing."""
+        if not enabled:
+            return cls(None)
+        return cls(default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser())
+
+    def get(
+        self,
+        kind: str,
+        inputs: Mapping[str, NDArray[Any]],
+        parameters: Mapping[str, Any],
+        compute: Callable[[], Mapping[str, NDArray[Any]]],
+    ) -> Arrays:
+        """The kept result, or a computed one that is kept from then on.
+
+        Args:
+            kind: What the result is; the first part of the file's name.
+            inputs: Arrays that the result depends on.
+            parameters: Numbers and strings that it depends on.
+            compute: Makes the result.
+
+        Returns:
+            The arrays that ``compute`` returned, now or earlier.
+
+        Warns:
+            CacheWarning: The folder cannot be written.
+        """
+        if self.folder is None:
+            return dict(compute())
+        key = content_key(kind, inputs, parameters)
+        path = self.folder / f"{kind}-{key}{SUFFIX}"
+        kept = _read(path)
+        if kept is not None:
+            return kept
+        arrays = {name: np.ascontiguousarray(array) for name, array in compute().items()}
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, save_arrays({**arrays, _DIGEST: _digest(arrays)}))
+        except OSError as error:
+            warnings.warn(
+                f"cannot keep {kind} in the cache folder {self.folder} ({error}); set {CACHE_VARIABLE} or "
+                "cache_dir to a folder that can be written",
+                CacheWarning,
+                stacklevel=2,
+            )
+        return arrays
+
+
+def content_key(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:
+    """SHA-256 of the kind, the arrays (bytes, shapes, dtypes), the parameters and the cache version."""
+    head = json.dumps([CACHE_VERSION, kind, dict(parameters)], sort_keys=True)
+    return hashlib.sha256(head.encode() + _digest(inputs).tobytes()).hexdigest()
+
+
+def _digest(arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    """SHA-256 of named arrays. *Shape:* ``(32,)``."""
+    total = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        total.update(json.dumps([name, array.dtype.str, list(array.shape)]).encode())
+        total.update(array.tobytes())
+    return np.frombuffer(total.digest(), dtype=np.uint8).copy()
+
+
+def _read(path: Path) -> Arrays | None:
+    """The entry's arrays if the file is there, can be parsed, and has the digest it was written with."""
+    try:
+        arrays = load_arrays(path.read_bytes())
+    except (OSError, SafetensorError, KeyError, ValueError):
+        # Whatever is wrong with the file, computing again is right.
+        return None
+    written = arrays.pop(_DIGEST, None)
+    return arrays if written is not None and np.array_equal(written, _digest(arrays)) else None

@@ -1,0 +1,115 @@
+"""One edge-collapse rule for all key-frames, and the cluster averages that it gives (section 3.2 of the paper)."""
+
+import threading
+from dataclasses import dataclass
+
+import fast_simplification
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from torch_modal.mesh import IntArray
+
+FloatArray = NDArray[np.float64]
+
+# fast-simplification keeps its mesh in static memory and has absolute thresholds.
+_NOT_THREAD_SAFE = threading.Lock()
+_WORKING_DIAGONAL = 100.0
+_AGGRESSIVENESS = 7.0
+
+
+@dataclass(frozen=True)
+class Coarsening:
+    """A partition of the fine vertices into clusters, each a vertex of the coarse mesh.
+
+    The restriction of positions and of modes is the same cluster average, so ``restrict(x + phi a)`` is exactly
+    ``restrict(x) + restrict(phi) a``. Positions that the simplification itself would place are never used: they solve
+    quadrics anew for every pose and are not linear in it.
+    """
+
+    clusters: IntArray
+    """Coarse vertex of each fine one, -1 for those that no face uses. *Shape:* ``(V,)``."""
+    faces: IntArray
+    """Faces of the coarse mesh. *Shape:* ``(F_coarse, 3)``."""
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of coarse vertices."""
+        return int(self.clusters.max()) + 1
+
+    def restriction(self) -> sparse.csr_matrix:
+        """Matrix of the cluster average. *Shape:* ``(V_coarse, V)``."""
+        members = np.flatnonzero(self.clusters >= 0)
+        clusters = self.clusters[members]
+        sizes = np.bincount(clusters, minlength=self.n_vertices)
+        shape = (self.n_vertices, len(self.clusters))
+        return sparse.csr_matrix((1.0 / sizes[clusters], (clusters, members)), shape=shape)
+
+    def restrict(self, x: FloatArray) -> FloatArray:
+        """Cluster averages. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
+        lead = x.shape[:-2]
+        columns = np.moveaxis(x.reshape(-1, *x.shape[-2:]), 1, 0).reshape(x.shape[-2], -1)
+        coarse = (self.restriction() @ columns).reshape(self.n_vertices, -1, 3)
+        return np.moveaxis(coarse, 0, 1).reshape(*lead, self.n_vertices, 3)
+
+
+def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
+    """Partition by the edge collapses of one pose."""
+    extent = np.ptp(points[np.unique(faces)], axis=0)
+    working = np.ascontiguousarray((points - points.mean(0)) * (_WORKING_DIAGONAL / np.linalg.norm(extent)))
+    with _NOT_THREAD_SAFE:
+        _, _, collapses = fast_simplification.simplify(
+            working,
+            np.ascontiguousarray(faces, dtype=np.int32),
+            target_count=n_faces,
+            agg=_AGGRESSIVENESS,
+            return_collapses=True,
+        )
+    root = np.arange(len(points))
+    root[collapses[:, 1]] = collapses[:, 0]
+    while not np.array_equal(root[root], root):
+        root = root[root]
+    coarse_faces = root[faces]
+    a, b, c = coarse_faces.T
+    coarse_faces = coarse_faces[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(coarse_faces, axis=1), axis=0, return_index=True)
+    coarse_faces = coarse_faces[np.sort(first)]
+    # Roots that lost all their faces carry no energy: they are left out, as are vertices that never had one.
+    used = np.unique(coarse_faces)
+    index = np.full(len(points), -1)
+    index[used] = np.arange(len(used))
+    return Coarsening(index[root], index[coarse_faces])
+
+
+def _thinnest(keyframes: FloatArray, coarsening: Coarsening) -> float:
+    """How thin the coarse triangles get: 1st percentile, worst key-frame, of area over longest edge squared."""
+    corners = coarsening.restrict(keyframes)[:, coarsening.faces]
+    sides = corners - np.roll(corners, 1, axis=2)
+    area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
+    longest = (sides**2).sum(-1).max(-1)
+    return float(np.percentile(area / np.maximum(longest, np.finfo(np.float64).tiny), 1, axis=-1).min())
+
+
+def coarsen(keyframes: FloatArray, faces: IntArray, n_faces: int = 1000) -> Coarsening:
+    """Partition the vertices of all key-frames by the edge collapses of one of them.
+
+    Every key-frame is tried as the one that the collapses are chosen on; the partition is kept whose triangles stay
+    fattest over all of them, as thin coarse triangles exaggerate bending and collapse on the way.
+
+    Args:
+        keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_faces: Faces of the coarse mesh; a mesh with no more than that is left as it is.
+
+    Raises:
+        ValueError: If ``n_faces`` is below 4.
+    """
+    if n_faces < 4:
+        raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
+    if len(faces) <= n_faces:
+        used = np.unique(faces)
+        index = np.full(keyframes.shape[1], -1)
+        index[used] = np.arange(len(used))
+        return Coarsening(index, index[faces])
+    candidates = [_collapse_once(points, faces, n_faces) for points in keyframes]
+    return max(candidates, key=lambda candidate: _thinnest(keyframes, candidate))

@@ -1,0 +1,206 @@
+"""Lowest vibration modes: the generalised eigenproblem ``K phi = lambda M phi``."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+N_RIGID = 6
+GUARD = 4
+"""Pairs computed beyond those asked for: the last of a batch are the least settled."""
+DENSE_BELOW = 600
+"""Number of unknowns under which LAPACK is as fast as a factorisation and Lanczos."""
+RIGID_TOLERANCE = 1e-8
+RESIDUAL_TOLERANCE = 1e-6
+SHIFT = 1.0
+"""Negative shift in units of 1 / (bounding-box diagonal)²; the lowest modes of slender bodies lie near it."""
+ZERO = 1e-9
+"""Largest eigenvalue that counts as zero, in the same units: rounding leaves 1e-13 to 1e-12, and the first
+mode of a rod 10,000 times longer than wide is still near 1e-6."""
+
+
+class ModalAnalysisError(RuntimeError):
+    """The eigenproblem has no trustworthy solution; the message says which check failed."""
+
+
+class VolumeModes(NamedTuple):
+    """Lowest modes of a tetrahedral mesh, the six rigid ones apart.
+
+    Attributes:
+        eigenvalues: Ascending. *Shape:* ``(k,)``.
+        modes: M-orthonormal and M-orthogonal to the rigid motions. *Shape:* ``(3N, k)``.
+        rigid_eigenvalues: As computed, zero up to rounding. *Shape:* ``(6,)``.
+        n_zero: How many eigenvalues are zero, the six included: six for each loose component.
+        residual: Largest ``|K phi - lambda M phi| / (lambda |M phi|)``.
+    """
+
+    eigenvalues: FloatArray
+    modes: FloatArray
+    rigid_eigenvalues: FloatArray
+    n_zero: int
+    residual: float
+
+
+def rigid_motions(positions: FloatArray, mass: FloatArray) -> FloatArray:
+    """M-orthonormal basis of the translations and infinitesimal rotations. *Shape:* ``(3N, 6)``.
+
+    Args:
+        positions: Rest positions, not all on one line. *Shape:* ``(N, 3)``.
+        mass: Mass of each vertex. *Shape:* ``(N,)``.
+    """
+    n = len(positions)
+    centered = positions - np.average(positions, axis=0, weights=mass)
+    # Of order 1 like the translations, so that the factorisation below is well conditioned.
+    centered = centered / np.sqrt(np.average((centered**2).sum(axis=1), weights=mass))
+    motions = np.zeros((n, 3, 6))
+    motions[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centered)
+    root = np.sqrt(np.repeat(mass, 3))[:, None]
+    return np.linalg.qr(root * motions.reshape(3 * n, 6))[0] / root
+
+
+def lowest_modes(k: sp.csc_matrix, mass: FloatArray, positions: FloatArray, n_modes: int) -> VolumeModes:
+    """Lowest elastic modes of ``K phi = lambda M phi`` with a lumped mass.
+
+    Shift-invert Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are
+    those of ``K`` itself, which a regularised ``K + eps M`` would not give for free. Then two steps of dense
+    clean-up: the span is made exactly M-orthogonal to the rigid motions, and ``K`` is diagonalised in it
+    (Rayleigh-Ritz). Small problems are solved densely. Of each mode's largest
+    components, the first is positive.
+
+    Args:
+        k: Stiffness, symmetric positive semi-definite. *Shape:* ``(3N, 3N)``.
+        mass: Mass of each vertex, positive. *Shape:* ``(N,)``.
+        positions: Rest positions. *Shape:* ``(N, 3)``.
+        n_modes: Number of elastic modes.
+
+    Returns:
+        The modes. Zero modes beyond the six (loose components) stay in as the first of them.
+
+    Raises:
+        ValueError: More modes than the mesh has.
+        ModalAnalysisError: The six zero modes are missing, the stiffness is indefinite, nothing but zero
+            modes was found, or a residual is too large.
+    """
+    possible = 3 * len(mass) - N_RIGID
+    if not 1 <= n_modes <= possible:
+        raise ValueError(
+            f"{n_modes} modes asked for, but {len(mass)} tetrahedral vertices have {possible} elastic modes; "
+            f"give 1 to {possible}"
+        )
+    masses = np.repeat(mass, 3)
+    if not (masses > 0).all():
+        raise ModalAnalysisError(f"{int((mass <= 0).sum())} vertices have no mass; remove unused vertices first")
+    n_pairs = min(n_modes + N_RIGID + GUARD, len(masses))
+    span = _lowest_span(k, masses, positions, n_pairs)
+
+    root = np.sqrt(masses)[:, None]
+    values = _rayleigh_ritz(k, span, root)[0]
+    rigid_eigenvalues = values[:N_RIGID]
+
+    # The rigid part is taken out exactly: six directions of the span lose all their length, and are left
+    # behind.
+    rigid = root * rigid_motions(positions, mass)
+    scaled = root * span
+    scaled -= rigid @ (rigid.T @ scaled)
+    elastic = np.linalg.svd(scaled, full_matrices=False)[0][:, : n_pairs - N_RIGID]
+    elastic -= rigid @ (rigid.T @ elastic)
+    eigenvalues, modes = _rayleigh_ritz(k, elastic / root, root)
+
+    first_elastic, n_zero = _count_zeros(eigenvalues, positions)
+    if not np.abs(rigid_eigenvalues).max() < RIGID_TOLERANCE * first_elastic:
+        raise ModalAnalysisError(
+            f"the six rigid motions have eigenvalues up to {np.abs(rigid_eigenvalues).max():.2e}, which is "
+            f"not zero beside the first elastic one, {first_elastic:.2e}; the tetrahedra are degenerate"
+        )
+    eigenvalues, modes = eigenvalues[:n_modes], modes[:, :n_modes]
+    modes = modes * _signs(modes)
+
+    residual = relative_residual(k, masses, eigenvalues, modes, first_elastic)
+    if not residual < RESIDUAL_TOLERANCE:
+        raise ModalAnalysisError(
+            f"the modes leave a relative residual of {residual:.2e} (allowed: {RESIDUAL_TOLERANCE:g}); "
+            "the tetrahedra are likely degenerate"
+        )
+    # Zero modes of loose pieces come out as -1e-13 as well as 1e-13; nobody should meet the root of that.
+    return VolumeModes(np.maximum(eigenvalues, 0.0), modes, rigid_eigenvalues, n_zero, residual)
+
+
+def relative_residual(
+    k: sp.csc_matrix, masses: FloatArray, eigenvalues: FloatArray, modes: FloatArray, smallest: float
+) -> float:
+    """Largest ``|K phi - lambda M phi| / (lambda |M phi|)``, Euclidean norms.
+
+    A zero mode counts as if its eigenvalue were ``smallest``, the first that is not zero.
+    """
+    inertia = masses[:, None] * modes
+    difference = np.linalg.norm(k @ modes - inertia * eigenvalues, axis=0)
+    return float((difference / (np.maximum(eigenvalues, smallest) * np.linalg.norm(inertia, axis=0))).max())
+
+
+def _count_zeros(eigenvalues: FloatArray, positions: FloatArray) -> tuple[float, int]:
+    """The first eigenvalue that is not zero, and the number of those that are, the rigid ones included."""
+    zero = ZERO / _squared_diagonal(positions)
+    if eigenvalues[0] < -zero:
+        raise ModalAnalysisError(
+            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; "
+            "the tetrahedra are likely degenerate"
+        )
+    n_extra = int((eigenvalues < zero).sum())
+    if n_extra == len(eigenvalues):
+        raise ModalAnalysisError(
+            f"all of the lowest {n_extra} modes are motions without deformation: the mesh falls into loose "
+            "pieces, each of which moves in six ways of its own; join them, or ask for more modes than that"
+        )
+    return float(eigenvalues[n_extra]), N_RIGID + n_extra
+
+
+def _signs(modes: FloatArray) -> FloatArray:
+    """Signs that make the first of the largest components positive. *Shape:* ``(k,)``.
+
+    "Largest" up to a thousandth: symmetric shapes have components of equal magnitude and opposite sign, and
+    rounding must not choose among them.
+    """
+    magnitude = np.abs(modes)
+    first = (magnitude >= 0.999 * magnitude.max(axis=0)).argmax(axis=0)
+    return np.where(np.take_along_axis(modes, first[None], axis=0)[0] < 0, -1.0, 1.0)
+
+
+def _squared_diagonal(positions: FloatArray) -> float:
+    """Squared diagonal of the bounding box: eigenvalues are proportional to its inverse."""
+    return float(((positions.max(axis=0) - positions.min(axis=0)) ** 2).sum())
+
+
+def _lowest_span(k: sp.csc_matrix, masses: FloatArray, positions: FloatArray, n_pairs: int) -> FloatArray:
+    """M-orthonormal basis of about the ``n_pairs`` lowest eigenvectors, rigid motions included."""
+    n = len(masses)
+    if n < DENSE_BELOW or 2 * n_pairs > n:
+        root = np.sqrt(masses)
+        symmetric = k.toarray() / root[:, None] / root
+        return scipy.linalg.eigh(symmetric, subset_by_index=(0, n_pairs - 1))[1] / root[:, None]
+
+    sigma = -SHIFT / _squared_diagonal(positions)
+    shifted = sp.csc_matrix(k - sigma * sp.diags(masses))
+    # Positive definite: no pivoting is needed, and a symmetric ordering keeps the fill low.
+    factors = spla.splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    inverse = spla.LinearOperator(shifted.shape, matvec=factors.solve, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(n)  # fixed, so that equal input gives equal modes
+    try:
+        values, vectors = spla.eigsh(k, k=n_pairs, M=sp.diags(masses), sigma=sigma, OPinv=inverse, v0=start)
+    except spla.ArpackError as error:
+        raise ModalAnalysisError(f"Lanczos iteration failed: {error}") from error
+    return vectors[:, np.argsort(values)]
+
+
+def _rayleigh_ritz(k: sp.csc_matrix, span: FloatArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues and M-orthonormal vectors of ``K`` within a span; ``root`` is the square root of M."""
+    basis = np.linalg.qr(root * span)[0] / root
+    restricted = basis.T @ (k @ basis)
+    values, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
+    return values, basis @ rotation

@@ -1,0 +1,287 @@
+"""A surface filled with tetrahedra, by fTetWild in a process of its own."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from torch_modal.inspect_mesh import signed_volume
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
+DIAGONAL = 100.0
+"""Bounding-box diagonal in which the pre-computation works: the decimation has absolute thresholds for it."""
+
+DEBRIS = 0.01
+"""Largest volume of a piece that is dropped if it only hangs on others, as a fraction of the whole."""
+
+
+class Tetrahedra(NamedTuple):
+    """A tetrahedral mesh.
+
+    Attributes:
+        vertices: Positions. *Shape:* ``(N, 3)``.
+        tets: Vertex indices, oriented so that volumes are positive. *Shape:* ``(T, 4)``.
+    """
+
+    vertices: FloatArray
+    tets: IntArray
+
+
+@dataclass(frozen=True)
+class TetrahedraSettings:
+    """How fine the tetrahedra are. The defaults took 2 to 5 s on meshes of 3k and 27k faces.
+
+    Attributes:
+        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal.
+        epsilon: How far the tetrahedra may leave the surface, as a fraction of the bounding-box diagonal.
+        stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is
+            10).
+        max_surface_faces: The surface is decimated to about this many faces first.
+
+    Raises:
+        ValueError: A number is out of range (fTetWild hangs on an ``epsilon`` of zero, for example).
+    """
+
+    edge_length_fac: float = 0.03
+    epsilon: float = 2e-3
+    stop_energy: float = 50.0
+    max_surface_faces: int = 2000
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("edge_length_fac", 2e-3, 1.0),
+            ("epsilon", 1e-5, 0.1),
+            ("stop_energy", 4.0, 1e6),
+            ("max_surface_faces", 100, 10**8),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} is {value}; give a number from {low:g} to {high:g}")
+
+
+class TetrahedralizationError(RuntimeError):
+    """No usable tetrahedra came out; the message says for which mesh, why, and what to do."""
+
+
+def tetrahedralize(
+    vertices: FloatArray,
+    faces: IntArray,
+    settings: TetrahedraSettings | None = None,
+    *,
+    timeout: float = 600.0,
+) -> Tetrahedra:
+    """Fill a closed surface with tetrahedra.
+
+    fTetWild makes a new surface mesh within its tolerance, so the vertices of the surface are not among those
+    of the result: embed them with :func:`~torch_modal.precompute.embedding.embed_surface`. It is not
+    deterministic either: two calls give two meshes. It runs in a child process, so a crash or a hang of it
+    becomes an exception here, and threads and data-loader workers may call this function.
+
+    Args:
+        vertices: Positions, any units. *Shape:* ``(V, 3)``.
+        faces: Vertex indices of a closed surface; vertices outside all faces are left out. *Shape:*
+            ``(F, 3)``.
+        settings: How fine the tetrahedra are.
+        timeout: Seconds after which the child process is killed.
+
+    Returns:
+        Tetrahedra in the units of ``vertices``: positive volumes, every vertex used.
+
+    Raises:
+        TetrahedralizationError: The child process crashed, took longer than ``timeout``, or gave no
+            tetrahedra or ones that do not fill the surface.
+    """
+    settings = settings or TetrahedraSettings()
+    used, compact = np.unique(faces, return_inverse=True)
+    surface = vertices[used]
+    center = (surface.min(axis=0) + surface.max(axis=0)) / 2
+    scale = DIAGONAL / np.linalg.norm(surface.max(axis=0) - surface.min(axis=0))
+    surface = (surface - center) * scale
+
+    failure = _Failure(len(vertices), len(faces))
+    raw = _run_worker(surface, outward(surface, compact.reshape(-1, 3)), settings, timeout, failure)
+    tetrahedra = without_debris(oriented(raw))
+    _check_fills(tetrahedra, surface, settings, failure)
+    return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
+
+
+def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
+    """The faces, all turned over if they wind clockwise seen from outside. *Shape:* ``(F, 3)``.
+
+    fTetWild keeps what the faces wind around, which is nothing for a mesh that is inside out.
+    """
+    return faces[:, ::-1] if signed_volume(vertices - vertices.mean(axis=0), faces) < 0 else faces
+
+
+def tet_volumes(tetrahedra: Tetrahedra) -> FloatArray:
+    """Signed volumes. *Shape:* ``(T,)``."""
+    corners = tetrahedra.vertices[tetrahedra.tets]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+
+
+def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
+    """The same mesh with positive volumes, without flat tetrahedra and unused vertices."""
+    volumes = tet_volumes(tetrahedra)
+    tets = tetrahedra.tets.copy()
+    tets[volumes < 0] = tets[volumes < 0][:, [1, 0, 2, 3]]
+    edges = tetrahedra.vertices[tets[:, 1:]] - tetrahedra.vertices[tets[:, :1]]
+    # A volume below rounding in units of the tetrahedron's own size has no usable gradients.
+    flat = np.abs(volumes) <= 1e-12 * np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) ** 3
+    used, compact = np.unique(tets[~flat], return_inverse=True)
+    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4))
+
+
+def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
+    """The same mesh without small pieces that hang on others by a vertex or an edge only.
+
+    fTetWild leaves them along the rims of open surfaces. They swing freely, and each adds zero modes.
+    """
+    tets = tetrahedra.tets
+    if len(tets) == 0:
+        return tetrahedra
+    sides = np.sort(np.concatenate([tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
+    owner = np.tile(np.arange(len(tets)), 4)
+    order = np.lexsort(sides.T)
+    shared = (np.diff(sides[order], axis=0) == 0).all(axis=1)
+    pairs = (owner[order][:-1][shared], owner[order][1:][shared])
+    graph = sp.coo_matrix((np.ones(len(pairs[0])), pairs), shape=(len(tets), len(tets)))
+    n_pieces, piece = connected_components(graph, directed=False)
+    volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
+    users = np.unique(np.stack([tets.reshape(-1), np.repeat(piece, 4)], axis=1), axis=0)
+    hinge = np.bincount(users[:, 0])[users[:, 0]] > 1  # a vertex of two pieces or more
+    hangs = np.bincount(users[:, 1], hinge, n_pieces) > 0
+    debris = hangs & (volumes < DEBRIS * volumes.sum())
+    used, compact = np.unique(tets[~debris[piece]], return_inverse=True)
+    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4))
+
+
+class _Failure(NamedTuple):
+    """The mesh that an error message speaks about."""
+
+    n_vertices: int
+    n_faces: int
+
+    def error(self, why: str, advice: str) -> TetrahedralizationError:
+        mesh = f"a mesh of {self.n_vertices} vertices and {self.n_faces} faces"
+        return TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {why}. {advice}")
+
+
+def _run_worker(
+    surface: FloatArray, faces: IntArray, settings: TetrahedraSettings, timeout: float, failure: _Failure
+) -> Tetrahedra:
+    """Hand the surface to the worker process, wait for it, read what it wrote."""
+    if not sys.executable:
+        raise failure.error(
+            "sys.executable is empty, so no worker process can be started", "Run in a normal interpreter"
+        )
+    with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
+        job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
+        np.savez(job, vertices=surface, faces=faces, timeout=timeout, **asdict(settings))
+        command = [sys.executable, str(WORKER), str(job), str(result)]
+        # Output goes to a file: a pipe that nobody empties would block the child.
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                cwd=folder,  # fTetWild leaves a __tracked_surface.stl where it runs
+                # Its own process group: it is killed as a whole, and Ctrl-C reaches only this process.
+                start_new_session=True,
+            )
+        try:
+            code = _wait(process, timeout)
+        finally:
+            _kill(process)  # also on KeyboardInterrupt
+        if code is None:
+            raise failure.error(
+                f"no result after the timeout of {timeout:g} s",
+                "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections",
+            )
+        if code != 0:
+            tail = (log.read_text(errors="replace").strip().splitlines() or [""])[-1]  # of a traceback: the error
+            raise failure.error(
+                f"the worker process ended with {_describe_exit(code)}" + (f" ({tail})" if tail else ""),
+                "Check the surface for self-intersections and degenerate faces, or try other settings",
+            )
+        try:
+            with np.load(result) as arrays:
+                return Tetrahedra(arrays["vertices"], arrays["tets"])
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise failure.error(f"the worker process left no readable result ({error})", "Try again") from error
+
+
+def _wait(process: subprocess.Popen[bytes], timeout: float) -> int | None:
+    """The exit code, or None after ``timeout`` seconds.
+
+    Polled, as a wait with a timeout in one piece cannot be interrupted by Ctrl-C on every platform.
+    """
+    end = time.monotonic() + timeout
+    while True:
+        try:
+            return process.wait(timeout=min(max(end - time.monotonic(), 0.0), 0.5))
+        except subprocess.TimeoutExpired:
+            if time.monotonic() >= end:
+                return None
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End the worker and whatever it started, and take in its exit status so that no zombie stays."""
+    if process.poll() is not None:
+        return
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.wait()
+
+
+def _describe_exit(code: int) -> str:
+    """``exit code 1`` or ``signal SIGSEGV``."""
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        return f"signal {signal.Signals(-code).name}"
+    except ValueError:
+        return f"signal {-code}"
+
+
+def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: TetrahedraSettings, failure: _Failure) -> None:
+    """Refuse a mesh that is empty, not finite, or does not reach all of the surface (diagonal 100)."""
+    advice = (
+        "Check that the surface is closed, its winding consistent, and no part thinner than "
+        f"{100 * settings.epsilon:g} % of the diagonal, or give a smaller epsilon"
+    )
+    if len(tetrahedra.tets) == 0:
+        raise failure.error("the result is empty", advice)
+    if not np.isfinite(tetrahedra.vertices).all():
+        raise failure.error("the result has coordinates that are not finite", advice)
+    # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
+    reach = DIAGONAL * (0.05 + 2 * settings.edge_length_fac)
+    distance = cKDTree(tetrahedra.vertices).query(surface)[0]
+    n_far = int((distance > reach).sum())
+    if n_far:
+        raise failure.error(
+            f"{n_far} of its vertices are further than {reach:g} % of the diagonal from the result",
+            advice + ", or raise max_surface_faces if small parts were lost in the decimation",
+        )
+    low, high = surface.min(axis=0) - reach, surface.max(axis=0) + reach
+    if (tetrahedra.vertices < low).any() or (tetrahedra.vertices > high).any():
+        raise failure.error("the result reaches far beyond the surface", advice)
