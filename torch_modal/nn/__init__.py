@@ -1,0 +1,1 @@
+"""Per-call work, torch only: the energy, the solver and the layers."""

@@ -1,0 +1,174 @@
+"""Between the caller's coordinates and the frame in which an in-between is sought."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal import mesh
+from torch_modal.basis import ModalBasis
+from torch_modal.keyframes import check_keyframes
+from torch_modal.precompute.coarsening import coarsen
+from torch_modal.rigid import RigidMotion, best_fit
+
+# Eq. 5 is not scale-invariant: its stiffnesses are meant for shapes of this bounding-box diagonal.
+DIAGONAL = 100.0
+
+# Combinations of columns whose squared norm is below this part of the largest are rounding, not directions.
+DEPENDENT = 1e-9
+
+
+class Pair(NamedTuple):
+    """Two key-frames of each sample, centred, scaled and turned to the first basis' reference."""
+
+    first: Tensor
+    """*Shape:* ``(B, V, 3)``."""
+    second: Tensor
+    """Turned on to ``first``. *Shape:* ``(B, V, 3)``."""
+    placed: RigidMotion
+    """From the caller's first key-frame to that of the frame, in the caller's units."""
+    between: RigidMotion
+    """From the first key-frame's pose to the second's, in the frame and its units."""
+
+
+class Columns(nn.Module):
+    """The same directions on the fine and on the coarse mesh.
+
+    Args:
+        fine: *Shape:* ``(n, V, 3)``.
+        coarse: Orthonormal under the coarse vertex weights. *Shape:* ``(n, V_coarse, 3)``.
+    """
+
+    fine: Tensor
+    coarse: Tensor
+
+    def __init__(self, fine: Tensor, coarse: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("fine", fine)
+        self.register_buffer("coarse", coarse)
+
+    def combine(self, a: Tensor) -> Tensor:
+        """Fine displacement of given amplitudes. *Shape:* ``(..., n) -> (..., V, 3)``."""
+        return (a @ self.fine.flatten(1)).unflatten(-1, (-1, 3))
+
+
+class Frame(nn.Module):
+    """The scale of 100, the alignment of two bases, and the coarse mesh that the energy is evaluated on.
+
+    Args:
+        bases: The bases at both ends, or one that serves for both.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        coarse_faces: Number of faces of the coarse mesh.
+
+    Raises:
+        ValueError: The bases do not fit each other or the faces.
+    """
+
+    scale: Tensor
+    faces: Tensor
+    coarse_faces: Tensor
+    weights: Tensor
+    coarse_weights: Tensor
+    clusters: Tensor
+    shares: Tensor
+    reference: Tensor
+
+    def __init__(self, bases: ModalBasis | Sequence[ModalBasis], faces: Tensor, coarse_faces: int) -> None:
+        super().__init__()
+        bases = [bases, bases] if isinstance(bases, ModalBasis) else list(bases)
+        if len(bases) != 2:
+            raise ValueError(f"an in-between lies between two bases, got {len(bases)}; pass [basis_a, basis_b]")
+        if bases[0].n_vertices != bases[1].n_vertices:
+            raise ValueError(
+                f"the bases belong to meshes of {bases[0].n_vertices} and {bases[1].n_vertices} vertices; both ends "
+                "of an in-between need one connectivity"
+            )
+        ends = [basis.to("cpu", torch.float64) for basis in bases]
+        shapes, faces = check_keyframes([end.reference for end in ends], faces, warn=False)
+        used = shapes[0][faces.unique()]
+        scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
+        weights = torch.from_numpy(mesh.vertex_areas(shapes[0].numpy(), faces.numpy()))
+        weights = weights / weights.sum()
+        turn = best_fit(shapes[1], shapes[0], weights)
+        references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale
+        coarsening = coarsen(references.numpy(), faces.numpy(), coarse_faces)
+        clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
+        member = torch.from_numpy(coarsening.clusters >= 0).double()
+        per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
+
+        self.n_coarse = coarsening.n_vertices
+        self.register_buffer("scale", scale)
+        self.register_buffer("faces", faces)
+        self.register_buffer("coarse_faces", torch.from_numpy(coarsening.faces))
+        self.register_buffer("weights", weights)
+        self.register_buffer("coarse_weights", per_cluster.index_add(0, clusters, weights))
+        self.register_buffer("clusters", clusters)
+        self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters])
+        self.register_buffer("reference", references[0])
+        #: Rigid motions of the shape half-way between the references, to first order.
+        self.rigid = self.orthonormal(_rigid_fields(references.mean(0)))
+        #: Modes of both ends, turned into this frame. Their scale does not matter.
+        self.modes = (ends[0].modes, ends[1].modes @ turn.rotation.mT)
+
+    def coarsen(self, x: Tensor) -> Tensor:
+        """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
+        out = x.new_zeros(*x.shape[:-2], self.n_coarse, 3)
+        return out.index_add(-2, self.clusters, self.shares[:, None] * x)
+
+    def orthonormal(self, directions: Tensor) -> Columns:
+        """Combinations of directions that are orthonormal on the coarse mesh; dependent ones are dropped.
+
+        Args:
+            directions: Displacements of the fine vertices. *Shape:* ``(m, V, 3)``.
+
+        Returns:
+            ``n <= m`` columns.
+        """
+        coarse = self.coarsen(directions)
+        weighted = (coarse * self.coarse_weights[:, None]).flatten(1)
+        values, vectors = torch.linalg.eigh(weighted @ coarse.flatten(1).mT)
+        keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
+        mix = (vectors[:, keep] / values[keep].sqrt()).mT
+        return Columns(torch.tensordot(mix, directions, 1), torch.tensordot(mix, coarse, 1))
+
+    def remove(self, directions: Tensor, columns: Columns) -> Tensor:
+        """Directions less their part in the span of columns, as the coarse mesh sees it. *Shape:* ``(..., V, 3)``."""
+        weighted = (columns.coarse * self.coarse_weights[:, None]).flatten(1)
+        return directions - columns.combine(self.coarsen(directions).flatten(-2) @ weighted.mT)
+
+    def elastic_columns(self, directions: Tensor) -> Columns:
+        """Independent combinations of directions, without rigid motions.
+
+        The energy does not see translations, and rotations only to second order: left in, they are null directions of
+        its Hessian. Modes of two key-frames are partly the same: what is dependent is dropped here, explicitly.
+
+        Args:
+            directions: Displacements of the fine vertices, of any scale. *Shape:* ``(m, V, 3)``.
+        """
+        directions = self.remove(directions, self.rigid)
+        sizes = torch.linalg.norm(self.coarsen(directions).flatten(1), dim=1)[:, None, None]
+        return self.orthonormal(directions / sizes.clamp_min(torch.finfo(sizes.dtype).tiny))
+
+    def place(self, x_a: Tensor, x_b: Tensor) -> Pair:
+        """Bring key-frames into the frame. *Shape:* ``(B, V, 3)`` each."""
+        placed = best_fit(x_a, self.reference / self.scale, self.weights)
+        first, second = placed.apply(x_a) * self.scale, x_b * self.scale
+        back = best_fit(second, first, self.weights)
+        return Pair(first, back.apply(second), placed, back.inverse())
+
+    def restore(self, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
+        """Bring a shape at the time ``t`` back to the caller, moved along the geodesic of the rigid motion.
+
+        Args:
+            x: Shapes of the frame. *Shape:* ``(B, V, 3)``.
+            pair: The key-frames that they lie between.
+            t: *Shape:* ``(B,)``.
+        """
+        return pair.placed.inverse().apply(pair.between.fraction(t).apply(x) / self.scale)
+
+
+def _rigid_fields(x: Tensor) -> Tensor:
+    """Translations and infinitesimal rotations of a shape. *Shape:* ``(V, 3) -> (6, V, 3)``."""
+    axes = torch.eye(3, dtype=x.dtype, device=x.device)[:, None].expand(3, *x.shape)
+    return torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape))])

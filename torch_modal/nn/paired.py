@@ -1,0 +1,129 @@
+"""The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.nn.frame import Columns, Frame, Pair
+from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement, Reference
+from torch_modal.nn.shell import ShellEnergy
+
+
+class PairedPlacement(NamedTuple):
+    """The two shapes of each sample and their similarity, a quadratic in the amplitudes."""
+
+    first: Placement
+    second: Placement
+    linear: Tensor
+    """*Shape:* ``(B, n)``."""
+    constant: Tensor
+    """*Shape:* ``(B,)``."""
+
+
+class PairedProblem(NamedTuple):
+    """The mid-shape of each sample as a minimisation."""
+
+    placement: PairedPlacement
+    pair: Pair
+
+
+class PairedShell(nn.Module):
+    r"""Eq. 4: :math:`d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)` in the amplitudes of both shapes.
+
+    Args:
+        shell: Energy on the coarse mesh.
+        ends: Columns of both spaces.
+        mu: Weight of the similarity, which is taken over the fine vertices.
+    """
+
+    gap: Tensor
+    gap_gram: Tensor
+
+    def __init__(self, shell: ShellEnergy, ends: tuple[Columns, Columns], mu: float | Tensor) -> None:
+        super().__init__()
+        self.mu = mu
+        self.first, self.second = (ModalShell(shell, end.coarse) for end in ends)
+        gap = torch.cat([ends[0].fine, -ends[1].fine]).flatten(1)
+        self.register_buffer("gap", gap)
+        self.register_buffer("gap_gram", gap @ gap.mT)
+
+    def split(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Amplitudes of the two shapes."""
+        n = self.first.columns.shape[-1]
+        return a[..., :n], a[..., n:]
+
+    def value(self, a: Tensor, placement: PairedPlacement) -> Tensor:
+        """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
+        a1, a2 = self.split(a)
+        similarity = (a * (a @ self.gap_gram + 2 * placement.linear)).sum(-1) + placement.constant
+        return self.first.value(a1, placement.first) + self.second.value(a2, placement.second) + self.mu * similarity
+
+    def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
+        """Gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
+        places = (placement.first, placement.second)
+        first, second = (
+            shell.derivatives(amplitudes, place, second_order)
+            for shell, amplitudes, place in zip((self.first, self.second), self.split(a), places, strict=True)
+        )
+        gradient = torch.cat([first.gradient, second.gradient], -1)
+        gradient = gradient + 2 * self.mu * (a @ self.gap_gram + placement.linear)
+        gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + 2 * self.mu * self.gap_gram
+        curved = None
+        if first.second_order is not None and second.second_order is not None:
+            curved = _block_diagonal(first.second_order, second.second_order)
+        return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
+
+
+class PairedSpace(nn.Module):
+    """Mid-shapes as the mean of ``x_1 = x_a + Phi_a a_1`` and ``x_2 = x_b + Phi_b a_2`` that minimise Eq. 4.
+
+    The two spaces barely meet, so that a small ``mu`` returns the linear mean and a large one distorts: this is the
+    paper's method, kept for comparison; the joint space is the better choice.
+
+    Args:
+        frame: Frame of the two bases.
+        shell: Energy on the frame's coarse mesh.
+        mu: Weight of the similarity.
+    """
+
+    def __init__(self, frame: Frame, shell: ShellEnergy, mu: float | Tensor) -> None:
+        super().__init__()
+        self.frame = frame
+        self.first, self.second = (frame.elastic_columns(modes) for modes in frame.modes)
+        self.energy = PairedShell(shell, (self.first, self.second), mu)
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of amplitudes."""
+        return len(self.energy.gap)
+
+    def problem(self, pair: Pair, t: Tensor) -> PairedProblem:
+        """Set up the mid-shapes of a batch. Eq. 4 knows the time 1/2 only, *shape* ``(B,)``.
+
+        Raises:
+            ValueError: Another time.
+        """
+        if bool((t != 0.5).any()):
+            raise ValueError("the paired space (Eq. 4) is defined at t = 1/2 only; use space='joint' for other times")
+        places = []
+        for x in (pair.first, pair.second):
+            coarse = self.frame.coarsen(x)
+            rest = self.energy.first.shell.rest(coarse)
+            places.append(Placement(coarse, None, [Reference(rest, torch.ones_like(t))]))
+        apart = (pair.first - pair.second).flatten(1)
+        placement = PairedPlacement(places[0], places[1], apart @ self.energy.gap.mT, (apart**2).sum(-1))
+        return PairedProblem(placement, pair)
+
+    def lift(self, a: Tensor, problem: PairedProblem) -> Tensor:
+        """The fine mid-shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""
+        a1, a2 = self.energy.split(a)
+        first = problem.pair.first + self.first.combine(a1)
+        second = problem.pair.second + self.second.combine(a2)
+        return 0.5 * (first + second)
+
+
+def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:
+    """*Shape:* ``(B, m, m), (B, n, n) -> (B, m + n, m + n)``."""
+    m, n = first.shape[-1], second.shape[-1]
+    return torch.cat([nn.functional.pad(first, (0, n)), nn.functional.pad(second, (m, 0))], -2)

@@ -1,0 +1,237 @@
+"""Discrete-shell energy of Eq. 5: edge lengths, dihedral angles and enclosed volume."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal import mesh
+
+# Eq. 5 divides by rest lengths, rest areas and the rest volume. The floors below only bite on input that has no
+# well-defined weight (coincident vertices, needles, a flat sheet); everywhere else the weights are the paper's.
+MIN_RELATIVE_LENGTH = 1e-6  # of the mean edge length
+MAX_BENDING_RATIO = 1e3  # of l^2 / A; an equilateral hinge has 1.15
+MIN_RELATIVE_VOLUME = 1e-6  # of (surface area)^(3/2); a sphere has 0.094
+
+
+class Measures(NamedTuple):
+    """What Eq. 5 measures on a shape."""
+
+    length: Tensor
+    """Edge lengths. *Shape:* ``(..., E)``."""
+    angle: Tensor
+    """Signed dihedral angles in radians, 0 where flat. *Shape:* ``(..., H)``."""
+    volume: Tensor
+    """Signed volume enclosed with the centroid. *Shape:* ``(...,)``."""
+
+
+class Rest(NamedTuple):
+    """A rest shape as Eq. 5 sees it: its measures and the weight of each of them."""
+
+    measures: Measures
+    weights: Measures
+
+
+def edge_length(edge: Tensor) -> Tensor:
+    """Length of edge vectors ``x_j - x_i``, components first. *Shape:* ``(3, ...) -> (...)``."""
+    return _nonzero((edge * edge).sum(0)).sqrt()
+
+
+def length_gradient(edge: Tensor) -> Tensor:
+    """Gradient of :func:`edge_length`. *Shape:* ``(3, ...) -> (3, ...)``."""
+    return edge / edge_length(edge)
+
+
+def dihedral_angle(spokes: Tensor) -> Tensor:
+    """Signed angle between the normals of the two triangles of a hinge, 0 where flat, in ``(-pi, pi]``.
+
+    With the edge ``e``, ``n1 = e x a`` and ``n2 = b x e``, the sine is ``(n1 x n2).e/|e| = -|e| n1.b`` and the cosine
+    ``n1.n2``, both up to the factor ``|n1||n2|``.
+
+    Args:
+        spokes: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` (:func:`torch_modal.mesh.hinges`),
+            components second. *Shape:* ``(3, 3, ...)``.
+    """
+    e, a, b = spokes
+    n1 = torch.linalg.cross(e, a, dim=0)
+    n2 = torch.linalg.cross(b, e, dim=0)
+    sine = -edge_length(e) * (n1 * b).sum(0)
+    cosine = (n1 * n2).sum(0)
+    # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
+    collapsed = (sine == 0) & (cosine == 0)
+    return torch.atan2(sine, torch.where(collapsed, torch.ones_like(cosine), cosine))
+
+
+def dihedral_gradient(spokes: Tensor) -> Tensor:
+    """Gradient of :func:`dihedral_angle` in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
+
+    ``torch.func`` gives the same through the angle itself, at eight times the cost (docs/performance.md).
+
+    Args:
+        spokes: As above. *Shape:* ``(3, 3, ...)``.
+
+    Returns:
+        Zero at the tip of a collapsed triangle. *Shape:* ``(3, 3, ...)``.
+    """
+    e, a, b = spokes
+    n1 = torch.linalg.cross(e, a, dim=0)
+    n2 = torch.linalg.cross(b, e, dim=0)
+    squared = _nonzero((e * e).sum(0))
+    length = squared.sqrt()
+    to_a = n1 * (-length / _nonzero((n1 * n1).sum(0)))
+    to_b = n2 * (-length / _nonzero((n2 * n2).sum(0)))
+    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) / squared
+    return torch.stack([to_e, to_a, to_b])
+
+
+def _nonzero(squared: Tensor) -> Tensor:
+    """The same where it is positive, else a constant: derivatives are 0 there, not NaN."""
+    tiny = torch.finfo(squared.dtype).tiny
+    return torch.where(squared > tiny, squared, tiny)
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """The same angle in ``[-pi, pi)``, with derivative one."""
+    return angle - 2 * math.pi * torch.floor(angle.detach() / (2 * math.pi) + 0.5)
+
+
+class ShellEnergy(nn.Module):
+    r"""Discrete-shell energy between a shape and a rest shape (Eq. 5 of the paper).
+
+    .. math::
+        d(\bar x, x) = \alpha \sum_e \frac{(\bar l_e - l_e)^2}{\bar l_e}
+            + \beta \sum_e (\bar\theta_e - \theta_e)^2 \frac{\bar l_e^2}{\bar A_e}
+            + \gamma \frac{(\bar v - v)^2}{\bar v^2}
+
+    Angle differences are wrapped. The volume is taken relative to the centroid, so that the energy of an open surface
+    does not change with a translation either. The three terms scale differently with size: the defaults are meant
+    for shapes with a bounding-box diagonal of about 100.
+
+    Args:
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        alpha: Stretching stiffness.
+        beta: Bending stiffness.
+        gamma: Volume stiffness.
+
+    The stiffnesses are attributes and may be replaced by tensors, of a gradient or of one value per sample.
+    """
+
+    faces: Tensor
+    edges: Tensor
+    hinges: Tensor
+    used: Tensor
+
+    def __init__(
+        self,
+        faces: Tensor,
+        alpha: float | Tensor = 500.0,
+        beta: float | Tensor = 10.0,
+        gamma: float | Tensor = 1000.0,
+    ) -> None:
+        super().__init__()
+        faces_array = torch.as_tensor(faces).detach().cpu().long().numpy()
+        edges, _ = mesh.unique_edges(faces_array)
+        self.register_buffer("faces", torch.from_numpy(faces_array.copy()))
+        self.register_buffer("edges", torch.from_numpy(edges))
+        self.register_buffer("hinges", torch.from_numpy(mesh.hinges(faces_array)))
+        self.register_buffer("used", torch.from_numpy(edges).unique())
+        self.alpha, self.beta, self.gamma = alpha, beta, gamma
+
+    # Inside, components come first: elementwise operations then run over long contiguous rows.
+
+    def edge_vectors(self, rows: Tensor) -> Tensor:
+        """``x_j - x_i`` of all edges. *Shape:* ``(3, ..., V) -> (3, ..., E)``."""
+        return rows[..., self.edges[:, 1]] - rows[..., self.edges[:, 0]]
+
+    def hinge_spokes(self, rows: Tensor) -> Tensor:
+        """The three vectors that :func:`dihedral_angle` takes. *Shape:* ``(3, ..., V) -> (3, 3, ..., H)``."""
+        origin, *ends = (rows[..., corner] for corner in self.hinges.unbind(1))
+        return torch.stack([end - origin for end in ends])
+
+    def volume(self, rows: Tensor) -> Tensor:
+        """Signed volume between the surface and its centroid. *Shape:* ``(3, ..., V) -> (...)``."""
+        rows = rows - rows[..., self.used].mean(-1, keepdim=True)
+        a, b, c = (rows[..., corner] for corner in self.faces.unbind(1))
+        return (a * torch.linalg.cross(b, c, dim=0)).sum((0, -1)) / 6
+
+    def measure(self, x: Tensor) -> Measures:
+        """Lengths, angles and volume of a shape.
+
+        Args:
+            x: Vertex positions. *Shape:* ``(..., V, 3)``.
+        """
+        rows = x.movedim(-1, 0).contiguous()
+        return Measures(
+            edge_length(self.edge_vectors(rows)), dihedral_angle(self.hinge_spokes(rows)), self.volume(rows)
+        )
+
+    def rest(self, x_rest: Tensor) -> Rest:
+        """Measures and weights of a rest shape: what stays the same while the shape moves.
+
+        Args:
+            x_rest: Vertex positions. *Shape:* ``(..., V, 3)``.
+        """
+        measures = self.measure(x_rest)
+        rows = x_rest.movedim(-1, 0).contiguous()
+        e, a, b = self.hinge_spokes(rows)
+        hinge_area = 0.5 * (_parallelogram(e, a) + _parallelogram(b, e))
+        squared = (e * e).sum(0)
+        length_floor = MIN_RELATIVE_LENGTH * measures.length.mean(-1, keepdim=True)
+        p, q, r = (rows[..., corner] for corner in self.faces.unbind(1))
+        surface = 0.5 * _parallelogram(q - p, r - p).sum(-1)
+        volume_floor = MIN_RELATIVE_VOLUME * surface**1.5
+        stiffness = [s[..., None] if isinstance(s, Tensor) else s for s in (self.alpha, self.beta)]
+        weights = Measures(
+            stiffness[0] / torch.maximum(measures.length, length_floor),
+            stiffness[1] * squared / torch.maximum(hinge_area, squared / MAX_BENDING_RATIO + length_floor**2),
+            self.gamma / torch.maximum(measures.volume.abs(), volume_floor) ** 2,
+        )
+        return Rest(measures, weights)
+
+    @staticmethod
+    def differences(measures: Measures, rest: Rest) -> Measures:
+        """Measures minus the rest shape's, angles wrapped."""
+        length, angle, volume = rest.measures
+        return Measures(measures.length - length, wrap_angle(measures.angle - angle), measures.volume - volume)
+
+    def residuals(self, x: Tensor, x_rest: Tensor) -> Tensor:
+        """The terms of Eq. 5 whose squares sum to the energy: E stretching, H bending, one volume.
+
+        Args:
+            x: Vertex positions. *Shape:* ``(..., V, 3)``.
+            x_rest: Rest positions, broadcast against ``x``. *Shape:* ``(..., V, 3)``.
+
+        Returns:
+            *Shape:* ``(..., E + H + 1)``.
+        """
+        rest = self.rest(x_rest)
+        parts = [
+            weight.sqrt() * difference
+            for weight, difference in zip(rest.weights, self.differences(self.measure(x), rest), strict=True)
+        ]
+        lead = torch.broadcast_shapes(parts[0].shape[:-1], parts[1].shape[:-1])
+        return torch.cat([parts[0].expand(*lead, -1), parts[1].expand(*lead, -1), parts[2].expand(lead)[..., None]], -1)
+
+    def forward(self, x: Tensor, x_rest: Tensor) -> Tensor:
+        """Energy of Eq. 5.
+
+        Args:
+            x: Vertex positions. *Shape:* ``(..., V, 3)``.
+            x_rest: Rest positions, broadcast against ``x``. *Shape:* ``(..., V, 3)``.
+
+        Returns:
+            *Shape:* ``(...,)``.
+        """
+        return self.energy(self.measure(x), self.rest(x_rest))
+
+    def energy(self, measures: Measures, rest: Rest) -> Tensor:
+        """Energy of a shape that was measured against a rest shape that was. *Shape:* ``(...,)``."""
+        length, angle, volume = self.differences(measures, rest)
+        weights = rest.weights
+        return (weights.length * length**2).sum(-1) + (weights.angle * angle**2).sum(-1) + weights.volume * volume**2
+
+
+def _parallelogram(a: Tensor, b: Tensor) -> Tensor:
+    """Area between two vectors. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
+    return edge_length(torch.linalg.cross(a, b, dim=0))
