@@ -69,7 +69,7 @@ def best_rotation(covariance: Tensor) -> Tensor:
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)
     rotation = (u * sign[..., None, :]) @ vh
-    if not (torch.is_grad_enabled() and covariance.requires_grad):
+    if not torch.is_grad_enabled():
         return rotation
     eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     for _ in range(2):

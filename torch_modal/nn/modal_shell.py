@@ -131,8 +131,14 @@ class ModalShell(nn.Module):
         stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
         resolution = rounding * (stiffest * curvatures.sum(-1)).sqrt()
-        curved = self.curvature(rows, edges, spokes, slope, placement.extra) if second_order else None
+        curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, resolution)
+
+    def second_order(self, a: Tensor, placement: Placement) -> Tensor:
+        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+        x = self.shape(a, placement)
+        slope, _ = self._slopes(self.shell.measure(x), placement.references)
+        return self.curvature(x.movedim(-1, 0).contiguous(), slope, placement.extra)
 
     def _volume_gradient(self, rows: Tensor) -> Tensor:
         """Gradient of :meth:`ShellEnergy.volume`. *Shape:* ``(3, B, V) -> (3, B, V)``."""
@@ -216,17 +222,15 @@ class _Curvature(nn.Module):
         p, q, r = self._face_corners(rows)
         return q - p, r - p
 
-    def forward(self, rows: Tensor, edges: Tensor, spokes: Tensor, slope: Measures, extra: Tensor | None) -> Tensor:
+    def forward(self, rows: Tensor, slope: Measures, extra: Tensor | None) -> Tensor:
         """The term for shapes with given slopes. *Shape:* ``(B, n, n)``.
 
         Args:
             rows: The shapes. *Shape:* ``(3, B, V)``.
-            edges: Their edges. *Shape:* ``(3, B, E)``.
-            spokes: Their hinges. *Shape:* ``(3, 3, B, H)``.
             slope: Derivative of the energy in each measure.
             extra: The column of each sample's own. *Shape:* ``(B, V, 3)``.
         """
-        on_edges, on_faces = self._local(rows, edges, spokes, slope)
+        on_edges, on_faces = self._local(rows, slope)
         chunk = max(1, _CHUNK_BYTES // (self.edge_columns.numel() * self.edge_columns.element_size()))
         parts = zip(on_edges.split(chunk), on_faces.split(chunk), strict=True)
         inner = torch.cat([self._sandwich(*part) for part in parts])
@@ -248,11 +252,10 @@ class _Curvature(nn.Module):
         lower = torch.cat([border, corner[:, None]], -1)
         return torch.cat([upper, lower[:, None]], 1)
 
-    def _local(self, rows: Tensor, edges: Tensor, spokes: Tensor, slope: Measures) -> tuple[Tensor, Tensor]:
+    def _local(self, rows: Tensor, slope: Measures) -> tuple[Tensor, Tensor]:
         """Matrices on edges ``(B, E, 3, 3)`` and vectors on faces ``(B, F_closed, 3)``."""
-        stretch = slope.length * _jacobian(length_gradient, edges)
-        bend = slope.angle * _jacobian(dihedral_gradient, spokes)
-        ee, ea, eb, aa, bb = bend[0, :, 0], bend[0, :, 1], bend[0, :, 2], bend[1, :, 1], bend[2, :, 2]
+        stretch = slope.length * _length_hessian(self.shell.edge_vectors(rows))
+        ee, ea, eb, aa, bb = slope.angle * _angle_hessian(self.shell.hinge_spokes(rows))
         sym_a, sym_b = 0.5 * (ea + ea.transpose(0, 1)), 0.5 * (eb + eb.transpose(0, 1))
         on_sides = torch.cat([ee + sym_a + sym_b, aa + sym_a, bb + sym_b, -sym_a, -sym_b], -1)
         on_edges = stretch.index_add(-1, self.hinge_sides.flatten(), on_sides)
@@ -271,14 +274,31 @@ class _Curvature(nn.Module):
         return edge_part + face_part + face_part.mT
 
 
-def _jacobian(gradient, at: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
-    """Local Jacobians of a gradient whose components come first. *Shape:* ``(*c, B, M) -> (*c, *c, B, M)``."""
-    components = at.shape[:-2]
-    n = components.numel()
-    units = torch.eye(n, dtype=at.dtype, device=at.device).reshape(n, *components, 1, 1).expand(n, *at.shape)
-    columns = vmap(lambda unit: jvp(gradient, (at,), (unit,))[1], out_dims=-1)(units)
-    ends = tuple(range(-len(components), 0))
-    return columns.unflatten(-1, components).movedim(ends, tuple(len(components) + i for i in range(len(ends))))
+def _length_hessian(edges: Tensor) -> Tensor:
+    """Hessians of edge lengths, from their gradient by ``torch.func``. *Shape:* ``(3, ...) -> (3, 3, ...)``."""
+    return vmap(lambda unit: jvp(length_gradient, (edges,), (unit,))[1])(_unit_vectors(edges))
+
+
+def _angle_hessian(spokes: Tensor) -> Tensor:
+    """Blocks ``ee, ea, eb, aa, bb`` of the Hessians of dihedral angles, from their gradient by ``torch.func``.
+
+    The block ``ab`` is zero, so that both tips are turned at once: six directions instead of nine. Blocks are indexed
+    by row, then column. *Shape:* ``(3, 3, ...) -> (5, 3, 3, ...)``.
+    """
+    units = _unit_vectors(spokes[0])
+    still = torch.zeros_like(units)
+    along = torch.cat([torch.stack([units, still, still], 1), torch.stack([still, units, units], 1)])
+    columns = vmap(lambda direction: jvp(dihedral_gradient, (spokes,), (direction,))[1])(along)
+    by_edge, by_tips = columns[:3], columns[3:]
+    # The e columns hold the blocks ee, ae and be: the last two are the transposes of ea and eb.
+    ee, ea, eb = by_edge.unbind(1)
+    return torch.stack([ee, ea, eb, by_tips[:, 1], by_tips[:, 2]])
+
+
+def _unit_vectors(like: Tensor) -> Tensor:
+    """The three constant fields of unit vectors. *Shape:* ``(3, ...) -> (3, 3, ...)``."""
+    eye = torch.eye(3, dtype=like.dtype, device=like.device)
+    return eye.reshape(3, 3, *[1] * (like.dim() - 1)).expand(3, *like.shape)
 
 
 def _axial(g: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Discrete-shell energy of Eq. 5: edge lengths, dihedral angles and enclosed volume."""
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -26,11 +27,24 @@ class Measures(NamedTuple):
     """Signed volume enclosed with the centroid. *Shape:* ``(...,)``."""
 
 
+class Stiffness(NamedTuple):
+    """Factors of the three terms of Eq. 5: numbers, or one for each sample."""
+
+    alpha: float | Tensor
+    beta: float | Tensor
+    gamma: float | Tensor
+
+
 class Rest(NamedTuple):
     """A rest shape as Eq. 5 sees it: its measures and the weight of each of them."""
 
     measures: Measures
     weights: Measures
+
+
+def per_sample(values: Iterable[float | Tensor], like: Tensor) -> tuple[Tensor, ...]:
+    """Numbers or tensors as one value for each sample: each of the shape of ``like``, ``(B,)``."""
+    return tuple(torch.as_tensor(value, dtype=like.dtype, device=like.device).expand_as(like) for value in values)
 
 
 def edge_length(edge: Tensor) -> Tensor:
@@ -138,6 +152,11 @@ class ShellEnergy(nn.Module):
         self.register_buffer("used", torch.from_numpy(edges).unique())
         self.alpha, self.beta, self.gamma = alpha, beta, gamma
 
+    @property
+    def stiffness(self) -> Stiffness:
+        """The three stiffnesses."""
+        return Stiffness(self.alpha, self.beta, self.gamma)
+
     # Inside, components come first: elementwise operations then run over long contiguous rows.
 
     def edge_vectors(self, rows: Tensor) -> Tensor:
@@ -166,11 +185,12 @@ class ShellEnergy(nn.Module):
             edge_length(self.edge_vectors(rows)), dihedral_angle(self.hinge_spokes(rows)), self.volume(rows)
         )
 
-    def rest(self, x_rest: Tensor) -> Rest:
+    def rest(self, x_rest: Tensor, stiffness: Stiffness | None = None) -> Rest:
         """Measures and weights of a rest shape: what stays the same while the shape moves.
 
         Args:
             x_rest: Vertex positions. *Shape:* ``(..., V, 3)``.
+            stiffness: Other stiffnesses than the module's own.
         """
         measures = self.measure(x_rest)
         rows = x_rest.movedim(-1, 0).contiguous()
@@ -181,11 +201,12 @@ class ShellEnergy(nn.Module):
         p, q, r = (rows[..., corner] for corner in self.faces.unbind(1))
         surface = 0.5 * _parallelogram(q - p, r - p).sum(-1)
         volume_floor = MIN_RELATIVE_VOLUME * surface**1.5
-        stiffness = [s[..., None] if isinstance(s, Tensor) else s for s in (self.alpha, self.beta)]
+        alpha, beta, gamma = stiffness or self.stiffness
+        alpha, beta = (s[..., None] if isinstance(s, Tensor) else s for s in (alpha, beta))
         weights = Measures(
-            stiffness[0] / torch.maximum(measures.length, length_floor),
-            stiffness[1] * squared / torch.maximum(hinge_area, squared / MAX_BENDING_RATIO + length_floor**2),
-            self.gamma / torch.maximum(measures.volume.abs(), volume_floor) ** 2,
+            alpha / torch.maximum(measures.length, length_floor),
+            beta * squared / torch.maximum(hinge_area, squared / MAX_BENDING_RATIO + length_floor**2),
+            gamma / torch.maximum(measures.volume.abs(), volume_floor) ** 2,
         )
         return Rest(measures, weights)
 
