@@ -79,8 +79,9 @@ def best_rotation(covariance: Tensor) -> Tensor:
         )
         trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         stiffness = trace * eye - 0.5 * (p + p.mT)
-        # Two vanishing singular values (all vertices on a line) leave a rotation free: the floor holds it still.
-        stiffness = stiffness + torch.finfo(p.dtype).eps * (trace.abs() + torch.finfo(p.dtype).tiny) * eye
+        # Two vanishing singular values (all vertices on a line, or in a point) leave a rotation free: held still.
+        floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, torch.finfo(p.dtype).eps * trace.abs(), 1)
+        stiffness = stiffness + floor.detach() * eye
         turn = torch.linalg.solve(stiffness, torque)
         rotation = rotation @ _flat(axis_angle_to_rotation_matrix, turn, 1)
     return rotation

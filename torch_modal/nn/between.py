@@ -9,12 +9,15 @@ from torch import Tensor, nn
 
 from torch_modal import mesh
 from torch_modal.basis import ModalBasis
-from torch_modal.nn.frame import Frame, Pair
+from torch_modal.nn.frame import DIAGONAL, Frame, Pair
 from torch_modal.nn.gauss_newton import GaussNewtonStep, Solution, Status
 from torch_modal.nn.implicit import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.paired import PairedSpace
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.nn.shell import ShellEnergy, enclosed_volume, per_sample
+
+# A key-frame smaller than this part of the basis' reference is a point.
+SMALLEST_SIZE = 1e-6
 
 
 class ConvergenceWarning(UserWarning):
@@ -48,15 +51,18 @@ class Between(nn.Module):
     ) -> None:
         super().__init__()
         frame = Frame(bases, faces, coarse_faces)
-        shell = ShellEnergy(frame.coarse_faces, *stiffness)
+        shell = ShellEnergy(frame.coarse_faces)
         if space == "joint":
             self.space: Any = JointSpace(frame, shell, frame.modes(bases))
         elif space == "paired":
-            self.space = PairedSpace(frame, shell, frame.modes(bases), mu)
+            self.space = PairedSpace(frame, shell, frame.modes(bases))
         else:
             raise ValueError(f"space is 'joint' or 'paired', got {space!r}")
         self.step = GaussNewtonStep(self.space.energy)
-        self.closed = len(mesh.boundary_edges(frame.coarse_faces.numpy())) == 0
+        self.closed = len(mesh.boundary_edges(frame.faces.numpy())) == 0
+        # Registered here alone: a module that hangs at two places confuses torch.func.functional_call.
+        self.alpha, self.beta, self.gamma = stiffness
+        self.mu = mu
 
     def forward(
         self,
@@ -75,8 +81,9 @@ class Between(nn.Module):
         stand_in = frame.reference / frame.scale
         clean_a, clean_b = (torch.where(usable[:, None, None], x, stand_in) for x in (x_a, x_b))
         pair = frame.place(clean_a, clean_b)
-        usable = usable & ~self._mirrored(pair)
-        problem = self.space.problem(pair, t)
+        usable = usable & self._solvable(pair)
+        weights = per_sample((self.mu, self.alpha, self.beta, self.gamma), t)
+        problem = self.space.problem(pair, t, *weights)
         space = self.space
         minimisation = Minimisation(
             self.step, space.placement, space.require, space.n_unknowns, max_steps, tolerance, report
@@ -87,11 +94,17 @@ class Between(nn.Module):
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
 
-    def _mirrored(self, pair: Pair) -> Tensor:
-        """Whether a closed shape is inside out at one end: on the way its volume would vanish. *Shape:* ``(B,)``."""
-        frame, shell = self.space.frame, self.space.shell
-        first, second = (shell.volume(frame.coarsen(x.detach()).movedim(-1, 0)) for x in (pair.first, pair.second))
-        return (first * second < 0) & self.closed
+    def _solvable(self, pair: Pair) -> Tensor:
+        """Whether both ends have a size, and, where closed, the same side out: else the volume would vanish on the way.
+
+        *Shape:* ``(B,)``.
+        """
+        faces = self.space.frame.faces
+        ends = [x.detach().movedim(-1, 0) for x in (pair.first, pair.second)]
+        sizes = [(x.amax(-1) - x.amin(-1)).norm(dim=0) for x in ends]
+        first, second = (enclosed_volume(x, faces) for x in ends)
+        mirrored = (first * second < 0) & self.closed
+        return (torch.minimum(*sizes) > SMALLEST_SIZE * DIAGONAL) & ~mirrored
 
 
 def report(solution: Solution, max_steps: int, forbid: bool) -> None:

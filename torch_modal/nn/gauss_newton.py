@@ -19,6 +19,7 @@ GOOD_DECREASE = 0.8
 
 # Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
 ROUNDING_MARGIN = 4.0
+ENERGY_ROUNDING = 64.0
 
 
 class AmplitudeEnergy(Protocol):
@@ -43,6 +44,8 @@ class Step(NamedTuple):
     """*Shape:* ``(B,)``."""
     gradient_norm: Tensor
     """Before the step. *Shape:* ``(B,)``."""
+    promised: Tensor
+    """Decrease of the energy that the quadratic model expects of the whole step. *Shape:* ``(B,)``."""
     moved: Tensor
     """False where no step was found that does not go uphill. *Shape:* ``(B,)``, bool."""
 
@@ -51,7 +54,7 @@ class Status(IntEnum):
     """How the minimisation of a sample ended."""
 
     CONVERGED = 0
-    """The gradient is within the tolerance, or as small as the rounding of the positions lets it be."""
+    """The gradient is within the tolerance, or as small as the rounding of positions and energy lets it be."""
     OUT_OF_STEPS = 1
     """There was more to gain."""
     STALLED = 2
@@ -137,16 +140,14 @@ class GaussNewtonStep(nn.Module):
         """The best of the candidate steps from a point whose derivatives are known."""
         directions = self.directions(derivatives)
         best, lowest = self._lowest(a, directions, placement)
-        # The quadratic model of a Newton step falls by half the slope along it.
-        promised = -0.5 * (directions * derivatives.gradient).sum(-1)
-        promised = torch.where(promised.isfinite(), promised, 0).amax(0)
+        promised = self._promised(directions, derivatives)
         poor = energy - lowest < GOOD_AGREEMENT * promised
         if bool(poor.any()):
             shorter, energies = self._lowest(a, self._shortened(directions), placement)
             improves = poor & (energies < lowest)
             best = torch.where(improves[:, None], shorter, best)
             lowest = torch.where(improves, energies, lowest)
-        return self._unless_uphill(a, energy, best, lowest, derivatives)
+        return self._unless_uphill(a, energy, best, lowest, promised, derivatives)
 
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, trying both directions at all lengths, without a branch that depends on data.
@@ -158,7 +159,8 @@ class GaussNewtonStep(nn.Module):
         derivatives = self.energy.derivatives(a, placement)
         directions = self.directions(derivatives)
         best, lowest = self._lowest(a, torch.cat([directions, self._shortened(directions)]), placement)
-        return self._unless_uphill(a, self.energy.value(a, placement), best, lowest, derivatives)
+        promised = self._promised(directions, derivatives)
+        return self._unless_uphill(a, self.energy.value(a, placement), best, lowest, promised, derivatives)
 
     @staticmethod
     def _shortened(directions: Tensor) -> Tensor:
@@ -166,11 +168,19 @@ class GaussNewtonStep(nn.Module):
         return torch.cat([length * directions for length in STEP_LENGTHS])
 
     @staticmethod
-    def _unless_uphill(a: Tensor, energy: Tensor, best: Tensor, lowest: Tensor, derivatives: Derivatives) -> Step:
+    def _promised(directions: Tensor, derivatives: Derivatives) -> Tensor:
+        """The quadratic model of a Newton step falls by half the slope along it. *Shape:* ``(D, B, n) -> (B,)``."""
+        promised = -0.5 * (directions * derivatives.gradient).sum(-1)
+        return torch.where(promised.isfinite(), promised, 0).amax(0)
+
+    @staticmethod
+    def _unless_uphill(
+        a: Tensor, energy: Tensor, best: Tensor, lowest: Tensor, promised: Tensor, derivatives: Derivatives
+    ) -> Step:
         # At the optimum the energy is flat to rounding while the gradient still has digits to gain.
         moved = lowest <= energy + 4 * torch.finfo(energy.dtype).eps * energy.abs()
         norm = derivatives.gradient.norm(dim=-1)
-        return Step(torch.where(moved[:, None], best, a), torch.where(moved, lowest, energy), norm, moved)
+        return Step(torch.where(moved[:, None], best, a), torch.where(moved, lowest, energy), norm, promised, moved)
 
     def _lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
         """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low."""
@@ -220,7 +230,9 @@ def minimise(
         taken = step.take(a, energy, derivatives, placement)
         go = ~resting & taken.moved
         stuck = ~resting & slow & ~taken.moved
-        status = torch.where(stuck, Status.STALLED, status)
+        # Where all that is left to gain drowns in the rounding of the energy, the minimum is found.
+        drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
+        status = torch.where(stuck, torch.where(drowned, Status.CONVERGED, Status.STALLED), status)
         resting = resting | stuck
         slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)
         a = torch.where(go[:, None], taken.amplitudes, a)

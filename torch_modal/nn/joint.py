@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.modal_shell import ModalShell, Placement, Reference
-from torch_modal.nn.shell import ShellEnergy, Stiffness, per_sample
+from torch_modal.nn.shell import ShellEnergy, Stiffness
 
 
 class JointProblem(NamedTuple):
@@ -37,7 +37,6 @@ class JointSpace(nn.Module):
     def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor]) -> None:
         super().__init__()
         self.frame = frame
-        self.shell = shell
         self.columns = frame.elastic_columns(torch.cat(list(modes)))
         self.energy = ModalShell(shell, self.columns.coarse)
 
@@ -46,12 +45,12 @@ class JointSpace(nn.Module):
         """Number of amplitudes."""
         return len(self.columns.fine) + 1
 
-    def problem(self, pair: Pair, t: Tensor) -> JointProblem:
-        """Set up the in-betweens of a batch at the times ``t``, *shape* ``(B,)``."""
+    def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> JointProblem:
+        """Set up the in-betweens of a batch at the times ``t``; ``mu`` plays no part. *Shape of each:* ``(B,)``."""
         base = torch.lerp(pair.first, pair.second, t[:, None, None])
         difference = self._difference(pair)
         coarse = (self.frame.coarsen(x) for x in (pair.first, pair.second, difference))
-        return JointProblem((*coarse, t, *per_sample(self.energy.shell.stiffness, t)), base, difference)
+        return JointProblem((*coarse, t, alpha, beta, gamma), base, difference)
 
     def placement(self, first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> Placement:
         """The minimisation on the coarse mesh, from the inputs of a problem."""

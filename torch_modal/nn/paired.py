@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.nn.frame import Columns, Frame, Pair
 from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement, Reference
-from torch_modal.nn.shell import ShellEnergy, Stiffness, per_sample
+from torch_modal.nn.shell import ShellEnergy, Stiffness
 
 
 class PairedPlacement(NamedTuple):
@@ -90,14 +90,11 @@ class PairedSpace(nn.Module):
         frame: Frame of the two bases.
         shell: Energy on the frame's coarse mesh.
         modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
-        mu: Weight of the similarity.
     """
 
-    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor], mu: float | Tensor) -> None:
+    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor]) -> None:
         super().__init__()
         self.frame = frame
-        self.shell = shell
-        self.mu = mu
         self.first, self.second = (frame.elastic_columns(end) for end in modes)
         self.energy = PairedShell(shell, (self.first, self.second))
 
@@ -106,12 +103,11 @@ class PairedSpace(nn.Module):
         """Number of amplitudes."""
         return len(self.energy.gap)
 
-    def problem(self, pair: Pair, t: Tensor) -> PairedProblem:
-        """Set up the mid-shapes of a batch. Eq. 4 knows the time 1/2 only, *shape* ``(B,)``."""
+    def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> PairedProblem:
+        """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. *Shape of each:* ``(B,)``."""
         coarse = (self.frame.coarsen(x) for x in (pair.first, pair.second))
         apart = (pair.first - pair.second).flatten(1)
-        weights = per_sample((self.mu, *self.energy.first.shell.stiffness), t)
-        return PairedProblem((*coarse, apart @ self.energy.gap.mT, (apart**2).sum(-1), t, *weights), pair)
+        return PairedProblem((*coarse, apart @ self.energy.gap.mT, (apart**2).sum(-1), t, mu, alpha, beta, gamma), pair)
 
     def placement(
         self, first: Tensor, second: Tensor, linear: Tensor, constant: Tensor, t: Tensor, mu: Tensor, *stiffness: Tensor

@@ -105,6 +105,12 @@ def _nonzero(squared: Tensor) -> Tensor:
     return torch.where(squared > tiny, squared, tiny)
 
 
+def enclosed_volume(rows: Tensor, faces: Tensor) -> Tensor:
+    """Signed volume between a surface and the origin. *Shape:* ``(3, ..., V), (F, 3) -> (...)``."""
+    a, b, c = (rows[..., corner] for corner in faces.unbind(1))
+    return (a * torch.linalg.cross(b, c, dim=0)).sum((0, -1)) / 6
+
+
 def wrap_angle(angle: Tensor) -> Tensor:
     """The same angle in ``[-pi, pi)``, with derivative one."""
     return angle - 2 * math.pi * torch.floor(angle.detach() / (2 * math.pi) + 0.5)
@@ -170,9 +176,7 @@ class ShellEnergy(nn.Module):
 
     def volume(self, rows: Tensor) -> Tensor:
         """Signed volume between the surface and its centroid. *Shape:* ``(3, ..., V) -> (...)``."""
-        rows = rows - rows[..., self.used].mean(-1, keepdim=True)
-        a, b, c = (rows[..., corner] for corner in self.faces.unbind(1))
-        return (a * torch.linalg.cross(b, c, dim=0)).sum((0, -1)) / 6
+        return enclosed_volume(rows - rows[..., self.used].mean(-1, keepdim=True), self.faces)
 
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of a shape.
