@@ -110,27 +110,26 @@ class ModalShell(nn.Module):
             extra_rows = placement.extra.movedim(-1, 0)
             edge_extra = shell.edge_vectors(extra_rows).movedim(0, -1)
             hinge_extra = shell.hinge_spokes(extra_rows).flatten(0, 1).movedim(0, -1)
-        to_lengths = length_gradient(edges).movedim(0, -1)
-        to_angles = dihedral_gradient(spokes).flatten(0, 1).movedim(0, -1)
+        # Rows of the Jacobian are scaled before they pass through the columns, where they are few numbers.
+        parts = (
+            (length_gradient(edges), slope.length, curvature.length, self.curvature.edge_columns, edge_extra),
+            (dihedral_gradient(spokes).flatten(0, 1), slope.angle, curvature.angle, self.hinge_columns, hinge_extra),
+        )
         to_volume = self._volume_gradient(rows).movedim(0, -1).flatten(1)
         volume_row = to_volume @ self.columns.flatten(0, 1)
         if placement.extra is not None:
             volume_row = torch.cat([volume_row, (to_volume * placement.extra.flatten(1)).sum(-1, True)], -1)
-        jacobian = torch.cat(
-            [
-                _through(to_lengths, self.curvature.edge_columns, edge_extra),
-                _through(to_angles, self.hinge_columns, hinge_extra),
-                volume_row[:, None],
-            ],
-            1,
-        )
-        slopes = torch.cat([slope.length, slope.angle, slope.volume[:, None]], 1)
-        curvatures = torch.cat([curvature.length, curvature.angle, curvature.volume[:, None]], 1)
-        gradient = (jacobian.mT @ slopes[..., None]).squeeze(-1)
-        gauss_newton = jacobian.mT @ (curvatures[..., None] * jacobian)
+        gradient = slope.volume[:, None] * volume_row
+        gauss_newton = curvature.volume[:, None, None] * volume_row[:, :, None] * volume_row[:, None, :]
+        for local, slopes, curvatures, columns, extra in parts:
+            root = curvatures.clamp_min(torch.finfo(curvatures.dtype).tiny).sqrt()
+            scaled = _through((root * local).movedim(0, -1), columns, extra)
+            gradient = gradient + (scaled.mT @ (slopes / root)[..., None]).squeeze(-1)
+            gauss_newton = gauss_newton + scaled.mT @ scaled
+        stiffness = curvature.length.sum(-1) + curvature.angle.sum(-1) + curvature.volume
         stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
-        resolution = rounding * (stiffest * curvatures.sum(-1)).sqrt()
+        resolution = rounding * (stiffest * stiffness).sqrt()
         curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, resolution)
 
@@ -172,7 +171,7 @@ class _Curvature(nn.Module):
     A block ``G`` between two sides ``u, v`` of a triangle with the third side ``v - u`` splits into its symmetric part,
     where ``2 u.Gv = u.Gu + v.Gv - (v-u).G(v-u)`` leaves one matrix on each side, and its antisymmetric part, where
     ``u.(w x v)`` is the same for any two sides of the triangle in order: one vector ``w``. The volume of a closed
-    surface is of the second kind; an open one is closed with a cone to its centroid.
+    surface is of the second kind; any other is closed with cones to its centroid.
 
     Args:
         shell: The energy.
@@ -192,7 +191,7 @@ class _Curvature(nn.Module):
         self.shell = shell
         faces, edges, hinges = (t.cpu().numpy() for t in (shell.faces, shell.edges, shell.hinges))
         n_vertices = columns.shape[1]
-        cone = np.array([[j, i, n_vertices] for i, j in mesh.boundary_loops(faces)]).reshape(-1, 3)
+        cone = np.array([[j, i, n_vertices] for i, j in mesh.boundary_chain(faces)]).reshape(-1, 3)
         self.register_buffer("closed_faces", torch.from_numpy(np.concatenate([faces, cone]).astype(np.int64)))
         i, j, k, m = hinges.T
         sides = [(i, j), (i, k), (i, m), (j, k), (j, m)]

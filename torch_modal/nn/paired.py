@@ -37,16 +37,17 @@ class PairedShell(nn.Module):
 
     Args:
         shell: Energy on the coarse mesh.
-        ends: Columns of both spaces; the similarity is taken over the fine vertices.
+        ends: Columns of both spaces.
+        used: Which of the fine vertices the similarity is taken over. *Shape:* ``(V,)``, bool.
     """
 
     gap: Tensor
     gap_gram: Tensor
 
-    def __init__(self, shell: ShellEnergy, ends: tuple[Columns, Columns]) -> None:
+    def __init__(self, shell: ShellEnergy, ends: tuple[Columns, Columns], used: Tensor) -> None:
         super().__init__()
         self.first, self.second = (ModalShell(shell, end.coarse) for end in ends)
-        gap = torch.cat([ends[0].fine, -ends[1].fine]).flatten(1)
+        gap = (torch.cat([ends[0].fine, -ends[1].fine]) * used[:, None]).flatten(1)
         self.register_buffer("gap", gap)
         self.register_buffer("gap_gram", gap @ gap.mT)
 
@@ -96,7 +97,7 @@ class PairedSpace(nn.Module):
         super().__init__()
         self.frame = frame
         self.first, self.second = (frame.elastic_columns(end) for end in modes)
-        self.energy = PairedShell(shell, (self.first, self.second))
+        self.energy = PairedShell(shell, (self.first, self.second), frame.weights > 0)
 
     @property
     def n_unknowns(self) -> int:
@@ -106,7 +107,7 @@ class PairedSpace(nn.Module):
     def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> PairedProblem:
         """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. *Shape of each:* ``(B,)``."""
         coarse = (self.frame.coarsen(x) for x in (pair.first, pair.second))
-        apart = (pair.first - pair.second).flatten(1)
+        apart = ((pair.first - pair.second) * (self.frame.weights > 0)[:, None]).flatten(1)
         return PairedProblem((*coarse, apart @ self.energy.gap.mT, (apart**2).sum(-1), t, mu, alpha, beta, gamma), pair)
 
     def placement(

@@ -49,12 +49,14 @@ def per_sample(values: Iterable[float | Tensor], like: Tensor) -> tuple[Tensor, 
 
 def edge_length(edge: Tensor) -> Tensor:
     """Length of edge vectors ``x_j - x_i``, components first. *Shape:* ``(3, ...) -> (...)``."""
-    return _nonzero((edge * edge).sum(0)).sqrt()
+    squared = (edge * edge).sum(0)
+    # The root of a constant where there is no length: its derivative is 0 there, not NaN.
+    return torch.where(squared > _tiny(edge), squared, _tiny(edge)).sqrt()
 
 
 def length_gradient(edge: Tensor) -> Tensor:
-    """Gradient of :func:`edge_length`. *Shape:* ``(3, ...) -> (3, ...)``."""
-    return edge / edge_length(edge)
+    """Gradient of :func:`edge_length`, 0 where there is no length. *Shape:* ``(3, ...) -> (3, ...)``."""
+    return edge * _inverse((edge * edge).sum(0)).sqrt()
 
 
 def dihedral_angle(spokes: Tensor) -> Tensor:
@@ -91,18 +93,22 @@ def dihedral_gradient(spokes: Tensor) -> Tensor:
     e, a, b = spokes
     n1 = torch.linalg.cross(e, a, dim=0)
     n2 = torch.linalg.cross(b, e, dim=0)
-    squared = _nonzero((e * e).sum(0))
-    length = squared.sqrt()
-    to_a = n1 * (-length / _nonzero((n1 * n1).sum(0)))
-    to_b = n2 * (-length / _nonzero((n2 * n2).sum(0)))
-    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) / squared
+    length = edge_length(e)
+    to_a = n1 * (-length * _inverse((n1 * n1).sum(0)))
+    to_b = n2 * (-length * _inverse((n2 * n2).sum(0)))
+    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * _inverse((e * e).sum(0))
     return torch.stack([to_e, to_a, to_b])
 
 
-def _nonzero(squared: Tensor) -> Tensor:
-    """The same where it is positive, else a constant: derivatives are 0 there, not NaN."""
-    tiny = torch.finfo(squared.dtype).tiny
-    return torch.where(squared > tiny, squared, tiny)
+def _tiny(like: Tensor) -> float:
+    """What a squared length or area must exceed to have a direction; its inverse still has room to grow."""
+    return torch.finfo(like.dtype).tiny ** 0.5
+
+
+def _inverse(squared: Tensor) -> Tensor:
+    """``1 / squared``, and 0 with all its derivatives where that has no meaning."""
+    positive = squared > _tiny(squared)
+    return torch.where(positive, 1 / torch.where(positive, squared, 1), 0)
 
 
 def enclosed_volume(rows: Tensor, faces: Tensor) -> Tensor:
