@@ -60,7 +60,7 @@ class InBetween(nn.Module):
         gamma: float | Tensor = 1000.0,
         coarse_faces: int = 1000,
         max_steps: int = 40,
-        tolerance: float = 1e-8,
+        tolerance: float = 1e-10,
         gradient: str = "implicit",
         unconverged: str = "warn",
     ) -> None:

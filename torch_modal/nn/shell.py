@@ -9,11 +9,14 @@ from torch import Tensor, nn
 
 from torch_modal import mesh
 
-# Eq. 5 divides by rest lengths, rest areas and the rest volume. The floors below only bite on input that has no
-# well-defined weight (coincident vertices, needles, a flat sheet); everywhere else the weights are the paper's.
+# Eq. 5 divides by rest lengths, rest areas and the rest volume. Edges and hinges without a size have no say, needles
+# and flat bodies a bounded one; everywhere else the weights are the paper's.
 MIN_RELATIVE_LENGTH = 1e-6  # of the mean edge length
 MAX_BENDING_RATIO = 1e3  # of l^2 / A; an equilateral hinge has 1.15
 MIN_RELATIVE_VOLUME = 1e-6  # of (surface area)^(3/2); a sphere has 0.094
+
+# Altitude of a triangle over its edge below which the triangle has no normal worth the name.
+COLLAPSED = 1e-6
 
 
 class Measures(NamedTuple):
@@ -56,7 +59,8 @@ def edge_length(edge: Tensor) -> Tensor:
 
 def length_gradient(edge: Tensor) -> Tensor:
     """Gradient of :func:`edge_length`, 0 where there is no length. *Shape:* ``(3, ...) -> (3, ...)``."""
-    return edge * _inverse((edge * edge).sum(0)).sqrt()
+    squared = (edge * edge).sum(0)
+    return edge * _inverse(squared.sqrt(), squared <= _tiny(edge))
 
 
 def dihedral_angle(spokes: Tensor) -> Tensor:
@@ -75,8 +79,8 @@ def dihedral_angle(spokes: Tensor) -> Tensor:
     sine = -edge_length(e) * (n1 * b).sum(0)
     cosine = (n1 * n2).sum(0)
     # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
-    collapsed = (sine == 0) & (cosine == 0)
-    return torch.atan2(sine, torch.where(collapsed, torch.ones_like(cosine), cosine))
+    flat = _collapsed(e, n1) | _collapsed(e, n2)
+    return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
 
 
 def dihedral_gradient(spokes: Tensor) -> Tensor:
@@ -88,27 +92,34 @@ def dihedral_gradient(spokes: Tensor) -> Tensor:
         spokes: As above. *Shape:* ``(3, 3, ...)``.
 
     Returns:
-        Zero at the tip of a collapsed triangle. *Shape:* ``(3, 3, ...)``.
+        Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
     """
     e, a, b = spokes
     n1 = torch.linalg.cross(e, a, dim=0)
     n2 = torch.linalg.cross(b, e, dim=0)
+    flat = _collapsed(e, n1) | _collapsed(e, n2)
     length = edge_length(e)
-    to_a = n1 * (-length * _inverse((n1 * n1).sum(0)))
-    to_b = n2 * (-length * _inverse((n2 * n2).sum(0)))
-    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * _inverse((e * e).sum(0))
+    to_a = n1 * (-length * _inverse((n1 * n1).sum(0), flat))
+    to_b = n2 * (-length * _inverse((n2 * n2).sum(0), flat))
+    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * _inverse((e * e).sum(0), flat)
     return torch.stack([to_e, to_a, to_b])
 
 
+def _collapsed(edge: Tensor, normal: Tensor) -> Tensor:
+    """Whether a triangle on this edge has no altitude. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
+    bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
+    base = (edge * edge).sum(0)
+    return (normal * normal).sum(0) <= (bound * base) ** 2 + _tiny(edge)
+
+
 def _tiny(like: Tensor) -> float:
-    """What a squared length or area must exceed to have a direction; its inverse still has room to grow."""
+    """What a squared length must exceed to have a direction; its inverse still has room to grow."""
     return torch.finfo(like.dtype).tiny ** 0.5
 
 
-def _inverse(squared: Tensor) -> Tensor:
-    """``1 / squared``, and 0 with all its derivatives where that has no meaning."""
-    positive = squared > _tiny(squared)
-    return torch.where(positive, 1 / torch.where(positive, squared, 1), 0)
+def _inverse(x: Tensor, zero: Tensor) -> Tensor:
+    """``1 / x``, and 0 with all its derivatives where told."""
+    return torch.where(zero, 0, 1 / torch.where(zero, 1, x))
 
 
 def enclosed_volume(rows: Tensor, faces: Tensor) -> Tensor:
@@ -205,17 +216,20 @@ class ShellEnergy(nn.Module):
         measures = self.measure(x_rest)
         rows = x_rest.movedim(-1, 0).contiguous()
         e, a, b = self.hinge_spokes(rows)
-        hinge_area = 0.5 * (_parallelogram(e, a) + _parallelogram(b, e))
+        n1, n2 = torch.linalg.cross(e, a, dim=0), torch.linalg.cross(b, e, dim=0)
+        hinge_area = 0.5 * (edge_length(n1) + edge_length(n2))
         squared = (e * e).sum(0)
-        length_floor = MIN_RELATIVE_LENGTH * measures.length.mean(-1, keepdim=True)
+        shortest = MIN_RELATIVE_LENGTH * measures.length.mean(-1, keepdim=True)
         p, q, r = (rows[..., corner] for corner in self.faces.unbind(1))
-        surface = 0.5 * _parallelogram(q - p, r - p).sum(-1)
+        surface = 0.5 * edge_length(torch.linalg.cross(q - p, r - p, dim=0)).sum(-1)
         volume_floor = MIN_RELATIVE_VOLUME * surface**1.5
         alpha, beta, gamma = stiffness or self.stiffness
         alpha, beta = (s[..., None] if isinstance(s, Tensor) else s for s in (alpha, beta))
+        pointlike = measures.length <= shortest
+        nameless = _collapsed(e, n1) | _collapsed(e, n2)
         weights = Measures(
-            alpha / torch.maximum(measures.length, length_floor),
-            beta * squared / torch.maximum(hinge_area, squared / MAX_BENDING_RATIO + length_floor**2),
+            alpha * _inverse(measures.length, pointlike),
+            beta * squared * _inverse(torch.maximum(hinge_area, squared / MAX_BENDING_RATIO), nameless),
             gamma / torch.maximum(measures.volume.abs(), volume_floor) ** 2,
         )
         return Rest(measures, weights)
@@ -261,8 +275,3 @@ class ShellEnergy(nn.Module):
         length, angle, volume = self.differences(measures, rest)
         weights = rest.weights
         return (weights.length * length**2).sum(-1) + (weights.angle * angle**2).sum(-1) + weights.volume * volume**2
-
-
-def _parallelogram(a: Tensor, b: Tensor) -> Tensor:
-    """Area between two vectors. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
-    return edge_length(torch.linalg.cross(a, b, dim=0))
