@@ -7,8 +7,10 @@ from torch_modal.export import save_animation as save_animation
 from torch_modal.export import save_frames as save_frames
 from torch_modal.keyframes import check_keyframes as check_keyframes
 from torch_modal.keyframes import load_keyframes as load_keyframes
+from torch_modal.nn.between import ConvergenceError as ConvergenceError
+from torch_modal.nn.between import ConvergenceWarning as ConvergenceWarning
 from torch_modal.nn.gauss_newton import GaussNewtonStep as GaussNewtonStep
-from torch_modal.nn.mid_shape import ConvergenceWarning as ConvergenceWarning
+from torch_modal.nn.in_between import InBetween as InBetween
 from torch_modal.nn.mid_shape import MidShape as MidShape
 from torch_modal.nn.shell import ShellEnergy as ShellEnergy
 from torch_modal.picture import render_sequence as render_sequence
@@ -20,8 +22,10 @@ from torch_modal.sequence import subdivide as subdivide
 from torch_modal.version import __version__ as __version__
 
 __all__ = [
+    "ConvergenceError",
     "ConvergenceWarning",
     "GaussNewtonStep",
+    "InBetween",
     "MeshError",
     "MeshWarning",
     "MidShape",

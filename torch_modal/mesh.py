@@ -52,11 +52,18 @@ def boundary_edges(faces: IntArray) -> IntArray:
     return edges[counts == 1]
 
 
-def boundary_loops(faces: IntArray) -> IntArray:
-    """Boundary edges in the direction of their face. *Shape:* ``(·, 2)``."""
+def boundary_chain(faces: IntArray) -> IntArray:
+    """Directed edges that are left when opposite ones cancel: the boundary of an open surface.
+
+    Where the winding is consistent, these are the edges of one face, in its direction. An edge that two faces run
+    along in the same direction, or a third face shares, is left as often as it does not cancel. *Shape:* ``(·, 2)``.
+    """
     directed, _ = _half_edges(faces)
-    _, index, counts = np.unique(np.sort(directed, axis=1), axis=0, return_index=True, return_counts=True)
-    return directed[index[counts == 1]]
+    edges, ids = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
+    forward = directed[:, 0] < directed[:, 1]
+    net = np.bincount(ids.reshape(-1), np.where(forward, 1, -1), minlength=len(edges)).astype(np.int64)
+    oriented = np.where((net > 0)[:, None], edges, edges[:, ::-1])
+    return np.repeat(oriented, np.abs(net), axis=0)
 
 
 def edge_index(edges: IntArray, i: IntArray, j: IntArray) -> IntArray:

@@ -69,7 +69,7 @@ def best_rotation(covariance: Tensor) -> Tensor:
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)
     rotation = (u * sign[..., None, :]) @ vh
-    if not (torch.is_grad_enabled() and covariance.requires_grad):
+    if not torch.is_grad_enabled():
         return rotation
     eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     for _ in range(2):
@@ -79,8 +79,9 @@ def best_rotation(covariance: Tensor) -> Tensor:
         )
         trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         stiffness = trace * eye - 0.5 * (p + p.mT)
-        # Two vanishing singular values (all vertices on a line) leave a rotation free: the floor holds it still.
-        stiffness = stiffness + torch.finfo(p.dtype).eps * (trace.abs() + torch.finfo(p.dtype).tiny) * eye
+        # Two vanishing singular values (all vertices on a line, or in a point) leave a rotation free: held still.
+        floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, torch.finfo(p.dtype).eps * trace.abs(), 1)
+        stiffness = stiffness + floor.detach() * eye
         turn = torch.linalg.solve(stiffness, torque)
         rotation = rotation @ _flat(axis_angle_to_rotation_matrix, turn, 1)
     return rotation

@@ -57,7 +57,7 @@ class Frame(nn.Module):
     """The scale of 100, the alignment of two bases, and the coarse mesh that the energy is evaluated on.
 
     Args:
-        bases: The bases at both ends, or one that serves for both.
+        bases: The basis at each end.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         coarse_faces: Number of faces of the coarse mesh.
 
@@ -73,12 +73,10 @@ class Frame(nn.Module):
     clusters: Tensor
     shares: Tensor
     reference: Tensor
+    turn: Tensor
 
-    def __init__(self, bases: ModalBasis | Sequence[ModalBasis], faces: Tensor, coarse_faces: int) -> None:
+    def __init__(self, bases: Sequence[ModalBasis], faces: Tensor, coarse_faces: int) -> None:
         super().__init__()
-        bases = [bases, bases] if isinstance(bases, ModalBasis) else list(bases)
-        if len(bases) != 2:
-            raise ValueError(f"an in-between lies between two bases, got {len(bases)}; pass [basis_a, basis_b]")
         if bases[0].n_vertices != bases[1].n_vertices:
             raise ValueError(
                 f"the bases belong to meshes of {bases[0].n_vertices} and {bases[1].n_vertices} vertices; both ends "
@@ -108,8 +106,12 @@ class Frame(nn.Module):
         self.register_buffer("reference", references[0])
         #: Rigid motions of the shape half-way between the references, to first order.
         self.rigid = self.orthonormal(_rigid_fields(references.mean(0)))
-        #: Modes of both ends, turned into this frame. Their scale does not matter.
-        self.modes = (ends[0].modes, ends[1].modes @ turn.rotation.mT)
+        self.register_buffer("turn", turn.rotation)
+
+    def modes(self, bases: Sequence[ModalBasis]) -> list[Tensor]:
+        """Modes of both ends, turned into this frame; their scale does not matter. *Shape of each:* ``(k, V, 3)``."""
+        first, second = (basis.modes.to(self.turn) for basis in bases)
+        return [first, second @ self.turn.mT]
 
     def coarsen(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""

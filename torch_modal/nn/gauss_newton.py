@@ -1,5 +1,6 @@
 """The damped Gauss-Newton step on modal amplitudes, and the loop that repeats it."""
 
+from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -18,6 +19,7 @@ GOOD_DECREASE = 0.8
 
 # Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
 ROUNDING_MARGIN = 4.0
+ENERGY_ROUNDING = 64.0
 
 
 class AmplitudeEnergy(Protocol):
@@ -29,6 +31,9 @@ class AmplitudeEnergy(Protocol):
     def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
         """Derivatives. *Shape:* ``(B, n)``."""
 
+    def second_order(self, a: Tensor, placement: Any) -> Tensor:
+        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+
 
 class Step(NamedTuple):
     """One step of every sample of a batch."""
@@ -37,8 +42,25 @@ class Step(NamedTuple):
     """*Shape:* ``(B, n)``."""
     energy: Tensor
     """*Shape:* ``(B,)``."""
+    gradient_norm: Tensor
+    """Before the step. *Shape:* ``(B,)``."""
+    promised: Tensor
+    """Decrease of the energy that the quadratic model expects of the whole step. *Shape:* ``(B,)``."""
     moved: Tensor
     """False where no step was found that does not go uphill. *Shape:* ``(B,)``, bool."""
+
+
+class Status(IntEnum):
+    """How the minimisation of a sample ended."""
+
+    CONVERGED = 0
+    """The gradient is within the tolerance, or as small as the rounding of positions and energy lets it be."""
+    OUT_OF_STEPS = 1
+    """There was more to gain."""
+    STALLED = 2
+    """No step went downhill any more."""
+    INVALID = 3
+    """No in-between exists: NaN or infinite entries, no size, or one key-frame of a closed mesh is a mirror image."""
 
 
 class Solution(NamedTuple):
@@ -52,8 +74,13 @@ class Solution(NamedTuple):
     """Relative to the gradient norm at the start. *Shape:* ``(B,)``."""
     n_steps: Tensor
     """Steps taken. *Shape:* ``(B,)``, int64."""
-    converged: Tensor
-    """Whether the gradient is within the tolerance, or at the rounding of the positions. *Shape:* ``(B,)``, bool."""
+    status: Tensor
+    """A :class:`Status` for each. *Shape:* ``(B,)``, int64."""
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether the gradient is within the tolerance. *Shape:* ``(B,)``, bool."""
+        return self.status == Status.CONVERGED
 
 
 class GaussNewtonStep(nn.Module):
@@ -75,6 +102,15 @@ class GaussNewtonStep(nn.Module):
         self.energy = energy
         self.damping = damping
 
+    def ridged(self, hessian: Tensor) -> Tensor:
+        """A Hessian with the ridge. *Shape:* ``(..., n, n)``."""
+        damping = self.damping
+        if damping is None:
+            damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6
+        size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
+        ridge = damping * size.abs() + torch.finfo(size.dtype).tiny
+        return hessian + ridge[..., None, None] * torch.eye(hessian.shape[-1], dtype=size.dtype, device=size.device)
+
     def directions(self, derivatives: Derivatives) -> Tensor:
         """Directions ``-H^-1 g`` of Gauss-Newton and, where given, of the full Hessian.
 
@@ -84,51 +120,75 @@ class GaussNewtonStep(nn.Module):
         hessians = derivatives.gauss_newton[None]
         if derivatives.second_order is not None:
             hessians = torch.cat([hessians, hessians + derivatives.second_order])
-        damping = self.damping
-        if damping is None:
-            damping = 1e-12 if hessians.dtype == torch.float64 else 1e-6
-        size = derivatives.gauss_newton.diagonal(dim1=-2, dim2=-1).mean(-1)
-        ridge = damping * size + torch.finfo(size.dtype).tiny
-        eye = torch.eye(hessians.shape[-1], dtype=size.dtype, device=size.device)
-        factor, info = torch.linalg.cholesky_ex(hessians + ridge[:, None, None] * eye)
+        hessians = self.ridged(hessians)
+        factor, info = torch.linalg.cholesky_ex(hessians)
+        definite = info == 0
+        if torch.is_grad_enabled():
+            # A failed factorisation that is not used would still give NaN gradients.
+            eye = torch.eye(hessians.shape[-1], dtype=hessians.dtype, device=hessians.device)
+            factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], hessians, eye))
         gradient = derivatives.gradient.expand(len(hessians), -1, -1)[..., None]
         direction = -torch.cholesky_solve(gradient, factor).squeeze(-1)
-        return torch.where((info == 0)[..., None], direction, torch.nan)
+        return torch.where(definite[..., None], direction, torch.nan)
+
+    @staticmethod
+    def floor(derivatives: Derivatives) -> Tensor:
+        """Gradient norm below which there is only rounding. *Shape:* ``(B,)``."""
+        return ROUNDING_MARGIN * derivatives.resolution
 
     def take(self, a: Tensor, energy: Tensor, derivatives: Derivatives, placement: Any) -> Step:
         """The best of the candidate steps from a point whose derivatives are known."""
         directions = self.directions(derivatives)
         best, lowest = self._lowest(a, directions, placement)
-        # The quadratic model of a Newton step falls by half the slope along it.
-        promised = -0.5 * (directions * derivatives.gradient).sum(-1)
-        promised = torch.where(promised.isfinite(), promised, 0).amax(0)
+        promised = self._promised(directions, derivatives)
         poor = energy - lowest < GOOD_AGREEMENT * promised
         if bool(poor.any()):
-            lengths = torch.tensor(STEP_LENGTHS, dtype=a.dtype, device=a.device)[:, None, None, None]
-            shorter, energies = self._lowest(a, (lengths * directions).flatten(0, 1), placement)
+            shorter, energies = self._lowest(a, self._shortened(directions), placement)
             improves = poor & (energies < lowest)
             best = torch.where(improves[:, None], shorter, best)
             lowest = torch.where(improves, energies, lowest)
-        # At the optimum the energy is flat to rounding while the gradient still has digits to gain.
-        moved = lowest <= energy + 4 * torch.finfo(energy.dtype).eps * energy.abs()
-        return Step(torch.where(moved[:, None], best, a), torch.where(moved, lowest, energy), moved)
-
-    def _lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-        """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low."""
-        candidates = a + steps
-        energies = self.energy.value(candidates.nan_to_num(), placement)
-        valid = candidates.isfinite().all(-1) & energies.isfinite()
-        lowest, index = torch.where(valid, energies, torch.inf).min(0)
-        return candidates.gather(0, index[None, :, None].expand(1, *a.shape)).squeeze(0), lowest
+        return self._unless_uphill(a, energy, best, lowest, promised, derivatives)
 
     def forward(self, a: Tensor, placement: Any) -> Step:
-        """Take one step with both directions.
+        """Take one step, trying both directions at all lengths, without a branch that depends on data.
 
         Args:
             a: Amplitudes. *Shape:* ``(B, n)``.
             placement: What the energy knows of each sample.
         """
-        return self.take(a, self.energy.value(a, placement), self.energy.derivatives(a, placement), placement)
+        derivatives = self.energy.derivatives(a, placement)
+        directions = self.directions(derivatives)
+        best, lowest = self._lowest(a, torch.cat([directions, self._shortened(directions)]), placement)
+        promised = self._promised(directions, derivatives)
+        return self._unless_uphill(a, self.energy.value(a, placement), best, lowest, promised, derivatives)
+
+    @staticmethod
+    def _shortened(directions: Tensor) -> Tensor:
+        """Shorter steps along each direction. *Shape:* ``(D, B, n) -> (D * L, B, n)``."""
+        return torch.cat([length * directions for length in STEP_LENGTHS])
+
+    @staticmethod
+    def _promised(directions: Tensor, derivatives: Derivatives) -> Tensor:
+        """The quadratic model of a Newton step falls by half the slope along it. *Shape:* ``(D, B, n) -> (B,)``."""
+        promised = -0.5 * (directions * derivatives.gradient).sum(-1)
+        return torch.where(promised.isfinite(), promised, 0).amax(0)
+
+    @staticmethod
+    def _unless_uphill(
+        a: Tensor, energy: Tensor, best: Tensor, lowest: Tensor, promised: Tensor, derivatives: Derivatives
+    ) -> Step:
+        # At the optimum the energy is flat to rounding while the gradient still has digits to gain.
+        moved = lowest <= energy + 4 * torch.finfo(energy.dtype).eps * energy.abs()
+        norm = derivatives.gradient.norm(dim=-1)
+        return Step(torch.where(moved[:, None], best, a), torch.where(moved, lowest, energy), norm, promised, moved)
+
+    def _lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+        """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low."""
+        usable = steps.isfinite().all(-1)
+        candidates = a + torch.where(usable[..., None], steps, 0)
+        energies = self.energy.value(candidates, placement)
+        lowest, index = torch.where(usable & energies.isfinite(), energies, torch.inf).min(0)
+        return candidates.gather(0, index[None, :, None].expand(1, *a.shape)).squeeze(0), lowest
 
 
 def minimise(
@@ -146,33 +206,37 @@ def minimise(
         tolerance: Bound on the gradient norm, relative to its value at the start.
     """
     energy = step.energy.value(a, placement)
-    start = torch.zeros_like(energy)
-    gradient_norm = torch.full_like(energy, torch.inf)
-    converged = torch.zeros_like(energy, dtype=torch.bool)
-    resting = torch.zeros_like(converged)
-    n_steps = torch.zeros_like(energy, dtype=torch.int64)
-    slow = torch.zeros_like(converged)
+    start = gradient_norm = torch.full_like(energy, torch.inf)
+    status = torch.full_like(energy, Status.OUT_OF_STEPS, dtype=torch.int64)
+    resting = torch.zeros_like(status, dtype=torch.bool)
+    slow = torch.zeros_like(resting)
+    n_steps = torch.zeros_like(status)
     for k in range(max_steps + 1):
-        derivatives = step.energy.derivatives(a, placement, second_order=bool(slow.any()))
-        if derivatives.second_order is not None:
-            # Samples that need no full Hessian yet must not profit from one that others need: NaN rules it out.
-            second_order = torch.where(slow[:, None, None], derivatives.second_order, torch.nan)
-            derivatives = derivatives._replace(second_order=second_order)
+        derivatives = step.energy.derivatives(a, placement, second_order=False)
         norm = derivatives.gradient.norm(dim=-1)
         if k == 0:
             start = norm
         gradient_norm = torch.where(resting, gradient_norm, norm)
-        floor = ROUNDING_MARGIN * derivatives.resolution
-        converged = converged | (~resting & (norm <= torch.maximum(tolerance * start, floor)))
-        resting = resting | converged | ~norm.isfinite()
+        done = ~resting & (norm <= torch.maximum(tolerance * start, step.floor(derivatives)))
+        broken = ~resting & ~(norm.isfinite() & energy.isfinite())
+        status = torch.where(done, Status.CONVERGED, torch.where(broken, Status.INVALID, status))
+        resting = resting | done | broken
         if k == max_steps or bool(resting.all()):
             break
+        if bool((slow & ~resting).any()):
+            # Samples that need no full Hessian yet must not profit from one that others need: NaN rules it out.
+            second_order = torch.where(slow[:, None, None], step.energy.second_order(a, placement), torch.nan)
+            derivatives = derivatives._replace(second_order=second_order)
         taken = step.take(a, energy, derivatives, placement)
         go = ~resting & taken.moved
-        resting = resting | (slow & ~taken.moved)
+        stuck = ~resting & slow & ~taken.moved
+        # Where all that is left to gain drowns in the rounding of the energy, the minimum is found.
+        drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
+        status = torch.where(stuck, torch.where(drowned, Status.CONVERGED, Status.STALLED), status)
+        resting = resting | stuck
         slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)
         a = torch.where(go[:, None], taken.amplitudes, a)
         energy = torch.where(go, taken.energy, energy)
         n_steps = n_steps + go
     relative = gradient_norm / start.clamp_min(torch.finfo(start.dtype).tiny)
-    return Solution(a, energy, relative, n_steps, converged)
+    return Solution(a, energy, relative, n_steps, status)

@@ -1,5 +1,6 @@
 """The joint space: one unknown shape in the sum of both modal spaces and the difference of the key-frames."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -7,14 +8,14 @@ from torch import Tensor, nn
 
 from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.modal_shell import ModalShell, Placement, Reference
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.nn.shell import ShellEnergy, Stiffness
 
 
 class JointProblem(NamedTuple):
     """The in-between of each sample as a minimisation."""
 
-    placement: Placement
-    """On the coarse mesh."""
+    inputs: tuple[Tensor, ...]
+    """What the minimiser depends on, for :meth:`JointSpace.placement`. *Shape of each:* ``(B, ...)``."""
     base: Tensor
     """Linear interpolation on the fine mesh. *Shape:* ``(B, V, 3)``."""
     difference: Tensor
@@ -30,12 +31,13 @@ class JointSpace(nn.Module):
     Args:
         frame: Frame of the two bases.
         shell: Energy on the frame's coarse mesh.
+        modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
     """
 
-    def __init__(self, frame: Frame, shell: ShellEnergy) -> None:
+    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor]) -> None:
         super().__init__()
         self.frame = frame
-        self.columns = frame.elastic_columns(torch.cat(frame.modes))
+        self.columns = frame.elastic_columns(torch.cat(list(modes)))
         self.energy = ModalShell(shell, self.columns.coarse)
 
     @property
@@ -43,17 +45,32 @@ class JointSpace(nn.Module):
         """Number of amplitudes."""
         return len(self.columns.fine) + 1
 
-    def problem(self, pair: Pair, t: Tensor) -> JointProblem:
-        """Set up the in-betweens of a batch at the times ``t``, *shape* ``(B,)``."""
+    def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> JointProblem:
+        """Set up the in-betweens of a batch at the times ``t``; ``mu`` plays no part. *Shape of each:* ``(B,)``."""
         base = torch.lerp(pair.first, pair.second, t[:, None, None])
         difference = self._difference(pair)
+        coarse = (self.frame.coarsen(x) for x in (pair.first, pair.second, difference))
+        return JointProblem((*coarse, t, alpha, beta, gamma), base, difference)
+
+    def placement(self, first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> Placement:
+        """The minimisation on the coarse mesh, from the inputs of a problem."""
         rest = self.energy.shell.rest
         references = [
-            Reference(rest(self.frame.coarsen(pair.first)), 1 - t),
-            Reference(rest(self.frame.coarsen(pair.second)), t),
+            Reference(rest(first, Stiffness(*stiffness)), 1 - t),
+            Reference(rest(second, Stiffness(*stiffness)), t),
         ]
-        placement = Placement(self.frame.coarsen(base), self.frame.coarsen(difference), references)
-        return JointProblem(placement, base, difference)
+        return Placement(torch.lerp(first, second, t[:, None, None]), difference, references)
+
+    @staticmethod
+    def require(first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> None:
+        """Times in [0, 1].
+
+        Raises:
+            ValueError: Others: outside, one of the two pulls would be negative.
+        """
+        outside = ~((t >= 0) & (t <= 1))
+        if bool(outside.any()):
+            raise ValueError(f"t lies in [0, 1], from key-frame to key-frame; got {float(t[outside][0])}")
 
     def lift(self, a: Tensor, problem: JointProblem) -> Tensor:
         """The fine shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""

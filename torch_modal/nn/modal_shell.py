@@ -110,29 +110,34 @@ class ModalShell(nn.Module):
             extra_rows = placement.extra.movedim(-1, 0)
             edge_extra = shell.edge_vectors(extra_rows).movedim(0, -1)
             hinge_extra = shell.hinge_spokes(extra_rows).flatten(0, 1).movedim(0, -1)
-        to_lengths = length_gradient(edges).movedim(0, -1)
-        to_angles = dihedral_gradient(spokes).flatten(0, 1).movedim(0, -1)
+        # Rows of the Jacobian are scaled before they pass through the columns, where they are few numbers.
+        parts = (
+            (length_gradient(edges), slope.length, curvature.length, self.curvature.edge_columns, edge_extra),
+            (dihedral_gradient(spokes).flatten(0, 1), slope.angle, curvature.angle, self.hinge_columns, hinge_extra),
+        )
         to_volume = self._volume_gradient(rows).movedim(0, -1).flatten(1)
         volume_row = to_volume @ self.columns.flatten(0, 1)
         if placement.extra is not None:
             volume_row = torch.cat([volume_row, (to_volume * placement.extra.flatten(1)).sum(-1, True)], -1)
-        jacobian = torch.cat(
-            [
-                _through(to_lengths, self.curvature.edge_columns, edge_extra),
-                _through(to_angles, self.hinge_columns, hinge_extra),
-                volume_row[:, None],
-            ],
-            1,
-        )
-        slopes = torch.cat([slope.length, slope.angle, slope.volume[:, None]], 1)
-        curvatures = torch.cat([curvature.length, curvature.angle, curvature.volume[:, None]], 1)
-        gradient = (jacobian.mT @ slopes[..., None]).squeeze(-1)
-        gauss_newton = jacobian.mT @ (curvatures[..., None] * jacobian)
+        gradient = slope.volume[:, None] * volume_row
+        gauss_newton = curvature.volume[:, None, None] * volume_row[:, :, None] * volume_row[:, None, :]
+        for local, slopes, curvatures, columns, extra in parts:
+            root = curvatures.clamp_min(torch.finfo(curvatures.dtype).tiny).sqrt()
+            scaled = _through((root * local).movedim(0, -1), columns, extra)
+            gradient = gradient + (scaled.mT @ (slopes / root)[..., None]).squeeze(-1)
+            gauss_newton = gauss_newton + scaled.mT @ scaled
+        stiffness = curvature.length.sum(-1) + curvature.angle.sum(-1) + curvature.volume
         stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
-        resolution = rounding * (stiffest * curvatures.sum(-1)).sqrt()
-        curved = self.curvature(rows, edges, spokes, slope, placement.extra) if second_order else None
+        resolution = rounding * (stiffest * stiffness).sqrt()
+        curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, resolution)
+
+    def second_order(self, a: Tensor, placement: Placement) -> Tensor:
+        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+        x = self.shape(a, placement)
+        slope, _ = self._slopes(self.shell.measure(x), placement.references)
+        return self.curvature(x.movedim(-1, 0).contiguous(), slope, placement.extra)
 
     def _volume_gradient(self, rows: Tensor) -> Tensor:
         """Gradient of :meth:`ShellEnergy.volume`. *Shape:* ``(3, B, V) -> (3, B, V)``."""
@@ -166,7 +171,7 @@ class _Curvature(nn.Module):
     A block ``G`` between two sides ``u, v`` of a triangle with the third side ``v - u`` splits into its symmetric part,
     where ``2 u.Gv = u.Gu + v.Gv - (v-u).G(v-u)`` leaves one matrix on each side, and its antisymmetric part, where
     ``u.(w x v)`` is the same for any two sides of the triangle in order: one vector ``w``. The volume of a closed
-    surface is of the second kind; an open one is closed with a cone to its centroid.
+    surface is of the second kind; any other is closed with cones to its centroid.
 
     Args:
         shell: The energy.
@@ -186,7 +191,7 @@ class _Curvature(nn.Module):
         self.shell = shell
         faces, edges, hinges = (t.cpu().numpy() for t in (shell.faces, shell.edges, shell.hinges))
         n_vertices = columns.shape[1]
-        cone = np.array([[j, i, n_vertices] for i, j in mesh.boundary_loops(faces)]).reshape(-1, 3)
+        cone = np.array([[j, i, n_vertices] for i, j in mesh.boundary_chain(faces)]).reshape(-1, 3)
         self.register_buffer("closed_faces", torch.from_numpy(np.concatenate([faces, cone]).astype(np.int64)))
         i, j, k, m = hinges.T
         sides = [(i, j), (i, k), (i, m), (j, k), (j, m)]
@@ -216,17 +221,15 @@ class _Curvature(nn.Module):
         p, q, r = self._face_corners(rows)
         return q - p, r - p
 
-    def forward(self, rows: Tensor, edges: Tensor, spokes: Tensor, slope: Measures, extra: Tensor | None) -> Tensor:
+    def forward(self, rows: Tensor, slope: Measures, extra: Tensor | None) -> Tensor:
         """The term for shapes with given slopes. *Shape:* ``(B, n, n)``.
 
         Args:
             rows: The shapes. *Shape:* ``(3, B, V)``.
-            edges: Their edges. *Shape:* ``(3, B, E)``.
-            spokes: Their hinges. *Shape:* ``(3, 3, B, H)``.
             slope: Derivative of the energy in each measure.
             extra: The column of each sample's own. *Shape:* ``(B, V, 3)``.
         """
-        on_edges, on_faces = self._local(rows, edges, spokes, slope)
+        on_edges, on_faces = self._local(rows, slope)
         chunk = max(1, _CHUNK_BYTES // (self.edge_columns.numel() * self.edge_columns.element_size()))
         parts = zip(on_edges.split(chunk), on_faces.split(chunk), strict=True)
         inner = torch.cat([self._sandwich(*part) for part in parts])
@@ -248,11 +251,10 @@ class _Curvature(nn.Module):
         lower = torch.cat([border, corner[:, None]], -1)
         return torch.cat([upper, lower[:, None]], 1)
 
-    def _local(self, rows: Tensor, edges: Tensor, spokes: Tensor, slope: Measures) -> tuple[Tensor, Tensor]:
+    def _local(self, rows: Tensor, slope: Measures) -> tuple[Tensor, Tensor]:
         """Matrices on edges ``(B, E, 3, 3)`` and vectors on faces ``(B, F_closed, 3)``."""
-        stretch = slope.length * _jacobian(length_gradient, edges)
-        bend = slope.angle * _jacobian(dihedral_gradient, spokes)
-        ee, ea, eb, aa, bb = bend[0, :, 0], bend[0, :, 1], bend[0, :, 2], bend[1, :, 1], bend[2, :, 2]
+        stretch = slope.length * _length_hessian(self.shell.edge_vectors(rows))
+        ee, ea, eb, aa, bb = slope.angle * _angle_hessian(self.shell.hinge_spokes(rows))
         sym_a, sym_b = 0.5 * (ea + ea.transpose(0, 1)), 0.5 * (eb + eb.transpose(0, 1))
         on_sides = torch.cat([ee + sym_a + sym_b, aa + sym_a, bb + sym_b, -sym_a, -sym_b], -1)
         on_edges = stretch.index_add(-1, self.hinge_sides.flatten(), on_sides)
@@ -271,14 +273,31 @@ class _Curvature(nn.Module):
         return edge_part + face_part + face_part.mT
 
 
-def _jacobian(gradient, at: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
-    """Local Jacobians of a gradient whose components come first. *Shape:* ``(*c, B, M) -> (*c, *c, B, M)``."""
-    components = at.shape[:-2]
-    n = components.numel()
-    units = torch.eye(n, dtype=at.dtype, device=at.device).reshape(n, *components, 1, 1).expand(n, *at.shape)
-    columns = vmap(lambda unit: jvp(gradient, (at,), (unit,))[1], out_dims=-1)(units)
-    ends = tuple(range(-len(components), 0))
-    return columns.unflatten(-1, components).movedim(ends, tuple(len(components) + i for i in range(len(ends))))
+def _length_hessian(edges: Tensor) -> Tensor:
+    """Hessians of edge lengths, from their gradient by ``torch.func``. *Shape:* ``(3, ...) -> (3, 3, ...)``."""
+    return vmap(lambda unit: jvp(length_gradient, (edges,), (unit,))[1])(_unit_vectors(edges))
+
+
+def _angle_hessian(spokes: Tensor) -> Tensor:
+    """Blocks ``ee, ea, eb, aa, bb`` of the Hessians of dihedral angles, from their gradient by ``torch.func``.
+
+    The block ``ab`` is zero, so that both tips are turned at once: six directions instead of nine. Blocks are indexed
+    by row, then column. *Shape:* ``(3, 3, ...) -> (5, 3, 3, ...)``.
+    """
+    units = _unit_vectors(spokes[0])
+    still = torch.zeros_like(units)
+    along = torch.cat([torch.stack([units, still, still], 1), torch.stack([still, units, units], 1)])
+    columns = vmap(lambda direction: jvp(dihedral_gradient, (spokes,), (direction,))[1])(along)
+    by_edge, by_tips = columns[:3], columns[3:]
+    # The e columns hold the blocks ee, ae and be: the last two are the transposes of ea and eb.
+    ee, ea, eb = by_edge.unbind(1)
+    return torch.stack([ee, ea, eb, by_tips[:, 1], by_tips[:, 2]])
+
+
+def _unit_vectors(like: Tensor) -> Tensor:
+    """The three constant fields of unit vectors. *Shape:* ``(3, ...) -> (3, 3, ...)``."""
+    eye = torch.eye(3, dtype=like.dtype, device=like.device)
+    return eye.reshape(3, 3, *[1] * (like.dim() - 1)).expand(3, *like.shape)
 
 
 def _axial(g: Tensor) -> Tensor:

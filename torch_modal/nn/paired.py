@@ -1,5 +1,6 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.nn.frame import Columns, Frame, Pair
 from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement, Reference
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.nn.shell import ShellEnergy, Stiffness
 
 
 class PairedPlacement(NamedTuple):
@@ -19,12 +20,15 @@ class PairedPlacement(NamedTuple):
     """*Shape:* ``(B, n)``."""
     constant: Tensor
     """*Shape:* ``(B,)``."""
+    mu: Tensor
+    """Weight of the similarity. *Shape:* ``(B,)``."""
 
 
 class PairedProblem(NamedTuple):
     """The mid-shape of each sample as a minimisation."""
 
-    placement: PairedPlacement
+    inputs: tuple[Tensor, ...]
+    """What the minimiser depends on, for :meth:`PairedSpace.placement`. *Shape of each:* ``(B, ...)``."""
     pair: Pair
 
 
@@ -34,17 +38,16 @@ class PairedShell(nn.Module):
     Args:
         shell: Energy on the coarse mesh.
         ends: Columns of both spaces.
-        mu: Weight of the similarity, which is taken over the fine vertices.
+        used: Which of the fine vertices the similarity is taken over. *Shape:* ``(V,)``, bool.
     """
 
     gap: Tensor
     gap_gram: Tensor
 
-    def __init__(self, shell: ShellEnergy, ends: tuple[Columns, Columns], mu: float | Tensor) -> None:
+    def __init__(self, shell: ShellEnergy, ends: tuple[Columns, Columns], used: Tensor) -> None:
         super().__init__()
-        self.mu = mu
         self.first, self.second = (ModalShell(shell, end.coarse) for end in ends)
-        gap = torch.cat([ends[0].fine, -ends[1].fine]).flatten(1)
+        gap = (torch.cat([ends[0].fine, -ends[1].fine]) * used[:, None]).flatten(1)
         self.register_buffer("gap", gap)
         self.register_buffer("gap_gram", gap @ gap.mT)
 
@@ -57,22 +60,25 @@ class PairedShell(nn.Module):
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
         a1, a2 = self.split(a)
         similarity = (a * (a @ self.gap_gram + 2 * placement.linear)).sum(-1) + placement.constant
-        return self.first.value(a1, placement.first) + self.second.value(a2, placement.second) + self.mu * similarity
+        strain = self.first.value(a1, placement.first) + self.second.value(a2, placement.second)
+        return strain + placement.mu * similarity
 
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
-        places = (placement.first, placement.second)
-        first, second = (
-            shell.derivatives(amplitudes, place, second_order)
-            for shell, amplitudes, place in zip((self.first, self.second), self.split(a), places, strict=True)
-        )
+        first, second = (shell.derivatives(part, place, False) for shell, part, place in self._ends(a, placement))
         gradient = torch.cat([first.gradient, second.gradient], -1)
-        gradient = gradient + 2 * self.mu * (a @ self.gap_gram + placement.linear)
-        gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + 2 * self.mu * self.gap_gram
-        curved = None
-        if first.second_order is not None and second.second_order is not None:
-            curved = _block_diagonal(first.second_order, second.second_order)
+        gradient = gradient + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
+        similar = 2 * placement.mu[:, None, None] * self.gap_gram
+        gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
+        curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
+
+    def second_order(self, a: Tensor, placement: PairedPlacement) -> Tensor:
+        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+        return _block_diagonal(*(shell.second_order(part, place) for shell, part, place in self._ends(a, placement)))
+
+    def _ends(self, a: Tensor, placement: PairedPlacement) -> Iterator[tuple[ModalShell, Tensor, Placement]]:
+        return zip((self.first, self.second), self.split(a), (placement.first, placement.second), strict=True)
 
 
 class PairedSpace(nn.Module):
@@ -84,36 +90,47 @@ class PairedSpace(nn.Module):
     Args:
         frame: Frame of the two bases.
         shell: Energy on the frame's coarse mesh.
-        mu: Weight of the similarity.
+        modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
     """
 
-    def __init__(self, frame: Frame, shell: ShellEnergy, mu: float | Tensor) -> None:
+    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor]) -> None:
         super().__init__()
         self.frame = frame
-        self.first, self.second = (frame.elastic_columns(modes) for modes in frame.modes)
-        self.energy = PairedShell(shell, (self.first, self.second), mu)
+        self.first, self.second = (frame.elastic_columns(end) for end in modes)
+        self.energy = PairedShell(shell, (self.first, self.second), frame.weights > 0)
 
     @property
     def n_unknowns(self) -> int:
         """Number of amplitudes."""
         return len(self.energy.gap)
 
-    def problem(self, pair: Pair, t: Tensor) -> PairedProblem:
-        """Set up the mid-shapes of a batch. Eq. 4 knows the time 1/2 only, *shape* ``(B,)``.
+    def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> PairedProblem:
+        """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. *Shape of each:* ``(B,)``."""
+        coarse = (self.frame.coarsen(x) for x in (pair.first, pair.second))
+        apart = ((pair.first - pair.second) * (self.frame.weights > 0)[:, None]).flatten(1)
+        return PairedProblem((*coarse, apart @ self.energy.gap.mT, (apart**2).sum(-1), t, mu, alpha, beta, gamma), pair)
+
+    def placement(
+        self, first: Tensor, second: Tensor, linear: Tensor, constant: Tensor, t: Tensor, mu: Tensor, *stiffness: Tensor
+    ) -> PairedPlacement:
+        """The minimisation on the coarse mesh, from the inputs of a problem."""
+        places = []
+        for shell, coarse in ((self.energy.first, first), (self.energy.second, second)):
+            rest = shell.shell.rest(coarse, Stiffness(*stiffness))
+            places.append(Placement(coarse, None, [Reference(rest, torch.ones_like(t))]))
+        return PairedPlacement(places[0], places[1], linear, constant, mu)
+
+    @staticmethod
+    def require(
+        first: Tensor, second: Tensor, linear: Tensor, constant: Tensor, t: Tensor, mu: Tensor, *stiffness: Tensor
+    ) -> None:
+        """The time 1/2.
 
         Raises:
             ValueError: Another time.
         """
         if bool((t != 0.5).any()):
             raise ValueError("the paired space (Eq. 4) is defined at t = 1/2 only; use space='joint' for other times")
-        places = []
-        for x in (pair.first, pair.second):
-            coarse = self.frame.coarsen(x)
-            rest = self.energy.first.shell.rest(coarse)
-            places.append(Placement(coarse, None, [Reference(rest, torch.ones_like(t))]))
-        apart = (pair.first - pair.second).flatten(1)
-        placement = PairedPlacement(places[0], places[1], apart @ self.energy.gap.mT, (apart**2).sum(-1))
-        return PairedProblem(placement, pair)
 
     def lift(self, a: Tensor, problem: PairedProblem) -> Tensor:
         """The fine mid-shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""

@@ -1,6 +1,7 @@
 """Discrete-shell energy of Eq. 5: edge lengths, dihedral angles and enclosed volume."""
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -8,11 +9,14 @@ from torch import Tensor, nn
 
 from torch_modal import mesh
 
-# Eq. 5 divides by rest lengths, rest areas and the rest volume. The floors below only bite on input that has no
-# well-defined weight (coincident vertices, needles, a flat sheet); everywhere else the weights are the paper's.
+# Eq. 5 divides by rest lengths, rest areas and the rest volume. Edges and hinges without a size have no say, needles
+# and flat bodies a bounded one; everywhere else the weights are the paper's.
 MIN_RELATIVE_LENGTH = 1e-6  # of the mean edge length
 MAX_BENDING_RATIO = 1e3  # of l^2 / A; an equilateral hinge has 1.15
 MIN_RELATIVE_VOLUME = 1e-6  # of (surface area)^(3/2); a sphere has 0.094
+
+# Altitude of a triangle over its edge below which the triangle has no normal worth the name.
+COLLAPSED = 1e-6
 
 
 class Measures(NamedTuple):
@@ -26,6 +30,14 @@ class Measures(NamedTuple):
     """Signed volume enclosed with the centroid. *Shape:* ``(...,)``."""
 
 
+class Stiffness(NamedTuple):
+    """Factors of the three terms of Eq. 5: numbers, or one for each sample."""
+
+    alpha: float | Tensor
+    beta: float | Tensor
+    gamma: float | Tensor
+
+
 class Rest(NamedTuple):
     """A rest shape as Eq. 5 sees it: its measures and the weight of each of them."""
 
@@ -33,14 +45,22 @@ class Rest(NamedTuple):
     weights: Measures
 
 
+def per_sample(values: Iterable[float | Tensor], like: Tensor) -> tuple[Tensor, ...]:
+    """Numbers or tensors as one value for each sample: each of the shape of ``like``, ``(B,)``."""
+    return tuple(torch.as_tensor(value, dtype=like.dtype, device=like.device).expand_as(like) for value in values)
+
+
 def edge_length(edge: Tensor) -> Tensor:
     """Length of edge vectors ``x_j - x_i``, components first. *Shape:* ``(3, ...) -> (...)``."""
-    return _nonzero((edge * edge).sum(0)).sqrt()
+    squared = (edge * edge).sum(0)
+    # The root of a constant where there is no length: its derivative is 0 there, not NaN.
+    return torch.where(squared > _tiny(edge), squared, _tiny(edge)).sqrt()
 
 
 def length_gradient(edge: Tensor) -> Tensor:
-    """Gradient of :func:`edge_length`. *Shape:* ``(3, ...) -> (3, ...)``."""
-    return edge / edge_length(edge)
+    """Gradient of :func:`edge_length`, 0 where there is no length. *Shape:* ``(3, ...) -> (3, ...)``."""
+    squared = (edge * edge).sum(0)
+    return edge * _inverse(squared.sqrt(), squared <= _tiny(edge))
 
 
 def dihedral_angle(spokes: Tensor) -> Tensor:
@@ -59,8 +79,8 @@ def dihedral_angle(spokes: Tensor) -> Tensor:
     sine = -edge_length(e) * (n1 * b).sum(0)
     cosine = (n1 * n2).sum(0)
     # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
-    collapsed = (sine == 0) & (cosine == 0)
-    return torch.atan2(sine, torch.where(collapsed, torch.ones_like(cosine), cosine))
+    flat = _collapsed(e, n1) | _collapsed(e, n2)
+    return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
 
 
 def dihedral_gradient(spokes: Tensor) -> Tensor:
@@ -72,23 +92,40 @@ def dihedral_gradient(spokes: Tensor) -> Tensor:
         spokes: As above. *Shape:* ``(3, 3, ...)``.
 
     Returns:
-        Zero at the tip of a collapsed triangle. *Shape:* ``(3, 3, ...)``.
+        Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
     """
     e, a, b = spokes
     n1 = torch.linalg.cross(e, a, dim=0)
     n2 = torch.linalg.cross(b, e, dim=0)
-    squared = _nonzero((e * e).sum(0))
-    length = squared.sqrt()
-    to_a = n1 * (-length / _nonzero((n1 * n1).sum(0)))
-    to_b = n2 * (-length / _nonzero((n2 * n2).sum(0)))
-    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) / squared
+    flat = _collapsed(e, n1) | _collapsed(e, n2)
+    length = edge_length(e)
+    to_a = n1 * (-length * _inverse((n1 * n1).sum(0), flat))
+    to_b = n2 * (-length * _inverse((n2 * n2).sum(0), flat))
+    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * _inverse((e * e).sum(0), flat)
     return torch.stack([to_e, to_a, to_b])
 
 
-def _nonzero(squared: Tensor) -> Tensor:
-    """The same where it is positive, else a constant: derivatives are 0 there, not NaN."""
-    tiny = torch.finfo(squared.dtype).tiny
-    return torch.where(squared > tiny, squared, tiny)
+def _collapsed(edge: Tensor, normal: Tensor) -> Tensor:
+    """Whether a triangle on this edge has no altitude. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
+    bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
+    base = (edge * edge).sum(0)
+    return (normal * normal).sum(0) <= (bound * base) ** 2 + _tiny(edge)
+
+
+def _tiny(like: Tensor) -> float:
+    """What a squared length must exceed to have a direction; its inverse still has room to grow."""
+    return torch.finfo(like.dtype).tiny ** 0.5
+
+
+def _inverse(x: Tensor, zero: Tensor) -> Tensor:
+    """``1 / x``, and 0 with all its derivatives where told."""
+    return torch.where(zero, 0, 1 / torch.where(zero, 1, x))
+
+
+def enclosed_volume(rows: Tensor, faces: Tensor) -> Tensor:
+    """Signed volume between a surface and the origin. *Shape:* ``(3, ..., V), (F, 3) -> (...)``."""
+    a, b, c = (rows[..., corner] for corner in faces.unbind(1))
+    return (a * torch.linalg.cross(b, c, dim=0)).sum((0, -1)) / 6
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
@@ -138,6 +175,11 @@ class ShellEnergy(nn.Module):
         self.register_buffer("used", torch.from_numpy(edges).unique())
         self.alpha, self.beta, self.gamma = alpha, beta, gamma
 
+    @property
+    def stiffness(self) -> Stiffness:
+        """The three stiffnesses."""
+        return Stiffness(self.alpha, self.beta, self.gamma)
+
     # Inside, components come first: elementwise operations then run over long contiguous rows.
 
     def edge_vectors(self, rows: Tensor) -> Tensor:
@@ -151,9 +193,7 @@ class ShellEnergy(nn.Module):
 
     def volume(self, rows: Tensor) -> Tensor:
         """Signed volume between the surface and its centroid. *Shape:* ``(3, ..., V) -> (...)``."""
-        rows = rows - rows[..., self.used].mean(-1, keepdim=True)
-        a, b, c = (rows[..., corner] for corner in self.faces.unbind(1))
-        return (a * torch.linalg.cross(b, c, dim=0)).sum((0, -1)) / 6
+        return enclosed_volume(rows - rows[..., self.used].mean(-1, keepdim=True), self.faces)
 
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of a shape.
@@ -166,26 +206,31 @@ class ShellEnergy(nn.Module):
             edge_length(self.edge_vectors(rows)), dihedral_angle(self.hinge_spokes(rows)), self.volume(rows)
         )
 
-    def rest(self, x_rest: Tensor) -> Rest:
+    def rest(self, x_rest: Tensor, stiffness: Stiffness | None = None) -> Rest:
         """Measures and weights of a rest shape: what stays the same while the shape moves.
 
         Args:
             x_rest: Vertex positions. *Shape:* ``(..., V, 3)``.
+            stiffness: Other stiffnesses than the module's own.
         """
         measures = self.measure(x_rest)
         rows = x_rest.movedim(-1, 0).contiguous()
         e, a, b = self.hinge_spokes(rows)
-        hinge_area = 0.5 * (_parallelogram(e, a) + _parallelogram(b, e))
+        n1, n2 = torch.linalg.cross(e, a, dim=0), torch.linalg.cross(b, e, dim=0)
+        hinge_area = 0.5 * (edge_length(n1) + edge_length(n2))
         squared = (e * e).sum(0)
-        length_floor = MIN_RELATIVE_LENGTH * measures.length.mean(-1, keepdim=True)
+        shortest = MIN_RELATIVE_LENGTH * measures.length.mean(-1, keepdim=True)
         p, q, r = (rows[..., corner] for corner in self.faces.unbind(1))
-        surface = 0.5 * _parallelogram(q - p, r - p).sum(-1)
+        surface = 0.5 * edge_length(torch.linalg.cross(q - p, r - p, dim=0)).sum(-1)
         volume_floor = MIN_RELATIVE_VOLUME * surface**1.5
-        stiffness = [s[..., None] if isinstance(s, Tensor) else s for s in (self.alpha, self.beta)]
+        alpha, beta, gamma = stiffness or self.stiffness
+        alpha, beta = (s[..., None] if isinstance(s, Tensor) else s for s in (alpha, beta))
+        pointlike = measures.length <= shortest
+        nameless = _collapsed(e, n1) | _collapsed(e, n2)
         weights = Measures(
-            stiffness[0] / torch.maximum(measures.length, length_floor),
-            stiffness[1] * squared / torch.maximum(hinge_area, squared / MAX_BENDING_RATIO + length_floor**2),
-            self.gamma / torch.maximum(measures.volume.abs(), volume_floor) ** 2,
+            alpha * _inverse(measures.length, pointlike),
+            beta * squared * _inverse(torch.maximum(hinge_area, squared / MAX_BENDING_RATIO), nameless),
+            gamma / torch.maximum(measures.volume.abs(), volume_floor) ** 2,
         )
         return Rest(measures, weights)
 
@@ -230,8 +275,3 @@ class ShellEnergy(nn.Module):
         length, angle, volume = self.differences(measures, rest)
         weights = rest.weights
         return (weights.length * length**2).sum(-1) + (weights.angle * angle**2).sum(-1) + weights.volume * volume**2
-
-
-def _parallelogram(a: Tensor, b: Tensor) -> Tensor:
-    """Area between two vectors. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
-    return edge_length(torch.linalg.cross(a, b, dim=0))
