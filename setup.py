@@ -17,16 +17,18 @@ setup(
     license="MIT",
     python_requires=">=3.10",
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
-    package_data={"torch_modal": ["py.typed"]},
+    package_data={"torch_modal": ["py.typed", "samples/*/*.ply"]},
     install_requires=[
         "torch>=2.4",
         "numpy>=1.24",
         "scipy>=1.11",
-        "trimesh>=4.4",
+        "trimesh>=4.6.13",  # earlier ones lose the mesh of some files
         "networkx>=3.0",
         "pytetwild[all]>=0.4.2",
         "fast-simplification>=0.1.11",
-        "kornia>=0.7.3",
+        # Before 0.9, its rotation matrices are right to 1e-6 only; 0.9 has no release for Python 3.10.
+        "kornia>=0.9; python_version >= '3.11'",
+        "kornia>=0.8.2; python_version < '3.11'",
         "safetensors>=0.4.3",
         "pygltflib>=1.16",
         "matplotlib>=3.7",

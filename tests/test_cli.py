@@ -1,0 +1,349 @@
+"""The commands as they are typed: exit codes, files, one-line errors, nothing overwritten unasked."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+import torch
+
+import torch_modal as tm
+from torch_modal import cli, demo
+from torch_modal.export import save_frames
+from torch_modal.precompute import modes as modes_module
+from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
+from torch_modal.sample_data import load_sample
+
+FAST = ["--modes", "6", "--levels", "1", "--coarse-faces", "200"]
+
+
+@pytest.fixture(scope="module")
+def meshes(capsule: tuple[np.ndarray, np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """A straight and a bent capsule as OBJ files, which hold float64 exactly."""
+    straight, faces = capsule
+    x, y, z = (straight - straight.mean(0)).T
+    radius = 4.2 / 1.2
+    bent = np.stack([radius - (radius - x) * np.cos(z / radius), y, (radius - x) * np.sin(z / radius)], axis=1)
+    folder = tmp_path_factory.mktemp("meshes")
+    return [str(file) for file in save_frames(np.stack([straight, bent]), faces, folder, fmt="obj", stem="key")]
+
+
+@pytest.fixture(autouse=True)
+def coarse_tetrahedra(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A third of the mesher's time; nothing here depends on how fine the tetrahedra are."""
+    coarse = TetrahedraSettings(edge_length_fac=0.05, epsilon=3e-3)
+    monkeypatch.setattr(modes_module, "TetrahedraSettings", lambda: coarse)
+
+
+@pytest.fixture
+def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails the test if the long part starts."""
+
+    def started(*_: object, **__: object) -> None:
+        raise AssertionError("the mesher was started")
+
+    monkeypatch.setattr(modes_module, "tetrahedralize", started)
+
+
+def fails(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """Run a command that must fail with exit code 1; its message, which must be one line."""
+    capsys.readouterr()
+    assert cli.main(argv) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    lines = said.err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("torch-modal: error: ")
+    return lines[0].removeprefix("torch-modal: error: ")
+
+
+def misused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """Run a command that must be refused as wrong usage; the last line it says."""
+    with pytest.raises(SystemExit) as left:
+        cli.main(argv)
+    assert left.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def run(*argv: str, **options: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "torch_modal.cli", *argv]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)  # type: ignore[call-overload]
+
+
+# ------------------------------------------------------------------------------------------------- subdivide
+def test_folder_gets_frames_and_animation(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, picture = tmp_path / "new" / "out", tmp_path / "picture.png"
+    argv = ["subdivide", *meshes, "--out", str(out), *FAST, "--format", "obj", "--picture", str(picture)]
+    assert cli.main(argv) == 0
+    assert sorted(file.name for file in out.iterdir()) == [
+        "animation.glb",
+        *(f"frame-{i:03d}.obj" for i in range(3)),
+    ]
+    frames, faces = tm.load_keyframes(sorted(out.glob("*.obj")))
+    keys = tm.load_keyframes(meshes)
+    assert torch.equal(faces, keys.faces)
+    assert torch.equal(frames[[0, 2]], keys.keyframes)  # bit for bit, in the caller's coordinates
+    # What the library gives with the same options; the cache makes the mesher's result the same.
+    bases = tm.extract_bases(*keys, 6)
+    expected = tm.subdivide(*keys, 1, bases=bases, coarse_faces=200)
+    torch.testing.assert_close(frames, expected, rtol=0, atol=1e-9)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr()
+    assert "2 key-frames" in said.out and str(picture) in said.out and str(out / "animation.glb") in said.out
+    assert said.err == ""
+
+
+def test_glb_alone_cyclic_with_a_number_of_frames(meshes: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "a.GLB"
+    argv = ["subdivide", *meshes, "--out", str(out), *FAST, "--cyclic", "--frames", "7", "--fps", "10", "--quiet"]
+    assert cli.main(argv) == 0
+    assert list(tmp_path.iterdir()) == [out]
+    gltf = pygltflib.GLTF2().load_binary(str(out))
+    (animation,) = gltf.animations
+    assert animation.extras == {"fps": 10.0, "frames": list(range(7)), "keyframes": [0, 4]}
+    times = gltf.accessors[animation.samplers[0].input]
+    assert times.max == [pytest.approx(0.7)]  # seven frames and the step back to the first
+
+
+def test_paired_space_and_mu_arrive(
+    meshes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: dict[str, object] = {}
+
+    def subdivide(keyframes: torch.Tensor, *_: object, **options: object) -> torch.Tensor:
+        seen.update(options)
+        return keyframes
+
+    monkeypatch.setattr(tm, "subdivide", subdivide)
+    argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
+    assert cli.main([*argv, "--space", "paired", "--mu", "0.5", "--quiet"]) == 0
+    assert (seen["space"], seen["mu"], seen["coarse_faces"]) == ("paired", 0.5, 1000)
+    assert len(seen["bases"]) == 2 and seen["bases"][0].n_modes == 6  # type: ignore[arg-type, index]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_nothing_is_overwritten_and_no_work_is_done_for_it(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_work: None
+) -> None:
+    base = ["subdivide", *meshes, *FAST, "--no-cache"]
+    glb, folder, picture = tmp_path / "a.glb", tmp_path / "out", tmp_path / "p.png"
+    folder.mkdir()
+    for existing, argv in (
+        (glb, ["--out", str(glb)]),
+        (folder / "animation.glb", ["--out", str(folder)]),
+        (folder / "frame-017.ply", ["--out", str(folder)]),
+        (picture, ["--out", str(tmp_path / "other.glb"), "--picture", str(picture)]),
+    ):
+        existing.write_text("mine")
+        assert "exists; --overwrite replaces it" in fails(capsys, *base, *argv)
+        assert existing.read_text() == "mine"
+        existing.unlink()
+    bases = tmp_path / "key-000.safetensors"
+    bases.write_text("mine")
+    assert "exists" in fails(capsys, "modes", *meshes, "--out", str(tmp_path))
+    (tmp_path / "hand.png").write_text("mine")
+    assert "exists" in fails(capsys, "demo", "--out", str(tmp_path))
+
+
+def test_overwrite_replaces_and_names_what_is_left_over(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("animation.glb", "frame-000.ply", "frame-009.ply"):
+        (tmp_path / name).write_text("old")
+    assert cli.main(["subdivide", *meshes, "--out", str(tmp_path), *FAST, "--overwrite", "--quiet"]) == 0
+    assert (tmp_path / "animation.glb").read_bytes().startswith(b"glTF")
+    assert (tmp_path / "frame-000.ply").read_bytes().startswith(b"ply")
+    assert (tmp_path / "frame-009.ply").read_text() == "old"
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "warning: " in said.err and "1 frames of an earlier run, from frame-009.ply" in said.err
+
+
+def test_key_frames_are_never_overwritten(
+    capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_work: None
+) -> None:
+    files = [str(file) for file in save_frames(np.stack([capsule[0]] * 2), capsule[1], tmp_path)]
+    message = fails(capsys, "subdivide", *files, "--out", str(tmp_path), "--overwrite", "--no-cache")
+    assert "frame-000.ply is one of the key-frames" in message
+
+
+def test_output_that_cannot_be_written_is_refused_before_the_work(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_work: None
+) -> None:
+    (tmp_path / "file").write_text("")
+    base = ["subdivide", *meshes, "--no-cache"]
+    assert "is a file" in fails(capsys, *base, "--out", str(tmp_path / "file" / "a.glb"))
+    assert "is a file" in fails(capsys, *base, "--out", str(tmp_path / "file"))
+    (tmp_path / "b.glb").mkdir()
+    assert "is a folder" in fails(capsys, *base, "--out", str(tmp_path / "b.glb"), "--overwrite")
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    if not os.access(locked, os.W_OK):  # root may write anywhere
+        assert "cannot be written" in fails(capsys, *base, "--out", str(locked / "a.glb"))
+
+
+# ---------------------------------------------------------------------------------------------------- errors
+def test_errors_are_one_line_and_debug_shows_the_traceback(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "a.glb")]
+    assert fails(capsys, "subdivide", meshes[0], "missing.obj", *out) == "missing.obj: no such file"
+    (tmp_path / "bad.obj").write_text("v 0 0\n")
+    assert "bad.obj: vertex line" in fails(capsys, "subdivide", meshes[0], str(tmp_path / "bad.obj"), *out)
+    assert "whole number from 0 to 12" in fails(capsys, "subdivide", *meshes, *out, "--levels", "13")
+    assert "ways to deform" in fails(capsys, "modes", meshes[0], "--out", str(tmp_path), "--modes", "100000")
+    with pytest.raises(FileNotFoundError):
+        cli.main(["subdivide", meshes[0], "missing.obj", *out, "--debug"])
+    assert list(tmp_path.iterdir()) == [tmp_path / "bad.obj"]
+
+
+def test_failed_mesher_is_one_line_and_a_bug_is_not(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    argv = ["modes", meshes[0], "--out", str(tmp_path), "--no-cache"]
+
+    def crash(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(modes_module, "tetrahedralize", crash)
+    error: Exception = TetrahedralizationError("cannot fill\nthis")
+    assert fails(capsys, *argv) == "cannot fill this"
+    error = TypeError("a bug")
+    with pytest.raises(TypeError, match="a bug"):
+        cli.main(argv)
+
+
+def test_warnings_are_lines_and_each_is_shown_once(
+    capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The open capsule is checked several times on the way."""
+    files = save_frames(np.stack([capsule[0], 1.1 * capsule[0]]), capsule[1][1:], tmp_path / "in", fmt="obj")
+    assert cli.main(["subdivide", *map(str, files), "--out", str(tmp_path / "a.glb"), *FAST]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("torch-modal: warning: the surface is open: 3 edges")
+
+
+def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "a.glb")]
+    assert "required: COMMAND" in misused(capsys)
+    assert "two key-frames or more" in misused(capsys, "subdivide", meshes[0], *out)
+    assert "required: --out" in misused(capsys, "subdivide", *meshes)
+    assert "ending in .glb or a folder" in misused(capsys, "subdivide", *meshes, "--out", "a.obj")
+    assert "--space paired" in misused(capsys, "subdivide", *meshes, *out, "--mu", "1")
+    assert "must end in .png or .pdf" in misused(capsys, "subdivide", *meshes, *out, "--picture", "a.jpg")
+    assert "one file, but there are 2" in misused(capsys, "modes", *meshes, "--out", "a.safetensors")
+    assert "the same file name" in misused(capsys, "modes", meshes[0], meshes[0], "--out", "a")
+    assert "is a folder here" in misused(capsys, "demo", "--out", "a.glb")
+    for option, value in (
+        ("--levels", "-1"),
+        ("--levels", "1.5"),
+        ("--frames", "1"),
+        ("--fps", "0"),
+        ("--fps", "nan"),
+        ("--fps", "inf"),
+        ("--modes", "0"),
+        ("--coarse-faces", "3"),
+        ("--mu", "many"),
+    ):
+        assert f"argument {option}: {value!r} is not a" in misused(capsys, "subdivide", *meshes, *out, option, value)
+
+
+def test_interrupt_says_one_line_and_leaves_with_130(meshes: list[str], tmp_path: Path) -> None:
+    """Ctrl-C while the mesher runs."""
+    out, scratch = tmp_path / "out", tmp_path / "scratch"
+    scratch.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "torch_modal.cli", "modes", *meshes, "--no-cache", "--out", str(out)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(scratch)},
+    )
+    end = time.monotonic() + 100
+    while not list(scratch.glob("torch_modal-*/log.txt")):
+        assert process.poll() is None and time.monotonic() < end, "the mesher was not started"
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert said == "torch-modal: interrupted\n"
+    assert not out.exists() and list(scratch.iterdir()) == []
+
+
+def test_closed_pipe_is_quiet() -> None:
+    """Nobody reads what --help prints."""
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "torch_modal.cli", "--help"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    os.close(write)
+    assert done.stderr == ""
+
+
+# ------------------------------------------------------------------------------------------- help, modes, demo
+def test_help_and_version() -> None:
+    assert run("--version").stdout == f"torch-modal {tm.__version__}\n"
+    assert "torch-modal demo" in run("--help").stdout
+
+
+@pytest.mark.parametrize("command", ["subdivide", "modes", "demo"])
+def test_help_has_an_example_that_the_parser_accepts(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main([command, "--help"])
+    assert left.value.code == 0
+    text = capsys.readouterr().out
+    examples = [line.split()[1:] for line in text.splitlines() if line.strip().startswith("torch-modal ")]
+    assert examples
+    for argv in examples:
+        assert argv[0] == command
+        cli._parser().parse_args(argv)
+    assert "default: 30" in text and "None" not in text
+
+
+def test_modes_writes_bases_and_prints_a_table(
+    meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["modes", *meshes, "--out", str(tmp_path / "bases"), "--modes", "6"]) == 0
+    bases = [tm.ModalBasis.load(tmp_path / "bases" / f"key-00{i}.safetensors") for i in range(2)]
+    keyframes = tm.load_keyframes(meshes).keyframes
+    for basis, shape in zip(bases, keyframes, strict=True):
+        assert torch.equal(basis.reference, shape)
+        assert basis.n_modes == 6
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[0] == "key-000.obj"
+    np.testing.assert_allclose([float(x) for x in lines[1].split()[1:]], bases[0].eigenvalues, rtol=6e-3)
+    ratios = (bases[0].eigenvalues / bases[0].eigenvalues[0]).sqrt()
+    np.testing.assert_allclose([float(x) for x in lines[2].split()[3:]], ratios, atol=6e-4)
+    assert cli.main(["modes", meshes[0], "--out", str(tmp_path / "one.safetensors"), "--modes", "6", "--quiet"]) == 0
+    assert tm.ModalBasis.load(tmp_path / "one.safetensors").n_modes == 6
+
+
+def test_demo_on_the_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What README promises, with room for a mesher that is not deterministic."""
+    out = tmp_path / "demo"
+    assert cli.main(["demo", "--sample", "hand", "--levels", "2", "--out", str(out)]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["hand.glb", "hand.png"]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == f"written to {out}: hand.glb, hand.png"
+    mean = next(line for line in lines if line.startswith("hand, mean")).split()
+    linear, ours, linear_volume, our_volume = float(mean[2]), float(mean[4]), float(mean[6]), float(mean[7])
+    assert linear == pytest.approx(10.2, abs=0.1) and linear_volume == pytest.approx(0.866, abs=2e-3)
+    assert ours < 2.5 and abs(our_volume - 1) < 0.03
+
+
+def test_demo_compares_with_the_truth_at_its_times() -> None:
+    """The truth itself has no error where a frame falls on its time, and times between frames are left out."""
+    sample = load_sample("hand")
+    sequence = torch.stack([sample.keyframes[0], *sample.truth, sample.keyframes[1]])
+    doubled = sequence * 2
+    for one in demo.compare("hand", sample, doubled, sequence, levels=2):
+        assert one.ours == (0.0, 1.0)
+        assert one.linear.edges == pytest.approx(1.0) and one.linear.volume == pytest.approx(8.0)
+    (half,) = demo.compare("hand", sample, sequence[::2], sequence[::2], levels=1)
+    assert half.time == 0.5 and half.ours == (0.0, 1.0)
