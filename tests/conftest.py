@@ -1,13 +1,29 @@
 """Fixtures that several test files share; everything made once per run."""
 
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from solids import box, surface
 
+from torch_modal.basis import ModalBasis
+from torch_modal.keyframes import Keyframes, load_keyframes
+from torch_modal.nn.frame import Pair
+from torch_modal.nn.mid_shape import MidShape
+from torch_modal.precompute.arap import arap_hessian, lumped_mass
+from torch_modal.precompute.eigen import lowest_modes
+from torch_modal.precompute.modes import extract_bases
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
+
+# The only releases for Python 3.10; their logarithm of a rotation has no gradient at no turn and at half a turn.
+OLD_KORNIA = version("kornia") < "0.9"
+needs_gradient_of_no_turn = pytest.mark.skipif(OLD_KORNIA, reason="kornia before 0.9: NaN gradient at no turn")
 
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
 
@@ -43,3 +59,85 @@ def capsule() -> tuple[np.ndarray, np.ndarray]:
 def capsule_tetrahedra(capsule: tuple[np.ndarray, np.ndarray]) -> Tetrahedra:
     """The capsule filled by the real mesher, once per run: few enough vertices for dense linear algebra."""
     return tetrahedralize(*capsule, COARSE)
+
+
+class Shapes(NamedTuple):
+    """Key-frames of one connectivity and a basis for each."""
+
+    keyframes: torch.Tensor
+    faces: torch.Tensor
+    bases: list[ModalBasis]
+
+    def pick(self, *indices: int) -> "Shapes":
+        """Some of them."""
+        return Shapes(self.keyframes[list(indices)], self.faces, [self.bases[i] for i in indices])
+
+
+def bent_bar(cells: tuple[int, int, int], n_modes: int) -> Shapes:
+    """A jittered bar of 4 x 1 x 1, straight, bent by 1.4 rad and twisted by 1.2 rad: modes without the mesher."""
+    bar = box(cells, (4.0, 1.0, 1.0), jitter=0.15)
+    x, y, z = (bar.vertices - bar.vertices.mean(0)).T
+    radius = 4.0 / 1.4
+    bent = np.stack([(radius - y) * np.sin(x / radius), radius - (radius - y) * np.cos(x / radius), z], 1)
+    c, s = np.cos(0.3 * x), np.sin(0.3 * x)
+    twisted = np.stack([x, c * y - s * z, s * y + c * z], 1)
+    used, faces = np.unique(surface(bar), return_inverse=True)
+    poses = [np.stack([x, y, z], 1), bent, twisted]
+    bases = []
+    for pose in poses:
+        solid = Tetrahedra(pose, bar.tets)
+        modes = lowest_modes(arap_hessian(solid), lumped_mass(solid), pose, n_modes)
+        at_surface = modes.modes.T.reshape(n_modes, -1, 3)[:, used]
+        numbers = (pose[used], modes.eigenvalues, at_surface.copy(), modes.rigid_eigenvalues)
+        bases.append(ModalBasis(*map(torch.from_numpy, numbers)))
+    keyframes = torch.from_numpy(np.stack(poses)[:, used])
+    return Shapes(keyframes, torch.from_numpy(faces.reshape(-1, 3)), bases)
+
+
+@pytest.fixture(scope="session")
+def bars() -> Shapes:
+    """Straight, bent and twisted bar of 164 vertices and 324 faces, 8 modes each; not a rigid motion apart."""
+    return bent_bar((12, 3, 3), 8)
+
+
+@pytest.fixture(scope="session")
+def small_bars() -> Shapes:
+    """The same with 38 vertices and 72 faces, 3 modes each: for tests against slow truth."""
+    return bent_bar((4, 2, 1), 3)
+
+
+@pytest.fixture(scope="session")
+def hand_path(data_dir: Path) -> Keyframes:
+    """Frames 00, 02, 04, 06, 08 of a hand that closes: the middle of a span is its reference in-between."""
+    return load_keyframes([data_dir / "mh-hand-path" / f"{i:02}.obj" for i in (0, 2, 4, 6, 8)])
+
+
+@pytest.fixture(scope="session")
+def hands(hand_path: Keyframes) -> Shapes:
+    """The hand with 30 modes of each frame, by the real mesher (half a minute)."""
+    return Shapes(*hand_path, extract_bases(*hand_path, 30, progress=False))
+
+
+@pytest.fixture(scope="session")
+def women(data_dir: Path) -> Shapes:
+    """A figure of 13,380 vertices at rest and in two steps of a walk, 30 modes each."""
+    shapes = load_keyframes([data_dir / "mh-woman" / f"{n}.obj" for n in ("00-rest", "02-walk-a", "03-walk-b")])
+    return Shapes(*shapes, extract_bases(*shapes, 30, progress=False))
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    """The one source of random numbers."""
+    return torch.Generator().manual_seed(0)
+
+
+def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
+    """What the layer's energy knows of the in-betweens of placed key-frames."""
+    member: Any = layer.in_between.members[0]
+    return member.space.placement(*member.problem(pair, t).inputs)
+
+
+def random_rotation(generator: torch.Generator) -> torch.Tensor:
+    """A rotation matrix, float64, uniform over all of them."""
+    q = torch.randn(4, dtype=torch.float64, generator=generator)
+    return quaternion_to_rotation_matrix(q / q.norm())

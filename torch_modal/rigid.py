@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
+from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matrix_to_quaternion
 from torch import Tensor
 
 
@@ -35,16 +35,22 @@ class RigidMotion(NamedTuple):
             t: Time, broadcast against the motion's leading dimensions. *Shape:* ``(...,)``.
         """
         t = t[..., None]
-        axis_angle = _flat(rotation_matrix_to_axis_angle, self.rotation, 2)
-        rotation = _flat(axis_angle_to_rotation_matrix, t * axis_angle, 1)
+        rotation = _exp(t * _log(self.rotation))
         return RigidMotion(rotation, self.source, self.source + t * (self.target - self.source))
 
 
-def _flat(function, x: Tensor, item_dims: int) -> Tensor:  # type: ignore[no-untyped-def]
-    """Apply a function of one batch dimension to any number of them."""
-    lead = x.shape[: x.dim() - item_dims]
-    y = function(x.reshape(-1, *x.shape[x.dim() - item_dims :]))
-    return y.reshape(*lead, *y.shape[1:])
+def _exp(axis_angle: Tensor) -> Tensor:
+    """Rotation about an axis by its length in radians. *Shape:* ``(..., 3) -> (..., 3, 3)``."""
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3)))
+
+
+def _log(rotation: Tensor) -> Tensor:
+    """Axis times angle of a rotation. *Shape:* ``(..., 3, 3) -> (..., 3)``."""
+    # The second argument keeps releases of kornia before 0.9 from rounding the angle to eight digits.
+    quaternion = rotation_matrix_to_quaternion(rotation.reshape(-1, 3, 3), 1e-30)
+    return quaternion_to_axis_angle(quaternion).reshape(rotation.shape[:-1])
 
 
 def centroid(x: Tensor, weights: Tensor) -> Tensor:
@@ -83,7 +89,7 @@ def best_rotation(covariance: Tensor) -> Tensor:
         floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, torch.finfo(p.dtype).eps * trace.abs(), 1)
         stiffness = stiffness + floor.detach() * eye
         turn = torch.linalg.solve(stiffness, torque)
-        rotation = rotation @ _flat(axis_angle_to_rotation_matrix, turn, 1)
+        rotation = rotation @ _exp(turn)
     return rotation
 
 

@@ -58,7 +58,6 @@ class Between(nn.Module):
             self.space = PairedSpace(frame, shell, frame.modes(bases))
         else:
             raise ValueError(f"space is 'joint' or 'paired', got {space!r}")
-        self.step = GaussNewtonStep(self.space.energy)
         self.closed = len(mesh.boundary_edges(frame.faces.numpy())) == 0
         # Registered here alone: a module that hangs at two places confuses torch.func.functional_call.
         self.alpha, self.beta, self.gamma = stiffness
@@ -82,8 +81,7 @@ class Between(nn.Module):
         clean_a, clean_b = (torch.where(usable[:, None, None], x, stand_in) for x in (x_a, x_b))
         pair = frame.place(clean_a, clean_b)
         usable = usable & self._solvable(pair)
-        weights = per_sample((self.mu, self.alpha, self.beta, self.gamma), t)
-        problem = self.space.problem(pair, t, *weights)
+        problem = self.problem(pair, t)
         space = self.space
         minimisation = Minimisation(
             self.step, space.placement, space.require, space.n_unknowns, max_steps, tolerance, report
@@ -93,6 +91,15 @@ class Between(nn.Module):
         shapes = frame.restore(self.space.lift(solution.amplitudes, problem), pair, t)
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
+
+    @property
+    def step(self) -> GaussNewtonStep:
+        """What is repeated. It has no state: registered, it would name all buffers of the energy twice."""
+        return GaussNewtonStep(self.space.energy)
+
+    def problem(self, pair: Pair, t: Tensor) -> Any:
+        """The minimisation of each sample, at the times ``t``, *shape* ``(B,)``."""
+        return self.space.problem(pair, t, *per_sample((self.mu, self.alpha, self.beta, self.gamma), t))
 
     def _solvable(self, pair: Pair) -> Tensor:
         """Whether both ends have a size, and, where closed, the same side out: else the volume would vanish on the way.

@@ -86,8 +86,9 @@ class Frame(nn.Module):
         shapes, faces = check_keyframes([end.reference for end in ends], faces, warn=False)
         used = shapes[0][faces.unique()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
-        weights = torch.from_numpy(mesh.vertex_areas(shapes[0].numpy(), faces.numpy()))
-        weights = weights / weights.sum()
+        # The areas of both ends, so that neither of them comes first.
+        areas = torch.stack([torch.from_numpy(mesh.vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
+        weights = (areas / areas.sum(1, keepdim=True)).mean(0)
         turn = best_fit(shapes[1], shapes[0], weights)
         references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale
         coarsening = coarsen(references.numpy(), faces.numpy(), coarse_faces)
@@ -103,7 +104,7 @@ class Frame(nn.Module):
         self.register_buffer("coarse_weights", per_cluster.index_add(0, clusters, weights))
         self.register_buffer("clusters", clusters)
         self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters])
-        self.register_buffer("reference", references[0])
+        self.register_buffer("reference", references[0].clone())
         #: Rigid motions of the shape half-way between the references, to first order.
         self.rigid = self.orthonormal(_rigid_fields(references.mean(0)))
         self.register_buffer("turn", turn.rotation)

@@ -21,6 +21,9 @@ GOOD_DECREASE = 0.8
 ROUNDING_MARGIN = 4.0
 ENERGY_ROUNDING = 64.0
 
+# Larger batches are cut: what one step of more samples touches does not fit into the caches of a CPU.
+SAMPLES_AT_ONCE = 4
+
 
 class AmplitudeEnergy(Protocol):
     """What can be minimised here: an energy of amplitudes, with its derivatives."""
@@ -196,7 +199,8 @@ def minimise(
 ) -> Solution:
     """Repeat the step until every sample has converged, or cannot go on.
 
-    Converged samples rest while the others go on, so that a sample's result does not depend on its batch.
+    Each sample takes its own path: those that are done leave the batch, and what is tried for one that needs the full
+    Hessian is not tried for the others. A sample's result does not depend on its batch.
 
     Args:
         step: The step to repeat.
@@ -205,38 +209,70 @@ def minimise(
         max_steps: Give up after that many.
         tolerance: Bound on the gradient norm, relative to its value at the start.
     """
+    if a.device.type == "cpu" and len(a) > SAMPLES_AT_ONCE:
+        cuts = [slice(i, i + SAMPLES_AT_ONCE) for i in range(0, len(a), SAMPLES_AT_ONCE)]
+        parts = [minimise(step, a[cut], _pick(placement, cut), max_steps, tolerance) for cut in cuts]
+        return Solution(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    result = _blank_solution(a)
+    rows = torch.arange(len(a), device=a.device)
     energy = step.energy.value(a, placement)
-    start = gradient_norm = torch.full_like(energy, torch.inf)
-    status = torch.full_like(energy, Status.OUT_OF_STEPS, dtype=torch.int64)
-    resting = torch.zeros_like(status, dtype=torch.bool)
-    slow = torch.zeros_like(resting)
-    n_steps = torch.zeros_like(status)
+    start = torch.full_like(energy, torch.inf)
+    slow = torch.zeros_like(energy, dtype=torch.bool)
     for k in range(max_steps + 1):
         derivatives = step.energy.derivatives(a, placement, second_order=False)
         norm = derivatives.gradient.norm(dim=-1)
         if k == 0:
             start = norm
-        gradient_norm = torch.where(resting, gradient_norm, norm)
-        done = ~resting & (norm <= torch.maximum(tolerance * start, step.floor(derivatives)))
-        broken = ~resting & ~(norm.isfinite() & energy.isfinite())
-        status = torch.where(done, Status.CONVERGED, torch.where(broken, Status.INVALID, status))
-        resting = resting | done | broken
-        if k == max_steps or bool(resting.all()):
+        status = torch.full_like(rows, Status.OUT_OF_STEPS)
+        status[norm <= torch.maximum(tolerance * start, step.floor(derivatives))] = Status.CONVERGED
+        status[~(norm.isfinite() & energy.isfinite())] = Status.INVALID
+        leaving = (status != Status.OUT_OF_STEPS) | (k == max_steps)
+        if not bool(leaving.all()):
+            if bool(slow.any()):
+                derivatives = derivatives._replace(second_order=_second_order(step.energy, a, placement, slow))
+            taken = step.take(a, energy, derivatives, placement)
+            # Where all that is left to gain drowns in the rounding of the energy, the minimum is found.
+            drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
+            stuck = ~leaving & slow & ~taken.moved
+            status[stuck] = torch.where(drowned, Status.CONVERGED, Status.STALLED)[stuck]
+            leaving = leaving | stuck
+        relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
+        left = Solution(a, energy, relative, result.n_steps[rows], status)
+        for whole, part in zip(result, left, strict=True):
+            whole[rows[leaving]] = part[leaving]
+        if bool(leaving.all()):
             break
-        if bool((slow & ~resting).any()):
-            # Samples that need no full Hessian yet must not profit from one that others need: NaN rules it out.
-            second_order = torch.where(slow[:, None, None], step.energy.second_order(a, placement), torch.nan)
-            derivatives = derivatives._replace(second_order=second_order)
-        taken = step.take(a, energy, derivatives, placement)
-        go = ~resting & taken.moved
-        stuck = ~resting & slow & ~taken.moved
-        # Where all that is left to gain drowns in the rounding of the energy, the minimum is found.
-        drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
-        status = torch.where(stuck, torch.where(drowned, Status.CONVERGED, Status.STALLED), status)
-        resting = resting | stuck
         slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)
-        a = torch.where(go[:, None], taken.amplitudes, a)
-        energy = torch.where(go, taken.energy, energy)
-        n_steps = n_steps + go
-    relative = gradient_norm / start.clamp_min(torch.finfo(start.dtype).tiny)
-    return Solution(a, energy, relative, n_steps, status)
+        result.n_steps[rows[~leaving & taken.moved]] += 1
+        a, energy = taken.amplitudes, taken.energy
+        if bool(leaving.any()):
+            stay = torch.nonzero(~leaving).flatten()
+            rows, a, energy, start, slow = (values[stay] for values in (rows, a, energy, start, slow))
+            placement = _pick(placement, stay)
+    return result
+
+
+def _blank_solution(a: Tensor) -> Solution:
+    number = a.new_zeros(len(a))
+    whole = torch.zeros_like(number, dtype=torch.int64)
+    return Solution(torch.zeros_like(a), number, number.clone(), whole, whole.clone())
+
+
+def _second_order(energy: AmplitudeEnergy, a: Tensor, placement: Any, where: Tensor) -> Tensor:
+    """The second-order term of some samples; NaN, which rules its direction out, for the others."""
+    chosen = torch.nonzero(where).flatten()
+    if len(chosen) == len(a):
+        return energy.second_order(a, placement)
+    whole = a.new_full((len(a), a.shape[-1], a.shape[-1]), torch.nan)
+    whole[chosen] = energy.second_order(a[chosen], _pick(placement, chosen))
+    return whole
+
+
+def _pick(placement: Any, samples: Tensor | slice) -> Any:
+    """The same for some of the samples: nested tuples and lists of tensors ``(B, ...)``."""
+    if isinstance(placement, Tensor):
+        return placement[samples]
+    if isinstance(placement, (tuple, list)):
+        parts = [_pick(part, samples) for part in placement]
+        return type(placement)(*parts) if hasattr(placement, "_fields") else type(placement)(parts)
+    return placement

@@ -18,6 +18,7 @@ from torch_modal.nn.shell import (
     Measures,
     Rest,
     ShellEnergy,
+    cross,
     dihedral_gradient,
     length_gradient,
 )
@@ -137,14 +138,14 @@ class ModalShell(nn.Module):
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
         x = self.shape(a, placement)
         slope, _ = self._slopes(self.shell.measure(x), placement.references)
-        return self.curvature(x.movedim(-1, 0).contiguous(), slope, placement.extra)
+        return self.curvature(self.shell, x.movedim(-1, 0).contiguous(), slope, placement.extra)
 
     def _volume_gradient(self, rows: Tensor) -> Tensor:
         """Gradient of :meth:`ShellEnergy.volume`. *Shape:* ``(3, B, V) -> (3, B, V)``."""
         shell = self.shell
         rows = rows - rows[..., shell.used].mean(-1, keepdim=True)
         a, b, c = (rows[..., corner] for corner in shell.faces.unbind(1))
-        parts = [torch.linalg.cross(*pair, dim=0) for pair in ((b, c), (c, a), (a, b))]
+        parts = [cross(*pair) for pair in ((b, c), (c, a), (a, b))]
         out = torch.zeros_like(rows).index_add(-1, shell.faces.T.flatten(), torch.cat(parts, -1)) / 6
         mean = out.sum(-1, keepdim=True) / len(shell.used)  # the centroid moves along; zero on a closed surface
         return out.index_add(-1, shell.used, -mean.expand(-1, -1, len(shell.used)).contiguous())
@@ -188,7 +189,6 @@ class _Curvature(nn.Module):
 
     def __init__(self, shell: ShellEnergy, columns: Tensor) -> None:
         super().__init__()
-        self.shell = shell
         faces, edges, hinges = (t.cpu().numpy() for t in (shell.faces, shell.edges, shell.hinges))
         n_vertices = columns.shape[1]
         cone = np.array([[j, i, n_vertices] for i, j in mesh.boundary_chain(faces)]).reshape(-1, 3)
@@ -206,38 +206,39 @@ class _Curvature(nn.Module):
 
         rows = columns.movedim(-1, 0)
         self.register_buffer("edge_columns", last(shell.edge_vectors(rows)))
-        first, second = self._face_sides(rows)
+        first, second = self._face_sides(shell, rows)
         self.register_buffer("face_first", last(first))
         self.register_buffer("face_second", last(second))
 
-    def _face_corners(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _face_corners(self, shell: ShellEnergy, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Corners of the closed surface. *Shape:* ``(3, ..., V) -> 3 of (3, ..., F_closed)``."""
-        centre = rows[..., self.shell.used].mean(-1, keepdim=True)
+        centre = rows[..., shell.used].mean(-1, keepdim=True)
         rows = torch.cat([rows, centre], -1)
         p, q, r = (rows[..., corner] for corner in self.closed_faces.unbind(1))
         return p, q, r
 
-    def _face_sides(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        p, q, r = self._face_corners(rows)
+    def _face_sides(self, shell: ShellEnergy, rows: Tensor) -> tuple[Tensor, Tensor]:
+        p, q, r = self._face_corners(shell, rows)
         return q - p, r - p
 
-    def forward(self, rows: Tensor, slope: Measures, extra: Tensor | None) -> Tensor:
+    def forward(self, shell: ShellEnergy, rows: Tensor, slope: Measures, extra: Tensor | None) -> Tensor:
         """The term for shapes with given slopes. *Shape:* ``(B, n, n)``.
 
         Args:
+            shell: The energy that the term belongs to.
             rows: The shapes. *Shape:* ``(3, B, V)``.
             slope: Derivative of the energy in each measure.
             extra: The column of each sample's own. *Shape:* ``(B, V, 3)``.
         """
-        on_edges, on_faces = self._local(rows, slope)
+        on_edges, on_faces = self._local(shell, rows, slope)
         chunk = max(1, _CHUNK_BYTES // (self.edge_columns.numel() * self.edge_columns.element_size()))
         parts = zip(on_edges.split(chunk), on_faces.split(chunk), strict=True)
         inner = torch.cat([self._sandwich(*part) for part in parts])
         if extra is None:
             return inner
         extra_rows = extra.movedim(-1, 0)
-        own_edges = self.shell.edge_vectors(extra_rows).movedim(0, -1)
-        own_first, own_second = (side.movedim(0, -1) for side in self._face_sides(extra_rows))
+        own_edges = shell.edge_vectors(extra_rows).movedim(0, -1)
+        own_first, own_second = (side.movedim(0, -1) for side in self._face_sides(shell, extra_rows))
         bent = (on_edges @ own_edges[..., None]).squeeze(-1)
         turned_first = torch.linalg.cross(on_faces, own_first)
         turned_second = torch.linalg.cross(own_second, on_faces)
@@ -251,16 +252,16 @@ class _Curvature(nn.Module):
         lower = torch.cat([border, corner[:, None]], -1)
         return torch.cat([upper, lower[:, None]], 1)
 
-    def _local(self, rows: Tensor, slope: Measures) -> tuple[Tensor, Tensor]:
+    def _local(self, shell: ShellEnergy, rows: Tensor, slope: Measures) -> tuple[Tensor, Tensor]:
         """Matrices on edges ``(B, E, 3, 3)`` and vectors on faces ``(B, F_closed, 3)``."""
-        stretch = slope.length * _length_hessian(self.shell.edge_vectors(rows))
-        ee, ea, eb, aa, bb = slope.angle * _angle_hessian(self.shell.hinge_spokes(rows))
+        stretch = slope.length * _length_hessian(shell.edge_vectors(rows))
+        ee, ea, eb, aa, bb = slope.angle * _angle_hessian(shell.hinge_spokes(rows))
         sym_a, sym_b = 0.5 * (ea + ea.transpose(0, 1)), 0.5 * (eb + eb.transpose(0, 1))
         on_sides = torch.cat([ee + sym_a + sym_b, aa + sym_a, bb + sym_b, -sym_a, -sym_b], -1)
         on_edges = stretch.index_add(-1, self.hinge_sides.flatten(), on_sides)
 
-        p, q, r = self._face_corners(rows)
-        on_faces = slope.volume[:, None] * (p + q + r - 3 * rows[..., self.shell.used].mean(-1, keepdim=True)) / 6
+        p, q, r = self._face_corners(shell, rows)
+        on_faces = slope.volume[:, None] * (p + q + r - 3 * rows[..., shell.used].mean(-1, keepdim=True)) / 6
         twists = torch.cat([_axial(ea) * self.hinge_signs[0], _axial(eb) * self.hinge_signs[1]], -1)
         on_faces = on_faces.index_add(-1, self.hinge_faces.flatten(), twists)
         return on_edges.permute(2, 3, 0, 1), on_faces.movedim(0, -1)
@@ -268,9 +269,16 @@ class _Curvature(nn.Module):
     def _sandwich(self, on_edges: Tensor, on_faces: Tensor) -> Tensor:
         """Through the columns on both sides. *Shape:* ``(B, n, n)``."""
         edge_part = self.edge_columns.flatten(0, 1).mT @ _per_item(on_edges, self.edge_columns).flatten(1, 2)
-        turned = torch.linalg.cross(self.face_second.expand(len(on_faces), -1, -1, -1), on_faces[..., None], dim=2)
+        turned = _per_item(_cross_with(on_faces), self.face_second)
         face_part = self.face_first.flatten(0, 1).mT @ turned.flatten(1, 2)
         return edge_part + face_part + face_part.mT
+
+
+def _cross_with(w: Tensor) -> Tensor:
+    """The matrix that takes ``x`` to ``x cross w``. *Shape:* ``(..., 3) -> (..., 3, 3)``."""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
 
 
 def _length_hessian(edges: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -46,7 +47,9 @@ class PairedShell(nn.Module):
 
     def __init__(self, shell: ShellEnergy, ends: tuple[Columns, Columns], used: Tensor) -> None:
         super().__init__()
-        self.first, self.second = (ModalShell(shell, end.coarse) for end in ends)
+        # Each with a shell of its own: a module that hangs at two places is saved twice.
+        self.first = ModalShell(shell, ends[0].coarse)
+        self.second = ModalShell(copy.deepcopy(shell), ends[1].coarse)
         gap = (torch.cat([ends[0].fine, -ends[1].fine]) * used[:, None]).flatten(1)
         self.register_buffer("gap", gap)
         self.register_buffer("gap_gram", gap @ gap.mT)

@@ -50,6 +50,12 @@ def per_sample(values: Iterable[float | Tensor], like: Tensor) -> tuple[Tensor, 
     return tuple(torch.as_tensor(value, dtype=like.dtype, device=like.device).expand_as(like) for value in values)
 
 
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product with components first, at half the cost of ``torch.linalg.cross`` there. *Shape:* ``(3, ...)``."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def edge_length(edge: Tensor) -> Tensor:
     """Length of edge vectors ``x_j - x_i``, components first. *Shape:* ``(3, ...) -> (...)``."""
     squared = (edge * edge).sum(0)
@@ -74,8 +80,8 @@ def dihedral_angle(spokes: Tensor) -> Tensor:
             components second. *Shape:* ``(3, 3, ...)``.
     """
     e, a, b = spokes
-    n1 = torch.linalg.cross(e, a, dim=0)
-    n2 = torch.linalg.cross(b, e, dim=0)
+    n1 = cross(e, a)
+    n2 = cross(b, e)
     sine = -edge_length(e) * (n1 * b).sum(0)
     cosine = (n1 * n2).sum(0)
     # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
@@ -95,8 +101,8 @@ def dihedral_gradient(spokes: Tensor) -> Tensor:
         Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
     """
     e, a, b = spokes
-    n1 = torch.linalg.cross(e, a, dim=0)
-    n2 = torch.linalg.cross(b, e, dim=0)
+    n1 = cross(e, a)
+    n2 = cross(b, e)
     flat = _collapsed(e, n1) | _collapsed(e, n2)
     length = edge_length(e)
     to_a = n1 * (-length * _inverse((n1 * n1).sum(0), flat))
@@ -125,7 +131,7 @@ def _inverse(x: Tensor, zero: Tensor) -> Tensor:
 def enclosed_volume(rows: Tensor, faces: Tensor) -> Tensor:
     """Signed volume between a surface and the origin. *Shape:* ``(3, ..., V), (F, 3) -> (...)``."""
     a, b, c = (rows[..., corner] for corner in faces.unbind(1))
-    return (a * torch.linalg.cross(b, c, dim=0)).sum((0, -1)) / 6
+    return (a * cross(b, c)).sum((0, -1)) / 6
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
@@ -216,12 +222,12 @@ class ShellEnergy(nn.Module):
         measures = self.measure(x_rest)
         rows = x_rest.movedim(-1, 0).contiguous()
         e, a, b = self.hinge_spokes(rows)
-        n1, n2 = torch.linalg.cross(e, a, dim=0), torch.linalg.cross(b, e, dim=0)
+        n1, n2 = cross(e, a), cross(b, e)
         hinge_area = 0.5 * (edge_length(n1) + edge_length(n2))
         squared = (e * e).sum(0)
         shortest = MIN_RELATIVE_LENGTH * measures.length.mean(-1, keepdim=True)
         p, q, r = (rows[..., corner] for corner in self.faces.unbind(1))
-        surface = 0.5 * edge_length(torch.linalg.cross(q - p, r - p, dim=0)).sum(-1)
+        surface = 0.5 * edge_length(cross(q - p, r - p)).sum(-1)
         volume_floor = MIN_RELATIVE_VOLUME * surface**1.5
         alpha, beta, gamma = stiffness or self.stiffness
         alpha, beta = (s[..., None] if isinstance(s, Tensor) else s for s in (alpha, beta))

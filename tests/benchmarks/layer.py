@@ -1,0 +1,278 @@
+"""How fast :class:`torch_modal.InBetween` is in a batch, forward and backward, and what its gradient costs in memory.
+
+    OMP_NUM_THREADS=2 python tests/benchmarks/layer.py
+    python tests/benchmarks/layer.py --device cuda --dtype float32 float64 --batches 1 4 16 64 256 1024
+
+Everything compared is measured in one run, in turns, so that a busy machine slows both sides; what to read are the
+ratios. The reference of a batch is a loop of single calls over the same samples. Each sample has key-frames and a time
+of its own. 30 + 30 and 50 + 50 modes make 60 and 100 unknowns, and one more for the difference of the key-frames;
+dependent modes are dropped.
+
+On a machine that others use too, threads wait for each other, small calls the most: the loop then looks bad without
+being so. ``OMP_NUM_THREADS=1 ... --cpu-time`` counts the time of the processor instead of the clock's.
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torch_modal as tm
+
+SAMPLE = Path(tm.__file__).parent / "samples" / "hand"
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+# Data sheets, dense, without sparsity: bytes per second, then flops per second in float32 and in float64. Float32 is
+# counted without TF32, which torch leaves off by default; float64 matrix products run on tensor cores.
+PEAKS = {
+    "H200": (4.8e12, 67e12, 67e12),
+    "H100": (3.35e12, 67e12, 67e12),
+    "A100": (2.0e12, 19.5e12, 19.5e12),
+    "L4": (0.3e12, 30e12, 0.47e12),
+}
+
+
+class Case:
+    """A layer with samples to put through it."""
+
+    def __init__(self, modes: int, batch: int, dtype: torch.dtype, arguments: argparse.Namespace) -> None:
+        keyframes, faces = tm.load_keyframes([SAMPLE / "key-0.ply", SAMPLE / "key-1.ply"])
+        bases = [basis.truncate(modes) for basis in tm.extract_bases(keyframes, faces, n_modes=50)]
+        layer = tm.InBetween(bases, faces, coarse_faces=arguments.coarse_faces)
+        self.layer = layer.to(arguments.device, dtype)
+        generator = torch.Generator().manual_seed(0)
+        times = torch.rand(batch, 1, generator=generator, dtype=torch.float64) * 0.8 + 0.1
+        ends = []
+        for x, basis in zip(keyframes, bases, strict=True):
+            # Each key-frame moves along its five softest modes.
+            softest = basis.modes[:5] / basis.modes[:5].flatten(1).norm(dim=1)[:, None, None]
+            push = torch.randn(batch, len(softest), generator=generator, dtype=torch.float64)
+            size = arguments.spread * (x.amax(0) - x.amin(0)).norm() * (len(x) / len(softest)) ** 0.5
+            ends.append(x + size * torch.tensordot(push, softest, 1))
+        self.samples = [value.to(arguments.device, dtype) for value in (*ends, times)]
+
+    def part(self, rows: slice) -> list[Tensor]:
+        """Some samples, as leaves of a graph."""
+        return [value[rows].clone().requires_grad_() for value in self.samples]
+
+
+def clock(arguments: argparse.Namespace, run: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds, and what came out."""
+    now = time.process_time if arguments.cpu_time else time.perf_counter
+    if arguments.device == "cuda":
+        torch.cuda.synchronize()
+    start = now()
+    out = run()
+    if arguments.device == "cuda":
+        torch.cuda.synchronize()
+    return now() - start, out
+
+
+def there_and_back(case: Case, rows: slice, arguments: argparse.Namespace) -> tuple[float, float, float]:
+    """Seconds of a forward pass alone, of one that is recorded, and of its backward pass."""
+    inputs = case.part(rows)
+    with torch.no_grad():
+        alone, _ = clock(arguments, lambda: case.layer(*inputs))
+    recorded, shapes = clock(arguments, lambda: case.layer(*inputs))
+    weights = torch.linspace(-1, 1, shapes[0].numel(), dtype=shapes.dtype, device=shapes.device).view_as(shapes[0])
+    backward, _ = clock(arguments, lambda: torch.autograd.grad((shapes * weights).sum(), inputs))
+    return alone, recorded, backward
+
+
+def straight_line(case: Case, rows: slice, arguments: argparse.Namespace) -> float:
+    """Seconds of linear interpolation of the same vertices."""
+    x_a, x_b, t = (value[rows] for value in case.samples)
+    return clock(arguments, lambda: torch.lerp(x_a[:, None], x_b[:, None], t[..., None, None]))[0]
+
+
+def speed(arguments: argparse.Namespace, modes: int, dtype_name: str) -> None:
+    """Print a table over batch sizes."""
+    device, batches = arguments.device, sorted(arguments.batches)
+    case = Case(modes, batches[-1], DTYPES[dtype_name], arguments)
+    layer, n_single = case.layer, min(batches[-1], arguments.singles)
+    space: Any = layer.members[0].space
+    solution = layer.solve(*case.samples).solution
+    lost = int((~solution.converged).sum())
+    mean_steps = float(solution.n_steps.double().mean())
+    print(
+        f"\n{modes}+{modes} modes ({space.n_unknowns} unknowns), {len(space.frame.coarse_faces)} coarse faces, "
+        f"{dtype_name}, {device}: {mean_steps:.1f} steps a sample on average, {int(solution.n_steps.max())} at most"
+        + (f", {lost} of {batches[-1]} not converged" if lost else "")
+    )
+    there_and_back(case, slice(0, 2), arguments)  # warm-up
+
+    loop: list[list[tuple[float, float, float]]] = []
+    found: dict[int, list[tuple[float, float, float]]] = {n: [] for n in batches}
+    lines: dict[int, list[float]] = {n: [] for n in batches}
+    for _ in range(arguments.repeats):
+        loop.append([there_and_back(case, slice(i, i + 1), arguments) for i in range(n_single)])
+        for n in batches:
+            found[n].append(there_and_back(case, slice(0, n), arguments))
+            lines[n].append(straight_line(case, slice(0, n), arguments))
+
+    print("  ms per in-between, median; x: throughput over the loop of single calls, same samples, same run")
+    print("  batch   forward    x    fwd+bwd    x   backward/forward   over linear interpolation")
+    for n in batches:
+        alone, recorded, backward = (1e3 * median(column) / n for column in zip(*found[n], strict=True))
+        # A loop over more samples than are measured one by one takes in proportion.
+        singles = [row[: min(n, n_single)] for row in loop]
+        forward_gain, both_gain = (
+            median(
+                sum(cost(one) for one in single) / len(single) * n / cost(batch)
+                for single, batch in zip(singles, found[n], strict=True)
+            )
+            for cost in (lambda s: s[0], lambda s: s[1] + s[2])
+        )
+        ratio = median(b / r for _, r, b in found[n])
+        print(
+            f"  {n:5d} {alone:9.2f} {forward_gain:5.2f} {recorded + backward:9.2f} {both_gain:5.2f} {ratio:12.2f} "
+            f"{alone / (1e3 * median(lines[n]) / n):18.0f} x"
+        )
+        if device == "cuda":
+            flops, moved = work(case, int(solution.n_steps[:n].max()), n)
+            share(flops, moved, median(s[0] for s in found[n]), n, dtype_name)
+    print(f"  load average of the machine now: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+def work(case: Case, most_steps: int, batch: int) -> tuple[float, float]:
+    """Flops and bytes of a forward pass, at the least.
+
+    Counted for one sample and one iteration, with M = E + H + 1 measures, n unknowns, F coarse faces:
+
+    - the Jacobian, 3 numbers of an edge and 9 of a hinge through the columns: 2 (3 E + 9 H) n flops; it is written
+      once, read and weighted, and both copies are read by the product: 4 M n numbers;
+    - J^T W J: 2 M n^2 flops;
+    - the second-order term: 3 x 3 blocks on the columns of the edges, 2 * 9 E n, then 2 * 3 E n^2; cross products on
+      the faces, 9 F n, then 2 * 3 F n^2; each product is written and read: 2 * 3 (E + F) n numbers;
+    - both Cholesky factorisations: 2 n^3 / 3 flops;
+    - two directions tried: 2 * 2 * 3 V_coarse n flops.
+
+    All samples of a batch are evaluated until the last one rests, and the derivatives once more to see that it does:
+    what rests is computed all the same. The fine shape costs 2 * 3 V n flops once. The columns are read once a batch
+    and iteration.
+    """
+    space: Any = case.layer.members[0].space
+    shell, n = space.shell, space.n_unknowns
+    e, h, f = len(shell.edges), len(shell.hinges), len(shell.faces)
+    m, item = e + h + 1, case.samples[0].element_size()
+    first_order = 2 * (3 * e + 9 * h) * n + 2 * m * n**2
+    second_order = 18 * e * n + 6 * e * n**2 + 9 * f * n + 6 * f * n**2
+    step = second_order + 2 * n**3 / 3 + 12 * space.frame.n_coarse * n
+    fine = 6 * space.frame.reference.shape[0] * n
+    flops = batch * ((most_steps + 1) * first_order + most_steps * step + fine)
+    numbers = batch * ((most_steps + 1) * 4 * m * n + most_steps * 6 * (e + f) * n)
+    columns = (most_steps + 1) * (3 * e + 9 * h + 6 * f) * n
+    return flops, item * (numbers + columns)
+
+
+def share(flops: float, moved: float, seconds: float, batch: int, dtype_name: str) -> None:
+    """Print the parts of the peaks."""
+    name = torch.cuda.get_device_name()
+    peaks = next((value for key, value in PEAKS.items() if key in name), None)
+    rates = f"{flops / seconds / 1e12:.3f} TFLOP/s, {moved / seconds / 1e9:.0f} GB/s"
+    if peaks is None:
+        print(f"        {rates}; the peaks of {name} are not in PEAKS")
+        return
+    bandwidth, arithmetic = peaks[0], peaks[1 if dtype_name == "float32" else 2]
+    print(
+        f"        {rates}: {100 * flops / seconds / arithmetic:.1f} % of peak arithmetic, "
+        f"{100 * moved / seconds / bandwidth:.1f} % of peak bandwidth"
+    )
+
+
+def memory(arguments: argparse.Namespace) -> None:
+    """Print what a gradient holds in memory over the number of steps."""
+    batch, limits = 4, (1, 2, 4, 8, 16)
+    print(f"\nMemory of forward and backward, MiB above what is there before, batch of {batch}, 30+30 modes, float64")
+    print("  max_steps   " + "".join(f"{n:8d}" for n in limits))
+    for gradient in ("implicit", "unroll"):
+        found = [_memory_of(arguments, gradient, n, batch) for n in limits]
+        print(f"  {gradient:11s} " + "".join(f"{value:8.0f}" for value in found))
+
+
+def _memory_of(arguments: argparse.Namespace, gradient: str, max_steps: int, batch: int) -> float:
+    """In a process of its own: a peak never falls again."""
+    options = ["--device", arguments.device, "--coarse-faces", str(arguments.coarse_faces)]
+    command = [sys.executable, __file__, *options, "--probe", gradient, str(max_steps), str(batch)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"the memory of {gradient} could not be measured:\n{done.stderr}")
+    return float(done.stdout.split()[-1])
+
+
+def probe(arguments: argparse.Namespace) -> None:
+    """Print the peak of one forward and backward pass, in MiB above what was there before."""
+    gradient, max_steps, batch = arguments.probe[0], *map(int, arguments.probe[1:])
+    case = Case(30, batch, torch.float64, arguments)
+    layer = case.layer
+    layer.gradient, layer.max_steps = gradient, max_steps
+    inputs = case.part(slice(0, batch))
+    cuda = arguments.device == "cuda"
+
+    def peak() -> float:
+        return torch.cuda.max_memory_allocated() / 2**20 if cuda else _resident_peak()
+
+    # What is loaded and set up on first use is not the gradient's.
+    small = case.part(slice(0, 1))
+    layer.max_steps = 1
+    layer.solve(*small).shapes.sum().backward()
+    layer.max_steps = max_steps
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated() / 2**20 if cuda else _resident_peak(reset=True)
+    layer.solve(*inputs).shapes.sum().backward()
+    print(peak() - before)
+
+
+def _resident_peak(reset: bool = False) -> float:
+    """Peak of resident memory in MiB; since the last reset where Linux lets us."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return float(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 2**10
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
+    parser.add_argument("--dtype", nargs="+", default=["float64"], choices=tuple(DTYPES))
+    parser.add_argument("--batches", nargs="+", type=int, default=[1, 2, 4, 8, 16, 32, 64])
+    parser.add_argument("--modes", nargs="+", type=int, default=[30, 50], help="of each key-frame, at most 50")
+    parser.add_argument("--coarse-faces", type=int, default=1000)
+    spread_help = "how far the key-frames of the samples differ (root mean square), in bounding-box diagonals"
+    parser.add_argument("--spread", type=float, default=0.003, help=spread_help)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--singles", type=int, default=64, help="samples of the loop that are measured one by one")
+    parser.add_argument("--cpu-time", action="store_true", help="processor time; with one thread only")
+    parser.add_argument("--no-memory", action="store_true")
+    parser.add_argument("--probe", nargs=3, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.cpu_time and (arguments.device == "cuda" or torch.get_num_threads() > 1):
+        parser.error("--cpu-time counts all threads together: it needs --device cpu and OMP_NUM_THREADS=1")
+    if arguments.probe:
+        probe(arguments)
+        return
+    name = torch.cuda.get_device_name() if arguments.device == "cuda" else f"{torch.get_num_threads()} threads"
+    print(f"torch {torch.__version__}, {name}; load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    for dtype_name in arguments.dtype:
+        for modes in arguments.modes:
+            speed(arguments, modes, dtype_name)
+    if not arguments.no_memory:
+        memory(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""The working frame: scale, alignment, coarse mesh and independent columns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import Shapes, random_rotation
+from torch import Tensor
+
+from torch_modal.nn.frame import DIAGONAL, Frame, Pair
+from torch_modal.precompute.coarsening import coarsen
+
+
+@pytest.fixture(scope="module")
+def frame(bars: Shapes) -> Frame:
+    return Frame(bars.bases[:2], bars.faces, coarse_faces=200)
+
+
+@pytest.fixture
+def moved(bars: Shapes, generator: torch.Generator) -> Tensor:
+    """The straight and the bent bar, each with its own rigid motion, in a batch of one. *Shape:* (2, 1, V, 3)."""
+    turns = torch.stack([random_rotation(generator), random_rotation(generator)])
+    return (bars.keyframes[:2] @ turns.mT + torch.tensor([[[30.0, -20, 10]], [[-5, 0, 8]]]))[:, None]
+
+
+def test_size_is_100_and_centred(frame: Frame, bars: Shapes) -> None:
+    reference = frame.reference
+    assert float((reference.amax(0) - reference.amin(0)).norm()) == pytest.approx(DIAGONAL, rel=1e-13)
+    assert (frame.weights[:, None] * reference).sum(0).abs().max() < 1e-11
+    assert float(frame.weights.sum()) == pytest.approx(1)
+    assert float(frame.coarse_weights.sum()) == pytest.approx(1)
+    straight = bars.keyframes[0]
+    torch.testing.assert_close(reference / frame.scale, straight - (frame.weights[:, None] * straight).sum(0))
+
+
+def test_coarsens_as_numpy_does(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
+    x = torch.randn(2, 3, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
+    clusters = frame.clusters.numpy()
+    by_hand = np.stack([x.numpy()[:, :, clusters == i].mean(2) for i in range(frame.n_coarse)], 2)
+    np.testing.assert_allclose(frame.coarsen(x).numpy(), by_hand, atol=1e-14)
+    assert len(frame.coarse_faces) <= 200 < len(bars.faces)
+
+
+def test_collapses_are_chosen_on_aligned_keyframes(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
+    """A rigid motion of the second basis changes nothing: same clusters, same space."""
+    turn = random_rotation(generator)
+    basis = bars.bases[1]
+    turned = replace(basis, reference=basis.reference @ turn.mT + 9, modes=basis.modes @ turn.mT)
+    other = Frame([bars.bases[0], turned], bars.faces, coarse_faces=200)
+    assert torch.equal(other.clusters, frame.clusters)
+    torch.testing.assert_close(
+        other.modes([bars.bases[0], turned])[1], frame.modes(bars.bases[:2])[1], atol=1e-11, rtol=0
+    )
+
+
+def test_place_and_restore(frame: Frame, moved: Tensor) -> None:
+    x_a, x_b = moved
+    pair = frame.place(x_a, x_b)
+    torch.testing.assert_close(pair.first[0], frame.reference, atol=1e-10, rtol=0)
+    at = torch.zeros(1, dtype=torch.float64)
+    torch.testing.assert_close(frame.restore(pair.first, pair, at), x_a, atol=1e-11, rtol=0)
+    torch.testing.assert_close(frame.restore(pair.second, pair, at + 1), x_b, atol=1e-11, rtol=0)
+    # The second is turned on to the first as well as it goes: no small rotation brings it closer.
+    arms = pair.first - (frame.weights[:, None] * pair.first).sum(-2, keepdim=True)
+    torque = (frame.weights[:, None] * torch.linalg.cross(arms, pair.second - pair.first)).sum(-2)
+    assert torque.abs().max() < 1e-10 * DIAGONAL**2
+
+
+def test_orthonormal_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
+    directions = torch.randn(5, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
+    mixed = torch.cat([directions, 3 * directions[:2] - directions[2:4], torch.zeros_like(directions[:1])])
+    columns = frame.orthonormal(mixed)
+    assert len(columns.fine) == len(columns.coarse) == 5, "three of eight are dependent"
+    weighted = columns.coarse * frame.coarse_weights[:, None]
+    gram = torch.einsum("mvc,nvc->mn", weighted, columns.coarse)
+    torch.testing.assert_close(gram, torch.eye(5, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(frame.coarsen(columns.fine), columns.coarse, atol=1e-9, rtol=0)
+    # The same space as the directions'.
+    fit = torch.linalg.lstsq(columns.fine.flatten(1).T, directions.flatten(1).T).solution
+    torch.testing.assert_close(fit.T @ columns.fine.flatten(1), directions.flatten(1), atol=1e-9, rtol=0)
+    a = torch.randn(2, 5, dtype=torch.float64, generator=generator)
+    torch.testing.assert_close(columns.combine(a), torch.einsum("bn,nvc->bvc", a, columns.fine))
+
+
+def test_remove_leaves_nothing_of_the_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
+    directions = torch.randn(3, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
+    columns = frame.orthonormal(directions[:2])
+    left = frame.remove(directions, columns)
+    assert left[:2].abs().max() < 1e-9
+    inner = torch.einsum("mvc,nvc->mn", frame.coarsen(left) * frame.coarse_weights[:, None], columns.coarse)
+    assert inner.abs().max() < 1e-12
+
+
+def test_elastic_columns_have_no_rigid_motion(frame: Frame, bars: Shapes) -> None:
+    modes = torch.cat(frame.modes(bars.bases[:2]))
+    columns = frame.elastic_columns(modes)
+    assert len(frame.rigid.fine) == 6
+    both = torch.cat([frame.rigid.coarse, columns.coarse])
+    gram = torch.einsum("mvc,nvc->mn", both * frame.coarse_weights[:, None], both)
+    torch.testing.assert_close(gram, torch.eye(len(both), dtype=torch.float64), atol=1e-8, rtol=0)
+    # With the rigid motions, they span every mode.
+    span = torch.cat([frame.rigid.fine, columns.fine]).flatten(1)
+    fit = torch.linalg.lstsq(span.T, modes.flatten(1).T).solution.T @ span
+    torch.testing.assert_close(fit, modes.flatten(1), atol=1e-7 * float(modes.abs().max()), rtol=0)
+
+
+def test_one_basis_for_both_ends(bars: Shapes) -> None:
+    twice = [bars.bases[0]] * 2
+    frame = Frame(twice, bars.faces, 200)
+    first, second = frame.modes(twice)
+    torch.testing.assert_close(first, second)
+    assert len(frame.elastic_columns(torch.cat([first, second])).fine) == 8, "the second eight are the first eight"
+
+
+def test_module(frame: Frame, bars: Shapes, moved: Tensor) -> None:
+    other = Frame([bars.bases[2], bars.bases[1]], bars.faces.flip(0), coarse_faces=200)
+    if other.n_coarse != frame.n_coarse:
+        pytest.skip("the two coarse meshes differ in size")
+    other.load_state_dict(frame.state_dict())
+    for mine, theirs in zip(other.place(*moved)[:2], frame.place(*moved)[:2], strict=True):
+        torch.testing.assert_close(mine, theirs, atol=0, rtol=0)
+    single = Frame(bars.bases[:2], bars.faces, 200).float()
+    pair = single.place(*moved.float())
+    assert isinstance(pair, Pair)
+    assert pair.first.dtype == torch.float32
+
+
+def test_exception(bars: Shapes, small_bars: Shapes) -> None:
+    with pytest.raises(ValueError, match="meshes of 164 and 30 vertices"):
+        Frame([bars.bases[0], small_bars.bases[0]], bars.faces, 200)
+    with pytest.raises(ValueError, match="vertices that do not exist"):
+        Frame(small_bars.bases[:2], bars.faces, 200)
+    with pytest.raises(ValueError, match="at least 4 faces"):
+        Frame(bars.bases[:2], bars.faces, 3)
+
+
+def test_keeps_what_coarsen_chose(frame: Frame, bars: Shapes) -> None:
+    references = torch.stack([frame.reference, frame.place(bars.keyframes[:1], bars.keyframes[1:2]).second[0]])
+    chosen = coarsen(references.numpy(), bars.faces.numpy(), 200)
+    np.testing.assert_array_equal(chosen.faces, frame.coarse_faces.numpy())

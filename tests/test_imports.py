@@ -1,0 +1,115 @@
+"""Imports go one way, and what is heavy is loaded by those who need it only."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "torch_modal"
+
+# From the ground up: a module may import those in earlier lines only, at the top of the file or inside functions.
+ORDER = [
+    ["version", "errors", "files", "mesh", "inspect_mesh"],
+    ["arrays", "basis", "export", "mesh_files", "rigid"],
+    ["keyframes", "picture"],
+    ["precompute", "precompute._tetwild_worker", "precompute.cache", "precompute.coarsening", "precompute.eigen"],
+    ["precompute.tetrahedra"],
+    ["precompute.arap"],
+    ["precompute.embedding"],
+    ["precompute.modes"],
+    ["nn", "nn.shell"],
+    ["nn.modal_shell"],
+    ["nn.frame", "nn.gauss_newton"],
+    ["nn.joint", "nn.paired", "nn.implicit"],
+    ["nn.between"],
+    ["nn.in_between"],
+    ["nn.mid_shape"],
+    ["sequence"],
+    ["sample_data"],
+    [""],
+    ["demo"],
+    ["commands"],
+    ["cli"],
+]
+RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
+MODULES = sorted(
+    str(path.relative_to(PACKAGE).with_suffix("")).replace("/", ".").removesuffix("__init__").removesuffix(".")
+    for path in PACKAGE.rglob("*.py")
+)
+FOREIGN_TO_LAYERS = set("scipy fast_simplification trimesh pytetwild tqdm pyvista matplotlib pygltflib".split())
+
+
+def imported(module: str) -> set[str]:
+    """Every module that a file imports, anywhere in it; of this package without its name."""
+    folder = PACKAGE / module.replace(".", "/")
+    path = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module} has a relative import"
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                within = whole.removeprefix("torch_modal.")
+                found.add(whole if within in MODULES and within != whole else str(node.module))
+    return {name.removeprefix("torch_modal").removeprefix(".") if is_own(name) else name for name in found}
+
+
+def is_own(name: str) -> bool:
+    return name == "torch_modal" or name.startswith("torch_modal.")
+
+
+def own(module: str) -> set[str]:
+    return {name for name in imported(module) if name in RANK}
+
+
+def test_every_module_has_its_place() -> None:
+    assert set(MODULES) <= set(RANK), f"give {sorted(set(MODULES) - set(RANK))} a line in ORDER"
+    assert "precompute.modes" in own("sequence"), "imports are not seen"
+    assert "mesh" in own("nn.frame"), "from torch_modal import mesh is not seen"
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda name: name or "torch_modal")
+def test_imports_go_one_way(module: str) -> None:
+    backwards = sorted(name for name in own(module) if RANK[name] >= RANK[module])
+    assert not backwards, f"{module or '__init__'} imports {backwards}, which stand no lower"
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("precompute")])
+def test_precompute_does_not_know_the_layers(module: str) -> None:
+    assert not {name for name in own(module) if name.startswith("nn")}
+    if module not in ("precompute", "precompute.modes"):
+        assert "torch" not in {name.split(".")[0] for name in imported(module)}, "modes.py alone makes tensors"
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("nn")])
+def test_layers_are_torch_only(module: str) -> None:
+    packages = {name.split(".")[0] for name in imported(module)}
+    assert not packages & FOREIGN_TO_LAYERS
+    if module not in ("nn.modal_shell", "nn.frame"):
+        assert "numpy" not in packages
+    # Only the frame, made once, looks into the other room.
+    allowed = {"precompute.coarsening"} if module == "nn.frame" else set()
+    assert {name for name in own(module) if name.startswith("precompute")} <= allowed
+
+
+def test_import_loads_nothing_heavy() -> None:
+    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild"]
+    code = f"import sys, torch_modal; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120, cwd=PACKAGE.parent
+    )
+    assert result.stdout.strip() == "[]"
+
+
+def test_public_names_are_there() -> None:
+    import torch_modal
+
+    assert sorted(torch_modal.__all__) == torch_modal.__all__
+    for name in torch_modal.__all__:
+        assert getattr(torch_modal, name) is not None
+    fixed = "load_keyframes extract_modes extract_bases ModalBasis ShellEnergy GaussNewtonStep MidShape subdivide"
+    assert set(fixed.split()) <= set(torch_modal.__all__)

@@ -1,0 +1,232 @@
+"""Rigid motions against known ones, against SciPy's, and against their own laws."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import needs_gradient_of_no_turn, random_rotation
+from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
+from torch.autograd import gradcheck, gradgradcheck
+
+from torch_modal.rigid import RigidMotion, best_fit, best_rotation, blend, centroid
+
+EYE = torch.eye(3, dtype=torch.float64)
+
+
+@pytest.fixture
+def cloud(generator: torch.Generator) -> Tensor:
+    return torch.randn(40, 3, dtype=torch.float64, generator=generator) * torch.tensor([3.0, 2.0, 1.0]) + 5
+
+
+@pytest.fixture
+def weights(generator: torch.Generator) -> Tensor:
+    return torch.rand(40, dtype=torch.float64, generator=generator) + 0.1
+
+
+def about(axis: list[float], angle: float) -> Tensor:
+    """Rotation matrix, by SciPy."""
+    unit = np.array(axis) / np.linalg.norm(axis)
+    return torch.from_numpy(Rotation.from_rotvec(angle * unit).as_matrix())
+
+
+def motion_by(rotation: Tensor, source: Tensor, target: Tensor) -> RigidMotion:
+    return RigidMotion(rotation, source, target)
+
+
+# ------------------------------------------------------------------------------------------------ the best fit
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.7, 3.1, np.pi])
+def test_recovers_a_known_motion(cloud: Tensor, weights: Tensor, angle: float) -> None:
+    rotation, move = about([1, -2, 0.5], angle), torch.tensor([10.0, -20.0, 30.0], dtype=torch.float64)
+    moved = cloud @ rotation.mT + move
+    fit = best_fit(cloud, moved, weights)
+    torch.testing.assert_close(fit.rotation, rotation, atol=1e-13, rtol=0)
+    torch.testing.assert_close(fit.apply(cloud), moved, atol=1e-12, rtol=0)
+    torch.testing.assert_close(fit.inverse().apply(moved), cloud, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("noise", [0.01, 1.0, 30.0])
+def test_agrees_with_scipy_on_noise(cloud: Tensor, weights: Tensor, generator: torch.Generator, noise: float) -> None:
+    moved = cloud @ random_rotation(generator).mT
+    moved = moved + noise * torch.randn(cloud.shape, dtype=torch.float64, generator=generator)
+    fit = best_fit(cloud, moved, weights)
+    mean = [np.average(x.numpy(), axis=0, weights=weights.numpy()) for x in (cloud, moved)]
+    truth, _ = Rotation.align_vectors(moved.numpy() - mean[1], cloud.numpy() - mean[0], weights.numpy())
+    np.testing.assert_allclose(fit.rotation.numpy(), truth.as_matrix(), atol=1e-10)
+    np.testing.assert_allclose(fit.target.numpy(), mean[1], rtol=1e-13)
+
+
+def test_never_a_reflection(cloud: Tensor, weights: Tensor) -> None:
+    mirrored = cloud * torch.tensor([1.0, 1.0, -1.0])
+    flat = cloud * torch.tensor([1.0, 1.0, 0.0])
+    for x, y in ((cloud, mirrored), (mirrored, cloud), (flat, flat @ about([1, 1, 0], 2.0).mT), (cloud, -cloud)):
+        rotation = best_fit(x, y, weights).rotation
+        assert float(torch.linalg.det(rotation)) == pytest.approx(1, abs=1e-12)
+        torch.testing.assert_close(rotation @ rotation.mT, EYE, atol=1e-12, rtol=0)
+    # A flat shape has both fits; the one without a reflection carries it exactly.
+    turned = flat @ about([1, 1, 0], 2.0).mT
+    torch.testing.assert_close(best_fit(flat, turned, weights).apply(flat), turned, atol=1e-12, rtol=0)
+
+
+def test_cardinality_and_weights(cloud: Tensor, weights: Tensor, generator: torch.Generator) -> None:
+    many = torch.randn(2, 3, 40, 3, dtype=torch.float64, generator=generator)
+    fit = best_fit(many, cloud, weights)
+    assert fit.rotation.shape == (2, 3, 3, 3)
+    one = best_fit(many[1, 2], cloud, weights)
+    torch.testing.assert_close(fit.rotation[1, 2], one.rotation, atol=1e-13, rtol=0)
+    torch.testing.assert_close(fit.apply(many)[1, 2], one.apply(many[1, 2]), atol=1e-12, rtol=0)
+    # A vertex of no weight has no say.
+    weights[0] = 0
+    before = best_fit(cloud, many[0, 0], weights)
+    cloud[0] += 100
+    torch.testing.assert_close(best_fit(cloud, many[0, 0], weights).rotation, before.rotation)
+    torch.testing.assert_close(centroid(cloud, weights), (weights[1:, None] * cloud[1:]).sum(0) / weights[1:].sum())
+
+
+# ------------------------------------------------------------------------------------------------- derivatives
+
+
+def covariances() -> dict[str, Tensor]:
+    turn = about([0.3, 1.0, -0.4], 1.1)
+    diagonal = {
+        "generic": [3.0, 2.0, 0.5],
+        "two equal": [2.0, 2.0, 0.7],
+        "sphere": [1.5, 1.5, 1.5],
+        "flat": [2.0, 1.0, 0.0],
+        "mirrored": [3.0, 2.0, -0.5],
+    }
+    matrices = {name: turn @ torch.diag(torch.tensor(d, dtype=torch.float64)) for name, d in diagonal.items()}
+    return {"unturned sphere": 2.0 * EYE, **matrices}
+
+
+@pytest.mark.parametrize("name", covariances())
+def test_gradcheck_best_rotation(name: str) -> None:
+    covariance = covariances()[name].clone().requires_grad_()
+    assert gradcheck(best_rotation, (covariance,), atol=1e-7)
+    assert gradgradcheck(best_rotation, (covariance,), atol=1e-6)
+
+
+def test_derivative_at_a_sphere_by_hand() -> None:
+    # R^T A stays symmetric: at A = c I, R = I + W with 2 c W = dA - dA^T.
+    change = torch.tensor([[0.3, -1.0, 2.0], [0.5, 0.1, -0.7], [0.0, 4.0, 1.0]], dtype=torch.float64)
+    _, derivative = torch.autograd.functional.jvp(best_rotation, 2.5 * EYE, change)
+    torch.testing.assert_close(derivative, (change - change.mT) / 5, atol=1e-12, rtol=0)
+
+
+def test_gradcheck_best_fit_and_blend_of_symmetric_shape() -> None:
+    cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3).requires_grad_()
+    turned = (cube.detach() @ about([1, 2, 3], 0.8).mT + 2).requires_grad_()
+    weights = torch.ones(8, dtype=torch.float64)
+    t = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(lambda x, y: best_fit(x, y, weights).apply(x), (cube, turned), atol=1e-7)
+    assert gradcheck(lambda x, y, t: blend(x, y, t, weights), (cube, turned, t), atol=1e-7)
+
+
+# ---------------------------------------------------------------------------------------------------- geodesic
+
+
+@pytest.fixture
+def motion(cloud: Tensor, weights: Tensor) -> RigidMotion:
+    rotation = about([1, -2, 0.5], 2.3)
+    return motion_by(rotation, centroid(cloud, weights), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+
+
+def time(t: float) -> Tensor:
+    return torch.tensor(t, dtype=torch.float64)
+
+
+def test_fraction_ends(motion: RigidMotion, cloud: Tensor) -> None:
+    torch.testing.assert_close(motion.fraction(time(0)).apply(cloud), cloud, atol=1e-13, rtol=0)
+    torch.testing.assert_close(motion.fraction(time(1)).apply(cloud), motion.apply(cloud), atol=1e-12, rtol=0)
+
+
+def test_two_halves_are_the_whole(motion: RigidMotion, cloud: Tensor) -> None:
+    half = motion.fraction(time(0.5))
+    torch.testing.assert_close(half.rotation @ half.rotation, motion.rotation, atol=1e-13, rtol=0)
+    again = motion_by(half.rotation, half.target, motion.target)
+    torch.testing.assert_close(again.apply(half.apply(cloud)), motion.apply(cloud), atol=1e-12, rtol=0)
+
+
+def test_constant_speed_as_scipys_slerp(motion: RigidMotion) -> None:
+    times = np.linspace(0, 1, 7)
+    truth = Slerp([0, 1], Rotation.from_matrix(np.stack([np.eye(3), motion.rotation.numpy()])))(times)
+    part = motion.fraction(torch.from_numpy(times))
+    np.testing.assert_allclose(part.rotation.numpy(), truth.as_matrix(), atol=1e-12)
+    steps = part.target.diff(dim=0)
+    torch.testing.assert_close(steps, steps[:1].expand_as(steps), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -2, 0.5], [-1, -1, -1]])
+def test_half_turn_is_a_choice_and_no_nan(axis: list[float], cloud: Tensor) -> None:
+    turn = about(axis, np.pi).requires_grad_()
+    origin = torch.zeros(3, dtype=torch.float64)
+    half = motion_by(turn, origin, origin).fraction(time(0.5))
+    torch.testing.assert_close(half.rotation @ half.rotation, turn, atol=1e-7, rtol=0)
+    unit = torch.tensor(axis, dtype=torch.float64) / torch.tensor(axis, dtype=torch.float64).norm()
+    torch.testing.assert_close(half.rotation @ unit, unit, atol=1e-7, rtol=0)
+    (gradient,) = torch.autograd.grad((half.apply(cloud) ** 2).sum() + half.rotation.sum(), turn)
+    assert gradient.isfinite().all()
+
+
+@needs_gradient_of_no_turn
+def test_gradcheck_fraction() -> None:
+    source, target = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in ([1.0, 2, 3], [4.0, 0, 1]))
+    t = time(0.4).requires_grad_()
+    for angle in (0.0, 1e-7, 2.0):
+        # Through a rotation vector, as a rotation matrix must not be perturbed freely.
+        start = about([1, 2, -1], angle)
+
+        def part(w: Tensor, t: Tensor, s: Tensor, e: Tensor, start: Tensor = start) -> Tensor:
+            zero = torch.zeros_like(w[0])
+            skew = torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
+            moved = motion_by(torch.linalg.matrix_exp(skew) @ start, s, e).fraction(t)
+            return torch.cat([moved.rotation.flatten(), moved.target])
+
+        w = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+        assert gradcheck(part, (w, t, source, target), atol=1e-6), f"angle {angle}"
+
+
+# ------------------------------------------------------------------------------------------------------- blend
+
+
+@pytest.fixture
+def deformed(cloud: Tensor, generator: torch.Generator) -> Tensor:
+    noise = torch.randn(cloud.shape, dtype=torch.float64, generator=generator)
+    return (cloud + 0.5 * noise) @ about([0, 1, 1], 1.5).mT + 3
+
+
+def test_blend_ends_and_direction(cloud: Tensor, deformed: Tensor, weights: Tensor) -> None:
+    torch.testing.assert_close(blend(cloud, deformed, time(0), weights), cloud, atol=1e-12, rtol=0)
+    torch.testing.assert_close(blend(cloud, deformed, time(1), weights), deformed, atol=1e-12, rtol=0)
+    there, back = blend(cloud, deformed, time(0.3), weights), blend(deformed, cloud, time(0.7), weights)
+    torch.testing.assert_close(there, back, atol=1e-12, rtol=0)
+
+
+def test_blend_commutes_with_rigid_motions(
+    cloud: Tensor, deformed: Tensor, weights: Tensor, generator: torch.Generator
+) -> None:
+    turn, move = random_rotation(generator), torch.tensor([7.0, -8.0, 9.0], dtype=torch.float64)
+    for t in (0.0, 0.25, 0.5, 0.9):
+        moved_before = blend(cloud @ turn.mT + move, deformed @ turn.mT + move, time(t), weights)
+        moved_after = blend(cloud, deformed, time(t), weights) @ turn.mT + move
+        torch.testing.assert_close(moved_before, moved_after, atol=1e-11, rtol=0)
+
+
+def distances(x: Tensor) -> Tensor:
+    return torch.linalg.norm(x[..., None, :, :] - x[..., None, :], dim=-1)
+
+
+def test_blend_of_a_rigid_motion_stays_congruent(cloud: Tensor, weights: Tensor) -> None:
+    turned = cloud @ about([1, 0, 1], 2.9).mT - 4
+    times = torch.linspace(0, 1, 5, dtype=torch.float64)
+    between = blend(cloud.expand(5, -1, -1), turned.expand(5, -1, -1), times, weights)
+    truth = distances(cloud).expand(5, -1, -1)
+    torch.testing.assert_close(distances(between), truth, atol=1e-11, rtol=0)
+
+
+def test_smoke_float32(cloud: Tensor, deformed: Tensor, weights: Tensor) -> None:
+    args = (cloud, deformed, time(0.5), weights)
+    single = blend(*(x.float() for x in args))
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), blend(*args), atol=1e-5, rtol=0)
