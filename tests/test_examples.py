@@ -1,0 +1,56 @@
+"""The examples do what they say, in a short form."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import torch
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def load_example(name: str) -> ModuleType:
+    """An example as a module, as ``python examples/name.py`` would run it."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # its named tuples look their annotations up there
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_train_timing_learns_times_without_labels(tmp_path: Path) -> None:
+    picture = tmp_path / "timing.png"
+    layer, linear = load_example("train_timing").main(steps=25, out=picture)
+    # An encoder that has learned nothing says 1/2 to everything: 0.167 off.
+    assert layer.timing_error < 0.05
+    assert layer.timing_error < 0.8 * linear.timing_error
+    # The truth is known whole; the encoder was shown 16 noisy markers. Linear decoding is 3.4 % and 8 % off.
+    assert layer.vertex_error < 2.4
+    assert layer.vertex_error < 0.7 * linear.vertex_error
+    assert layer.edge_error < 0.25 * linear.edge_error
+    first, last = layer.losses[0], sum(layer.losses[-5:]) / 5
+    assert last < 0.45 * first, (first, last)
+    assert last < 0.65 * sum(linear.losses[-5:]) / 5
+    assert picture.stat().st_size > 50_000
+
+
+def test_train_timing_depends_on_its_seed_only() -> None:
+    example = load_example("train_timing")
+    data = example.load_data(n_seen=8)
+    x_a, x_b = data.keyframes
+
+    def straight(t: torch.Tensor) -> torch.Tensor:
+        return x_a + t[:, None, None] * (x_b - x_a)
+
+    runs = [example.train(data, straight, steps=3, seed=seed) for seed in (0, 0, 1)]
+    assert runs[0].losses == runs[1].losses != runs[2].losses
+    assert runs[0].times.equal(runs[1].times)
+
+
+def test_farthest_points_are_spread() -> None:
+    """On a line of 9 points, three are the ends and the middle."""
+    line = torch.zeros(9, 3, dtype=torch.float64)
+    line[:, 0] = torch.arange(9)
+    assert sorted(load_example("train_timing").farthest_points(line, 3).tolist()) == [0, 4, 8]
