@@ -21,9 +21,6 @@ GOOD_DECREASE = 0.8
 ROUNDING_MARGIN = 4.0
 ENERGY_ROUNDING = 64.0
 
-# Larger batches are cut: what one step of more samples touches does not fit into the caches of a CPU.
-SAMPLES_AT_ONCE = 4
-
 
 class AmplitudeEnergy(Protocol):
     """What can be minimised here: an energy of amplitudes, with its derivatives."""
@@ -36,6 +33,9 @@ class AmplitudeEnergy(Protocol):
 
     def second_order(self, a: Tensor, placement: Any) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+
+    def slope(self, a: Tensor, direction: Tensor, placement: Any) -> Tensor:
+        """Derivative of the energy along a direction. *Shape:* ``(B, n), (B, n) -> (B,)``."""
 
 
 class Step(NamedTuple):
@@ -209,10 +209,6 @@ def minimise(
         max_steps: Give up after that many.
         tolerance: Bound on the gradient norm, relative to its value at the start.
     """
-    if a.device.type == "cpu" and len(a) > SAMPLES_AT_ONCE:
-        cuts = [slice(i, i + SAMPLES_AT_ONCE) for i in range(0, len(a), SAMPLES_AT_ONCE)]
-        parts = [minimise(step, a[cut], _pick(placement, cut), max_steps, tolerance) for cut in cuts]
-        return Solution(*(torch.cat(values) for values in zip(*parts, strict=True)))
     result = _blank_solution(a)
     rows = torch.arange(len(a), device=a.device)
     energy = step.energy.value(a, placement)
@@ -268,7 +264,7 @@ def _second_order(energy: AmplitudeEnergy, a: Tensor, placement: Any, where: Ten
     return whole
 
 
-def _pick(placement: Any, samples: Tensor | slice) -> Any:
+def _pick(placement: Any, samples: Tensor) -> Any:
     """The same for some of the samples: nested tuples and lists of tensors ``(B, ...)``."""
     if isinstance(placement, Tensor):
         return placement[samples]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.func import grad, jvp
+from torch.func import grad
 
 from torch_modal.nn.gauss_newton import GaussNewtonStep, Solution, Status, minimise
 
@@ -68,12 +68,11 @@ class _ArgMin(torch.autograd.Function):
         wanted = [i for i, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
 
         def slope(*variables: Tensor) -> Tensor:
-            """Derivative of the energy along the adjoint."""
+            """The energy's slope along the adjoint, of all samples."""
             changed = list(inputs)
             for i, variable in zip(wanted, variables, strict=True):
                 changed[i] = variable
-            placement = minimisation.placement(*changed)
-            return jvp(lambda a: energy.value(a, placement), (amplitudes,), (adjoint,))[1].sum()
+            return energy.slope(amplitudes, adjoint, minimisation.placement(*changed)).sum()
 
         grads: list[Tensor | None] = [None] * len(inputs)
         if wanted:

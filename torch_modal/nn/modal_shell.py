@@ -140,6 +140,21 @@ class ModalShell(nn.Module):
         slope, _ = self._slopes(self.shell.measure(x), placement.references)
         return self.curvature(self.shell, x.movedim(-1, 0).contiguous(), slope, placement.extra)
 
+    def slope(self, a: Tensor, direction: Tensor, placement: Placement) -> Tensor:
+        """Derivative of the energy along a direction of amplitudes: what the adjoint is differentiated through.
+
+        *Shape:* ``(B, n), (B, n) -> (B,)``.
+        """
+        shell = self.shell
+        x = self.shape(a, placement)
+        moved = self.shape(direction, placement) - placement.base
+        rows, along = (y.movedim(-1, 0).contiguous() for y in (x, moved))
+        slope, _ = self._slopes(shell.measure(x), placement.references)
+        length = (length_gradient(shell.edge_vectors(rows)) * shell.edge_vectors(along)).sum(0)
+        angle = (dihedral_gradient(shell.hinge_spokes(rows)) * shell.hinge_spokes(along)).sum((0, 1))
+        volume = (self._volume_gradient(rows) * along).sum((0, -1))
+        return (slope.length * length).sum(-1) + (slope.angle * angle).sum(-1) + slope.volume * volume
+
     def _volume_gradient(self, rows: Tensor) -> Tensor:
         """Gradient of :meth:`ShellEnergy.volume`. *Shape:* ``(3, B, V) -> (3, B, V)``."""
         shell = self.shell

@@ -76,6 +76,14 @@ class PairedShell(nn.Module):
         curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
 
+    def slope(self, a: Tensor, direction: Tensor, placement: PairedPlacement) -> Tensor:
+        """Derivative of the energy along a direction of amplitudes. *Shape:* ``(B, n), (B, n) -> (B,)``."""
+        strain = sum(
+            shell.slope(part, along, place)
+            for (shell, part, place), along in zip(self._ends(a, placement), self.split(direction), strict=True)
+        )
+        return strain + 2 * placement.mu * (direction * (a @ self.gap_gram + placement.linear)).sum(-1)
+
     def second_order(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
         return _block_diagonal(*(shell.second_order(part, place) for shell, part, place in self._ends(a, placement)))
