@@ -12,7 +12,7 @@ from conftest import COARSE
 from solids import box, surface, together
 
 from torch_modal.keyframes import MeshError, MeshWarning
-from torch_modal.precompute import eigen, modes
+from torch_modal.precompute import eigen, filling, modes
 from torch_modal.precompute.arap import HESSIAN_FORMS, arap_hessian, lumped_mass
 from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
@@ -151,7 +151,7 @@ def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
     def fill(points: np.ndarray, *args: object, **kwargs: object) -> Tetrahedra:
         return Tetrahedra((BOX.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BOX.tets)
 
-    monkeypatch.setattr(modes, "tetrahedralize", fill)
+    monkeypatch.setattr(filling, "tetrahedralize", fill)
     return BOX.vertices[used], compact.reshape(-1, 3)
 
 
@@ -198,7 +198,7 @@ def test_cached_modes_are_the_same_and_not_recomputed(
     first = extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path))
     assert len(list(tmp_path.iterdir())) == 4
     monkeypatch.setattr(modes, "lowest_modes", None)
-    monkeypatch.setattr(modes, "tetrahedralize", None)
+    monkeypatch.setattr(filling, "tetrahedralize", None)
     for basis, again in zip(first, extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path)), strict=True):
         np.testing.assert_array_equal(basis.modes, again.modes)
         np.testing.assert_array_equal(basis.eigenvalues, again.eigenvalues)
@@ -210,7 +210,7 @@ def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     two = together(box((4, 2, 2), (2.0, 1.0, 1.0)), box((4, 2, 2), (2.0, 1.0, 1.0)))
     two.vertices[45:, 2] += 3.0
     center, scale = (1.0, 0.5, 2.0), 100 / np.linalg.norm([2.0, 1.0, 4.0])
-    monkeypatch.setattr(modes, "tetrahedralize", lambda *a, **k: Tetrahedra((two.vertices - center) * scale, two.tets))
+    monkeypatch.setattr(filling, "tetrahedralize", lambda *a, **k: Tetrahedra((two.vertices - center) * scale, two.tets))
     faces = surface(two)
     used, compact = np.unique(faces, return_inverse=True)
     with pytest.warns(MeshWarning, match=r"has 2 loose pieces.* 6 of its first modes"):
@@ -226,11 +226,11 @@ def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) 
 
     with pytest.raises(MeshError, match=r"key-frame 1: the surface is flat"):
         extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, cache=False)
-    monkeypatch.setattr(modes, "tetrahedralize", fail)
+    monkeypatch.setattr(filling, "tetrahedralize", fail)
     with pytest.raises(TetrahedralizationError, match="key-frame 0: no luck"):
-        extract_bases(np.stack([vertices, vertices]), faces, 4, cache=False)
+        extract_bases(np.stack([vertices, vertices]), faces, 4, mesher="tetwild", cache=False)
     with pytest.raises(TetrahedralizationError, match=r"^no luck"):
-        extract_modes(vertices, faces, 4, cache=False)
+        extract_modes(vertices, faces, 4, mesher="tetwild", cache=False)
 
 
 @pytest.mark.parametrize("n_modes", [0, -1, 2.5, True, 10_000])

@@ -18,15 +18,12 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.inspect_mesh import signed_volume
+from torch_modal.precompute.surface import DIAGONAL, outward
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
-DIAGONAL = 100.0
-"""Bounding-box diagonal in which the pre-computation works: the decimation has absolute thresholds for it."""
-
 DEBRIS = 0.01
 """Largest volume of a piece that is dropped if it only hangs on others, as a fraction of the whole."""
 
@@ -36,11 +33,13 @@ class Tetrahedra(NamedTuple):
 
     Attributes:
         vertices: Positions. *Shape:* ``(N, 3)``.
-        tets: Vertex indices, oriented so that volumes are positive. *Shape:* ``(T, 4)``.
+        tets: Vertex indices; as they are made, volumes are positive. *Shape:* ``(T, 4)``.
+        inside: Fraction of each tetrahedron that is inside the surface; None if all of them are. *Shape:* ``(T,)``.
     """
 
     vertices: FloatArray
     tets: IntArray
+    inside: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -121,18 +120,16 @@ def tetrahedralize(
     return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
 
 
-def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
-    """The faces, all turned over if they wind clockwise seen from outside. *Shape:* ``(F, 3)``.
-
-    fTetWild keeps what the faces wind around, which is nothing for a mesh that is inside out.
-    """
-    return faces[:, ::-1] if signed_volume(vertices - vertices.mean(axis=0), faces) < 0 else faces
-
-
 def tet_volumes(tetrahedra: Tetrahedra) -> FloatArray:
     """Signed volumes. *Shape:* ``(T,)``."""
     corners = tetrahedra.vertices[tetrahedra.tets]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+
+
+def solid_volumes(tetrahedra: Tetrahedra) -> FloatArray:
+    """Volume of the part of each tetrahedron that is solid; inverted ones count like others. *Shape:* ``(T,)``."""
+    volumes = np.abs(tet_volumes(tetrahedra))
+    return volumes if tetrahedra.inside is None else volumes * tetrahedra.inside
 
 
 def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
@@ -143,8 +140,7 @@ def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
     edges = tetrahedra.vertices[tets[:, 1:]] - tetrahedra.vertices[tets[:, :1]]
     # A volume below rounding in units of the tetrahedron's own size has no usable gradients.
     flat = np.abs(volumes) <= 1e-12 * np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) ** 3
-    used, compact = np.unique(tets[~flat], return_inverse=True)
-    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4))
+    return _kept(Tetrahedra(tetrahedra.vertices, tets, tetrahedra.inside), ~flat)
 
 
 def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
@@ -167,8 +163,14 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     hinge = np.bincount(users[:, 0])[users[:, 0]] > 1  # a vertex of two pieces or more
     hangs = np.bincount(users[:, 1], hinge, n_pieces) > 0
     debris = hangs & (volumes < DEBRIS * volumes.sum())
-    used, compact = np.unique(tets[~debris[piece]], return_inverse=True)
-    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4))
+    return _kept(tetrahedra, ~debris[piece])
+
+
+def _kept(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:
+    """Some of the tetrahedra, with the vertices that they use."""
+    used, compact = np.unique(tetrahedra.tets[kept], return_inverse=True)
+    inside = None if tetrahedra.inside is None else tetrahedra.inside[kept]
+    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4), inside)
 
 
 class _Failure(NamedTuple):
