@@ -12,8 +12,6 @@ from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationErro
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-CELL = 2 / 3
-"""Edge of a cube in ideal edge lengths of the mesher, which leaves longer edges inside than on the surface."""
 SAMPLES = 4
 """Samples of the inside along the edge of a cube."""
 LEAST_INSIDE = 0.02
@@ -29,13 +27,12 @@ def lattice(surface: Surface, edge_length_fac: float) -> Tetrahedra:
 
     Args:
         surface: What to fill.
-        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal, as for
-            :class:`~torch_modal.precompute.tetrahedra.TetrahedraSettings`.
+        edge_length_fac: Edge of a cube as a fraction of the bounding-box diagonal.
 
     Raises:
         TetrahedralizationError: The lattice would be too fine, or nothing is inside.
     """
-    cell = CELL * edge_length_fac * DIAGONAL
+    cell = edge_length_fac * DIAGONAL
     low = surface.points.min(axis=0) - 1.5 * cell
     counts = np.ceil((surface.points.max(axis=0) + 1.5 * cell - low) / cell).astype(np.int64)
     if counts.prod() * SAMPLES**3 > MAX_SAMPLES:
