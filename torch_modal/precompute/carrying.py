@@ -73,6 +73,7 @@ class Carrier:
         self._volumes = solid_volumes(tetrahedra)
         extent = float(np.linalg.norm(np.ptp(points, axis=0)))
         areas = vertex_areas(points, faces)
+        self._area = areas.sum()
         # |W x - p|² is a mean over the surface, per diagonal squared; the other term a mean over the volume.
         self._pull = sp.diags(FIT_WEIGHT * self._volumes.sum() / extent**2 * areas / areas.sum()) @ weights
         stiffness = np.einsum("tak,tbk->tab", self._gradients, self._gradients) * self._volumes[:, None, None]
@@ -91,17 +92,20 @@ class Carrier:
         Args:
             points: The surface in the new pose. *Shape:* ``(U, 3)``.
         """
-        turns = local_rotations(self._points, points, self._faces)
+        areas = vertex_areas(points, self._faces)
+        # The bounding box, and with it the unit here, changes with the pose; the size of the shape hardly does.
+        scale = np.sqrt(areas.sum() / self._area)
+        target = points / scale
+        turns = local_rotations(self._points, target, self._faces)
         # The smoothest field of matrices that is the turn of the surface on the surface.
         field = self._factors.solve(self._pull.T @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
-        rotations = _nearest_rotations(field[self._rest.tets].mean(axis=1))
-        vertices = self._place(rotations, points)
+        rotations = nearest_rotations(field[self._rest.tets].mean(axis=1))
+        vertices = self._place(rotations, target)
         for _ in range(N_STEPS):
-            vertices = self._place(_nearest_rotations(self._deformation(vertices)), points)
+            vertices = self._place(nearest_rotations(self._deformation(vertices)), target)
 
-        carried = self._rest._replace(vertices=vertices)
-        distance = np.linalg.norm(self._weights @ vertices - points, axis=1) / np.linalg.norm(np.ptp(points, axis=0))
-        areas = vertex_areas(points, self._faces)
+        carried = self._rest._replace(vertices=vertices * scale)
+        distance = np.linalg.norm(self._weights @ vertices - target, axis=1) / np.linalg.norm(np.ptp(target, axis=0))
         return Carried(
             carried,
             float(np.sqrt(np.average(distance**2, weights=areas))),
@@ -141,9 +145,9 @@ def local_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> F
     usable = area > 1e-12 * area.max()
     gradients = np.zeros((len(faces), 3, 3))
     gradients[usable] = posed[usable] @ np.linalg.inv(rest[usable])
-    weighted = np.repeat(_nearest_rotations(gradients) * area[:, None, None], 3, axis=0).reshape(-1, 9)
+    weighted = np.repeat(nearest_rotations(gradients) * area[:, None, None], 3, axis=0).reshape(-1, 9)
     summed = [np.bincount(faces.reshape(-1), column, minlength=len(before)) for column in weighted.T]
-    return _nearest_rotations(np.stack(summed, axis=1).reshape(-1, 3, 3))
+    return nearest_rotations(np.stack(summed, axis=1).reshape(-1, 3, 3))
 
 
 def self_proximity(surface: Surface) -> float:
@@ -163,7 +167,7 @@ def self_proximity(surface: Surface) -> float:
     return float(areas[opposed].sum() / areas.sum())
 
 
-def _nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
+def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
     """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``."""
     u, _, vt = np.linalg.svd(matrices)
     flip = np.ones((len(matrices), 3))

@@ -13,7 +13,7 @@ from torch_modal.precompute.tetrahedra import Tetrahedra
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-N_NEIGHBOURS = 24
+N_NEIGHBOURS = 12
 RINGS = 2
 """Rings of tetrahedra vertices around the four of the closest tetrahedron."""
 MAX_RINGS = 6
@@ -30,8 +30,8 @@ class Neighbours(NamedTuple):
     """The tetrahedra's vertices that each point hangs on, padded with kernels of zero.
 
     Attributes:
-        vertex: *Shape:* ``(V, 24)``.
-        kernel: How much each of them counts; falls to zero with the distance. *Shape:* ``(V, 24)``.
+        vertex: *Shape:* ``(V, 12)``.
+        kernel: How much each of them counts; falls to zero with the distance. *Shape:* ``(V, 12)``.
     """
 
     vertex: IntArray
@@ -41,7 +41,7 @@ class Neighbours(NamedTuple):
 def embed_surface(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None) -> sp.csr_matrix:
     """Weights that carry displacements of the tetrahedra's vertices to points on or near their surface.
 
-    Each point takes a moving-least-squares fit of a linear function to the (about 24) nearest vertices. Constant and
+    Each point takes a moving-least-squares fit of a linear function to the (about 12) nearest vertices. Constant and
     linear displacements are carried exactly (up to rounding), so rigid motions stay rigid; clamped barycentric
     weights, the usual choice, make modes rough.
 
@@ -190,7 +190,7 @@ def _nearest_reached(
 
 
 def _moving_least_squares(points: FloatArray, vertices: FloatArray, nearest: Neighbours) -> FloatArray:
-    """Weights ``θ_j p_jᵀ (Σ θ p pᵀ)⁻¹ p(x)`` with ``p = (1, (x_j - x) / r)``. *Shape:* ``(·, 24)``."""
+    """Weights ``θ_j p_jᵀ (Σ θ p pᵀ)⁻¹ p(x)`` with ``p = (1, (x_j - x) / r)``. *Shape:* ``(·, 12)``."""
     offset = vertices[nearest.vertex] - points[:, None]
     used = nearest.kernel > 0
     radius = np.sqrt(((offset**2).sum(axis=2) * used).max(axis=1))
