@@ -123,7 +123,7 @@ def _indicator(
     squared[0, 0, 0] = 1.0
     transformed = sum(1j * k[axis] * np.fft.rfftn(field[axis].reshape(counts)) for axis in range(3)) / squared
     transformed[0, 0, 0] = 0.0
-    solution = np.fft.irfftn(transformed, s=tuple(counts)) / spacing**2
+    solution = np.fft.irfftn(transformed, s=tuple(counts), axes=(0, 1, 2)) / spacing**2
     rim = np.ones(counts, dtype=bool)
     rim[1:-1, 1:-1, 1:-1] = False
     return solution - solution[rim].mean()

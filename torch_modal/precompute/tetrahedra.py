@@ -44,7 +44,7 @@ class Tetrahedra(NamedTuple):
 
 @dataclass(frozen=True)
 class TetrahedraSettings:
-    """How fine the tetrahedra are. The defaults took 2 to 5 s on meshes of 3k and 27k faces.
+    """How fine the tetrahedra are. The defaults take 3 to 5 s on meshes of 3k to 27k faces.
 
     Attributes:
         edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal.
@@ -57,10 +57,10 @@ class TetrahedraSettings:
         ValueError: A number is out of range (fTetWild hangs on an ``epsilon`` of zero, for example).
     """
 
-    edge_length_fac: float = 0.03
+    edge_length_fac: float = 0.025
     epsilon: float = 2e-3
     stop_energy: float = 50.0
-    max_surface_faces: int = 2000
+    max_surface_faces: int = 3000
 
     def __post_init__(self) -> None:
         for name, low, high in (
