@@ -128,7 +128,7 @@ class Filler:
         return tetrahedralize(surface.points, surface.faces, self.settings, timeout=self.timeout)
 
     def _by_lattice(self, surface: Surface) -> Tetrahedra:
-        return lattice(surface, self.settings.edge_length_fac)
+        return lattice(surface, self.settings.edge_length(surface.points, surface.faces))
 
     def _kept(self, mesher: str, surface: Surface, make: Callable[[Surface], Tetrahedra]) -> Tetrahedra:
         arrays = self.cache.get(

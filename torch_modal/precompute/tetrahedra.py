@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,12 +18,18 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from torch_modal.inspect_mesh import signed_volume
+from torch_modal.mesh import vertex_areas
 from torch_modal.precompute.surface import DIAGONAL, outward
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
+EDGES_PER_THICKNESS = 0.55
+EDGE_RANGE = (0.018, 0.04)
+"""Slender shapes need finer tetrahedra: with one across a limb it is far too stiff. Bulky ones would get too many."""
+
 DEBRIS = 0.01
 """Largest volume of a piece that is dropped if it only hangs on others, as a fraction of the whole."""
 
@@ -47,7 +53,8 @@ class TetrahedraSettings:
     """How fine the tetrahedra are. The defaults take 3 to 5 s on meshes of 3k to 27k faces.
 
     Attributes:
-        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal.
+        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about half of the
+            mean thickness (twice the volume over the area), from 0.018 to 0.04.
         epsilon: How far the tetrahedra may leave the surface, as a fraction of the bounding-box diagonal.
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is
             10).
@@ -57,7 +64,7 @@ class TetrahedraSettings:
         ValueError: A number is out of range (fTetWild hangs on an ``epsilon`` of zero, for example).
     """
 
-    edge_length_fac: float = 0.025
+    edge_length_fac: float | None = None
     epsilon: float = 2e-3
     stop_energy: float = 50.0
     max_surface_faces: int = 3000
@@ -70,8 +77,21 @@ class TetrahedraSettings:
             ("max_surface_faces", 100, 10**8),
         ):
             value = getattr(self, name)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise ValueError(f"{name} is {value}; give a number from {low:g} to {high:g}")
+
+    def edge_length(self, points: FloatArray, faces: IntArray) -> float:
+        """The edge length for a surface, as a fraction of its bounding-box diagonal.
+
+        Args:
+            points: *Shape:* ``(V, 3)``.
+            faces: *Shape:* ``(F, 3)``.
+        """
+        if self.edge_length_fac is not None:
+            return self.edge_length_fac
+        volume = abs(signed_volume(points - points.mean(axis=0), faces))
+        thickness = 2 * volume / vertex_areas(points, faces).sum() / np.linalg.norm(np.ptp(points, axis=0))
+        return float(np.clip(EDGES_PER_THICKNESS * thickness, *EDGE_RANGE))
 
 
 class TetrahedralizationError(RuntimeError):
@@ -114,7 +134,9 @@ def tetrahedralize(
     surface = (surface - center) * scale
 
     failure = _Failure(len(vertices), len(faces))
-    raw = _run_worker(surface, outward(surface, compact.reshape(-1, 3)), settings, timeout, failure)
+    compact = outward(surface, compact.reshape(-1, 3))
+    settings = replace(settings, edge_length_fac=settings.edge_length(surface, compact))
+    raw = _run_worker(surface, compact, settings, timeout, failure)
     tetrahedra = without_debris(oriented(raw))
     _check_fills(tetrahedra, surface, settings, failure)
     return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
@@ -276,7 +298,7 @@ def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: Tetrahed
     if not np.isfinite(tetrahedra.vertices).all():
         raise failure.error("the result has coordinates that are not finite", advice)
     # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
-    reach = DIAGONAL * (0.05 + 2 * settings.edge_length_fac)
+    reach = DIAGONAL * (0.05 + 2 * (settings.edge_length_fac or EDGE_RANGE[1]))
     distance = cKDTree(tetrahedra.vertices).query(surface)[0]
     n_far = int((distance > reach).sum())
     if n_far:
