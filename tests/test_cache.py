@@ -10,7 +10,15 @@ import pytest
 
 from torch_modal.files import write_atomically
 from torch_modal.precompute import cache as cache_module
-from torch_modal.precompute.cache import Cache, CacheWarning, content_key, default_cache_dir
+from torch_modal.precompute.cache import (
+    Cache,
+    CacheContent,
+    CacheWarning,
+    cache_content,
+    clear_cache,
+    content_key,
+    default_cache_dir,
+)
 
 POINTS = np.arange(6.0).reshape(2, 3)
 RESULT = {"values": np.linspace(0, 1, 50), "index": np.arange(8).reshape(2, 4)}
@@ -149,3 +157,21 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
         write_atomically(path, b"new")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
     assert path.read_bytes() == b"old"
+
+
+def test_content_and_clearing(tmp_path: Path) -> None:
+    assert cache_content(tmp_path / "none") == clear_cache(tmp_path / "none") == CacheContent(0, 0)
+    compute = Counted()
+    get(tmp_path, compute, k=1)
+    get(tmp_path, compute, k=2)
+    entries = list(tmp_path.iterdir())
+    remains = tmp_path / f".{entries[0].name}.123-abcd.tmp"
+    remains.write_bytes(b"half")
+    for name in ("mine.safetensors", "notes.txt"):
+        (tmp_path / name).write_text("mine")
+    wanted = CacheContent(3, 4 + sum(path.stat().st_size for path in entries))
+    assert cache_content(tmp_path) == wanted
+    assert clear_cache(tmp_path) == wanted
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.safetensors", "notes.txt"]
+    assert_right(get(tmp_path, compute, k=1))
+    assert compute.calls == 3

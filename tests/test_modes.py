@@ -12,7 +12,7 @@ from conftest import COARSE
 from solids import box, surface, together
 
 from torch_modal.keyframes import MeshError, MeshWarning
-from torch_modal.precompute import eigen, modes
+from torch_modal.precompute import filling, lanczos, modes
 from torch_modal.precompute.arap import HESSIAN_FORMS, arap_hessian, lumped_mass
 from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
@@ -34,7 +34,7 @@ def test_modes_of_a_meshed_surface(form: str, capsule_tetrahedra: Tetrahedra) ->
     """The numbers that everything later leans on, on the mesher's own tetrahedra."""
     result = solve(capsule_tetrahedra, 20, form)
     k, m = arap_hessian(capsule_tetrahedra, form), np.repeat(lumped_mass(capsule_tetrahedra), 3)
-    assert len(m) > eigen.DENSE_BELOW
+    assert len(m) > lanczos.DENSE_BELOW
     phi, lam = result.modes, result.eigenvalues
     assert np.abs(result.rigid_eigenvalues).max() < 1e-8 * lam[0]
     assert result.n_zero == 6
@@ -57,7 +57,7 @@ def test_agrees_with_dense_eigh(form: str, cells: tuple[int, int, int]) -> None:
     # A square cross-section, so that bending modes come in pairs of equal eigenvalues.
     solid = box(cells, (5.0, 1.0, 1.0))
     k, m = arap_hessian(solid, form).toarray(), np.repeat(lumped_mass(solid), 3)
-    assert (len(m) > eigen.DENSE_BELOW) == (cells[0] == 10)
+    assert (len(m) > lanczos.DENSE_BELOW) == (cells[0] == 10)
     values, vectors = scipy.linalg.eigh(k, np.diag(m))
     result = solve(solid, 25, form)
     np.testing.assert_allclose(result.eigenvalues, values[6:31], rtol=1e-9)
@@ -151,7 +151,7 @@ def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
     def fill(points: np.ndarray, *args: object, **kwargs: object) -> Tetrahedra:
         return Tetrahedra((BOX.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BOX.tets)
 
-    monkeypatch.setattr(modes, "tetrahedralize", fill)
+    monkeypatch.setattr(filling, "tetrahedralize", fill)
     return BOX.vertices[used], compact.reshape(-1, 3)
 
 
@@ -198,7 +198,7 @@ def test_cached_modes_are_the_same_and_not_recomputed(
     first = extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path))
     assert len(list(tmp_path.iterdir())) == 4
     monkeypatch.setattr(modes, "lowest_modes", None)
-    monkeypatch.setattr(modes, "tetrahedralize", None)
+    monkeypatch.setattr(filling, "tetrahedralize", None)
     for basis, again in zip(first, extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path)), strict=True):
         np.testing.assert_array_equal(basis.modes, again.modes)
         np.testing.assert_array_equal(basis.eigenvalues, again.eigenvalues)
@@ -210,7 +210,9 @@ def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     two = together(box((4, 2, 2), (2.0, 1.0, 1.0)), box((4, 2, 2), (2.0, 1.0, 1.0)))
     two.vertices[45:, 2] += 3.0
     center, scale = (1.0, 0.5, 2.0), 100 / np.linalg.norm([2.0, 1.0, 4.0])
-    monkeypatch.setattr(modes, "tetrahedralize", lambda *a, **k: Tetrahedra((two.vertices - center) * scale, two.tets))
+    monkeypatch.setattr(
+        filling, "tetrahedralize", lambda *a, **k: Tetrahedra((two.vertices - center) * scale, two.tets)
+    )
     faces = surface(two)
     used, compact = np.unique(faces, return_inverse=True)
     with pytest.warns(MeshWarning, match=r"has 2 loose pieces.* 6 of its first modes"):
@@ -226,11 +228,11 @@ def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) 
 
     with pytest.raises(MeshError, match=r"key-frame 1: the surface is flat"):
         extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, cache=False)
-    monkeypatch.setattr(modes, "tetrahedralize", fail)
+    monkeypatch.setattr(filling, "tetrahedralize", fail)
     with pytest.raises(TetrahedralizationError, match="key-frame 0: no luck"):
-        extract_bases(np.stack([vertices, vertices]), faces, 4, cache=False)
+        extract_bases(np.stack([vertices, vertices]), faces, 4, mesher="tetwild", cache=False)
     with pytest.raises(TetrahedralizationError, match=r"^no luck"):
-        extract_modes(vertices, faces, 4, cache=False)
+        extract_modes(vertices, faces, 4, mesher="tetwild", cache=False)
 
 
 @pytest.mark.parametrize("n_modes", [0, -1, 2.5, True, 10_000])

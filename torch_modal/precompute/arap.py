@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
 
 FloatArray = NDArray[np.float64]
 HessianForm = Literal["element", "vertex"]
@@ -49,8 +49,8 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "element") -> sp.cs
 
 
 def lumped_mass(tetrahedra: Tetrahedra) -> FloatArray:
-    """Mass of each vertex: a quarter of the volumes around it, at a density of 1. *Shape:* ``(N,)``."""
-    volumes = np.abs(tet_volumes(tetrahedra))
+    """Mass of each vertex: a quarter of the solid volumes around it, at a density of 1. *Shape:* ``(N,)``."""
+    volumes = solid_volumes(tetrahedra)
     quarters = np.repeat(volumes / 4, 4)
     return np.bincount(tetrahedra.tets.reshape(-1), quarters, len(tetrahedra.vertices)).astype(np.float64)
 
@@ -69,7 +69,7 @@ def _element_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     They follow from ``|sym G|² = ½ (|G|² + tr G²)`` with ``G = ∇u = Σ u_a g_aᵀ`` and hat gradients ``g``.
     """
     g = hat_gradients(tetrahedra)
-    volumes = np.abs(tet_volumes(tetrahedra))
+    volumes = solid_volumes(tetrahedra)
     blocks = np.einsum("tbi,taj->tabij", g, g)
     blocks += np.einsum("tak,tbk->tab", g, g)[..., None, None] * np.eye(3)
     blocks *= volumes[:, None, None, None, None]
@@ -108,7 +108,7 @@ def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[NDArray[np.int64], NDA
     """Every edge in both directions with its clamped cotangent weight ``c_ij = -Σ_t vol_t g_i · g_j``."""
     n = len(tetrahedra.vertices)
     g = hat_gradients(tetrahedra)
-    stiffness = -np.einsum("tak,tbk->tab", g, g) * np.abs(tet_volumes(tetrahedra))[:, None, None]
+    stiffness = -np.einsum("tak,tbk->tab", g, g) * solid_volumes(tetrahedra)[:, None, None]
     rows = np.broadcast_to(tetrahedra.tets[:, :, None], stiffness.shape).reshape(-1)
     columns = np.broadcast_to(tetrahedra.tets[:, None, :], stiffness.shape).reshape(-1)
     off_diagonal = rows != columns

@@ -1,14 +1,16 @@
 """Results of the pre-computation, kept on disk under the hash of what they were computed from."""
 
+import contextlib
 import hashlib
 import json
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +20,12 @@ from safetensors.numpy import save as save_arrays
 
 from torch_modal.files import write_atomically
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Part of every key: raise it when an algorithm of the pre-computation changes, and old entries are left."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 SUFFIX = ".safetensors"
 _DIGEST = "digest"
+_OWN_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -104,6 +107,57 @@ class Cache:
                 stacklevel=2,
             )
         return arrays
+
+
+class CacheContent(NamedTuple):
+    """What stands in a cache folder."""
+
+    n_entries: int
+    n_bytes: int
+
+
+def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
+    """Number of entries in a cache folder and their size; none if there is no such folder.
+
+    Args:
+        cache_dir: The folder, by default :func:`default_cache_dir`.
+    """
+    sizes = []
+    for path in _files(cache_dir):
+        with contextlib.suppress(FileNotFoundError):  # another process may be clearing
+            sizes.append(path.stat().st_size)
+    return CacheContent(len(sizes), sum(sizes))
+
+
+def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
+    """Remove the entries of a cache folder and what a killed process left half-written. Other files stay.
+
+    Processes that use the folder at the same time compute again what they miss.
+
+    Args:
+        cache_dir: The folder, by default :func:`default_cache_dir`.
+
+    Returns:
+        What was removed.
+
+    Raises:
+        OSError: An entry cannot be removed.
+    """
+    sizes = []
+    for path in _files(cache_dir):
+        with contextlib.suppress(FileNotFoundError):
+            size = path.stat().st_size
+            path.unlink()
+            sizes.append(size)
+    return CacheContent(len(sizes), sum(sizes))
+
+
+def _files(cache_dir: str | os.PathLike[str] | None) -> list[Path]:
+    """Entries and remains of them, known by their names: somebody's own files may stand beside them."""
+    folder = default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser()
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if _OWN_NAME.fullmatch(path.name))
 
 
 def content_key(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:

@@ -3,18 +3,16 @@
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
+
+from torch_modal.precompute.lanczos import lowest_eigenvectors
 
 FloatArray = NDArray[np.float64]
 
 N_RIGID = 6
 GUARD = 4
 """Pairs computed beyond those asked for: the last of a batch are the least settled."""
-DENSE_BELOW = 600
-"""Number of unknowns under which LAPACK is as fast as a factorisation and Lanczos."""
 RIGID_TOLERANCE = 1e-8
 RESIDUAL_TOLERANCE = 1e-6
 SHIFT = 1.0
@@ -68,7 +66,7 @@ def rigid_motions(positions: FloatArray, mass: FloatArray) -> FloatArray:
 def lowest_modes(k: sp.csc_matrix, mass: FloatArray, positions: FloatArray, n_modes: int) -> VolumeModes:
     """Lowest elastic modes of ``K phi = lambda M phi`` with a lumped mass.
 
-    Shift-invert Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are
+    Shift-invert block Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are
     those of ``K`` itself, which a regularised ``K + eps M`` would not give for free. Then two steps of dense
     clean-up: the span is made exactly M-orthogonal to the rigid motions, and ``K`` is diagonalised in it
     (Rayleigh-Ritz). Small problems are solved densely. Of each mode's largest
@@ -179,23 +177,10 @@ def _squared_diagonal(positions: FloatArray) -> float:
 
 def _lowest_span(k: sp.csc_matrix, masses: FloatArray, positions: FloatArray, n_pairs: int) -> FloatArray:
     """M-orthonormal basis of about the ``n_pairs`` lowest eigenvectors, rigid motions included."""
-    n = len(masses)
-    if n < DENSE_BELOW or 2 * n_pairs > n:
-        root = np.sqrt(masses)
-        symmetric = k.toarray() / root[:, None] / root
-        return scipy.linalg.eigh(symmetric, subset_by_index=(0, n_pairs - 1))[1] / root[:, None]
-
-    sigma = -SHIFT / _squared_diagonal(positions)
-    shifted = sp.csc_matrix(k - sigma * sp.diags(masses))
-    # Positive definite: no pivoting is needed, and a symmetric ordering keeps the fill low.
-    factors = spla.splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    inverse = spla.LinearOperator(shifted.shape, matvec=factors.solve, dtype=np.float64)
-    start = np.random.default_rng(0).standard_normal(n)  # fixed, so that equal input gives equal modes
     try:
-        values, vectors = spla.eigsh(k, k=n_pairs, M=sp.diags(masses), sigma=sigma, OPinv=inverse, v0=start)
-    except spla.ArpackError as error:
-        raise ModalAnalysisError(f"Lanczos iteration failed: {error}") from error
-    return vectors[:, np.argsort(values)]
+        return lowest_eigenvectors(k, masses, n_pairs, SHIFT / _squared_diagonal(positions))
+    except RuntimeError as error:  # of Lanczos, or of SuperLU on a singular matrix
+        raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
 
 
 def _rayleigh_ritz(k: sp.csc_matrix, span: FloatArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:

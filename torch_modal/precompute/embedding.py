@@ -13,7 +13,7 @@ from torch_modal.precompute.tetrahedra import Tetrahedra
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-N_NEIGHBOURS = 24
+N_NEIGHBOURS = 12
 RINGS = 2
 """Rings of tetrahedra vertices around the four of the closest tetrahedron."""
 MAX_RINGS = 6
@@ -26,14 +26,24 @@ _CANDIDATES = 32
 _CHUNK = 4096
 
 
+class Neighbours(NamedTuple):
+    """The tetrahedra's vertices that each point hangs on, padded with kernels of zero.
+
+    Attributes:
+        vertex: *Shape:* ``(V, 12)``.
+        kernel: How much each of them counts; falls to zero with the distance. *Shape:* ``(V, 12)``.
+    """
+
+    vertex: IntArray
+    kernel: FloatArray
+
+
 def embed_surface(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None) -> sp.csr_matrix:
     """Weights that carry displacements of the tetrahedra's vertices to points on or near their surface.
 
-    Each point takes a moving-least-squares fit of a linear function to the (about 24) nearest vertices. Only
-    vertices a few edges away from the closest tetrahedron are asked, and that tetrahedron is searched for
-    slightly below the surface, so that limbs that touch do not mix. Constant and linear displacements are
-    carried exactly (up to rounding), so rigid motions stay rigid; clamped barycentric weights, the usual
-    choice, make modes rough.
+    Each point takes a moving-least-squares fit of a linear function to the (about 12) nearest vertices. Constant and
+    linear displacements are carried exactly (up to rounding), so rigid motions stay rigid; clamped barycentric
+    weights, the usual choice, make modes rough.
 
     Args:
         points: Positions on the surface. *Shape:* ``(V, 3)``.
@@ -44,15 +54,47 @@ def embed_surface(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArra
     Returns:
         Rows sum to one, and ``weights @ tetrahedra.vertices`` are the points. *Shape:* ``(V, N)``.
     """
+    return fit_weights(points, tetrahedra.vertices, find_neighbours(points, tetrahedra, normals))
+
+
+def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: Neighbours) -> sp.csr_matrix:
+    """Linear-precise weights of known neighbours, in whatever pose both now are.
+
+    Args:
+        points: Positions on the surface. *Shape:* ``(V, 3)``.
+        vertices: Positions of the tetrahedra's vertices. *Shape:* ``(N, 3)``.
+        neighbours: Those of each point, found in this pose or another.
+
+    Returns:
+        Rows sum to one, and ``weights @ vertices`` are the points. *Shape:* ``(V, N)``.
+    """
+    rows = np.repeat(np.arange(len(points)), N_NEIGHBOURS)
+    weights = [
+        _moving_least_squares(points[chunk], vertices, Neighbours(neighbours.vertex[chunk], neighbours.kernel[chunk]))
+        for chunk in _chunks(np.arange(len(points)))
+    ]
+    entries = (np.concatenate(weights).reshape(-1), (rows, neighbours.vertex.reshape(-1)))
+    return sp.coo_matrix(entries, shape=(len(points), len(vertices))).tocsr()
+
+
+def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None) -> Neighbours:
+    """The nearest vertices that are only a few edges away from the closest tetrahedron of each point.
+
+    That tetrahedron is searched for slightly below the surface, so that limbs that touch do not mix.
+
+    Args:
+        points: Positions on the surface. *Shape:* ``(V, 3)``.
+        tetrahedra: The mesh that carries them.
+        normals: Outward unit normals at the points; without them the points are searched for where they are.
+            *Shape:* ``(V, 3)``.
+    """
     extent = np.ptp(tetrahedra.vertices, axis=0)
     below = points if normals is None else points - PUSH * np.linalg.norm(extent) * normals
     closest = closest_tetrahedra(below, tetrahedra)
     adjacency = _adjacency(tetrahedra)
 
-    n_vertices = len(tetrahedra.vertices)
-    wanted = min(N_NEIGHBOURS, n_vertices)
-    neighbours = np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64)
-    weights = np.zeros((len(points), N_NEIGHBOURS))
+    wanted = min(N_NEIGHBOURS, len(tetrahedra.vertices))
+    found = Neighbours(np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64), np.zeros((len(points), N_NEIGHBOURS)))
     left = np.arange(len(points))
     reached: sp.csr_matrix | None = None
     for rings in range(MAX_RINGS + 1):
@@ -62,18 +104,16 @@ def embed_surface(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArra
             continue
         last = rings == MAX_RINGS
         retry = []
-        for chunk in np.array_split(left, max(1, -(-len(left) // _CHUNK))):
-            nearest = _nearest_reached(points[chunk], tetrahedra, closest[chunk], reached)
+        for chunk in _chunks(left):
+            nearest, number = _nearest_reached(points[chunk], tetrahedra, closest[chunk], reached)
             fit = _moving_least_squares(points[chunk], tetrahedra.vertices, nearest)
-            good = (nearest.number >= wanted) & (np.abs(fit).sum(axis=1) <= MAX_AMPLIFICATION) | last
-            neighbours[chunk[good]], weights[chunk[good]] = nearest.vertex[good], fit[good]
+            good = (number >= wanted) & (np.abs(fit).sum(axis=1) <= MAX_AMPLIFICATION) | last
+            found.vertex[chunk[good]], found.kernel[chunk[good]] = nearest.vertex[good], nearest.kernel[good]
             retry.append(chunk[~good])
         left = np.concatenate(retry)
         if len(left) == 0:
             break
-    rows = np.repeat(np.arange(len(points)), N_NEIGHBOURS)
-    entries = (weights.reshape(-1), (rows, neighbours.reshape(-1)))
-    return sp.coo_matrix(entries, shape=(len(points), n_vertices)).tocsr()
+    return found
 
 
 def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
@@ -88,7 +128,7 @@ def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
     n_candidates = min(_CANDIDATES, len(centroids))
     candidates = cKDTree(centroids).query(points, k=n_candidates)[1].reshape(len(points), n_candidates)
     closest = np.empty(len(points), dtype=np.int64)
-    for chunk in np.array_split(np.arange(len(points)), max(1, -(-len(points) // _CHUNK))):
+    for chunk in _chunks(np.arange(len(points))):
         tets = candidates[chunk]
         offset = points[chunk, None] - centroids[tets]
         barycentric = 0.25 + np.einsum("vci,vcai->vca", offset, gradients[tets])
@@ -97,12 +137,9 @@ def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
     return closest
 
 
-class _Nearest(NamedTuple):
-    """Nearest vertices of each point and their kernel ``(·, 24)``, padded, and the true number ``(·,)``."""
-
-    vertex: IntArray
-    kernel: FloatArray
-    number: IntArray
+def _chunks(indices: IntArray) -> list[IntArray]:
+    """Parts of at most 4096, so that the arrays of each stay small."""
+    return np.array_split(indices, max(1, -(-len(indices) // _CHUNK)))
 
 
 def _adjacency(tetrahedra: Tetrahedra) -> sp.csr_matrix:
@@ -115,8 +152,10 @@ def _adjacency(tetrahedra: Tetrahedra) -> sp.csr_matrix:
     return sp.csr_matrix(incidence.T @ incidence)
 
 
-def _nearest_reached(points: FloatArray, tetrahedra: Tetrahedra, closest: IntArray, reached: sp.csr_matrix) -> _Nearest:
-    """The nearest vertices among those that ``reached`` connects with the closest tetrahedron's four."""
+def _nearest_reached(
+    points: FloatArray, tetrahedra: Tetrahedra, closest: IntArray, reached: sp.csr_matrix
+) -> tuple[Neighbours, IntArray]:
+    """The nearest vertices among those that ``reached`` connects with the closest tetrahedron's four; their number."""
     tets, row_of_point = np.unique(closest, return_inverse=True)
     seeds = sp.csr_matrix(
         (
@@ -146,15 +185,12 @@ def _nearest_reached(points: FloatArray, tetrahedra: Tetrahedra, closest: IntArr
     last = np.take_along_axis(squared, count[:, None] - 1, axis=1)
     radius = np.where(np.isfinite(squared[:, -1:]), squared[:, -1:], 1.2 * last)
     kernel = np.clip(1 - np.where(np.isfinite(squared), squared, np.inf) / np.maximum(radius, 1e-300), 0, None) ** 2
-    return _Nearest(
-        np.maximum(np.take_along_axis(index, order, axis=1)[:, :N_NEIGHBOURS], 0),
-        kernel[:, :N_NEIGHBOURS],
-        count,
-    )
+    vertex = np.maximum(np.take_along_axis(index, order, axis=1)[:, :N_NEIGHBOURS], 0)
+    return Neighbours(vertex, kernel[:, :N_NEIGHBOURS]), count
 
 
-def _moving_least_squares(points: FloatArray, vertices: FloatArray, nearest: _Nearest) -> FloatArray:
-    """Weights ``θ_j p_jᵀ (Σ θ p pᵀ)⁻¹ p(x)`` with ``p = (1, (x_j - x) / r)``. *Shape:* ``(·, 24)``."""
+def _moving_least_squares(points: FloatArray, vertices: FloatArray, nearest: Neighbours) -> FloatArray:
+    """Weights ``θ_j p_jᵀ (Σ θ p pᵀ)⁻¹ p(x)`` with ``p = (1, (x_j - x) / r)``. *Shape:* ``(·, 12)``."""
     offset = vertices[nearest.vertex] - points[:, None]
     used = nearest.kernel > 0
     radius = np.sqrt(((offset**2).sum(axis=2) * used).max(axis=1))

@@ -3,7 +3,6 @@
 import contextlib
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,23 +14,21 @@ from tqdm import tqdm
 
 from torch_modal.basis import ModalBasis
 from torch_modal.keyframes import MeshError, MeshWarning, check_keyframes, require_solid
-from torch_modal.precompute.arap import HESSIAN_FORMS, HessianForm, arap_hessian, lumped_mass
+from torch_modal.precompute.arap import HESSIAN_FORMS, HessianForm, arap_hessian
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, VolumeModes, lowest_modes
-from torch_modal.precompute.embedding import embed_surface
-from torch_modal.precompute.tetrahedra import (
-    DIAGONAL,
-    Tetrahedra,
-    TetrahedralizationError,
-    TetrahedraSettings,
-    outward,
-    tetrahedralize,
-)
+from torch_modal.precompute.filling import MESHERS, Body, Filler, Filling, Mesher, meshing_order
+from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, TetrahedraSettings
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_DIAGONAL_RANGE = (1e-90, 1e90)
+QUALITIES = {
+    "fast": TetrahedraSettings(),
+    "fine": TetrahedraSettings(edge_length_fac=0.02, epsilon=1e-3, stop_energy=10.0, max_surface_faces=10_000),
+}
+"""Named settings; ``docs/precompute.md`` says what each costs and gives."""
 
 
 def extract_modes(
@@ -40,7 +37,8 @@ def extract_modes(
     n_modes: int = 30,
     *,
     form: HessianForm = "element",
-    settings: TetrahedraSettings | None = None,
+    settings: TetrahedraSettings | str = "fast",
+    mesher: Mesher = "auto",
     timeout: float = 600.0,
     cache_dir: str | None = None,
     cache: bool = True,
@@ -52,8 +50,10 @@ def extract_modes(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes, k.
         form: Form of the Hessian, see :func:`~torch_modal.precompute.arap.arap_hessian`.
-        settings: How fine the tetrahedra are.
-        timeout: Seconds that the mesher may take.
+        settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
+        mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
+            than one cell; ``"auto"`` takes the first, and the second where the first fails.
+        timeout: Seconds that the child process of fTetWild may take.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
 
@@ -72,6 +72,7 @@ def extract_modes(
         n_modes,
         form=form,
         settings=settings,
+        mesher=mesher,
         timeout=timeout,
         cache_dir=cache_dir,
         cache=cache,
@@ -85,7 +86,9 @@ def extract_bases(
     n_modes: int = 30,
     *,
     form: HessianForm = "element",
-    settings: TetrahedraSettings | None = None,
+    settings: TetrahedraSettings | str = "fast",
+    mesher: Mesher = "auto",
+    carry: bool = True,
     timeout: float = 600.0,
     cache_dir: str | None = None,
     cache: bool = True,
@@ -93,17 +96,21 @@ def extract_bases(
 ) -> list[ModalBasis]:
     """Lowest vibration modes of each key-frame.
 
-    Each key-frame is filled with tetrahedra (in a child process), the as-rigid-as-possible stiffness and a
-    lumped mass of density 1 give ``K phi = lambda M phi``, and its lowest elastic modes are restricted to the
-    surface. Constants of the autograd graph: nothing here is differentiated.
+    The key-frame that touches itself least is filled with tetrahedra (in a child process), which are carried to the
+    others. The as-rigid-as-possible stiffness and a lumped mass of density 1 give ``K phi = lambda M phi``, and the
+    lowest elastic modes are restricted to the surface. Constants of the autograd graph: nothing here is
+    differentiated.
 
     Args:
         keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes of each, k.
         form: Form of the Hessian, see :func:`~torch_modal.precompute.arap.arap_hessian`.
-        settings: How fine the tetrahedra are.
-        timeout: Seconds that the mesher may take for a key-frame.
+        settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
+        mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
+            than one cell; ``"auto"`` takes the first, and the second where the first fails.
+        carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each has its own.
+        timeout: Seconds that the child process of fTetWild may take for a key-frame.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
         progress: Whether a bar shows key-frame and stage; by default on terminals only.
@@ -118,32 +125,36 @@ def extract_bases(
         ModalAnalysisError: The modes failed a check.
 
     Warns:
-        MeshWarning: What `check_keyframes` warns about; a shape of several loose pieces.
+        MeshWarning: What `check_keyframes` warns about; a shape of several loose pieces; fTetWild failed, and the
+            lattice took its place.
     """
     if form not in HESSIAN_FORMS:
         raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
+    if mesher not in MESHERS:
+        raise ValueError(f"the mesher is {mesher!r}; give one of {MESHERS}")
     positions, working_faces = check_keyframes(keyframes, faces)
     shapes = positions.detach().cpu().double().numpy()
     triangles = working_faces.cpu().numpy()
     _check_n_modes(n_modes, len(np.unique(triangles)))
-    surfaces = []
+    surfaces: list[Surface] = []
     for index, shape in enumerate(shapes):
         with _naming_keyframe(index, len(shapes)):
             require_solid(shape, triangles)
-            surfaces.append(_Surface.of(shape, triangles))
+            surfaces.append(Surface.of(shape, triangles))
 
     kept = Cache.at(cache_dir, enabled=cache)
+    filler = Filler(_settings(settings), mesher, timeout, kept)
     with tqdm(total=2 * len(shapes), disable=None if progress is None else not progress, leave=False) as bar:
 
         def report(index: int, stage: str) -> None:
             bar.set_description(f"key-frame {index + 1}/{len(shapes)}: {stage}")
 
-        fillings = _fill(surfaces, settings or TetrahedraSettings(), timeout, kept, report, bar.update)
+        fillings = _fill(surfaces, filler, carry, report, bar.update)
         bases = []
-        for index, (shape, surface, tetrahedra) in enumerate(zip(shapes, surfaces, fillings, strict=True)):
+        for index, (shape, filling) in enumerate(zip(shapes, fillings, strict=True)):
             report(index, "modes")
             with _naming_keyframe(index, len(shapes)):
-                bases.append(_basis(shape, surface, tetrahedra, n_modes, form, kept))
+                bases.append(_basis(shape, filling, n_modes, form, kept))
             bar.update()
     return bases
 
@@ -159,97 +170,50 @@ def _naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
         raise type(error)(f"key-frame {index}: {error}") from error
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """A shape as the pre-computation sees it: used vertices only, centred, a bounding-box diagonal of 100.
-
-    Attributes:
-        points: *Shape:* ``(U, 3)``.
-        faces: Indices into ``points``, wound counterclockwise seen from outside. *Shape:* ``(F, 3)``.
-        used: Which vertices of the shape the points are. *Shape:* ``(U,)``.
-        scale: Units here per unit of the caller.
-    """
-
-    points: FloatArray
-    faces: IntArray
-    used: IntArray
-    scale: float
-
-    @classmethod
-    def of(cls, shape: FloatArray, faces: IntArray) -> "_Surface":
-        used, compact = np.unique(faces, return_inverse=True)
-        points = shape[used]
-        low, high = points.min(axis=0), points.max(axis=0)
-        diagonal = float(np.linalg.norm(high - low))
-        if not _DIAGONAL_RANGE[0] < diagonal < _DIAGONAL_RANGE[1]:
-            raise MeshError(
-                f"the bounding-box diagonal is {diagonal:.3g}, at which eigenvalues leave the range of "
-                "float64; choose another unit"
-            )
-        points = (points - (low + high) / 2) * (DIAGONAL / diagonal)
-        return cls(points, outward(points, compact.reshape(-1, 3)), used, DIAGONAL / diagonal)
-
-    def normals(self) -> FloatArray:
-        """Outward unit normals of the points, zero where the faces have no area. *Shape:* ``(U, 3)``."""
-        corners = self.points[self.faces]
-        weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        summed = np.stack(
-            [np.bincount(self.faces.reshape(-1), np.repeat(c, 3), minlength=len(self.points)) for c in weighted.T],
-            axis=1,
-        )
-        return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
-
-
 def _fill(
-    surfaces: list[_Surface],
-    settings: TetrahedraSettings,
-    timeout: float,
-    cache: Cache,
+    surfaces: list[Surface],
+    filler: Filler,
+    carry: bool,
     report: Callable[[int, str], None],
     done: Callable[[], object],
-) -> list[Tetrahedra]:
-    """Tetrahedra of every key-frame, in the units of the surfaces.
-
-    Each key-frame has its own; nothing outside this function depends on that.
-    """
-    fillings = []
-    for index, surface in enumerate(surfaces):
-        report(index, "tetrahedra")
-
-        def compute(surface: _Surface = surface) -> dict[str, NDArray[Any]]:
-            return tetrahedralize(surface.points, surface.faces, settings, timeout=timeout)._asdict()
-
+) -> list[Filling]:
+    """Tetrahedra of every key-frame: made for one and carried to the others, unless they do not survive that."""
+    fillings: dict[int, Filling] = {}
+    first: Body | None = None
+    for index in meshing_order(surfaces) if carry and len(surfaces) > 1 else range(len(surfaces)):
+        surface = surfaces[index]
         with _naming_keyframe(index, len(surfaces)):
-            inputs = {"points": surface.points, "faces": surface.faces}
-            fillings.append(Tetrahedra(**cache.get("tetrahedra", inputs, asdict(settings), compute)))
+            filling = None
+            if carry and first is not None:
+                report(index, "carrying tetrahedra")
+                filling = filler.carried(first, surface)
+            if filling is None:
+                report(index, "tetrahedra")
+                body = filler.body(surface)
+                first = first or body
+                filling = Filling(body, surface, body.tetrahedra)
+        fillings[index] = filling
         done()
-    return fillings
+    return [fillings[index] for index in range(len(surfaces))]
 
 
-def _basis(
-    shape: FloatArray,
-    surface: _Surface,
-    tetrahedra: Tetrahedra,
-    n_modes: int,
-    form: HessianForm,
-    cache: Cache,
-) -> ModalBasis:
+def _basis(shape: FloatArray, filling: Filling, n_modes: int, form: HessianForm, cache: Cache) -> ModalBasis:
     """Modes of the tetrahedra, restricted to the surface, in the caller's units."""
+    tetrahedra, surface = filling.tetrahedra, filling.surface
 
     def compute() -> dict[str, NDArray[Any]]:
-        solid = lowest_modes(arap_hessian(tetrahedra, form), lumped_mass(tetrahedra), tetrahedra.vertices, n_modes)
-        weights = embed_surface(surface.points, tetrahedra, surface.normals())
+        solid = lowest_modes(arap_hessian(tetrahedra, form), filling.mass(), tetrahedra.vertices, n_modes)
         return {
             "eigenvalues": solid.eigenvalues,
-            "modes": _restrict(weights, solid),
+            "modes": _restrict(filling.weights(), solid),
             "rigid_eigenvalues": solid.rigid_eigenvalues,
-            "n_zero": np.array(solid.n_zero),
+            "n_zero": np.array([solid.n_zero]),
         }
 
-    inputs = {"points": surface.points, "faces": surface.faces, **tetrahedra._asdict()}
-    result = cache.get("modes", inputs, {"n_modes": n_modes, "form": form}, compute)
-    if result["n_zero"] > N_RIGID:
-        _warn_of_loose_pieces(tetrahedra, int(result["n_zero"]))
+    result = cache.get("modes", filling.content(), {"n_modes": int(n_modes), "form": form}, compute)
+    n_zero = int(result["n_zero"][0])
+    if n_zero > N_RIGID:
+        _warn_of_loose_pieces(tetrahedra, n_zero)
     modes = np.zeros((n_modes, *shape.shape))
     # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
     modes[:, surface.used] = result["modes"] * surface.scale**1.5
@@ -265,6 +229,14 @@ def _restrict(weights: sp.csr_matrix, solid: VolumeModes) -> FloatArray:
     """Modes at the surface points, ``(k, U, 3)``, from columns with interleaved coordinates."""
     n, k = solid.modes.shape[0] // 3, solid.modes.shape[1]
     return (weights @ solid.modes.reshape(n, 3 * k)).reshape(-1, 3, k).transpose(2, 0, 1)
+
+
+def _settings(settings: TetrahedraSettings | str) -> TetrahedraSettings:
+    if isinstance(settings, TetrahedraSettings):
+        return settings
+    if settings not in QUALITIES:
+        raise ValueError(f"settings are {settings!r}; give TetrahedraSettings or one of {tuple(QUALITIES)}")
+    return QUALITIES[settings]
 
 
 def _check_n_modes(n_modes: int, n_used: int) -> None:

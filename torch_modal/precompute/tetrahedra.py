@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,13 +19,16 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from torch_modal.inspect_mesh import signed_volume
+from torch_modal.mesh import vertex_areas
+from torch_modal.precompute.surface import DIAGONAL, outward
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
-DIAGONAL = 100.0
-"""Bounding-box diagonal in which the pre-computation works: the decimation has absolute thresholds for it."""
+EDGES_PER_THICKNESS = 0.55
+EDGE_RANGE = (0.018, 0.04)
+"""Slender shapes need finer tetrahedra: with one across a limb it is far too stiff. Bulky ones would get too many."""
 
 DEBRIS = 0.01
 """Largest volume of a piece that is dropped if it only hangs on others, as a fraction of the whole."""
@@ -36,19 +39,22 @@ class Tetrahedra(NamedTuple):
 
     Attributes:
         vertices: Positions. *Shape:* ``(N, 3)``.
-        tets: Vertex indices, oriented so that volumes are positive. *Shape:* ``(T, 4)``.
+        tets: Vertex indices; as they are made, volumes are positive. *Shape:* ``(T, 4)``.
+        inside: Fraction of each tetrahedron that is inside the surface; None if all of them are. *Shape:* ``(T,)``.
     """
 
     vertices: FloatArray
     tets: IntArray
+    inside: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class TetrahedraSettings:
-    """How fine the tetrahedra are. The defaults took 2 to 5 s on meshes of 3k and 27k faces.
+    """How fine the tetrahedra are. The defaults take 3 to 5 s on meshes of 3k to 27k faces.
 
     Attributes:
-        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal.
+        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about half of the
+            mean thickness (twice the volume over the area), from 0.018 to 0.04.
         epsilon: How far the tetrahedra may leave the surface, as a fraction of the bounding-box diagonal.
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is
             10).
@@ -58,10 +64,10 @@ class TetrahedraSettings:
         ValueError: A number is out of range (fTetWild hangs on an ``epsilon`` of zero, for example).
     """
 
-    edge_length_fac: float = 0.03
+    edge_length_fac: float | None = None
     epsilon: float = 2e-3
     stop_energy: float = 50.0
-    max_surface_faces: int = 2000
+    max_surface_faces: int = 3000
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -71,8 +77,21 @@ class TetrahedraSettings:
             ("max_surface_faces", 100, 10**8),
         ):
             value = getattr(self, name)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise ValueError(f"{name} is {value}; give a number from {low:g} to {high:g}")
+
+    def edge_length(self, points: FloatArray, faces: IntArray) -> float:
+        """The edge length for a surface, as a fraction of its bounding-box diagonal.
+
+        Args:
+            points: *Shape:* ``(V, 3)``.
+            faces: *Shape:* ``(F, 3)``.
+        """
+        if self.edge_length_fac is not None:
+            return self.edge_length_fac
+        volume = abs(signed_volume(points - points.mean(axis=0), faces))
+        thickness = 2 * volume / vertex_areas(points, faces).sum() / np.linalg.norm(np.ptp(points, axis=0))
+        return float(np.clip(EDGES_PER_THICKNESS * thickness, *EDGE_RANGE))
 
 
 class TetrahedralizationError(RuntimeError):
@@ -115,24 +134,24 @@ def tetrahedralize(
     surface = (surface - center) * scale
 
     failure = _Failure(len(vertices), len(faces))
-    raw = _run_worker(surface, outward(surface, compact.reshape(-1, 3)), settings, timeout, failure)
+    compact = outward(surface, compact.reshape(-1, 3))
+    settings = replace(settings, edge_length_fac=settings.edge_length(surface, compact))
+    raw = _run_worker(surface, compact, settings, timeout, failure)
     tetrahedra = without_debris(oriented(raw))
     _check_fills(tetrahedra, surface, settings, failure)
     return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
-
-
-def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
-    """The faces, all turned over if they wind clockwise seen from outside. *Shape:* ``(F, 3)``.
-
-    fTetWild keeps what the faces wind around, which is nothing for a mesh that is inside out.
-    """
-    return faces[:, ::-1] if signed_volume(vertices - vertices.mean(axis=0), faces) < 0 else faces
 
 
 def tet_volumes(tetrahedra: Tetrahedra) -> FloatArray:
     """Signed volumes. *Shape:* ``(T,)``."""
     corners = tetrahedra.vertices[tetrahedra.tets]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+
+
+def solid_volumes(tetrahedra: Tetrahedra) -> FloatArray:
+    """Volume of the part of each tetrahedron that is solid; inverted ones count like others. *Shape:* ``(T,)``."""
+    volumes = np.abs(tet_volumes(tetrahedra))
+    return volumes if tetrahedra.inside is None else volumes * tetrahedra.inside
 
 
 def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
@@ -143,8 +162,7 @@ def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
     edges = tetrahedra.vertices[tets[:, 1:]] - tetrahedra.vertices[tets[:, :1]]
     # A volume below rounding in units of the tetrahedron's own size has no usable gradients.
     flat = np.abs(volumes) <= 1e-12 * np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) ** 3
-    used, compact = np.unique(tets[~flat], return_inverse=True)
-    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4))
+    return _kept(Tetrahedra(tetrahedra.vertices, tets, tetrahedra.inside), ~flat)
 
 
 def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
@@ -167,8 +185,14 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     hinge = np.bincount(users[:, 0])[users[:, 0]] > 1  # a vertex of two pieces or more
     hangs = np.bincount(users[:, 1], hinge, n_pieces) > 0
     debris = hangs & (volumes < DEBRIS * volumes.sum())
-    used, compact = np.unique(tets[~debris[piece]], return_inverse=True)
-    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4))
+    return _kept(tetrahedra, ~debris[piece])
+
+
+def _kept(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:
+    """Some of the tetrahedra, with the vertices that they use."""
+    used, compact = np.unique(tetrahedra.tets[kept], return_inverse=True)
+    inside = None if tetrahedra.inside is None else tetrahedra.inside[kept]
+    return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4), inside)
 
 
 class _Failure(NamedTuple):
@@ -274,7 +298,7 @@ def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: Tetrahed
     if not np.isfinite(tetrahedra.vertices).all():
         raise failure.error("the result has coordinates that are not finite", advice)
     # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
-    reach = DIAGONAL * (0.05 + 2 * settings.edge_length_fac)
+    reach = DIAGONAL * (0.05 + 2 * (settings.edge_length_fac or EDGE_RANGE[1]))
     distance = cKDTree(tetrahedra.vertices).query(surface)[0]
     n_far = int((distance > reach).sum())
     if n_far:

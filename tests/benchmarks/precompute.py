@@ -1,0 +1,260 @@
+"""What the pre-computation costs and gives, as ratios measured in one run, with nothing taken from a cache.
+
+    python tests/benchmarks/precompute.py [--samples DIR] [--data DIR] [--parts speed memory carrying capture]
+
+Each line says what is asked for, in brackets. Times are wall-clock and processor seconds of this run and its children;
+compare the ratios, and the processor seconds if the machine is shared.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from numpy.typing import NDArray
+
+import torch_modal as tm
+from torch_modal.mesh import unique_edges, vertex_areas
+from torch_modal.precompute.arap import arap_hessian, hat_gradients, lumped_mass
+from torch_modal.precompute.eigen import lowest_modes
+from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
+from torch_modal.precompute.modes import QUALITIES
+from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ROOT = Path(__file__).parents[2]
+BARE = {"edge_length_fac": 0.03, "epsilon": 2e-3}
+FULL = TetrahedraSettings(edge_length_fac=0.03, epsilon=2e-3, stop_energy=10.0, max_surface_faces=10**8)
+REFERENCE = TetrahedraSettings(edge_length_fac=0.0125, epsilon=5e-4, stop_energy=10.0, max_surface_faces=10**8)
+N_MODES = 30
+
+
+class Cost(NamedTuple):
+    """Seconds."""
+
+    wall: float
+    processor: float
+
+
+def measured(work: Callable[[], object]) -> Cost:
+    """What the work costs, child processes included."""
+
+    def processor() -> float:
+        used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return sum(u.ru_utime + u.ru_stime for u in used)
+
+    wall, before = time.perf_counter(), processor()
+    work()
+    return Cost(time.perf_counter() - wall, processor() - before)
+
+
+def refined(keyframes: FloatArray, faces: IntArray, n_vertices: int) -> tuple[FloatArray, IntArray]:
+    """The same surfaces with more vertices: the longest edges of the first are split at their middle, in all."""
+    while keyframes.shape[1] < n_vertices:
+        edges, _ = unique_edges(faces)
+        length = np.linalg.norm(keyframes[0][edges[:, 0]] - keyframes[0][edges[:, 1]], axis=1)
+        sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
+        base = keyframes.shape[1]
+        of_face = np.searchsorted(edges[:, 0] * base + edges[:, 1], sides[..., 0] * base + sides[..., 1])
+        at = length[of_face].argmax(axis=1)
+        longest = of_face[np.arange(len(faces)), at]
+        # The longest edge of both its faces: so no face is split twice in a round.
+        chosen = np.flatnonzero(np.bincount(longest, minlength=len(edges)) == 2)
+        chosen = chosen[np.argsort(-length[chosen])][: n_vertices - base]
+        middle = np.full(len(edges), -1)
+        middle[chosen] = base + np.arange(len(chosen))
+        keyframes = np.concatenate([keyframes, keyframes[:, edges[chosen]].mean(axis=2)], axis=1)
+        split = middle[longest] >= 0
+        turns = (at[split, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(faces[split], turns, axis=1).T
+        m = middle[longest[split]]
+        faces = np.concatenate([faces[~split], np.stack([a, m, c], axis=1), np.stack([m, b, c], axis=1)])
+    return keyframes, faces
+
+
+def sample(folder: Path, pattern: str = "key-*") -> tuple[FloatArray, IntArray]:
+    """Key-frames and faces from a folder."""
+    keyframes, faces = tm.load_keyframes(sorted(p for p in folder.glob(pattern) if p.suffix in (".ply", ".obj")))
+    return keyframes.numpy(), faces.numpy()
+
+
+def speed(keyframes: FloatArray, faces: IntArray) -> None:
+    """Bases of six key-frames against one bare call of the mesher on one of them."""
+    keyframes, faces = refined(keyframes, faces, 8431)
+
+    def bare(folder: str) -> None:
+        # In a process of its own like ours: it replaces signal handlers. Its start counts for both.
+        code = (
+            "import json, sys, numpy as np, pytetwild\nd = np.load(sys.argv[1])\n"
+            "pytetwild.tetrahedralize(d['v'], d['f'].astype(np.int32), **json.loads(sys.argv[2]))"
+        )
+        subprocess.run([sys.executable, "-c", code, "bare.npz", json.dumps(BARE)], check=True, cwd=folder)
+
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "bare.npz", v=keyframes[0], f=faces)
+        reference = measured(lambda: bare(folder))
+    n = keyframes.shape[1]
+    print(f"one bare pytetwild call, {n} vertices: {reference.wall:.1f} s, {reference.processor:.1f} cpu")
+    ways: list[tuple[str, float | None, dict[str, Any]]] = [
+        ("carried (default)", 0.7, {}),
+        ("lattice", 0.4, {"mesher": "lattice"}),
+        ("own tetrahedra for each", None, {"carry": False}),
+    ]
+    for name, bound, chosen in ways:
+        cost = measured(lambda chosen=chosen: tm.extract_bases(keyframes, faces, 50, cache=False, **chosen))
+        asked = "" if bound is None else f" [at most {bound}]"
+        print(
+            f"six bases of 50 modes, {name}: {cost.wall:.1f} s, {cost.processor:.1f} cpu; against the bare call: "
+            f"{cost.wall / reference.wall:.2f} wall{asked}, {cost.processor / reference.processor:.2f} cpu"
+        )
+
+
+def memory(keyframes: FloatArray, faces: IntArray) -> None:
+    """Peak memory of a process that makes two bases of 26k vertices, and of its worker."""
+    if "--in-child" not in sys.argv:
+        command = [sys.executable, __file__, *sys.argv[1:], "--in-child", "--parts", "memory"]
+        print(subprocess.run(command, check=True, capture_output=True, text=True).stdout, end="")
+        return
+    keyframes, faces = refined(keyframes[:2], faces, 26_000)
+    tm.extract_bases(keyframes, faces, 50, cache=False)
+    own, child = (resource.getrusage(w).ru_maxrss / 2**20 for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    print(
+        f"peak memory, {keyframes.shape[1]} vertices, two key-frames: {own:.2f} GiB, its worker {child:.2f} [below 2]"
+    )
+
+
+def energy(mid: torch.Tensor, ends: list[torch.Tensor], faces: torch.Tensor) -> float:
+    """Mean shell energy of the way to both ends, over all vertices, at a diagonal of 100."""
+    scale = 100 / float((ends[0].amax(dim=0) - ends[0].amin(dim=0)).norm())
+    shell = tm.ShellEnergy(faces)
+    return sum(float(shell(mid * scale, end * scale)) for end in ends) / 2
+
+
+def carrying(sets: dict[str, tuple[FloatArray, IntArray, list[tuple[int, int]]]]) -> None:
+    """Mid-shape energies with carried tetrahedra, and with a lattice, against own tetrahedra."""
+    for name, (keyframes, faces, spans) in sets.items():
+        used = sorted({index for span in spans for index in span})
+        made = {
+            way: tm.extract_bases(keyframes[used], faces, N_MODES, cache=False, **chosen)
+            for way, chosen in (("own", {"carry": False}), ("carried", {}), ("lattice", {"mesher": "lattice"}))
+        }
+        x, f = torch.from_numpy(keyframes[used]), torch.from_numpy(faces)
+        for a, b in spans:
+            i, j = used.index(a), used.index(b)
+            values = {
+                way: energy(tm.MidShape([bases[i], bases[j]], f)(x[i], x[j]), [x[i], x[j]], f)
+                for way, bases in made.items()
+            }
+            ratios = {way: values[way] / values["own"] for way in values}
+            print(
+                f"mid-shape energy against own tetrahedra, {name} {a}/{b}: carried {ratios['carried']:.3f} "
+                f"[at most 1.02], lattice {ratios['lattice']:.3f}"
+            )
+
+
+def clamped_weights(surface: Surface, tetrahedra: Tetrahedra) -> sp.csr_matrix:
+    """The usual embedding: barycentric coordinates in the closest tetrahedron, negative ones set to zero."""
+    tets = closest_tetrahedra(surface.points, tetrahedra)
+    corners = tetrahedra.tets[tets]
+    offset = surface.points - tetrahedra.vertices[corners].mean(axis=1)
+    weights = np.clip(0.25 + np.einsum("vi,vai->va", offset, hat_gradients(tetrahedra)[tets]), 0, None)
+    weights /= weights.sum(axis=1, keepdims=True)
+    rows = np.repeat(np.arange(len(corners)), 4)
+    shape = (len(corners), len(tetrahedra.vertices))
+    return sp.csr_matrix((weights.reshape(-1), (rows, corners.reshape(-1))), shape=shape)
+
+
+def capture(name: str, vertices: FloatArray, faces: IntArray) -> None:
+    """How much of the mode space of a fine reference other settings hold, and how rough their modes are."""
+    surface = Surface.of(vertices, faces)
+    areas = np.repeat(np.sqrt(vertex_areas(surface.points, surface.faces)), 3)[:, None]
+    shell = tm.ShellEnergy(torch.from_numpy(surface.faces.copy()))
+    rest = torch.from_numpy(surface.points)
+
+    def at_surface(weights: sp.csr_matrix, modes: FloatArray) -> FloatArray:
+        n = len(modes) // 3
+        return (weights @ modes.reshape(n, -1)).reshape(3 * len(surface.points), -1)
+
+    def roughness(modes: FloatArray) -> FloatArray:
+        moved = [0.1 * column / np.sqrt((column**2).mean()) for column in modes.T]
+        return np.array([float(shell(rest + torch.from_numpy(u.reshape(-1, 3)), rest)) for u in moved])
+
+    axes = np.eye(3)
+    rigid = [np.broadcast_to(axis, surface.points.shape) for axis in axes]
+    rigid += [np.cross(axis, surface.points) for axis in axes]
+    rigid_span = np.linalg.qr(areas * np.stack([r.reshape(-1) for r in rigid], axis=1))[0]
+
+    def span(modes: FloatArray) -> FloatArray:
+        weighted = areas * modes
+        return np.linalg.qr(weighted - rigid_span @ (rigid_span.T @ weighted))[0]
+
+    found = {}
+    ways = {"reference": REFERENCE, "fast": QUALITIES["fast"], "full": FULL, "fine": QUALITIES["fine"]}
+    for way, settings in ways.items():
+        start = time.perf_counter()
+        tetrahedra = tetrahedralize(surface.points, surface.faces, settings)
+        seconds = time.perf_counter() - start
+        solid = lowest_modes(arap_hessian(tetrahedra), lumped_mass(tetrahedra), tetrahedra.vertices, N_MODES)
+        smooth = at_surface(embed_surface(surface.points, tetrahedra, surface.normals), solid.modes)
+        found[way] = (smooth, seconds, len(tetrahedra.vertices))
+        if way == "fast":
+            clamped = at_surface(clamped_weights(surface, tetrahedra), solid.modes)
+            found["fast, clamped"] = (clamped, seconds, len(tetrahedra.vertices))
+    reference = found["reference"][0]
+    fine_span, fine_roughness = span(reference), roughness(reference)
+    for way, (modes, seconds, n) in found.items():
+        held = float(((span(modes).T @ fine_span) ** 2).sum() / N_MODES)
+        rough = float(np.median(roughness(modes) / fine_roughness))
+        print(
+            f"{name}, {way}: {seconds:.1f} s of meshing, {n} vertices; captured {held:.3f} [at least 0.95], median "
+            f"shell energy of a mode {rough:.2f} of the reference's"
+        )
+
+
+def main() -> None:
+    """Run the parts asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--samples", type=Path, default=ROOT / "torch_modal" / "samples")
+    more = ROOT.parent / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=more, help="more meshes, if they are there")
+    parser.add_argument("--parts", nargs="+", default=["speed", "memory", "carrying", "capture"])
+    parser.add_argument("--in-child", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    creature = sample(arguments.samples / "creature")
+    if "speed" in arguments.parts:
+        speed(*creature)
+    if "memory" in arguments.parts:
+        memory(*creature)
+    if "carrying" in arguments.parts:
+        sets = {
+            "creature": (*creature, [(i, i + 1) for i in range(5)]),
+            "sculpted hand": (*sample(arguments.samples / "hand"), [(0, 1)]),
+        }
+        if arguments.data.is_dir():
+            sets["hand"] = (*sample(arguments.data / "mh-hand-path", "0*"), [(0, 8), (0, 4), (4, 8)])
+            sets["woman"] = (*sample(arguments.data / "mh-woman", "0*"), [(0, 1), (0, 2), (1, 2)])
+        carrying(sets)
+    if "capture" in arguments.parts:
+        capture("creature", creature[0][0], creature[1])
+        if arguments.data.is_dir():
+            for name in ("mh-hand-path", "mh-woman"):
+                keyframes, faces = sample(arguments.data / name, "0*")
+                capture(name, keyframes[0], faces)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Carried tetrahedra: exact where the truth is known, refused where they are no good, and chosen well."""
+
+import numpy as np
+import pytest
+import torch
+from solids import bent, box, surface
+
+from torch_modal.precompute import filling, modes
+from torch_modal.precompute.arap import arap_hessian, lumped_mass
+from torch_modal.precompute.cache import Cache
+from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, self_proximity
+from torch_modal.precompute.eigen import lowest_modes
+from torch_modal.precompute.embedding import embed_surface
+from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
+from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tet_volumes
+
+BAR = box((16, 4, 4), (8.0, 1.0, 1.0))
+FACES = surface(BAR)
+USED, COMPACT = np.unique(FACES, return_inverse=True)
+COMPACT = COMPACT.reshape(-1, 3)
+POINTS = BAR.vertices[USED]
+TURN = np.linalg.qr(np.array([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]]))[0]
+TURN = TURN * np.sign(np.linalg.det(TURN))
+
+
+@pytest.fixture(scope="module")
+def carrier() -> Carrier:
+    return Carrier(BAR, POINTS, COMPACT, embed_surface(POINTS, BAR))
+
+
+def test_rigid_motions_and_scale_are_carried_exactly(carrier: Carrier) -> None:
+    result = carrier.carry(POINTS @ TURN.T * 7.0 + 3.0)
+    np.testing.assert_allclose(result.tetrahedra.vertices, BAR.vertices @ TURN.T * 7.0 + 3.0, atol=1e-10)
+    assert max(result.fit_rms, result.fit_max) < 1e-10
+    assert result.inverted == 0
+
+
+def test_a_bent_bar_is_filled_as_it_bends(carrier: Carrier) -> None:
+    """Bent by 270 degrees, further than any interpolation of positions or of single rotations can follow."""
+    angle = 1.5 * np.pi
+    result = carrier.carry(bent(POINTS, angle))
+    truth = bent(BAR.vertices, angle)
+    assert np.linalg.norm(result.tetrahedra.vertices - truth, axis=1).max() < 0.1
+    assert result.inverted == 0
+    assert result.is_good
+    assert (tet_volumes(result.tetrahedra) > 0).all()
+
+
+def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) -> None:
+    points = bent(POINTS, np.pi)
+    bar = Surface(POINTS, COMPACT, USED, 1.0)
+    carried = Filling(Body(bar, BAR), Surface(points, COMPACT, USED, 1.0), carrier.carry(points).tetrahedra)
+    truth = Tetrahedra(bent(BAR.vertices, np.pi), BAR.tets)
+    found = lowest_modes(arap_hessian(carried.tetrahedra), carried.mass(), carried.tetrahedra.vertices, 8)
+    wanted = lowest_modes(arap_hessian(truth), lumped_mass(truth), truth.vertices, 8)
+    np.testing.assert_allclose(found.eigenvalues, wanted.eigenvalues, rtol=0.05)
+    np.testing.assert_allclose(carried.weights() @ carried.tetrahedra.vertices, points, atol=1e-10)
+    assert carried.mass().sum() == pytest.approx(np.abs(tet_volumes(truth)).sum(), rel=0.01)
+
+
+def test_what_cannot_be_followed_is_seen(carrier: Carrier) -> None:
+    mirrored = carrier.carry(POINTS * (1.0, 1.0, -1.0))
+    assert mirrored.inverted > 0.5
+    assert not mirrored.is_good
+    crumpled = carrier.carry(POINTS + np.random.default_rng(0).normal(size=POINTS.shape))
+    assert crumpled.fit_rms > 5e-3
+    assert not crumpled.is_good
+
+
+@pytest.mark.parametrize(
+    ("measures", "good"),
+    [((0.004, 0.09, 0.03), True), ((0.006, 0.0, 0.0), False), ((0.0, 0.11, 0.0), False), ((0.0, 0.0, 0.05), False)],
+)
+def test_borders_of_the_checks(measures: tuple[float, float, float], good: bool) -> None:
+    assert Carried(BAR, *measures).is_good is good
+
+
+def test_local_rotations_of_a_turn() -> None:
+    turns = local_rotations(POINTS, POINTS @ TURN.T * 2.0 + 1.0, COMPACT)
+    np.testing.assert_allclose(turns, np.broadcast_to(TURN, turns.shape), atol=1e-12)
+
+
+def test_a_degenerate_face_does_no_harm() -> None:
+    faces = np.concatenate([COMPACT, [[COMPACT[0, 0], COMPACT[0, 1], COMPACT[0, 1]]]])
+    assert np.isfinite(local_rotations(POINTS, POINTS @ TURN.T, faces)).all()
+
+
+def horseshoe(angle: float) -> np.ndarray:
+    fine = box((48, 6, 6), (16.0, 1.0, 1.0))
+    return bent(fine.vertices[np.unique(surface(fine))], angle)
+
+
+def test_self_proximity_grows_as_the_ends_meet() -> None:
+    fine = box((48, 6, 6), (16.0, 1.0, 1.0))
+    faces = np.unique(surface(fine), return_inverse=True)[1].reshape(-1, 3)
+    surfaces = [Surface.of(horseshoe(angle), faces) for angle in (1.98 * np.pi, 1.0, 0.0)]
+    closeness = [self_proximity(s) for s in surfaces]
+    assert closeness[2] == 0
+    assert closeness[0] > closeness[1]
+    assert meshing_order(surfaces)[-1] == 0
+
+
+# --------------------------------------------------------------------------------------- a set of key-frames
+
+
+@pytest.fixture
+def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """A mesher that knows the bar; it keeps the surfaces that it was asked to fill."""
+    asked: list[np.ndarray] = []
+
+    def fill(points: np.ndarray, *args: object, **kwargs: object) -> Tetrahedra:
+        asked.append(points)
+        low, high = BAR.vertices.min(axis=0), BAR.vertices.max(axis=0)
+        return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
+
+    monkeypatch.setattr(filling, "tetrahedralize", fill)
+    return asked
+
+
+def test_the_mesher_runs_once_for_a_set(meshed: list[np.ndarray]) -> None:
+    poses = np.stack([bent(POINTS, 1.0), POINTS, bent(POINTS, 2.0)])
+    bases = modes.extract_bases(poses[[1, 0, 2]], COMPACT, 5, cache=False)
+    assert len(meshed) == 1
+    for basis, pose in zip(bases, poses[[1, 0, 2]], strict=True):
+        np.testing.assert_array_equal(basis.reference, pose)
+    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, carry=False, cache=False)
+    assert len(meshed) == 3
+
+
+def test_a_keyframe_that_cannot_be_carried_to_has_its_own(
+    meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch_modal.precompute.carrying.MAX_FIT", -1.0)
+    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, cache=False)
+    assert len(meshed) == 2
+
+
+def test_carried_tetrahedra_come_from_the_cache(
+    meshed: list[np.ndarray], tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filler = Filler(TetrahedraSettings(), "tetwild", 1.0, Cache.at(tmp_path))
+    surfaces = [Surface.of(pose, COMPACT) for pose in (POINTS, bent(POINTS, 1.0))]
+    first = filler.carried(filler.body(surfaces[0]), surfaces[1])
+    monkeypatch.setattr(filling, "Carrier", None)
+    again = filler.carried(filler.body(surfaces[0]), surfaces[1])
+    assert len(meshed) == 1
+    assert first is not None and again is not None
+    np.testing.assert_array_equal(first.tetrahedra.vertices, again.tetrahedra.vertices)
+
+
+def test_equal_poses_have_equal_modes(meshed: list[np.ndarray]) -> None:
+    """The same key-frame twice, the second turned: the same modes, turned."""
+    first, second = modes.extract_bases(np.stack([POINTS, POINTS @ TURN.T]), COMPACT, 6, cache=False)
+    torch.testing.assert_close(first.eigenvalues, second.eigenvalues, rtol=1e-6, atol=0)
+    a = (first.modes @ torch.from_numpy(TURN).T).flatten(1)
+    b = second.modes.flatten(1)
+    overlap = torch.linalg.svdvals(torch.linalg.qr(a.T).Q.T @ torch.linalg.qr(b.T).Q)
+    assert overlap.min() > 0.999

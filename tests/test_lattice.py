@@ -1,0 +1,113 @@
+"""The lattice fills what is inside, the same way each time, whatever the surface is like."""
+
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+from solids import box, surface
+
+from torch_modal.errors import MeshWarning
+from torch_modal.precompute import filling
+from torch_modal.precompute.arap import arap_hessian, lumped_mass
+from torch_modal.precompute.eigen import lowest_modes
+from torch_modal.precompute.lattice import lattice
+from torch_modal.precompute.modes import extract_bases, extract_modes
+from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings, solid_volumes, tet_volumes
+
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+@pytest.mark.parametrize("cell", [0.08, 0.04])
+def test_volume_and_place(capsule: Mesh, cell: float) -> None:
+    whole = Surface.of(*capsule)
+    filled = lattice(whole, cell)
+    assert (tet_volumes(filled) > 0).all()
+    exact = trimesh.Trimesh(whole.points, whole.faces)
+    assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=0.02)
+    mass = lumped_mass(filled)
+    center = (mass[:, None] * filled.vertices).sum(axis=0) / mass.sum()
+    np.testing.assert_allclose(center, exact.center_mass, atol=0.3)  # of a diagonal of 100
+    low, high = filled.vertices.min(axis=0), filled.vertices.max(axis=0)
+    assert (low <= whole.points.min(axis=0)).all() and (high >= whole.points.max(axis=0)).all()
+
+
+def test_each_side_is_shared_alike(capsule: Mesh) -> None:
+    """Neighbouring cubes cut their common side along the same diagonal: no side belongs to three tetrahedra, and the
+    outer sides are closed."""
+    filled = lattice(Surface.of(*capsule), 0.06)
+    sides = np.sort(np.concatenate([filled.tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
+    assert np.unique(sides, axis=0, return_counts=True)[1].max() == 2
+    edges = np.sort(np.concatenate([surface(filled)[:, c] for c in ([0, 1], [1, 2], [2, 0])]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
+
+
+def test_deterministic(capsule: Mesh) -> None:
+    one, two = (lattice(Surface.of(*capsule), 0.05) for _ in range(2))
+    for first, second in zip(one, two, strict=True):
+        np.testing.assert_array_equal(first, second)
+    bases = [extract_modes(*capsule, 10, mesher="lattice", cache=False) for _ in range(2)]
+    np.testing.assert_array_equal(bases[0].modes, bases[1].modes)
+
+
+def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:
+    """The bar fills its cells by a third only; a lattice that counted cells as full would be far too stiff."""
+    solid = box((30, 6, 6), (10.0, 1.0, 1.3))
+    faces = surface(solid)
+    used, compact = np.unique(faces, return_inverse=True)
+    bar = Surface.of(
+        solid.vertices[used] @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces=compact.reshape(-1, 3)
+    )
+    filled = lattice(bar, 0.025)
+    found = lowest_modes(arap_hessian(filled), lumped_mass(filled), filled.vertices, 5).eigenvalues
+    wanted = lowest_modes(arap_hessian(solid), lumped_mass(solid), solid.vertices, 5).eigenvalues / bar.scale**2
+    np.testing.assert_allclose(found, wanted, rtol=0.35)
+
+
+def test_open_and_half_flipped_surfaces(capsule: Mesh) -> None:
+    """A hole is closed: with an eighth of the faces missing the volume stays."""
+    vertices, faces = capsule
+    centers = vertices[faces].mean(axis=1)
+    far = centers[:, 2] > np.quantile(centers[:, 2], 0.875)
+    whole, opened = Surface.of(vertices, faces), Surface.of(vertices, faces[~far])
+    share = solid_volumes(lattice(opened, 0.05)).sum() / opened.scale**3
+    assert share == pytest.approx(solid_volumes(lattice(whole, 0.05)).sum() / whole.scale**3, rel=0.25)
+
+
+def test_too_fine_a_lattice_is_refused(capsule: Mesh) -> None:
+    with pytest.raises(TetrahedralizationError, match="give a larger edge_length_fac"):
+        lattice(Surface.of(*capsule), 0.002)
+
+
+def test_it_takes_over_with_a_warning(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
+        raise TetrahedralizationError("signal SIGSEGV")
+
+    monkeypatch.setattr(filling, "tetrahedralize", fail)
+    with pytest.warns(MeshWarning, match="lattice of cubes takes its place: signal SIGSEGV"):
+        basis = extract_modes(*capsule, 6, cache=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        same = extract_modes(*capsule, 6, mesher="lattice", cache=False)
+    np.testing.assert_array_equal(basis.modes, same.modes)
+
+
+@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("settings", "best")])
+def test_unknown_names(capsule: Mesh, name: str, value: str) -> None:
+    with pytest.raises(ValueError, match=f"{value}.*give"):
+        extract_bases([capsule[0]], capsule[1], 5, **{name: value})
+
+
+def test_settings_reach_the_mesher(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[float] = []
+
+    def note(surface: Surface, edge: float):
+        seen.append(edge)
+        return lattice(surface, 0.05)
+
+    monkeypatch.setattr(filling, "lattice", note)
+    for settings in ("fast", "fine", TetrahedraSettings(edge_length_fac=0.07)):
+        extract_modes(*capsule, 5, settings=settings, mesher="lattice", cache=False)
+    assert seen[0] > seen[1]
+    assert seen[2] == 0.07

@@ -1,0 +1,175 @@
+"""The tetrahedra of one key-frame carried to the others, so that the mesher runs once for a whole set."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from torch_modal.mesh import vertex_areas
+from torch_modal.precompute.arap import hat_gradients
+from torch_modal.precompute.surface import DIAGONAL, Surface
+from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes, tet_volumes
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FIT_WEIGHT = 1e4
+"""Weight of the surface against the shape of the tetrahedra; both are made free of units."""
+N_STEPS = 5
+"""Local-global steps after the first solve. The energy hardly falls after that."""
+MAX_FIT_RMS = 5e-3
+MAX_FIT = 0.1
+"""Largest distances of the carried surface from the key-frame, in bounding-box diagonals."""
+MAX_INVERTED = 0.04
+"""Largest fraction of inverted tetrahedra. Up to 2.5 % change neither modes nor mid-shapes."""
+NEAR = 0.03
+"""Gaps up to this width count as near, in bounding-box diagonals."""
+
+
+class Carried(NamedTuple):
+    """Tetrahedra of one key-frame in the pose of another.
+
+    Attributes:
+        tetrahedra: Some of them may be inverted.
+        fit_rms: Root mean square distance of the carried surface from the key-frame, in bounding-box diagonals.
+        fit_max: The largest distance.
+        inverted: Fraction of the tetrahedra that are inverted.
+    """
+
+    tetrahedra: Tetrahedra
+    fit_rms: float
+    fit_max: float
+    inverted: float
+
+    @property
+    def is_good(self) -> bool:
+        """Whether modes of these tetrahedra can be trusted; if not, the key-frame needs its own."""
+        return self.fit_rms <= MAX_FIT_RMS and self.fit_max <= MAX_FIT and self.inverted <= MAX_INVERTED
+
+
+class Carrier:
+    """The tetrahedra of one key-frame, ready to be carried.
+
+    As-rigid-as-possible deformation of the tetrahedra that takes their surface to where it is known to go. The matrix
+    of all its linear solves is the same, for each step and each key-frame: it is factored here, once.
+
+    Args:
+        tetrahedra: The mesh in the first pose.
+        points: The surface in the first pose. *Shape:* ``(U, 3)``.
+        faces: Its faces. *Shape:* ``(F, 3)``.
+        weights: How the surface hangs on the tetrahedra
+            (:func:`~torch_modal.precompute.embedding.embed_surface`). *Shape:* ``(U, N)``.
+    """
+
+    def __init__(self, tetrahedra: Tetrahedra, points: FloatArray, faces: IntArray, weights: sp.csr_matrix) -> None:
+        self._rest = tetrahedra
+        self._points = points
+        self._faces = faces
+        self._weights = weights
+        self._gradients = hat_gradients(tetrahedra)
+        self._volumes = solid_volumes(tetrahedra)
+        extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+        areas = vertex_areas(points, faces)
+        self._area = areas.sum()
+        # |W x - p|² is a mean over the surface, per diagonal squared; the other term a mean over the volume.
+        self._pull = sp.diags(FIT_WEIGHT * self._volumes.sum() / extent**2 * areas / areas.sum()) @ weights
+        stiffness = np.einsum("tak,tbk->tab", self._gradients, self._gradients) * self._volumes[:, None, None]
+        rows = np.repeat(tetrahedra.tets, 4, axis=1).reshape(-1)
+        columns = np.tile(tetrahedra.tets, 4).reshape(-1)
+        n = len(tetrahedra.vertices)
+        laplacian = sp.coo_matrix((stiffness.reshape(-1), (rows, columns)), shape=(n, n))
+        system = sp.csc_matrix(laplacian.tocsc() + weights.T @ self._pull)
+        self._factors = spla.splu(
+            system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+
+    def carry(self, points: FloatArray) -> Carried:
+        """The tetrahedra in the pose of another key-frame.
+
+        Args:
+            points: The surface in the new pose. *Shape:* ``(U, 3)``.
+        """
+        areas = vertex_areas(points, self._faces)
+        # The bounding box, and with it the unit here, changes with the pose; the size of the shape hardly does.
+        scale = np.sqrt(areas.sum() / self._area)
+        target = points / scale
+        turns = local_rotations(self._points, target, self._faces)
+        # The smoothest field of matrices that is the turn of the surface on the surface.
+        field = self._factors.solve(self._pull.T @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
+        rotations = nearest_rotations(field[self._rest.tets].mean(axis=1))
+        vertices = self._place(rotations, target)
+        for _ in range(N_STEPS):
+            vertices = self._place(nearest_rotations(self._deformation(vertices)), target)
+
+        carried = self._rest._replace(vertices=vertices * scale)
+        distance = np.linalg.norm(self._weights @ vertices - target, axis=1) / np.linalg.norm(np.ptp(target, axis=0))
+        return Carried(
+            carried,
+            float(np.sqrt(np.average(distance**2, weights=areas))),
+            float(distance.max()),
+            float((tet_volumes(carried) <= 0).mean()),
+        )
+
+    def _deformation(self, vertices: FloatArray) -> FloatArray:
+        """Deformation gradient of each tetrahedron. *Shape:* ``(T, 3, 3)``."""
+        return np.einsum("tai,taj->tij", vertices[self._rest.tets], self._gradients)
+
+    def _place(self, rotations: FloatArray, points: FloatArray) -> FloatArray:
+        """Minimise ``sum_t vol_t |∇x - R_t|²`` with the surface pulled to the points. *Shape:* ``(N, 3)``."""
+        forces = np.einsum("t,tij,taj->tai", self._volumes, rotations, self._gradients).reshape(-1, 3)
+        corners = self._rest.tets.reshape(-1)
+        n = len(self._rest.vertices)
+        summed = np.stack([np.bincount(corners, force, minlength=n) for force in forces.T], axis=1)
+        return self._factors.solve(summed + self._pull.T @ points)
+
+
+def local_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
+    """How a surface turns around each of its vertices from one pose to another.
+
+    The rotation nearest to the mean of the deformation gradients of the faces around, each with its unit normal as
+    third direction. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
+    """
+    frames = []
+    for x in (before, after):
+        corners = x[faces]
+        one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        normal = np.cross(one, two)
+        # As long as the edges are on average, so that flat and large faces count alike.
+        area = np.linalg.norm(normal, axis=1)
+        normal /= np.maximum(np.sqrt(area), 1e-300)[:, None]
+        frames.append((np.stack([one, two, normal], axis=2), area))
+    (rest, area), (posed, _) = frames
+    usable = area > 1e-12 * area.max()
+    gradients = np.zeros((len(faces), 3, 3))
+    gradients[usable] = posed[usable] @ np.linalg.inv(rest[usable])
+    weighted = np.repeat(nearest_rotations(gradients) * area[:, None, None], 3, axis=0).reshape(-1, 9)
+    summed = [np.bincount(faces.reshape(-1), column, minlength=len(before)) for column in weighted.T]
+    return nearest_rotations(np.stack(summed, axis=1).reshape(-1, 3, 3))
+
+
+def self_proximity(surface: Surface) -> float:
+    """Fraction of the area that has an opposing part of the surface near in front of it.
+
+    From such a pose tetrahedra cannot be carried well: they fuse what touches.
+
+    """
+    points, normals = surface.points, surface.normals
+    tree = cKDTree(points)
+    opposed = np.zeros(len(points), dtype=bool)
+    # Half-way to the opposing side that side becomes nearer than the own one.
+    for distance in np.array([1 / 16, 1 / 8, 1 / 4, 1 / 2]) * NEAR * DIAGONAL:
+        nearest = tree.query(points + distance * normals)[1]
+        opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < -0.3
+    areas = vertex_areas(points, surface.faces)
+    return float(areas[opposed].sum() / areas.sum())
+
+
+def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
+    """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``."""
+    u, _, vt = np.linalg.svd(matrices)
+    flip = np.ones((len(matrices), 3))
+    flip[:, 2] = np.sign(np.linalg.det(u @ vt))
+    return (u * flip[:, None]) @ vt

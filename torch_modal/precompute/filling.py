@@ -1,0 +1,162 @@
+"""Key-frames filled with tetrahedra: meshed once for the whole set where that works."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from torch_modal.errors import MeshWarning
+from torch_modal.precompute.arap import lumped_mass
+from torch_modal.precompute.cache import Arrays, Cache
+from torch_modal.precompute.carrying import Carrier, self_proximity
+from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
+from torch_modal.precompute.lattice import lattice
+from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.tetrahedra import (
+    Tetrahedra,
+    TetrahedralizationError,
+    TetrahedraSettings,
+    solid_volumes,
+    tetrahedralize,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Mesher = Literal["auto", "tetwild", "lattice"]
+MESHERS: tuple[Mesher, ...] = ("auto", "tetwild", "lattice")
+
+
+@dataclass(frozen=True)
+class Body:
+    """A key-frame with tetrahedra of its own.
+
+    Attributes:
+        surface: The key-frame.
+        tetrahedra: In the units of the surface.
+    """
+
+    surface: Surface
+    tetrahedra: Tetrahedra
+
+    @cached_property
+    def neighbours(self) -> Neighbours:
+        """What each point of the surface hangs on."""
+        return find_neighbours(self.surface.points, self.tetrahedra, self.surface.normals)
+
+    @cached_property
+    def carrier(self) -> Carrier:
+        """What takes the tetrahedra to other key-frames."""
+        weights = fit_weights(self.surface.points, self.tetrahedra.vertices, self.neighbours)
+        return Carrier(self.tetrahedra, self.surface.points, self.surface.faces, weights)
+
+
+@dataclass(frozen=True)
+class Filling:
+    """Tetrahedra in the pose of a key-frame: its own, or those of another.
+
+    Mass and neighbours are those of the pose that the tetrahedra were made in: there none is inverted, and no point
+    is nearer to another limb than to its own.
+
+    Attributes:
+        body: The key-frame that the tetrahedra were made for.
+        surface: The key-frame that they are in the pose of.
+        tetrahedra: In that pose, in the units of the surface.
+    """
+
+    body: Body
+    surface: Surface
+    tetrahedra: Tetrahedra
+
+    def mass(self) -> FloatArray:
+        """Mass of each vertex, at a density of 1 in this pose. *Shape:* ``(N,)``."""
+        rest = lumped_mass(self.body.tetrahedra)
+        return rest * (solid_volumes(self.tetrahedra).sum() / rest.sum())
+
+    def weights(self) -> sp.csr_matrix:
+        """How the surface hangs on the tetrahedra. *Shape:* ``(U, N)``."""
+        return fit_weights(self.surface.points, self.tetrahedra.vertices, self.body.neighbours)
+
+    def content(self) -> Arrays:
+        """Everything that modes depend on, for the cache."""
+        rest = {f"rest_{name}": array for name, array in _as_arrays(self.body.tetrahedra).items()}
+        surfaces = {"points": self.surface.points, "faces": self.surface.faces, "rest_points": self.body.surface.points}
+        return {**surfaces, **rest, "vertices": self.tetrahedra.vertices}
+
+
+@dataclass(frozen=True)
+class Filler:
+    """How surfaces are filled with tetrahedra.
+
+    Attributes:
+        settings: How fine the tetrahedra are.
+        mesher: ``"tetwild"``, ``"lattice"``, or ``"auto"``: the first, and the second where the first fails.
+        timeout: Seconds that the child process of fTetWild may take.
+        cache: Where tetrahedra are kept.
+    """
+
+    settings: TetrahedraSettings
+    mesher: Mesher
+    timeout: float
+    cache: Cache
+
+    def body(self, surface: Surface) -> Body:
+        """The surface with tetrahedra of its own.
+
+        Raises:
+            TetrahedralizationError: No mesher could fill it.
+
+        Warns:
+            MeshWarning: fTetWild failed, and the lattice took its place.
+        """
+        if self.mesher != "lattice":
+            try:
+                return Body(surface, self._kept("tetwild", surface, self._by_tetwild))
+            except TetrahedralizationError as error:
+                if self.mesher == "tetwild":
+                    raise
+                warnings.warn(
+                    f"fTetWild failed, so a lattice of cubes takes its place: {error}", MeshWarning, stacklevel=3
+                )
+        return Body(surface, self._kept("lattice", surface, self._by_lattice))
+
+    def _by_tetwild(self, surface: Surface) -> Tetrahedra:
+        return tetrahedralize(surface.points, surface.faces, self.settings, timeout=self.timeout)
+
+    def _by_lattice(self, surface: Surface) -> Tetrahedra:
+        return lattice(surface, self.settings.edge_length(surface.points, surface.faces))
+
+    def _kept(self, mesher: str, surface: Surface, make: Callable[[Surface], Tetrahedra]) -> Tetrahedra:
+        arrays = self.cache.get(
+            "tetrahedra",
+            {"points": surface.points, "faces": surface.faces},
+            {**asdict(self.settings), "mesher": mesher},
+            lambda: _as_arrays(make(surface)),
+        )
+        return Tetrahedra(**arrays)
+
+    def carried(self, body: Body, surface: Surface) -> Filling | None:
+        """The body in the pose of another key-frame, or None if its tetrahedra do not survive that."""
+
+        def compute() -> dict[str, NDArray[Any]]:
+            result = body.carrier.carry(surface.points)
+            return {"vertices": result.tetrahedra.vertices, "is_good": np.array([result.is_good])}
+
+        inputs = {"points": surface.points, "faces": surface.faces, "rest_points": body.surface.points}
+        kept = self.cache.get("carried", {**inputs, **_as_arrays(body.tetrahedra)}, {}, compute)
+        if not kept["is_good"][0]:
+            return None
+        return Filling(body, surface, body.tetrahedra._replace(vertices=kept["vertices"]))
+
+
+def _as_arrays(tetrahedra: Tetrahedra) -> dict[str, NDArray[Any]]:
+    return {name: array for name, array in tetrahedra._asdict().items() if array is not None}
+
+
+def meshing_order(surfaces: list[Surface]) -> list[int]:
+    """Key-frames in the order in which they should be filled: the one that touches itself least comes first."""
+    return [int(i) for i in np.argsort([self_proximity(surface) for surface in surfaces], kind="stable")]
