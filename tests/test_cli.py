@@ -16,6 +16,7 @@ import torch_modal as tm
 from torch_modal import cli, demo
 from torch_modal.export import save_frames
 from torch_modal.precompute import modes as modes_module
+from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
 from torch_modal.sample_data import load_sample
 
@@ -347,3 +348,15 @@ def test_demo_compares_with_the_truth_at_its_times() -> None:
         assert one.linear.edges == pytest.approx(1.0) and one.linear.volume == pytest.approx(8.0)
     (half,) = demo.compare("hand", sample, sequence[::2], sequence[::2], levels=1)
     assert half.time == 0.5 and half.ours == (0.0, 1.0)
+
+
+def test_cache_is_measured_and_cleared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stranger = tmp_path / "notes.txt"
+    stranger.write_text("mine")
+    Cache.at(tmp_path).get("tets", {}, {}, lambda: {"x": np.zeros(2**18)})
+    assert cli.main(["cache", "--cache-dir", str(tmp_path)]) == 0
+    assert f"1 entries, 2.0 MiB in {tmp_path}" in capsys.readouterr().out
+    assert cli.main(["cache", "--clear", "--cache-dir", str(tmp_path)]) == 0
+    assert "1 entries, 2.0 MiB removed" in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert stranger.read_text() == "mine"

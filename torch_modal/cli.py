@@ -66,6 +66,13 @@ DEMO_EXAMPLES = """\
 example:
   torch-modal demo --sample hand --out hand-demo"""
 
+CACHE = """\
+Say how large the cache is, where tetrahedra and modes are kept between runs."""
+
+CACHE_EXAMPLES = """\
+example:
+  torch-modal cache --clear"""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
@@ -224,7 +231,7 @@ def _parser() -> argparse.ArgumentParser:
         "--mu",
         type=_number(float, 0, above=True),
         metavar="X",
-        help="how strongly --space paired pulls its two shapes together (default: 0.1)",
+        help="how strongly --space paired pulls its two shapes together (default: 1)",
     )
     sub.add_argument(
         "--format", choices=("ply", "obj", "off"), default="ply", help="of the frames (default: %(default)s)"
@@ -281,6 +288,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_modes(sub)
     _add_common(sub)
+
+    sub = command("cache", commands.cache, "size of the cache of tetrahedra and modes", CACHE, CACHE_EXAMPLES)
+    sub.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
+    sub.add_argument(
+        "--cache-dir", metavar="DIR", help="another folder (default: TORCH_MODAL_CACHE, or the user's cache folder)"
+    )
+    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
 
 
@@ -291,6 +305,19 @@ def _add_modes(sub: argparse.ArgumentParser) -> None:
         default=30,
         metavar="N",
         help="elastic modes of each key-frame; 20 to 100 are usual (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--mesher",
+        choices=("auto", "tetwild", "lattice"),
+        default="auto",
+        help="what fills the surfaces: fTetWild, a lattice of cubes (deterministic, takes open surfaces), or auto: the "
+        "second where the first fails (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--quality",
+        choices=("fast", "fine"),
+        default="fast",
+        help="how fine the tetrahedra are (default: %(default)s)",
     )
 
 

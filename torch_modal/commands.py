@@ -8,7 +8,7 @@ import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 OUTPUT_SUFFIXES = (".obj", ".ply", ".off", ".glb", ".gltf", ".stl", ".png", ".pdf", ".safetensors")
 """Of files: an ``--out`` that ends so is not meant as a folder."""
@@ -33,9 +33,7 @@ def subdivide(args: argparse.Namespace) -> None:
     places = tm.keyframe_places(len(args.meshes), args.levels, cyclic=args.cyclic, n_frames=args.frames)
     keyframes, faces = tm.load_keyframes(args.meshes)
     progress = False if args.quiet else None
-    bases = tm.extract_bases(
-        keyframes, faces, args.modes, cache_dir=args.cache_dir, cache=not args.no_cache, progress=progress
-    )
+    bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
     options = {} if args.mu is None else {"mu": args.mu}
     frames = tm.subdivide(
         keyframes,
@@ -86,9 +84,7 @@ def modes(args: argparse.Namespace) -> None:
         faces,
         args.modes,
         form=args.form,
-        cache_dir=args.cache_dir,
-        cache=not args.no_cache,
-        progress=False if args.quiet else None,
+        **_precompute_options(args),
     )
     report = _reporter(args)
     shown = min(8, args.modes)
@@ -118,11 +114,29 @@ def demo(args: argparse.Namespace) -> None:
         args.out,
         levels=args.levels,
         n_modes=args.modes,
-        cache_dir=args.cache_dir,
-        cache=not args.no_cache,
-        progress=False if args.quiet else None,
+        precompute=_precompute_options(args),
         report=_reporter(args),
     )
+
+
+def cache(args: argparse.Namespace) -> None:
+    """Run ``torch-modal cache``."""
+    from torch_modal.precompute.cache import cache_content, clear_cache, default_cache_dir
+
+    n_entries, n_bytes = (clear_cache if args.clear else cache_content)(args.cache_dir)
+    there = "removed from" if args.clear else "in"
+    print(f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB {there} {args.cache_dir or default_cache_dir()}")
+
+
+def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:
+    """What `extract_bases` is told besides the key-frames."""
+    return {
+        "mesher": args.mesher,
+        "settings": args.quality,
+        "cache_dir": args.cache_dir,
+        "cache": not args.no_cache,
+        "progress": False if args.quiet else None,
+    }
 
 
 def _reporter(args: argparse.Namespace) -> Callable[[str], None]:

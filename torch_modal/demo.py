@@ -1,9 +1,9 @@
 """The main job on the sample key-frames, beside linear interpolation and the truth."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -45,9 +45,7 @@ def run_demo(
     *,
     levels: int = 3,
     n_modes: int = 30,
-    cache_dir: str | None = None,
-    cache: bool = True,
-    progress: bool | None = None,
+    precompute: Mapping[str, Any] | None = None,
     report: Callable[[str], None] = print,
 ) -> list[Comparison]:
     """Subdivide the samples; write an animation and a picture of each, and say how good they are.
@@ -57,28 +55,30 @@ def run_demo(
         out: Folder for ``NAME.glb`` and ``NAME.png``, which are replaced.
         levels: How often the number of intervals doubles.
         n_modes: Elastic modes of each key-frame.
-        cache_dir: Folder of the cache.
-        cache: Whether tetrahedra and modes are kept.
-        progress: Whether bars are shown; by default on terminals only.
+        precompute: Further options of `extract_bases`; ``progress`` holds for the rest too.
         report: Takes each line of the table and of the summary.
 
     Returns:
         The comparisons behind the table: one for each true frame that a frame of the result falls on.
     """
+    options = dict(precompute or {})
     found: list[Comparison] = []
     files: list[Path] = []
     for name in names:
         sample = load_sample(name)
         report(f"{name}: {len(sample.keyframes)} key-frames of {sample.keyframes.shape[1]} vertices")
         started = time.perf_counter()
-        bases = extract_bases(
-            sample.keyframes, sample.faces, n_modes, cache_dir=cache_dir, cache=cache, progress=progress
-        )
+        bases = extract_bases(sample.keyframes, sample.faces, n_modes, **options)
         extracted = time.perf_counter()
-        frames = subdivide(sample.keyframes, sample.faces, levels, bases=bases, cyclic=sample.cyclic, progress=progress)
+        frames = subdivide(
+            sample.keyframes, sample.faces, levels, bases=bases, cyclic=sample.cyclic, progress=options.get("progress")
+        )
         finished = time.perf_counter()
         new = len(frames) - len(sample.keyframes)
-        report(f"  {n_modes} modes of each: {extracted - started:.1f} s" + (", kept in the cache" if cache else ""))
+        report(
+            f"  {n_modes} modes of each: {extracted - started:.1f} s"
+            + (", kept in the cache" if options.get("cache", True) else "")
+        )
         report(f"  {new} shapes in between: {finished - extracted:.1f} s")
         places = keyframe_places(len(sample.keyframes), levels, cyclic=sample.cyclic)
         linear = linear_sequence(sample.keyframes, places)
