@@ -15,6 +15,7 @@ import torch
 import torch_modal as tm
 from torch_modal import cli, demo
 from torch_modal.export import save_frames
+from torch_modal.precompute import filling
 from torch_modal.precompute import modes as modes_module
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
@@ -38,7 +39,7 @@ def meshes(capsule: tuple[np.ndarray, np.ndarray], tmp_path_factory: pytest.Temp
 def coarse_tetrahedra(monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the mesher's time; nothing here depends on how fine the tetrahedra are."""
     coarse = TetrahedraSettings(edge_length_fac=0.05, epsilon=3e-3)
-    monkeypatch.setattr(modes_module, "TetrahedraSettings", lambda: coarse)
+    monkeypatch.setitem(modes_module.QUALITIES, "fast", coarse)
 
 
 @pytest.fixture
@@ -48,7 +49,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*_: object, **__: object) -> None:
         raise AssertionError("the mesher was started")
 
-    monkeypatch.setattr(modes_module, "tetrahedralize", started)
+    monkeypatch.setattr(filling, "tetrahedralize", started)
 
 
 def fails(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
@@ -207,12 +208,12 @@ def test_errors_are_one_line_and_debug_shows_the_traceback(
 def test_failed_mesher_is_one_line_and_a_bug_is_not(
     meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    argv = ["modes", meshes[0], "--out", str(tmp_path), "--no-cache"]
+    argv = ["modes", meshes[0], "--out", str(tmp_path), "--no-cache", "--mesher", "tetwild"]
 
     def crash(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(modes_module, "tetrahedralize", crash)
+    monkeypatch.setattr(filling, "tetrahedralize", crash)
     error: Exception = TetrahedralizationError("cannot fill\nthis")
     assert fails(capsys, *argv) == "cannot fill this"
     error = TypeError("a bug")

@@ -5,10 +5,12 @@ import math
 import pickle
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import torch
 from conftest import Shapes, bent_bar, needs_gradient_of_no_turn, random_rotation
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
 
@@ -382,11 +384,14 @@ class TestTorch:
         torch.testing.assert_close(called, other(x_a, x_b, 0.5), rtol=0, atol=1e-8)
         assert float((called - layer(x_a, x_b, 0.5)).abs().max()) > 1e-4
 
-    def test_copies_are_equal(self, layer: InBetween, bars: Shapes) -> None:
+    def test_copies_are_equal(self, layer: InBetween, bars: Shapes, tmp_path: Path) -> None:
         expected = layer(*bars.keyframes[:2], 0.5)
         loaded = InBetween(bars.bases[:2], bars.faces, coarse_faces=200)
         loaded.load_state_dict(layer.state_dict())
-        for twin in (copy.deepcopy(layer), pickle.loads(pickle.dumps(layer)), loaded):
+        save_file(layer.state_dict(), tmp_path / "layer.safetensors")  # refuses tensors that share memory
+        stored = InBetween(bars.bases[:2], bars.faces, coarse_faces=200)
+        stored.load_state_dict(load_file(tmp_path / "layer.safetensors"))
+        for twin in (stored, copy.deepcopy(layer), pickle.loads(pickle.dumps(layer)), loaded):
             assert torch.equal(twin(*bars.keyframes[:2], 0.5), expected)
 
     def test_deterministic(self, layer: InBetween, bars: Shapes) -> None:

@@ -11,7 +11,7 @@ from torch_modal.basis import ModalBasis
 from torch_modal.nn.between import Between, InBetweenResult, report
 from torch_modal.nn.gauss_newton import Solution
 
-# The best of a grid over three spans of a hand (docs/how-it-works.md); the result depends on it, and on the mesh.
+# The best of a grid over three spans of a hand (tests/benchmarks/quality.py); it depends on the mesh.
 DEFAULT_MU = 1.0
 
 
@@ -39,9 +39,9 @@ class InBetween(nn.Module):
         tolerance: Bound on the gradient norm, relative to the one at the start.
         gradient: ``"implicit"`` (by the implicit function theorem with the full Hessian; memory does not grow with the
             steps) or ``"unroll"`` (through all steps).
-        unconverged: What happens to samples that did not converge while gradients are recorded: ``"warn"`` lets no
-            gradient flow through their amplitudes, ``"raise"`` raises. With ``gradient="unroll"`` only :meth:`solve`
-            tells.
+        unconverged: What happens when samples did not converge: ``"warn"`` warns and lets no gradient flow through
+            their amplitudes, ``"raise"`` raises where gradients are recorded. With ``gradient="unroll"`` only
+            :meth:`solve` tells.
 
     Raises:
         ValueError: An argument is not usable.

@@ -92,7 +92,7 @@ def dihedral_angle(spokes: Tensor) -> Tensor:
 def dihedral_gradient(spokes: Tensor) -> Tensor:
     """Gradient of :func:`dihedral_angle` in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
 
-    ``torch.func`` gives the same through the angle itself, at eight times the cost (docs/performance.md).
+    ``torch.func`` gives the same through the angle itself, at ten times the cost (docs/how-it-works.md).
 
     Args:
         spokes: As above. *Shape:* ``(3, 3, ...)``.
