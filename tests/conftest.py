@@ -1,5 +1,6 @@
 """Fixtures that several test files share; everything made once per run."""
 
+import signal
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -135,6 +136,11 @@ def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
     """What the layer's energy knows of the in-betweens of placed key-frames."""
     member: Any = layer.in_between.members[0]
     return member.space.placement(*member.problem(pair, t).inputs)
+
+
+def listen_to_ctrl_c() -> None:
+    """For ``preexec_fn``: a run in the background of a shell has SIGINT ignored, and its children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def random_rotation(generator: torch.Generator) -> torch.Tensor:

@@ -11,6 +11,7 @@ import numpy as np
 import pygltflib
 import pytest
 import torch
+from conftest import listen_to_ctrl_c
 
 import torch_modal as tm
 from torch_modal import cli, demo
@@ -266,6 +267,7 @@ def test_interrupt_says_one_line_and_leaves_with_130(meshes: list[str], tmp_path
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "TMPDIR": str(scratch)},
+        preexec_fn=listen_to_ctrl_c,
     )
     end = time.monotonic() + 100
     while not list(scratch.glob("torch_modal-*/log.txt")):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import listen_to_ctrl_c
 from hostile_inputs import CASES, EITHER, ERROR
 from torch.utils.data import DataLoader, Dataset
 
@@ -62,6 +63,7 @@ def start(cache: Path, code: str = CALL) -> "subprocess.Popen[str]":
         stderr=subprocess.PIPE,
         text=True,
         env=environment(cache),
+        preexec_fn=listen_to_ctrl_c if os.name == "posix" else None,
     )
 
 
