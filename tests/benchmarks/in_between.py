@@ -82,9 +82,11 @@ def main() -> None:
             linear = median_seconds(lambda: torch.lerp(case.x_a, case.x_b, 0.5), 50 * arguments.repeats)  # noqa: B023
             frame = layer.space.frame
             half = torch.full((1,), 0.5, dtype=torch.float64)
-            problem = layer.in_between.members[0].problem(frame.place(case.x_a[None], case.x_b[None]), half)
+            member = layer.in_between.members[0]
+            inputs = member.problem(frame.place(case.x_a[None], case.x_b[None]), half).inputs
+            placement = member.space.placement(*inputs)
             start = torch.zeros(1, layer.space.n_unknowns, dtype=torch.float64)
-            gain = float(solution.energy / layer.space.energy.value(start, problem.placement))
+            gain = float(solution.energy / layer.space.energy.value(start, placement))
         row = f"{case.name:<20}{len(case.x_a):>7}{int(solution.n_steps):>7}{gain:>15.3f}"
         row += f"{1e3 * seconds:>9.1f}{seconds / linear:>10.0f}"
         if not arguments.skip_mesher:
