@@ -224,8 +224,9 @@ def minimise(
         status[~(norm.isfinite() & energy.isfinite())] = Status.INVALID
         leaving = (status != Status.OUT_OF_STEPS) | (k == max_steps)
         if not bool(leaving.all()):
-            if bool(slow.any()):
-                derivatives = derivatives._replace(second_order=_second_order(step.energy, a, placement, slow))
+            needing = slow & ~leaving
+            if bool(needing.any()):
+                derivatives = derivatives._replace(second_order=_second_order(step.energy, a, placement, needing))
             taken = step.take(a, energy, derivatives, placement)
             # Where all that is left to gain drowns in the rounding of the energy, the minimum is found.
             drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
