@@ -22,6 +22,7 @@ ORDER = [
     ["precompute.filling"],
     ["precompute.modes"],
     ["nn", "nn.shell"],
+    ["nn.curvature"],
     ["nn.modal_shell"],
     ["nn.frame", "nn.gauss_newton"],
     ["nn.joint", "nn.paired", "nn.implicit"],
@@ -91,7 +92,7 @@ def test_precompute_does_not_know_the_layers(module: str) -> None:
 def test_layers_are_torch_only(module: str) -> None:
     packages = {name.split(".")[0] for name in imported(module)}
     assert not packages & FOREIGN_TO_LAYERS
-    if module not in ("nn.modal_shell", "nn.frame"):
+    if module not in ("nn.curvature", "nn.frame"):
         assert "numpy" not in packages
     # Only the frame, made once, looks into the other room.
     allowed = {"precompute.coarsening"} if module == "nn.frame" else set()

@@ -7,7 +7,7 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
-from torch_modal.nn import modal_shell
+from torch_modal.nn import curvature
 from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement, Reference
 from torch_modal.nn.shell import ShellEnergy
 
@@ -132,7 +132,7 @@ def test_second_order_is_optional_and_comes_in_chunks(small_bars: Shapes, monkey
     whole, first_order = case.derivatives(), case.derivatives(second_order=False)
     assert first_order.second_order is None
     assert torch.equal(whole.gauss_newton, first_order.gauss_newton)
-    monkeypatch.setattr(modal_shell, "_CHUNK_BYTES", 1)  # one sample at a time
+    monkeypatch.setattr(curvature, "_CHUNK_BYTES", 1)  # one sample at a time
     assert whole.second_order is not None
     torch.testing.assert_close(case.derivatives().second_order, whole.second_order, rtol=1e-12, atol=1e-9)
 

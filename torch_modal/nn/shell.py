@@ -56,6 +56,11 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
+def pick(rows: Tensor, index: Tensor) -> Tensor:
+    """``rows[..., index]``, by the operation that is three times as fast on a CPU. *Shape:* ``(..., V), (m,)``."""
+    return rows.gather(-1, index.expand(*rows.shape[:-1], -1))
+
+
 def edge_length(edge: Tensor) -> Tensor:
     """Length of edge vectors ``x_j - x_i``, components first. *Shape:* ``(3, ...) -> (...)``."""
     squared = (edge * edge).sum(0)
@@ -111,6 +116,52 @@ def dihedral_gradient(spokes: Tensor) -> Tensor:
     return torch.stack([to_e, to_a, to_b])
 
 
+def length_hessian(edge: Tensor) -> Tensor:
+    """Hessian of :func:`edge_length`, 0 where there is no length. *Shape:* ``(3, ...) -> (3, 3, ...)``."""
+    squared = (edge * edge).sum(0)
+    inverse = _inverse(squared.sqrt(), squared <= _tiny(edge))
+    unit = edge * inverse
+    eye = torch.eye(3, dtype=edge.dtype, device=edge.device).reshape(3, 3, *[1] * (edge.dim() - 1))
+    return (eye - unit[:, None] * unit) * inverse
+
+
+def dihedral_hessian(spokes: Tensor) -> Tensor:
+    r"""Hessian of :func:`dihedral_angle` in closed form, as its blocks between different vertices.
+
+    Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude ``h``
+    and ``w = n x e``: with :math:`S = (n w^T + w n^T)\, |e| / |n_1|^2` and :math:`U = e n^T / (|e| |n_1|)`, a tip
+    whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with ``j``. The edge's own,
+    between ``e`` and ``e``, is :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)`. The two tips have none. What is left
+    follows because translations change nothing.
+
+    Args:
+        spokes: As above. *Shape:* ``(3, 3, ...)``.
+
+    Returns:
+        The blocks of the vertices ``ij, ki, kj, li, lj`` (:func:`torch_modal.mesh.hinges`), indexed by row, then
+        column; zero where a triangle is collapsed. *Shape:* ``(5, 3, 3, ...)``.
+    """
+    e, a, b = spokes
+    n1, n2 = cross(e, a), cross(b, e)
+    flat = _collapsed(e, n1) | _collapsed(e, n2)
+    length = edge_length(e)
+    per_length = _inverse(length, flat)
+    own: Tensor | float = 0.0
+    blocks = []
+    for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
+        area = (normal * normal).sum(0)
+        per_area = _inverse(area, flat)
+        # n and w are not of length one here: their factors are in front.
+        half = (normal * (length * per_area * per_area))[:, None] * w
+        s = half + half.transpose(0, 1)
+        u = e[:, None] * (normal * (per_length * per_area))
+        r = (tip * e).sum(0) * per_length * per_length
+        across = u - r * s
+        own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1)) + across
+        blocks += [-s - across, across]
+    return torch.stack([-own, *blocks])  # type: ignore[operator]
+
+
 def _collapsed(edge: Tensor, normal: Tensor) -> Tensor:
     """Whether a triangle on this edge has no altitude. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
     bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
@@ -130,7 +181,7 @@ def _inverse(x: Tensor, zero: Tensor) -> Tensor:
 
 def enclosed_volume(rows: Tensor, faces: Tensor) -> Tensor:
     """Signed volume between a surface and the origin. *Shape:* ``(3, ..., V), (F, 3) -> (...)``."""
-    a, b, c = (rows[..., corner] for corner in faces.unbind(1))
+    a, b, c = (pick(rows, corner) for corner in faces.unbind(1))
     return (a * cross(b, c)).sum((0, -1)) / 6
 
 
@@ -190,16 +241,16 @@ class ShellEnergy(nn.Module):
 
     def edge_vectors(self, rows: Tensor) -> Tensor:
         """``x_j - x_i`` of all edges. *Shape:* ``(3, ..., V) -> (3, ..., E)``."""
-        return rows[..., self.edges[:, 1]] - rows[..., self.edges[:, 0]]
+        return pick(rows, self.edges[:, 1]) - pick(rows, self.edges[:, 0])
 
     def hinge_spokes(self, rows: Tensor) -> Tensor:
         """The three vectors that :func:`dihedral_angle` takes. *Shape:* ``(3, ..., V) -> (3, 3, ..., H)``."""
-        origin, *ends = (rows[..., corner] for corner in self.hinges.unbind(1))
+        origin, *ends = (pick(rows, corner) for corner in self.hinges.unbind(1))
         return torch.stack([end - origin for end in ends])
 
     def volume(self, rows: Tensor) -> Tensor:
         """Signed volume between the surface and its centroid. *Shape:* ``(3, ..., V) -> (...)``."""
-        return enclosed_volume(rows - rows[..., self.used].mean(-1, keepdim=True), self.faces)
+        return enclosed_volume(rows - pick(rows, self.used).mean(-1, keepdim=True), self.faces)
 
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of a shape.
@@ -226,7 +277,7 @@ class ShellEnergy(nn.Module):
         hinge_area = 0.5 * (edge_length(n1) + edge_length(n2))
         squared = (e * e).sum(0)
         shortest = MIN_RELATIVE_LENGTH * measures.length.mean(-1, keepdim=True)
-        p, q, r = (rows[..., corner] for corner in self.faces.unbind(1))
+        p, q, r = (pick(rows, corner) for corner in self.faces.unbind(1))
         surface = 0.5 * edge_length(cross(q - p, r - p)).sum(-1)
         volume_floor = MIN_RELATIVE_VOLUME * surface**1.5
         alpha, beta, gamma = stiffness or self.stiffness
