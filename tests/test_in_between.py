@@ -18,6 +18,7 @@ from torch_modal.nn.between import ConvergenceError, ConvergenceWarning
 from torch_modal.nn.gauss_newton import Status
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.shell import ShellEnergy
 
 DOUBLE = torch.float64
 
@@ -124,6 +125,29 @@ class TestValues:
         loop = torch.stack([layer(a, b, s) for a, b, s in zip(x_a, x_b, t, strict=True)])
         assert float((layer(x_a, x_b, t) - loop).abs().max()) < bound * diagonal(bars.keyframes[0])
 
+    def test_local_interpolation_lowers_the_energy_and_keeps_the_conventions(self, bars: Shapes) -> None:
+        layers = [InBetween(bars.bases[1:], bars.faces, coarse_faces=200, local=n > 0, polish=n // 2) for n in range(3)]
+        x_a, x_b = bars.keyframes[1:]
+        shell = ShellEnergy(bars.faces)
+        scale = 100 / diagonal(x_a)
+        energies = [
+            float(sum(shell(scale * layer(x_a, x_b, 0.5)[0], scale * x) for x in (x_a, x_b))) for layer in layers
+        ]
+        assert energies[2] < energies[1] < energies[0]
+        at = times(0.0, 0.2, 0.9, 1.0)
+        together = layers[1](x_a, x_b, at)
+        assert torch.equal(together[0], x_a)
+        assert torch.equal(together[3], x_b)
+        alone = torch.stack([layers[1](x_a, x_b, t)[0] for t in at])
+        torch.testing.assert_close(together, alone, rtol=0, atol=1e-10)
+        single = copy.deepcopy(layers[1]).float()(x_a.float(), x_b.float(), at.float())
+        assert float((single - together).abs().max()) < 1e-3 * diagonal(x_a)
+
+    @pytest.mark.parametrize("polish", [-1, 1.5])
+    def test_a_number_of_steps_is_whole(self, bars: Shapes, polish: float) -> None:
+        with pytest.raises(ValueError, match="number of steps"):
+            InBetween(bars.bases[:2], bars.faces, polish=polish)  # type: ignore[arg-type]
+
     def test_float32_is_near_float64(self, bars: Shapes) -> None:
         exact = InBetween(bars.bases[1:], bars.faces, coarse_faces=200)
         single = copy.deepcopy(exact).float()
@@ -180,6 +204,37 @@ class TestGradients:
                 lambda y, name=name: value(**{**inputs, name: y}), x, direction, DIFFERENCE_STEPS[name]
             )
             assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5), name
+
+    def test_through_the_steps_on_the_fine_mesh(self, large: Shapes, generator: torch.Generator) -> None:
+        """Local interpolation and polish are part of the function that is differentiated."""
+        weights = torch.randn(large.keyframes.shape[1:], generator=generator, dtype=DOUBLE)
+        inputs = self.inputs(large, "joint", generator)
+        del inputs["mu"]
+
+        def value(local: bool = True, **inputs: Tensor) -> Tensor:
+            constants = {name: inputs[name] for name in ("alpha", "beta", "gamma")}
+            layer = InBetween(
+                large.bases[1:],
+                large.faces,
+                coarse_faces=200,
+                tolerance=1e-13,
+                local=local,
+                polish=int(local),
+                **constants,
+            )
+            return (layer(inputs["x_a"], inputs["x_b"], inputs["t"]) * weights).sum()
+
+        leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
+        gradients = torch.autograd.grad(value(**leaves), list(leaves.values()))
+        for name, gradient in zip(inputs, gradients, strict=True):
+            x = inputs[name]
+            direction = torch.randn(x.shape, generator=generator, dtype=DOUBLE) if x.dim() else torch.ones_like(x)
+            expected = central_difference(
+                lambda y, name=name: value(**{**inputs, name: y}), x, direction, DIFFERENCE_STEPS[name]
+            )
+            assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5), name
+        (without,) = torch.autograd.grad(value(local=False, **leaves), leaves["x_a"])
+        assert float((without - gradients[0]).norm()) > 1e-2 * float(without.norm())
 
     def test_the_gauss_newton_hessian_would_not_do(
         self, large: Shapes, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch

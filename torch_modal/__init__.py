@@ -5,6 +5,8 @@ from torch_modal.errors import MeshError as MeshError
 from torch_modal.errors import MeshWarning as MeshWarning
 from torch_modal.export import save_animation as save_animation
 from torch_modal.export import save_frames as save_frames
+from torch_modal.full_space import FullSpaceResult as FullSpaceResult
+from torch_modal.full_space import full_space as full_space
 from torch_modal.keyframes import check_keyframes as check_keyframes
 from torch_modal.keyframes import load_keyframes as load_keyframes
 from torch_modal.nn.between import ConvergenceError as ConvergenceError
@@ -24,6 +26,7 @@ from torch_modal.version import __version__ as __version__
 __all__ = [
     "ConvergenceError",
     "ConvergenceWarning",
+    "FullSpaceResult",
     "GaussNewtonStep",
     "InBetween",
     "MeshError",
@@ -35,6 +38,7 @@ __all__ = [
     "check_keyframes",
     "extract_bases",
     "extract_modes",
+    "full_space",
     "keyframe_places",
     "linear_sequence",
     "load_keyframes",

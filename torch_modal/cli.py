@@ -234,6 +234,19 @@ def _parser() -> argparse.ArgumentParser:
         help="how strongly --space paired pulls its two shapes together (default: 1)",
     )
     sub.add_argument(
+        "--no-local",
+        dest="local",
+        action="store_false",
+        help="leave out the steps on the fine mesh that mend what the modes cannot reach",
+    )
+    sub.add_argument(
+        "--polish",
+        type=_number(int, 0),
+        metavar="N",
+        default=0,
+        help="further steps on the fine mesh, towards the optimum over all vertices (default: %(default)s)",
+    )
+    sub.add_argument(
         "--format", choices=("ply", "obj", "off"), default="ply", help="of the frames (default: %(default)s)"
     )
     sub.add_argument(

@@ -45,6 +45,8 @@ def subdivide(args: argparse.Namespace) -> None:
         progress=progress,
         space=args.space,
         coarse_faces=args.coarse_faces,
+        local=args.local,
+        polish=args.polish,
         **options,
     )
     report = _reporter(args)

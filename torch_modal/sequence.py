@@ -27,6 +27,7 @@ def subdivide(
     n_modes: int = 30,
     cyclic: bool = False,
     n_frames: int | None = None,
+    local: bool = True,
     progress: bool | None = None,
     **mid_shape: Any,
 ) -> Tensor:
@@ -46,8 +47,9 @@ def subdivide(
         n_frames: Number of frames of the result, by linear fill (along the geodesic of the rigid motion) between the
             subdivided shapes. The key-frames keep their place in it: intervals differ by one frame where the number
             does not divide. Default: the subdivided shapes as they are.
+        local: Whether each mid-shape takes a few steps on the fine mesh, for what the modes cannot reach.
         progress: Whether to show progress bars. Default: on a terminal only.
-        **mid_shape: Further options of :class:`torch_modal.MidShape`, such as ``space`` or ``coarse_faces``.
+        **mid_shape: Further options of :class:`torch_modal.MidShape`: ``space``, ``coarse_faces``, ``polish``, ...
 
     Returns:
         The sequence in the caller's coordinates, dtype and device, the key-frames bit for bit at their places. *Shape:*
@@ -78,7 +80,7 @@ def subdivide(
     with bar, torch.no_grad():
         for i in range(intervals):
             j = (i + 1) % n_keys
-            segment = _Segment((bases[i], bases[j]), working_faces, mid_shape, keyframes.device)
+            segment = _Segment((bases[i], bases[j]), working_faces, {**mid_shape, "local": local}, keyframes.device)
             shapes = torch.stack([keyframes[i], keyframes[j]])
             for _ in range(levels):
                 shapes = _interleave(shapes, segment.mid_shapes(shapes))

@@ -162,4 +162,4 @@ def _rows_of_blocks(edges: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
     place = within[:, None] * _NEIGHBOURS + np.arange(_NEIGHBOURS)
     filled = place < degree[owner][:, None]
     slots = order[first[owner][:, None] + np.where(filled, place, 0)]
-    return tuple(torch.from_numpy(array) for array in (vertices[owner], slots, filled))
+    return torch.from_numpy(vertices[owner]), torch.from_numpy(slots), torch.from_numpy(filled)

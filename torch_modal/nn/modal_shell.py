@@ -15,12 +15,10 @@ from torch_modal.nn.shell import (
     Measures,
     Rest,
     ShellEnergy,
-    cross,
     dihedral_angle,
     dihedral_gradient,
     edge_length,
     length_gradient,
-    pick,
 )
 
 
@@ -43,6 +41,26 @@ class Reference(NamedTuple):
     rest: Rest
     pull: Tensor
     """Factor of its energy. *Shape:* ``(B,)``."""
+
+
+def slopes_of(measures: Measures, references: Sequence[Reference]) -> tuple[Measures, Measures]:
+    """First and second derivative of the energy in each measure, summed over the references."""
+    slopes, curvatures = [], []
+    for rest, pull in references:
+        differences = ShellEnergy.differences(measures, rest)
+        pulls = (pull[:, None], pull[:, None], pull)
+        doubled = [2 * p * w for p, w in zip(pulls, rest.weights, strict=True)]
+        slopes.append([w * d for w, d in zip(doubled, differences, strict=True)])
+        curvatures.append(doubled)
+    return (
+        Measures(*(sum(parts) for parts in zip(*slopes, strict=True))),
+        Measures(*(sum(parts) for parts in zip(*curvatures, strict=True))),
+    )
+
+
+def energy_of(shell: ShellEnergy, measures: Measures, references: Sequence[Reference]) -> Tensor:
+    """Energy of shapes that were measured, summed over the references. *Shape:* ``(..., B)``."""
+    return sum(pull * shell.energy(measures, rest) for rest, pull in references)  # type: ignore[return-value]
 
 
 class Placement(NamedTuple):
@@ -86,10 +104,7 @@ class ModalShell(nn.Module):
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
-        measures = self.shell.measure(self.shape(a, placement))
-        return sum(  # type: ignore[return-value]
-            pull * self.shell.energy(measures, rest) for rest, pull in placement.references
-        )
+        return energy_of(self.shell, self.shell.measure(self.shape(a, placement)), placement.references)
 
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``.
@@ -104,9 +119,9 @@ class ModalShell(nn.Module):
         rows = x.movedim(-1, 0).contiguous()
         edges, spokes = shell.edge_vectors(rows), shell.hinge_spokes(rows)
         measures = Measures(edge_length(edges), dihedral_angle(spokes), shell.volume(rows))
-        slope, curvature = self._slopes(measures, placement.references)
+        slope, curvature = slopes_of(measures, placement.references)
 
-        to_volume = self._volume_gradient(rows).movedim(0, -1).flatten(1)
+        to_volume = self.shell.volume_gradient(rows).movedim(0, -1).flatten(1)
         volume_row = to_volume @ self.columns.flatten(0, 1)
         edge_extra = hinge_extra = None
         if placement.extra is not None:
@@ -132,7 +147,7 @@ class ModalShell(nn.Module):
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
         x = self.shape(a, placement)
-        slope, _ = self._slopes(self.shell.measure(x), placement.references)
+        slope, _ = slopes_of(self.shell.measure(x), placement.references)
         return self.curvature(self.shell, self.columns, x.movedim(-1, 0).contiguous(), slope, placement.extra)
 
     def slope(self, a: Tensor, direction: Tensor, placement: Placement) -> Tensor:
@@ -144,35 +159,11 @@ class ModalShell(nn.Module):
         x = self.shape(a, placement)
         moved = self.shape(direction, placement) - placement.base
         rows, along = (y.movedim(-1, 0).contiguous() for y in (x, moved))
-        slope, _ = self._slopes(shell.measure(x), placement.references)
+        slope, _ = slopes_of(shell.measure(x), placement.references)
         length = (length_gradient(shell.edge_vectors(rows)) * shell.edge_vectors(along)).sum(0)
         angle = (dihedral_gradient(shell.hinge_spokes(rows)) * shell.hinge_spokes(along)).sum((0, 1))
-        volume = (self._volume_gradient(rows) * along).sum((0, -1))
+        volume = (self.shell.volume_gradient(rows) * along).sum((0, -1))
         return (slope.length * length).sum(-1) + (slope.angle * angle).sum(-1) + slope.volume * volume
-
-    def _volume_gradient(self, rows: Tensor) -> Tensor:
-        """Gradient of :meth:`ShellEnergy.volume`. *Shape:* ``(3, B, V) -> (3, B, V)``."""
-        shell = self.shell
-        rows = rows - pick(rows, shell.used).mean(-1, keepdim=True)
-        a, b, c = (pick(rows, corner) for corner in shell.faces.unbind(1))
-        parts = [cross(*pair) for pair in ((b, c), (c, a), (a, b))]
-        out = torch.zeros_like(rows).index_add(-1, shell.faces.T.flatten(), torch.cat(parts, -1)) / 6
-        mean = out.sum(-1, keepdim=True) / len(shell.used)  # the centroid moves along; zero on a closed surface
-        return out.index_add(-1, shell.used, -mean.expand(-1, -1, len(shell.used)).contiguous())
-
-    def _slopes(self, measures: Measures, references: Sequence[Reference]) -> tuple[Measures, Measures]:
-        """First and second derivative of the energy in each measure, summed over the references."""
-        slopes, curvatures = [], []
-        for rest, pull in references:
-            differences = self.shell.differences(measures, rest)
-            pulls = (pull[:, None], pull[:, None], pull)
-            doubled = [2 * p * w for p, w in zip(pulls, rest.weights, strict=True)]
-            slopes.append([w * d for w, d in zip(doubled, differences, strict=True)])
-            curvatures.append(doubled)
-        return (
-            Measures(*(sum(parts) for parts in zip(*slopes, strict=True))),
-            Measures(*(sum(parts) for parts in zip(*curvatures, strict=True))),
-        )
 
 
 def _normal_equations(

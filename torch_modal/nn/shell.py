@@ -146,7 +146,7 @@ def dihedral_hessian(spokes: Tensor) -> Tensor:
     flat = _collapsed(e, n1) | _collapsed(e, n2)
     length = edge_length(e)
     per_length = _inverse(length, flat)
-    own: Tensor | float = 0.0
+    own = e.new_zeros(())
     blocks = []
     for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
         area = (normal * normal).sum(0)
@@ -159,7 +159,7 @@ def dihedral_hessian(spokes: Tensor) -> Tensor:
         across = u - r * s
         own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1)) + across
         blocks += [-s - across, across]
-    return torch.stack([-own, *blocks])  # type: ignore[operator]
+    return torch.stack([-own, *blocks])
 
 
 def _collapsed(edge: Tensor, normal: Tensor) -> Tensor:
@@ -252,13 +252,25 @@ class ShellEnergy(nn.Module):
         """Signed volume between the surface and its centroid. *Shape:* ``(3, ..., V) -> (...)``."""
         return enclosed_volume(rows - pick(rows, self.used).mean(-1, keepdim=True), self.faces)
 
+    def volume_gradient(self, rows: Tensor) -> Tensor:
+        """Gradient of :meth:`volume`. *Shape:* ``(3, ..., V) -> (3, ..., V)``."""
+        rows = rows - pick(rows, self.used).mean(-1, keepdim=True)
+        a, b, c = (pick(rows, corner) for corner in self.faces.unbind(1))
+        parts = [cross(*pair) for pair in ((b, c), (c, a), (a, b))]
+        out = torch.zeros_like(rows).index_add(-1, self.faces.T.flatten(), torch.cat(parts, -1)) / 6
+        mean = out.sum(-1, keepdim=True) / len(self.used)  # the centroid moves along; zero on a closed surface
+        return out.index_add(-1, self.used, -mean.expand(*mean.shape[:-1], len(self.used)).contiguous())
+
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of a shape.
 
         Args:
             x: Vertex positions. *Shape:* ``(..., V, 3)``.
         """
-        rows = x.movedim(-1, 0).contiguous()
+        return self.measure_rows(x.movedim(-1, 0).contiguous())
+
+    def measure_rows(self, rows: Tensor) -> Measures:
+        """Lengths, angles and volume of a shape, components first. *Shape:* ``(3, ..., V)``."""
         return Measures(
             edge_length(self.edge_vectors(rows)), dihedral_angle(self.hinge_spokes(rows)), self.volume(rows)
         )
