@@ -28,7 +28,7 @@ class Body(NamedTuple):
     """A surface and how it moves."""
 
     rest: FloatArray
-    """*Shape:* ``(V, 3)``."""
+    """Straight; the first key-frame, but for the gutter. *Shape:* ``(V, 3)``."""
     faces: IntArray
     """Wound counterclockwise seen from outside. *Shape:* ``(F, 3)``."""
     motion: Motion
@@ -256,25 +256,34 @@ def _sheet() -> tuple[FloatArray, IntArray]:
     return sheet_surface((72, 36), (BAR, 2.0))
 
 
-def _degrees(motion: Callable[..., FloatArray], angle: float, start: float, stop: float) -> Motion:
-    return partial(motion, angle=np.radians(angle), start=start, stop=stop)
-
-
-_BODIES: dict[str, tuple[Callable[[], tuple[FloatArray, IntArray]], Motion]] = {
-    "bar bent 90": (_bar, _degrees(bend, 90, 0, BAR)),
-    "bar bent 180": (_bar, _degrees(bend, 180, 0, BAR)),
-    "bar twisted 90": (_bar, _degrees(twist, 90, 0, BAR)),
-    "bar twisted 180": (_bar, _degrees(twist, 180, 0, BAR)),
-    "tube bent 90": (_tube, _degrees(bend, 90, 0, BAR)),
-    "tube squeezed": (_tube, partial(squeeze, amount=1.2, radius=0.6)),
-    "vessel bent 60": (_vessel, _degrees(bend, 60, 0.3, 3.2)),
-    "limb bent 120": (_limb, _degrees(bend, 120, 1.5, LIMB)),
-    "elbow bent 120": (_limb, _degrees(bend, 120, 2.6, 3.4)),
-    "sheet rolled 270": (_sheet, _degrees(bend, 270, 0, BAR)),
+_BENT = {
+    "bar bent": (_bar, bend, 0.0, BAR),
+    "bar twisted": (_bar, twist, 0.0, BAR),
+    "tube bent": (_tube, bend, 0.0, BAR),
+    "vessel bent": (_vessel, bend, 0.3, 3.2),
+    "limb bent": (_limb, bend, 1.5, LIMB),
+    "elbow bent": (_limb, bend, 2.6, 3.4),
+    "sheet rolled": (_sheet, bend, 0.0, BAR),
+    "gutter rolled": (_sheet, bend, 0.0, BAR),
 }
+GUTTER = 1 / 3
+"""How far the gutter, a sheet, is rolled already at the first key-frame: a flat one has no inside to be filled."""
+SQUEEZED = "tube squeezed"
 
-BODIES = tuple(_BODIES)
-"""Names that :func:`body` takes: what is moved, how, and by how many degrees."""
+BODIES = (
+    "bar bent 90",
+    "bar bent 180",
+    "bar twisted 90",
+    "bar twisted 180",
+    "tube bent 90",
+    SQUEEZED,
+    "vessel bent 60",
+    "limb bent 120",
+    "elbow bent 120",
+    "sheet rolled 270",
+    "gutter rolled 270",
+)
+"""The bodies that are looked at by default; :func:`body` takes other angles as well."""
 
 
 @cache
@@ -289,8 +298,22 @@ def body(name: str, jittered: bool = False) -> Body:
     """One of the bodies, of 2,000 to 4,000 vertices.
 
     Args:
-        name: One of ``BODIES``.
+        name: What is moved and how, and by how many degrees in its whole: ``"bar twisted 180"``.
         jittered: Whether its triangulation is irregular.
+
+    Raises:
+        ValueError: There is no such body.
     """
-    make, motion = _BODIES[name]
-    return Body(*_at_rest(make, jittered), motion)
+    if name == SQUEEZED:
+        return Body(*_at_rest(_tube, jittered), partial(squeeze, amount=1.2, radius=0.6))
+    kind, _, degrees = name.rpartition(" ")
+    if kind not in _BENT or not degrees.isdigit():
+        raise ValueError(f"there is no body {name!r}; there are {SQUEEZED!r} and, with an angle, {', '.join(_BENT)}")
+    make, bending, start, stop = _BENT[kind]
+    motion = partial(bending, angle=np.radians(int(degrees)), start=start, stop=stop)
+    return Body(*_at_rest(make, jittered), partial(_later, motion) if kind.startswith("gutter") else motion)
+
+
+def _later(motion: Motion, points: FloatArray, time: float) -> FloatArray:
+    """The motion without its first part."""
+    return motion(points, GUTTER + (1 - GUTTER) * time)

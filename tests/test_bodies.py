@@ -10,6 +10,8 @@ from torch_modal.inspect_mesh import consistent_winding, degenerate_faces, repea
 
 HOLLOW = [name for name in BODIES if name.startswith(("tube", "vessel"))]
 
+SHEETS = ("sheet", "gutter")
+
 
 def lengths(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
@@ -25,7 +27,7 @@ def test_one_manifold_surface_of_the_promised_size(name: str, jittered: bool) ->
     assert not degenerate_faces(shape.faces).any() and not repeated_faces(shape.faces).any()
     assert len(consistent_winding(shape.faces).flipped) == 0
     euler = len(shape.rest) - len(edges) + len(shape.faces)
-    if name.startswith("sheet"):
+    if name.startswith(SHEETS):
         assert set(counts) == {1, 2} and euler == 1  # a disc
     else:
         assert set(counts) == {2} and euler == (0 if name.startswith("tube") else 2)
@@ -35,7 +37,8 @@ def test_one_manifold_surface_of_the_promised_size(name: str, jittered: bool) ->
 @pytest.mark.parametrize("name", BODIES)
 def test_motion_starts_at_rest(name: str) -> None:
     shape = body(name)
-    assert np.allclose(shape.pose(0.0), shape.rest, atol=1e-13)
+    start = bend(shape.rest, 1.0, np.radians(90), 0, BAR) if name.startswith("gutter") else shape.rest
+    assert np.allclose(shape.pose(0.0), start, atol=1e-13)
     assert np.ptp(shape.pose(1.0) - shape.pose(0.0)) > 0.3
 
 
@@ -64,7 +67,7 @@ def test_no_face_turns_over_and_no_face_degenerates(name: str, jittered: bool) -
         assert (np.linalg.norm(found, axis=1) > 0.2 * np.linalg.norm(normals(shape.rest), axis=1)).all()
 
 
-@pytest.mark.parametrize("name", [name for name in BODIES if not name.startswith("sheet")])
+@pytest.mark.parametrize("name", [name for name in BODIES if not name.startswith(SHEETS)])
 def test_volume_stays(name: str) -> None:
     """Pappus: sections that are symmetric about the centre line sweep the volume of the straight body."""
     shape = body(name)
@@ -188,6 +191,13 @@ def test_irregular_is_the_same_surface_otherwise_triangulated(name: str) -> None
         assert np.array_equal(mesh.boundary_edges(other.faces), mesh.boundary_edges(regular.faces))
     again = body(name, jittered=True)
     assert np.array_equal(again.rest, other.rest) and np.array_equal(again.faces, other.faces)
+
+
+def test_names_carry_angles_and_unknown_ones_are_refused() -> None:
+    assert np.allclose(body("bar bent 90").pose(1.0), body("bar bent 360").pose(0.25))
+    for name in ("bar", "bar bent", "bar bent far", "rope bent 90"):
+        with pytest.raises(ValueError, match="there is no body"):
+            body(name)
 
 
 def test_a_body_too_thick_for_its_arc_is_refused() -> None:

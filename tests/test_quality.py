@@ -20,13 +20,9 @@ from torch_modal.rigid import RigidMotion
 BENCHMARKS = Path(__file__).parent / "benchmarks"
 
 
-def case_of(name: str) -> cases.Case:
-    return next(case for case in cases.bodies(jittered=False) if case.name == name)
-
-
 @pytest.fixture(scope="module")
 def bent_bar() -> cases.Case:
-    return case_of("bar bent 180")
+    return next(cases.bodies(["bar bent 180"]))
 
 
 def moved(x: torch.Tensor) -> torch.Tensor:

@@ -139,9 +139,9 @@ def samples() -> Iterator[Case]:
             yield Case(f"sample {name} {i}/{(i + 1) % n}", shapes, i, (i + 1) % n, truths)
 
 
-def bodies(jittered: bool) -> Iterator[Case]:
+def bodies(names: Iterable[str] = BODIES, jittered: bool = False) -> Iterator[Case]:
     """Synthetic bodies that bend far, and thin and hollow ones."""
-    for name in BODIES:
+    for name in names:
         shape = body(name, jittered)
         first, half, last = (torch.from_numpy(shape.pose(t)) for t in (0.0, HALF, 1.0))
         shapes = KeyframeSet(torch.stack([first, last]), torch.from_numpy(np.array(shape.faces)))

@@ -73,9 +73,10 @@ def chosen_cases(arguments: argparse.Namespace) -> Iterator[Case]:
     if arguments.samples:
         yield from cases.samples()
     if arguments.bodies:
-        yield from cases.bodies(jittered=False)
+        yield from cases.bodies()
     if arguments.irregular:
         yield from cases.bodies(jittered=True)
+    yield from cases.bodies(arguments.body)
 
 
 def parse() -> argparse.Namespace:
@@ -86,6 +87,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--samples", action="store_true", help="the samples that come with the package")
     parser.add_argument("--bodies", action="store_true", help="bars, hollow and slender bodies, a sheet")
     parser.add_argument("--irregular", action="store_true", help="the same with irregular triangles")
+    parser.add_argument("--body", nargs="+", default=[], metavar="NAME", help="others, such as 'bar bent 270'")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--only", default="", metavar="TEXT", help="only cases with this in their name")
     parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
@@ -94,8 +96,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--bars", type=Path, metavar="FILE.png", help="draw the errors as bars")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
     arguments = parser.parse_args()
-    if not (arguments.folders or arguments.shared or arguments.samples or arguments.bodies or arguments.irregular):
-        parser.error("name a folder of frames, or --shared, --samples, --bodies or --irregular")
+    named = ("folders", "shared", "samples", "bodies", "irregular", "body")
+    if not any(getattr(arguments, name) for name in named):
+        parser.error("name a folder of frames, or --shared, --samples, --bodies, --irregular or --body")
     return arguments
 
 
