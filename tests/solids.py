@@ -39,13 +39,3 @@ def surface(solid: Tetrahedra) -> np.ndarray:
     faces = np.concatenate([solid.tets[:, c] for c in ([1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1])])
     _, first, counts = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first[counts == 1]]
-
-
-def bent(points: np.ndarray, angle: float) -> np.ndarray:
-    """Points of a bar along x, its axis bent to an arc of ``angle`` radians. *Shape:* ``(V, 3)``."""
-    if angle == 0:
-        return points.copy()
-    radius = points[:, 0].max() / angle
-    turn = points[:, 0] / radius
-    distance = radius - (points[:, 1] - 0.5)
-    return np.stack([distance * np.sin(turn), radius - distance * np.cos(turn), points[:, 2]], axis=1)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from solids import bent, box, surface
+from bodies import bend
+from solids import box, surface
 
 from torch_modal.precompute import filling, modes
 from torch_modal.precompute.arap import arap_hessian, lumped_mass
@@ -22,6 +23,11 @@ COMPACT = COMPACT.reshape(-1, 3)
 POINTS = BAR.vertices[USED]
 TURN = np.linalg.qr(np.array([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]]))[0]
 TURN = TURN * np.sign(np.linalg.det(TURN))
+
+
+def bent(points: np.ndarray, angle: float) -> np.ndarray:
+    """Points of the bar, its axis bent to an arc of ``angle`` radians. *Shape:* ``(V, 3)``."""
+    return bend(points - [0, 0.5, 0], 1.0, angle, 0, points[:, 0].max())
 
 
 @pytest.fixture(scope="module")

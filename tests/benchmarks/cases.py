@@ -1,60 +1,155 @@
-"""Pairs of key-frames that the benchmarks run on, with a reference in-between and a basis for both ends."""
+"""Pairs of key-frames that the benchmarks run on, what is known to lie between them, and bases for both ends."""
 
-from collections.abc import Iterator
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
+import numpy as np
 import torch
 
 import torch_modal as tm
+from torch_modal.mesh_files import SUFFIXES
 from torch_modal.sample_data import load_sample
 
+sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
+from bodies import BODIES, body
+
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
+HALF = 0.5
 
 
-class Case(NamedTuple):
-    """Two key-frames and what lies half-way between them."""
+@dataclass(eq=False)
+class KeyframeSet:
+    """Shapes of one connectivity, whose bases are made together when they are first asked for."""
+
+    keyframes: torch.Tensor
+    faces: torch.Tensor
+    made: dict[int, list[tm.ModalBasis]] = field(default_factory=dict)
+
+    def bases(self, n_modes: int) -> list[tm.ModalBasis]:
+        """Of all shapes, in their order."""
+        if n_modes not in self.made:
+            self.made[n_modes] = tm.extract_bases(self.keyframes, self.faces, n_modes)
+        return self.made[n_modes]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Two key-frames, and the times between them at which shapes are wanted."""
 
     name: str
-    x_a: torch.Tensor
-    x_b: torch.Tensor
-    truth: torch.Tensor | None
-    faces: torch.Tensor
-    bases: list[tm.ModalBasis]
+    shapes: KeyframeSet
+    first: int
+    last: int
+    truths: dict[float, torch.Tensor]
+    """The true in-betweens that are known, by their time. *Shape of each:* ``(V, 3)``."""
+    times: tuple[float, ...] = (HALF,)
+
+    @property
+    def x_a(self) -> torch.Tensor:
+        """*Shape:* ``(V, 3)``."""
+        return self.shapes.keyframes[self.first]
+
+    @property
+    def x_b(self) -> torch.Tensor:
+        """*Shape:* ``(V, 3)``."""
+        return self.shapes.keyframes[self.last]
+
+    @property
+    def faces(self) -> torch.Tensor:
+        """*Shape:* ``(F, 3)``."""
+        return self.shapes.faces
+
+    def bases(self, n_modes: int = 30) -> list[tm.ModalBasis]:
+        """Of both ends."""
+        both = self.shapes.bases(n_modes)
+        return [both[self.first], both[self.last]]
+
+    def at(self, times: Iterable[float]) -> Case:
+        """The same at other times."""
+        return replace(self, times=tuple(times))
+
+
+def spans(
+    name: str, files: list[Path], ends: Iterable[tuple[int, int]], labels: list[str] | None = None, truth: bool = False
+) -> Iterator[Case]:
+    """Pairs out of a sequence; of a motion, the frames between both are the truth at their places."""
+    frames, faces = tm.load_keyframes(files)
+    ends = list(ends)
+    used = sorted({i for pair in ends for i in pair})
+    shapes = KeyframeSet(frames[used], faces)
+    for i, j in ends:
+        truths = {(k - i) / (j - i): frames[k] for k in range(i + 1, j)} if truth else {}
+        pair = "/".join((labels or [file.stem for file in files])[k] for k in (i, j))
+        yield Case(f"{name} {pair}", shapes, used.index(i), used.index(j), truths)
+
+
+def folder(path: Path) -> Iterator[Case]:
+    """All frames of a folder in the order of their names: the first and the last are key-frames, the others truth.
+
+    Raises:
+        SystemExit: There are fewer than two.
+    """
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    if len(files) < 2:
+        sys.exit(f"{path} holds {len(files)} meshes ({', '.join(SUFFIXES)}); a case needs two key-frames or more")
+    yield from spans(path.name, files, [(0, len(files) - 1)], truth=True)
 
 
 def hand_path() -> Iterator[Case]:
     """Three spans of a closing hand; nothing, with a word, where the data is not there."""
-    folder = DATA / "mh-hand-path"
-    if not folder.is_dir():
-        print(f"(no hand path: the folder {folder} is not there)")
-        return
-    keyframes, faces = tm.load_keyframes([folder / f"{i:02}.obj" for i in (0, 2, 4, 6, 8)])
-    bases = tm.extract_bases(keyframes, faces)
-    for i, j, k in ((0, 4, 2), (0, 2, 1), (2, 4, 3)):
-        name = f"hand path {2 * i:02}/{2 * j:02}"
-        yield Case(name, keyframes[i], keyframes[j], keyframes[k], faces, [bases[i], bases[j]])
+    files = [DATA / "mh-hand-path" / f"{i:02}.obj" for i in range(9)]
+    if _there(files[0].parent):
+        yield from spans("mh-hand-path", files, [(0, 8), (0, 4), (4, 8)], truth=True)
 
 
 def women() -> Iterator[Case]:
-    """Two spans of a walk, without a reference."""
-    folder = DATA / "mh-woman"
-    if not folder.is_dir():
-        print(f"(no walking figure: the folder {folder} is not there)")
-        return
-    names = ("00-rest", "02-walk-a", "03-walk-b")
-    keyframes, faces = tm.load_keyframes([folder / f"{name}.obj" for name in names])
-    bases = tm.extract_bases(keyframes, faces)
-    for i, j in ((1, 2), (0, 1)):
-        name = f"woman {names[i][:2]}/{names[j][:2]}"
-        yield Case(name, keyframes[i], keyframes[j], None, faces, [bases[i], bases[j]])
+    """A figure at rest and in two steps of a walk, without a reference."""
+    files = [DATA / "mh-woman" / f"{name}.obj" for name in ("00-rest", "02-walk-a", "03-walk-b")]
+    if _there(files[0].parent):
+        yield from spans("mh-woman", files, [(1, 2), (0, 1), (0, 2)], ["00", "02", "03"])
+
+
+def shared() -> Iterator[Case]:
+    """Every data set that is kept beside the project."""
+    yield from hand_path()
+    yield from women()
+    for name, ends in (
+        ("mh-hand", [(0, 3), (0, 4), (2, 3), (2, 4)]),
+        ("ict-face", [(0, 1), (0, 2), (1, 2), (0, 3)]),
+        ("hyper-cube", [(0, 1), (1, 2), (2, 3)]),
+    ):
+        if _there(DATA / name):
+            files = sorted((DATA / name).glob("*.obj"))
+            labels = [file.stem[:2] if file.stem[:2].isdigit() else file.stem[-1] for file in files]
+            yield from spans(name, files, ends, labels)
 
 
 def samples() -> Iterator[Case]:
-    """The first span of each sample that comes with the package."""
+    """All spans of the samples that come with the package."""
     for name in ("creature", "hand"):
         sample = load_sample(name)
-        x_a, x_b = sample.keyframes[:2]
-        bases = tm.extract_bases([x_a, x_b], sample.faces)
-        truth = sample.truth[sample.true_times.index(0.5)]
-        yield Case(f"sample {name} 0/1", x_a, x_b, truth, sample.faces, bases)
+        shapes = KeyframeSet(sample.keyframes, sample.faces)
+        n = len(sample.keyframes)
+        for i in range(n if sample.cyclic else n - 1):
+            truths = {t - i: x for t, x in zip(sample.true_times, sample.truth, strict=True) if i < t < i + 1}
+            yield Case(f"sample {name} {i}/{(i + 1) % n}", shapes, i, (i + 1) % n, truths)
+
+
+def bodies(names: Iterable[str] = BODIES, jittered: bool = False) -> Iterator[Case]:
+    """Synthetic bodies that bend far, and thin and hollow ones."""
+    for name in names:
+        shape = body(name, jittered)
+        first, half, last = (torch.from_numpy(shape.pose(t)) for t in (0.0, HALF, 1.0))
+        shapes = KeyframeSet(torch.stack([first, last]), torch.from_numpy(np.array(shape.faces)))
+        quarters = {t: torch.from_numpy(shape.pose(t)) for t in (0.25, 0.75)}
+        yield Case(name + (", irregular" if jittered else ""), shapes, 0, 1, {HALF: half, **quarters})
+
+
+def _there(path: Path) -> bool:
+    if not path.is_dir():
+        print(f"(without {path.name}: the folder {path} is not there)")
+    return path.is_dir()

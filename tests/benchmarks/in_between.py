@@ -75,7 +75,7 @@ def main() -> None:
     print(f"{'case':<20}" + "".join(f"{name:>{width}}" for name, width in columns))
     mesher: dict[tuple[int, float], float] = {}
     for case in chain(hand_path(), women(), samples()):
-        layer = tm.MidShape(case.bases, case.faces, coarse_faces=1000)
+        layer = tm.MidShape(case.bases(), case.faces, coarse_faces=1000)
         with torch.no_grad():
             solution = layer.solve(case.x_a, case.x_b).solution
             seconds = median_seconds(lambda: layer.solve(case.x_a, case.x_b), arguments.repeats)  # noqa: B023

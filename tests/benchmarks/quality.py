@@ -1,64 +1,139 @@
-"""How near in-betweens come to a known one: linear, joint space, and the paired space over a grid of mu.
+"""How good in-betweens are: the methods of this package, linear interpolation, and peers, side by side.
 
-    python tests/benchmarks/quality.py [--samples]
+    python tests/benchmarks/quality.py [FOLDER ...] [--shared] [--samples] [--bodies] [--irregular]
 
-Errors are means over the edges of the relative error of their length; volumes are ratios to the true frame's. Linear
-interpolation is given the best rigid motion between the key-frames, as the others are.
+A folder holds the frames of a motion, in the order of their names: the first and the last are the key-frames, those
+between are the truth at their places. Two frames alone have no truth, and then only energies, drift and volumes are
+compared. Peers join when they are installed (pip install morphomatics), or with ``--peer-python``.
+
+Everything is measured at t = 1/2, and the edge error also over all times with a truth (docs/quality.md says what the
+columns mean). Times are processor seconds on one thread, best of several: compare them within one run.
 """
 
 import argparse
-import math
-from itertools import chain
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
+import cases
 import torch
-from cases import Case, hand_path, samples
+from cases import HALF, Case
+from measures import Row, Yardstick
+from methods import METHODS, Method, UnavailableError
+from sheet import draw_bars, draw_sheet
+from tables import case_table, load_rows, markdown, save_rows
+from timing import untimed
 
-import torch_modal as tm
-from torch_modal import mesh
-from torch_modal.rigid import best_fit
-
-MU_GRID = (1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 10.0, 100.0)
-
-
-def linear(case: Case) -> torch.Tensor:
-    """Mean of the first key-frame and the second laid upon it."""
-    laid = best_fit(case.x_b, case.x_a, torch.ones(len(case.x_a), dtype=case.x_a.dtype)).apply(case.x_b)
-    return 0.5 * (case.x_a + laid)
+REFERENCE = "full"
+"""The method whose optimum tells which way faces look where there is no truth; it comes first."""
 
 
-def quality(x: torch.Tensor, case: Case) -> tuple[float, float]:
-    """Mean relative edge-length error and volume ratio."""
-    assert case.truth is not None
-    i, j = torch.from_numpy(mesh.unique_edges(case.faces.numpy())[0]).T
-    length, wanted = (torch.linalg.norm(shape[i] - shape[j], dim=1) for shape in (x, case.truth))
-    measure = tm.ShellEnergy(case.faces).measure
-    return float(((length - wanted).abs() / wanted).mean()), float(measure(x).volume / measure(case.truth).volume)
+def run(case: Case, names: list[str], shapes: dict[str, torch.Tensor]) -> Iterator[Row]:
+    """All methods on one case; their shapes half-way are put into ``shapes``."""
+    yardstick = Yardstick(case)
+    upright = None
+    for name in sorted(names, key=lambda name: name != REFERENCE):
+        row = Row(case.name, name)
+        try:
+            found = attempt(case, METHODS[name], row, yardstick)
+        except UnavailableError as error:
+            row.note = f"not available: {error}"
+            print(f"    {name}: {error}", file=sys.stderr)
+        except (ValueError, RuntimeError) as error:
+            row.note = f"failed: {str(error)[:100]}"
+        else:
+            shapes[name] = found
+            upright = found if name == REFERENCE else upright
+            yardstick.measure(row, found, upright)
+        yield row
 
 
-def show(method: str, x: torch.Tensor, case: Case, note: str = "") -> float:
-    """Print a row; return its edge error."""
-    error, volume = quality(x, case)
-    print(f"  {method:<20}{100 * error:>9.2f} %{volume:>9.4f}{note:>40}", flush=True)
-    return error
+def attempt(case: Case, method: Method, row: Row, yardstick: Yardstick) -> torch.Tensor:
+    """Call a method: at t = 1/2, which is timed, and at all times with a truth."""
+    half = method.function(case.at([HALF]))
+    row.seconds, row.note = half.seconds, half.note
+    others = [time for time in case.truths if time != HALF]
+    if not method.half_only and case.truths:
+        errors = [yardstick.edge_error(half.frames[0], HALF)] if HALF in case.truths else []
+        if others:
+            with untimed():
+                frames = method.function(case.at(others)).frames
+            errors += [yardstick.edge_error(x, time) for x, time in zip(frames, others, strict=True)]
+        row.edge_error_all = sum(errors) / len(errors)
+    return half.frames[0]
+
+
+def chosen_cases(arguments: argparse.Namespace) -> Iterator[Case]:
+    """The cases that were asked for."""
+    for folder in arguments.folders:
+        yield from cases.folder(folder)
+    if arguments.shared:
+        yield from cases.shared()
+    if arguments.samples:
+        yield from cases.samples()
+    if arguments.bodies:
+        yield from cases.bodies()
+    if arguments.irregular:
+        yield from cases.bodies(jittered=True)
+    yield from cases.bodies(arguments.body)
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="frames of a motion, or two key-frames")
+    parser.add_argument("--shared", action="store_true", help="all data sets that are kept beside the project")
+    parser.add_argument("--samples", action="store_true", help="the samples that come with the package")
+    parser.add_argument("--bodies", action="store_true", help="bars, hollow and slender bodies, a sheet")
+    parser.add_argument("--irregular", action="store_true", help="the same with irregular triangles")
+    parser.add_argument("--body", nargs="+", default=[], metavar="NAME", help="others, such as 'bar bent 270'")
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="NAME")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only cases with this in their name")
+    parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
+    parser.add_argument("--results", type=Path, metavar="FILE.json", help="keep results, and go on from those there")
+    parser.add_argument("--markdown", type=Path, metavar="FILE.md", help="write all tables")
+    parser.add_argument("--bars", type=Path, metavar="FILE.png", help="draw the errors as bars")
+    parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
+    arguments = parser.parse_args()
+    named = ("folders", "shared", "samples", "bodies", "irregular", "body")
+    if not any(getattr(arguments, name) for name in named):
+        parser.error("name a folder of frames, or --shared, --samples, --bodies, --irregular or --body")
+    return arguments
 
 
 def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", action="store_true", help="also the key-frames that come with the package")
-    chosen = chain(hand_path(), samples() if parser.parse_args().samples else ())
-    for case in chosen:
-        print(f"{case.name}{'edge error':>24}{'volume':>9}")
-        show("linear", linear(case), case)
-        methods = [("joint", "joint", 0.0), *((f"paired, mu = {mu:g}", "paired", mu) for mu in MU_GRID)]
-        best = (math.inf, "")
-        for name, space, mu in methods:
-            shapes, solution = tm.MidShape(case.bases, case.faces, space, mu).solve(case.x_a, case.x_b)
-            note = f"{int(solution.n_steps)} steps, gradient {float(solution.gradient_norm):.0e}"
-            error = show(name, shapes, case, note + ("" if solution.converged else ", NOT CONVERGED"))
-            if space == "paired":
-                best = min(best, (error, name))
-        print(f"  best of the paired space: {best[1]}")
+    """Run what is missing, print and write tables."""
+    arguments = parse()
+    if arguments.peer_python:
+        os.environ["TORCH_MODAL_PEER_PYTHON"] = str(arguments.peer_python)
+    torch.set_num_threads(1)
+    rows = load_rows(arguments.results)
+    drawn: list[tuple[Case, dict[str, torch.Tensor]]] = []
+    shown: list[Row] = []
+    for case in chosen_cases(arguments):
+        if arguments.only not in case.name:
+            continue
+        known = {row.method: row for row in rows if row.case == case.name}
+        missing = [name for name in arguments.methods if name not in known or arguments.sheet]
+        shapes: dict[str, torch.Tensor] = {}
+        if missing:
+            with torch.no_grad():
+                known |= {row.method: row for row in run(case, missing, shapes)}
+            rows = [row for row in rows if row.case != case.name] + list(known.values())
+            save_rows(arguments.results, rows)
+        mine = [known[name] for name in METHODS if name in known and name in arguments.methods]
+        print(case_table(case.name, mine), flush=True)
+        shown += mine
+        drawn.append((case, shapes))
+    text = markdown(shown)
+    print(text)
+    if arguments.markdown:
+        arguments.markdown.write_text(text)
+    if arguments.bars:
+        draw_bars(shown, arguments.bars)
+    if arguments.sheet:
+        draw_sheet(drawn, arguments.sheet)
 
 
 if __name__ == "__main__":

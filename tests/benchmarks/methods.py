@@ -1,0 +1,159 @@
+"""The ways to an in-between that are compared.
+
+A method is a function of a case that gives the frames at the case's times, and how long one call for all of them took,
+with everything that can be prepared beforehand left out. To add one, write the function under ``@method(name)``.
+"""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from cases import HALF, Case
+from timing import timed
+
+import torch_modal as tm
+from torch_modal.rigid import blend
+
+PEER_SECONDS = 600
+
+
+class Outcome(NamedTuple):
+    """What a method gives."""
+
+    frames: torch.Tensor
+    """*Shape:* ``(T, V, 3)``."""
+    seconds: float
+    """Processor seconds of one call for all T; NaN where there is nothing to time."""
+    note: str = ""
+    """What a reader should know: that it did not converge, for instance."""
+
+
+class Method(NamedTuple):
+    """A way to in-betweens."""
+
+    function: Callable[[Case], Outcome]
+    half_only: bool
+    """Whether it knows t = 1/2 alone."""
+
+
+class UnavailableError(Exception):
+    """This method cannot run here, or not on this case."""
+
+
+METHODS: dict[str, Method] = {}
+
+
+def method(name: str, half_only: bool = False) -> Callable[[Callable[[Case], Outcome]], Callable[[Case], Outcome]]:
+    """Put a function into ``METHODS``."""
+
+    def register(function: Callable[[Case], Outcome]) -> Callable[[Case], Outcome]:
+        METHODS[name] = Method(function, half_only)
+        return function
+
+    return register
+
+
+@method("truth")
+def truth(case: Case) -> Outcome:
+    """The true in-betweens themselves: what a perfect guess would show in each column."""
+    if set(case.times) - set(case.truths):
+        raise UnavailableError("no truth")
+    return Outcome(torch.stack([case.truths[t] for t in case.times]), float("nan"))
+
+
+@method("linear")
+def linear(case: Case) -> Outcome:
+    """Straight lines between the first key-frame and the second laid upon it; the rigid motion along its geodesic."""
+    times = torch.tensor(case.times, dtype=case.x_a.dtype)
+    weights = torch.ones(len(case.x_a), dtype=case.x_a.dtype)
+    return Outcome(*timed(lambda: blend(case.x_a, case.x_b, times, weights)))
+
+
+@method("paired", half_only=True)
+def paired(case: Case) -> Outcome:
+    """The paper's space, with the default mu."""
+    layer = tm.MidShape(case.bases(30), case.faces, space="paired")
+    result, seconds = timed(lambda: layer.solve(case.x_a, case.x_b))
+    return Outcome(result.shapes[None], seconds, convergence(result))
+
+
+@method("joint")
+def joint(case: Case) -> Outcome:
+    """The default: 30 modes of each end, 1,000 coarse faces."""
+    return by_layer(case, 30)
+
+
+@method("joint 80/3000")
+def joint_fine(case: Case) -> Outcome:
+    """More modes and coarse faces."""
+    return by_layer(case, 80, coarse_faces=3000)
+
+
+@method("morphomatics")
+def differential_coordinates(case: Case) -> Outcome:
+    """Differential coordinates with the first key-frame as the reference, as in the library's tutorial."""
+    return by_peer(case, "first")
+
+
+@method("morphomatics, mean")
+def differential_coordinates_of_mean(case: Case) -> Outcome:
+    """The same with the mean of both as the reference, as in the library's statistical shape model."""
+    return by_peer(case, "mean")
+
+
+@method("morphomatics, fundamental")
+def fundamental_coordinates(case: Case) -> Outcome:
+    """The library's coordinates of metric and curvature."""
+    return by_peer(case, "fundamental")
+
+
+def by_layer(case: Case, n_modes: int, **options: Any) -> Outcome:
+    """In-betweens by the layer with these options."""
+    layer = tm.InBetween(case.bases(n_modes), case.faces, **options)
+    result, seconds = timed(lambda: layer.solve(case.x_a, case.x_b, torch.tensor(case.times, dtype=torch.float64)))
+    return Outcome(result.shapes, seconds, convergence(result))
+
+
+def convergence(result: Any) -> str:
+    """The number of steps where all went well, the statuses where not."""
+    solution = result.solution
+    if bool(solution.converged.all()):
+        return f"{int(solution.n_steps.max())} steps"
+    return f"not converged: statuses {sorted(set(solution.status.reshape(-1).tolist()))}"
+
+
+def peer_python() -> str | None:
+    """The interpreter that has the peers: ``TORCH_MODAL_PEER_PYTHON``, or this one if they are installed here."""
+    given = os.environ.get("TORCH_MODAL_PEER_PYTHON")
+    return given or (sys.executable if importlib.util.find_spec("morphomatics") else None)
+
+
+def by_peer(case: Case, kind: str) -> Outcome:
+    """In-betweens by morphomatics, in a child process: its threads and its memory are its own."""
+    python = peer_python()
+    if python is None:
+        raise UnavailableError("pip install morphomatics, or name a Python that has it with --peer-python")
+    used = case.faces.unique()
+    number = torch.full((len(case.x_a),), -1).index_put((used,), torch.arange(len(used)))
+    with tempfile.TemporaryDirectory() as scratch:
+        request, answer = Path(scratch) / "request.npz", Path(scratch) / "answer.npz"
+        arrays = {"x_a": case.x_a[used].numpy(), "x_b": case.x_b[used].numpy(), "faces": number[case.faces].numpy()}
+        np.savez(request, kind=kind, times=np.array(case.times), **arrays)
+        command = [python, str(Path(__file__).with_name("peer_worker.py")), str(request), str(answer)]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+        environment.pop("PYTHONPATH", None)
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PEER_SECONDS)
+        if run.returncode != 0:
+            raise UnavailableError((run.stderr.strip() or f"exit code {run.returncode}").splitlines()[-1][:120])
+        given = np.load(answer)
+        frames, seconds = torch.from_numpy(given["frames"]).to(case.x_a.dtype), float(given["seconds"])
+    whole = torch.lerp(case.x_a, case.x_b, HALF).repeat(len(case.times), 1, 1)
+    whole[:, used] = frames  # vertices of no face stay where they are
+    return Outcome(whole, seconds, f"{1e3 * float(given['plain_seconds']):.1f} ms if not compiled")

@@ -1,0 +1,90 @@
+"""In-betweens by morphomatics, in a process of its own: ``python peer_worker.py request.npz answer.npz``.
+
+The Python that runs this needs morphomatics, not torch or torch_modal. The shape space (gradient and divergence of the
+reference, factors of its Poisson system, compiled geodesic) is made before the clock starts; what is timed goes from
+key-frames to in-betweens. The geodesic is compiled by ``jax.jit``; how long it takes without is told beside.
+"""
+
+import sys
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from morphomatics.geom import Surface
+from morphomatics.manifold import DifferentialCoords, FundamentalCoords
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from timing import timed
+
+MEAN_STEPS = 10
+MEAN_TOLERANCE = 1e-3
+
+
+class PinnedCoords(DifferentialCoords):
+    """Differential coordinates of a surface that may have several pieces.
+
+    Gradients do not see where a piece lies, and the library pins one vertex of all: here it is one of each piece, and
+    the pieces are put where they lie in the linear in-between.
+    """
+
+    def update_ref_geom(self, v: np.ndarray) -> None:
+        super().update_ref_geom(v)
+        f = self.ref.f
+        links = sparse.coo_matrix((np.ones(2 * len(f)), (f[:, :2].T.ravel(), f[:, 1:].T.ravel())), (len(v), len(v)))
+        self.n_pieces, self.piece = connected_components(links, directed=False)
+        if self.n_pieces > 1:
+            pins = np.unique(self.piece, return_index=True)[1]
+            pin = sparse.coo_matrix((np.ones(len(pins)), (pins, pins)), (len(v), len(v)))
+            self.poisson = sparse.linalg.factorized((self.ref.div @ self.ref.grad + pin).tocsc())
+
+    def centred(self, x: np.ndarray, like: np.ndarray) -> np.ndarray:
+        """Each piece moved to the centroid that it has in another shape."""
+        if self.n_pieces == 1:
+            return x
+        size = np.bincount(self.piece)[:, None]
+        gap = [np.bincount(self.piece, (like - x)[:, axis]) for axis in range(3)]
+        return x + (np.stack(gap, axis=1) / size)[self.piece]
+
+
+def space(kind: str, x_a: np.ndarray, x_b: np.ndarray, faces: np.ndarray) -> tuple:
+    """The shape space and its geodesic."""
+    made = (FundamentalCoords if kind == "fundamental" else PinnedCoords)(Surface(x_a.copy(), faces))
+
+    def geodesic(a: jax.Array, b: jax.Array, t: float) -> jax.Array:
+        return made.connec.exp(a, t * made.connec.log(a, b))
+
+    if kind == "mean":
+        # As the library's StatisticalShapeModel does: until the reference is the mean of both, or that diverges.
+        move, tolerance = np.inf, MEAN_TOLERANCE * x_a.std(axis=0).mean()
+        for _ in range(MEAN_STEPS):
+            mean = np.asarray(made.from_coords(geodesic(made.to_coords(x_a), made.to_coords(x_b), 0.5)))
+            last, move = move, np.linalg.norm(mean - made.ref.v, axis=1).max()
+            if move > last:
+                break
+            made.update_ref_geom(mean)
+            if move < tolerance:
+                break
+    return made, geodesic
+
+
+def main(request: str, answer: str) -> None:
+    """Read key-frames, write frames and seconds."""
+    given = np.load(request)
+    x_a, x_b, faces = given["x_a"], given["x_b"], given["faces"]
+    made, geodesic = space(str(given["kind"]), x_a, x_b, faces)
+
+    def frames(geodesic: Callable) -> np.ndarray:
+        a, b = made.to_coords(x_a), made.to_coords(x_b)
+        found = []
+        for t in given["times"]:
+            x = np.asarray(made.from_coords(geodesic(a, b, float(t))))
+            found.append(made.centred(x, (1 - t) * x_a + t * x_b) if isinstance(made, PinnedCoords) else x)
+        return np.stack(found)
+
+    compiled = jax.jit(geodesic)
+    result, seconds = timed(lambda: frames(compiled))
+    np.savez(answer, frames=result, seconds=seconds, plain_seconds=timed(lambda: frames(geodesic))[1])
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

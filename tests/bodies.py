@@ -1,0 +1,319 @@
+"""Bodies that bend far, and thin and hollow ones: surfaces with motions in closed form, so that in-betweens are known.
+
+A body is a surface at rest along the x axis and a motion of space. The key-frames are the motion's ends, and the motion
+half-way is the true in-between: every motion here turns its body by an angle that grows evenly with time, and keeps the
+lengths along its centre line (bar, limb, tube), around its wall (squeezed tube) or everywhere (sheet).
+"""
+
+from collections.abc import Callable
+from functools import cache, partial
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from solids import box, surface
+
+from torch_modal import mesh
+from torch_modal.inspect_mesh import signed_volume
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Motion = Callable[[FloatArray, float], FloatArray]
+
+SHARP = np.radians(40.0)  # hinges sharper than this belong to the shape, not to its triangulation
+
+
+class Body(NamedTuple):
+    """A surface and how it moves."""
+
+    rest: FloatArray
+    """Straight; the first key-frame, but for the gutter. *Shape:* ``(V, 3)``."""
+    faces: IntArray
+    """Wound counterclockwise seen from outside. *Shape:* ``(F, 3)``."""
+    motion: Motion
+    """Where points near the body at rest are at a time in [0, 1]. *Shape:* ``(n, 3), () -> (n, 3)``."""
+
+    def pose(self, time: float) -> FloatArray:
+        """The surface at a time. *Shape:* ``(V, 3)``."""
+        return self.motion(self.rest, time)
+
+
+# ------------------------------------------------------------------------------------------------------------- motions
+
+
+def bend(points: FloatArray, time: float, angle: float, start: float, stop: float) -> FloatArray:
+    """The x axis bent to an arc of ``angle`` (in its whole) between two places; straight, and rigid, before and after.
+
+    Lengths on the axis do not change. Points at the height ``y`` come nearer to each other by ``1 - y angle / length``.
+    """
+    x, y, z = points.T
+    angle = angle * time
+    turn = angle * np.clip((x - start) / (stop - start), 0, 1)
+    radius = (stop - start) / angle if angle else np.inf
+    # Where the axis goes; the limit of no angle is taken by the sine of half of it.
+    half = np.sinc(turn / (2 * np.pi)) * np.clip(x - start, 0, stop - start)  # chord of the arc
+    past, before = np.maximum(x - stop, 0), np.minimum(x, start)
+    along = before + half * np.cos(turn / 2) + past * np.cos(turn)
+    across = half * np.sin(turn / 2) + past * np.sin(turn)
+    if (y >= radius)[(x > start) & (x < stop)].any():
+        raise ValueError(f"an arc of the radius {radius:g} folds a body that is {y.max():g} high on its inner side")
+    return np.stack([along - y * np.sin(turn), across + y * np.cos(turn), z], axis=1)
+
+
+def twist(points: FloatArray, time: float, angle: float, start: float, stop: float) -> FloatArray:
+    """Sections turned about the x axis, by ``angle`` from one end to the other."""
+    x, y, z = points.T
+    turn = angle * time * (x - start) / (stop - start)
+    c, s = np.cos(turn), np.sin(turn)
+    return np.stack([x, c * y - s * z, s * y + c * z], axis=1)
+
+
+def squeeze(points: FloatArray, time: float, amount: float, radius: float) -> FloatArray:
+    """Round sections about the x axis made oval; the curvature ``(1 + amount cos 2 theta) / radius`` grows evenly.
+
+    The circle of this radius keeps its lengths, the wall its thickness.
+    """
+    x, y, z = points.T
+    theta, distance = np.arctan2(z, y), np.hypot(y, z)
+    # The tangent's direction is known in closed form, the curve is its integral: by Gauss' rule with two points a cell.
+    n = 4096
+    cell = 2 * np.pi / n
+
+    def tangent(angle: FloatArray) -> FloatArray:
+        turned = angle + 0.5 * amount * time * np.sin(2 * angle) + np.pi / 2
+        return np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+
+    def way(start: FloatArray, length: FloatArray) -> FloatArray:
+        places = (start + length * (0.5 + offset) for offset in (-np.sqrt(1 / 12), np.sqrt(1 / 12)))
+        return length[:, None] * sum(tangent(place) for place in places) / 2
+
+    steps = way(np.arange(n) * cell, np.full(n, cell))
+    corners = np.cumsum(steps, axis=0) - steps
+    corners -= corners.mean(axis=0)
+    place = np.mod(theta, 2 * np.pi)
+    index = np.minimum((place / cell).astype(np.int64), n - 1)
+    curve = corners[index] + way(index * cell, place - index * cell)
+    direction = tangent(theta)
+    normal = np.stack([direction[:, 1], -direction[:, 0]], axis=-1)
+    oval = radius * curve + (distance - radius)[:, None] * normal
+    return np.column_stack([x, oval])
+
+
+# ------------------------------------------------------------------------------------------------------------ surfaces
+
+
+def bar_surface(cells: tuple[int, int, int], size: tuple[float, float, float]) -> tuple[FloatArray, IntArray]:
+    """A box along x, centred on the axis, its vertices spread evenly."""
+    solid = box(cells, size)
+    used, faces = np.unique(surface(solid), return_inverse=True)
+    return solid.vertices[used] - [0, size[1] / 2, size[2] / 2], faces.reshape(-1, 3)
+
+
+def turned_surface(profile: FloatArray, spacing: float, closed: bool = False) -> tuple[FloatArray, IntArray]:
+    """A profile turned about the x axis, in triangles of about one size.
+
+    Args:
+        profile: Corners ``(x, r)``; the first and the last lie on the axis unless it is closed. *Shape:* ``(n, 2)``.
+        spacing: Length of an edge, about.
+        closed: Whether the last corner is joined to the first, round a hole.
+    """
+    ends = np.concatenate([profile, profile[:1]]) if closed else profile
+    points = []
+    for start, stop in pairwise(ends):
+        n = max(1, round(np.linalg.norm(stop - start) / spacing))
+        points.append(start + (stop - start) * np.arange(n)[:, None] / n)
+    line = np.concatenate(points if closed else [*points, ends[-1:]])
+    vertices, rings, n_vertices = [], [], 0
+    for x, r in line:
+        n = max(8, round(2 * np.pi * r / spacing)) if r > 0 else 1
+        angle = 2 * np.pi * np.arange(n) / n
+        vertices.append(np.stack([np.full(n, x), r * np.cos(angle), r * np.sin(angle)], axis=1))
+        rings.append(np.arange(n_vertices, n_vertices + n))
+        n_vertices += n
+    pairs = zip(rings, [*rings[1:], rings[0]] if closed else rings[1:], strict=False)
+    faces = np.concatenate([_stitched(a, b) for a, b in pairs])
+    points = np.concatenate(vertices)
+    return points, faces if signed_volume(points, faces) > 0 else faces[:, ::-1].copy()
+
+
+def _stitched(a: IntArray, b: IntArray) -> IntArray:
+    """Triangles between two rings that both start at the angle 0. *Shape:* ``(n,), (m,) -> (·, 3)``."""
+    i = j = 0
+    n, m = (len(ring) if len(ring) > 1 else 0 for ring in (a, b))
+    faces = []
+    while i < n or j < m:
+        # The ring that lags behind goes on, so that both come round together.
+        if j == m or (i < n and (i + 1) * m <= (j + 1) * n):
+            faces.append((a[i], a[(i + 1) % n], b[j % max(m, 1)]))
+            i += 1
+        else:
+            faces.append((a[i % max(n, 1)], b[(j + 1) % m], b[j]))
+            j += 1
+    return np.array(faces)
+
+
+def sheet_surface(cells: tuple[int, int], size: tuple[float, float]) -> tuple[FloatArray, IntArray]:
+    """A flat rectangle in y = 0 from x = 0, with a boundary."""
+    nx, nz = cells
+    x, z = np.meshgrid(np.linspace(0, size[0], nx + 1), np.linspace(0, size[1], nz + 1), indexing="ij")
+    corner = (np.arange(nx)[:, None] * (nz + 1) + np.arange(nz)).reshape(-1)
+    a, b, c, d = corner, corner + nz + 1, corner + nz + 2, corner + 1
+    faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([a, d, c], axis=1)])
+    return np.stack([x, np.zeros_like(x), z - size[1] / 2], axis=-1).reshape(-1, 3), faces
+
+
+def irregular(vertices: FloatArray, faces: IntArray, jitter: float = 0.35) -> tuple[FloatArray, IntArray]:
+    """The same surface with vertices moved about within it and some edges turned round.
+
+    Vertices on sharp edges and on the boundary stay, and so do these edges.
+
+    Args:
+        vertices: *Shape:* ``(V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
+        jitter: How far vertices move, as a part of the way to a random point of one of their faces.
+    """
+    random = np.random.default_rng(0)
+    hinges = mesh.hinges(faces)
+    i, j, k, left = (vertices[corner] for corner in hinges.T)
+    first, second = np.cross(j - i, k - i), np.cross(left - i, j - i)
+    first, second = (n / np.linalg.norm(n, axis=1, keepdims=True) for n in (first, second))
+    smooth = np.einsum("hi,hi->h", first, second) > np.cos(SHARP)
+    fixed = np.zeros(len(vertices), dtype=bool)
+    fixed[hinges[~smooth, :2]] = fixed[mesh.boundary_edges(faces)] = True
+
+    own = np.empty(len(vertices), dtype=np.int64)  # a random face of each vertex
+    order = random.permutation(len(faces))
+    own[faces[order]] = order[:, None]
+    target = np.einsum("vc,vci->vi", random.dirichlet([1, 1, 1], len(vertices)), vertices[faces[own]])
+    moved = np.where(fixed[:, None], vertices, vertices + jitter * (target - vertices))
+
+    return moved, _turned_edges(moved, faces, hinges[smooth], random)
+
+
+def _turned_edges(
+    vertices: FloatArray, faces: IntArray, hinges: IntArray, random: np.random.Generator, share: float = 0.3
+) -> IntArray:
+    """Some edges replaced by the other diagonal of their two triangles, where those stay fat."""
+    faces = faces.copy()
+    face_of = {tuple(np.roll(face, -c)): f for f, face in enumerate(faces) for c in range(3)}
+    edges = {tuple(edge) for edge in mesh.unique_edges(faces)[0]}
+    touched: set[int] = set()
+    for i, j, k, m in random.permutation(hinges)[: int(share * len(hinges))]:
+        first, second = face_of[i, j, k], face_of[j, i, m]
+        new = (min(k, m), max(k, m))
+        if touched & {first, second} or new in edges:
+            continue
+        corners = np.array([[i, m, k], [m, j, k]])
+        if _fatness(vertices, corners).min() < 0.3:
+            continue
+        faces[first], faces[second] = corners
+        touched |= {first, second}
+        edges.add(new)
+    return faces
+
+
+def _fatness(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """Area over that of an equilateral triangle with the longest edge. *Shape:* ``(F,)``."""
+    a, b, c = (vertices[corner] for corner in faces.T)
+    longest = np.max([np.einsum("fi,fi->f", e, e) for e in (b - a, c - b, a - c)], axis=0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 / (np.sqrt(3) / 4 * longest)
+
+
+# -------------------------------------------------------------------------------------------------------------- bodies
+
+BAR = 4.0
+WALL = 0.06
+LIMB = 5.0
+
+
+def _bar() -> tuple[FloatArray, IntArray]:
+    return bar_surface((52, 13, 13), (BAR, 1.0, 1.0))
+
+
+def _tube() -> tuple[FloatArray, IntArray]:
+    outer, inner = 0.6 + WALL / 2, 0.6 - WALL / 2
+    return turned_surface(np.array([[0, outer], [BAR, outer], [BAR, inner], [0, inner]]), 0.11, closed=True)
+
+
+def _vessel() -> tuple[FloatArray, IntArray]:
+    """A bottle with an open neck."""
+    outer = np.array([[0, 0], [0, 0.9], [0.1, 1.0], [3.2, 1.0], [3.7, 0.5], [4.2, 0.5]])
+    inner = np.array([[4.2, 0.44], [3.67, 0.44], [3.17, 0.94], [0.13, 0.94], [0.06, 0.87], [0.06, 0]])
+    return turned_surface(np.concatenate([outer, inner]), 0.14)
+
+
+def _limb() -> tuple[FloatArray, IntArray]:
+    """A ball with a limb a tenth as thick, which ends round."""
+    ball, root = np.linspace(np.pi, np.arcsin(0.1), 40), np.linspace(np.pi / 2, 0, 4)[1:]
+    profile = [[np.cos(a), np.sin(a)] for a in ball] + [[LIMB, 0.1]]
+    profile += [[LIMB + 0.1 * np.cos(a), 0.1 * np.sin(a)] for a in root]
+    profile[0][1] = profile[-1][1] = 0.0
+    return turned_surface(np.array(profile), 0.085)
+
+
+def _sheet() -> tuple[FloatArray, IntArray]:
+    return sheet_surface((72, 36), (BAR, 2.0))
+
+
+_BENT = {
+    "bar bent": (_bar, bend, 0.0, BAR),
+    "bar twisted": (_bar, twist, 0.0, BAR),
+    "tube bent": (_tube, bend, 0.0, BAR),
+    "vessel bent": (_vessel, bend, 0.3, 3.2),
+    "limb bent": (_limb, bend, 1.5, LIMB),
+    "elbow bent": (_limb, bend, 2.6, 3.4),
+    "sheet rolled": (_sheet, bend, 0.0, BAR),
+    "gutter rolled": (_sheet, bend, 0.0, BAR),
+}
+GUTTER = 1 / 3
+"""How far the gutter, a sheet, is rolled already at the first key-frame: a flat one has no inside to be filled."""
+SQUEEZED = "tube squeezed"
+
+BODIES = (
+    "bar bent 90",
+    "bar bent 180",
+    "bar twisted 90",
+    "bar twisted 180",
+    "tube bent 90",
+    SQUEEZED,
+    "vessel bent 60",
+    "limb bent 120",
+    "elbow bent 120",
+    "sheet rolled 270",
+    "gutter rolled 270",
+)
+"""The bodies that are looked at by default; :func:`body` takes other angles as well."""
+
+
+@cache
+def _at_rest(make: Callable[[], tuple[FloatArray, IntArray]], jittered: bool) -> tuple[FloatArray, IntArray]:
+    surface_at_rest = irregular(*make()) if jittered else make()
+    for array in surface_at_rest:
+        array.setflags(write=False)  # others get the same arrays
+    return surface_at_rest
+
+
+def body(name: str, jittered: bool = False) -> Body:
+    """One of the bodies, of 2,000 to 4,000 vertices.
+
+    Args:
+        name: What is moved and how, and by how many degrees in its whole: ``"bar twisted 180"``.
+        jittered: Whether its triangulation is irregular.
+
+    Raises:
+        ValueError: There is no such body.
+    """
+    if name == SQUEEZED:
+        return Body(*_at_rest(_tube, jittered), partial(squeeze, amount=1.2, radius=0.6))
+    kind, _, degrees = name.rpartition(" ")
+    if kind not in _BENT or not degrees.isdigit():
+        raise ValueError(f"there is no body {name!r}; there are {SQUEEZED!r} and, with an angle, {', '.join(_BENT)}")
+    make, bending, start, stop = _BENT[kind]
+    motion = partial(bending, angle=np.radians(int(degrees)), start=start, stop=stop)
+    return Body(*_at_rest(make, jittered), partial(_later, motion) if kind.startswith("gutter") else motion)
+
+
+def _later(motion: Motion, points: FloatArray, time: float) -> FloatArray:
+    """The motion without its first part."""
+    return motion(points, GUTTER + (1 - GUTTER) * time)
