@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,6 +97,37 @@ def joint_fine(case: Case) -> Outcome:
     return by_layer(case, 80, coarse_faces=3000)
 
 
+@method("joint + local")
+def joint_and_local(case: Case) -> Outcome:
+    """The default, with the steps on the fine mesh after it, as ``subdivide`` does."""
+    return by_layer(case, 30, local=True)
+
+
+@method("joint + local + polish 2")
+def joint_and_polish(case: Case) -> Outcome:
+    """The same with two longer steps."""
+    return by_layer(case, 30, local=True, polish=2)
+
+
+@method("full")
+def full(case: Case) -> Outcome:
+    """The optimum over all vertices: the best of what a modal and a linear start lead to."""
+    starts = InBetweens(case, 30, {"local": True})()
+    return by_full_space(
+        case,
+        lambda x_a, x_b, t, k: min(
+            (tm.full_space(x_a, x_b, case.faces, t, start=start) for start in (starts.shapes[k], None)),
+            key=lambda result: result.energies[-1],
+        ),
+    )
+
+
+@method("global Froehlich-Botsch")
+def example_based(case: Case) -> Outcome:
+    """One reference with interpolated lengths, angles and volume, over all vertices, from a linear start."""
+    return by_full_space(case, lambda x_a, x_b, t, k: tm.full_space(x_a, x_b, case.faces, t, example_based=True))
+
+
 @method("morphomatics")
 def differential_coordinates(case: Case) -> Outcome:
     """Differential coordinates with the first key-frame as the reference, as in the library's tutorial."""
@@ -114,11 +146,31 @@ def fundamental_coordinates(case: Case) -> Outcome:
     return by_peer(case, "fundamental")
 
 
+class InBetweens:
+    """A layer with these options, to be called for all times of a case."""
+
+    def __init__(self, case: Case, n_modes: int, options: dict[str, Any]) -> None:
+        self.case, self.times = case, torch.tensor(case.times, dtype=torch.float64)
+        self.layer = tm.InBetween(case.bases(n_modes), case.faces, **options)
+
+    def __call__(self) -> Any:
+        with torch.no_grad():
+            return self.layer.solve(self.case.x_a, self.case.x_b, self.times)
+
+
 def by_layer(case: Case, n_modes: int, **options: Any) -> Outcome:
     """In-betweens by the layer with these options."""
-    layer = tm.InBetween(case.bases(n_modes), case.faces, **options)
-    result, seconds = timed(lambda: layer.solve(case.x_a, case.x_b, torch.tensor(case.times, dtype=torch.float64)))
+    result, seconds = timed(InBetweens(case, n_modes, options))
     return Outcome(result.shapes, seconds, convergence(result))
+
+
+def by_full_space(case: Case, solve: Callable[..., Any]) -> Outcome:
+    """Over all vertices, once: it is too slow to be timed several times."""
+    begin = time.process_time()
+    results = [solve(case.x_a, case.x_b, t, k) for k, t in enumerate(case.times)]
+    seconds = time.process_time() - begin
+    notes = [f"{len(result.energies) - 1} steps" + ("" if result.stagnated else ", cut off") for result in results]
+    return Outcome(torch.stack([result.shape for result in results]), seconds, notes[0])
 
 
 def convergence(result: Any) -> str:
