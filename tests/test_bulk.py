@@ -8,6 +8,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -378,6 +379,26 @@ def test_real_sets(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> No
     for mine, its in zip(tm.extract_bases(keyframes, own_faces, 4, mesher="lattice"), stored.bases, strict=True):
         torch.testing.assert_close(its.eigenvalues, mine.eigenvalues)
         torch.testing.assert_close(its.modes, mine.modes, rtol=1e-6, atol=1e-9)
+
+
+def test_a_set_is_done_when_its_bases_are_there(capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    """Not when somebody notices: the command may be killed between the two."""
+    files = save_frames(np.stack([capsule[0], 1.1 * capsule[0]]), capsule[1], tmp_path / "a", fmt="obj")
+    records = Records(tmp_path / "out")
+    records.prepare()
+    record = Record("a", r.STARTED, "its files changed", output="a", inputs="1", ours=True)
+    records.write(record)
+    job = {"files": list(map(str, files)), "folder": str(tmp_path / "out" / "a"), "record_file": str(records.file("a"))}
+    options = {"n_modes": 4, "mesher": "lattice", "cache": False}
+    process = set_process.SetProcess({**job, "options": options, "record": asdict(record)}, 100.0)
+    try:
+        _wait_until(lambda: records.read("a").status == r.DONE)  # type: ignore[union-attr]
+        assert len(open_set(tmp_path / "out" / "a")) == 2
+        found = records.read("a")
+        assert found is not None and found.finished
+        assert replace(found, finished="") == replace(record, status=r.DONE, keyframes=2, vertices=len(capsule[0]))
+    finally:
+        process.close()
 
 
 def test_worker_says_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

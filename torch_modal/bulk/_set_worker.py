@@ -1,7 +1,8 @@
 """The process that computes one set, seen from inside: ``main(JOB, RESULT)``, two JSON files.
 
-The job has ``files``, ``folder`` (where the bases go), ``options`` (of `extract_bases`) and ``timeout``. The result has
-``status`` and ``reason``, and what is known of the set: ``keyframes``, ``vertices``, ``warnings``. A crash leaves none.
+The job has ``files``, ``folder`` (where the bases go), ``options`` (of `extract_bases`), ``timeout``, and the set's
+``record`` with the ``record_file`` it stands in. The result has ``status`` and ``reason``, and what is known of the
+set: ``keyframes``, ``vertices``, ``warnings``. A crash leaves none.
 """
 
 import _thread
@@ -16,7 +17,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from torch_modal.bulk.records import DONE, FAILED, REFUSED
+from torch_modal.bulk.records import DONE, FAILED, REFUSED, Record, ended
 from torch_modal.bulk.tree import same_stems
 from torch_modal.errors import MeshError
 from torch_modal.files import write_atomically
@@ -42,6 +43,7 @@ def main(job_path: str, result_path: str) -> None:
         warnings.simplefilter("always", UserWarning)
         try:
             _compute(job, found)
+            _keep(job, {**found, "warnings": _texts(caught)})
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             found["status"] = REFUSED if isinstance(error, ValueError) else FAILED
             kind = "" if isinstance(error, (ValueError, RuntimeError)) else f"{type(error).__name__}: "
@@ -49,8 +51,7 @@ def main(job_path: str, result_path: str) -> None:
         except Exception as error:  # a bug, which should not take the other sets' time
             found["status"], found["log"] = FAILED, traceback.format_exc()[-2000:]
             found["reason"] = f"{type(error).__name__}: {error}"
-    texts = (" ".join(str(w.message).split()) for w in caught if issubclass(w.category, UserWarning))
-    found["warnings"] = list(dict.fromkeys(texts))
+    found["warnings"] = _texts(caught)
     write_atomically(Path(result_path), json.dumps(found).encode())
 
 
@@ -71,6 +72,18 @@ def _compute(job: dict[str, Any], found: dict[str, Any]) -> None:
     timeout = MESHER_SHARE * job["timeout"]
     bases = extract_bases(keyframes, faces, timeout=timeout, progress=False, **job["options"])
     write_set(job["folder"], keyframes, faces, bases, [file.name for file in files])
+
+
+def _keep(job: dict[str, Any], found: dict[str, Any]) -> None:
+    """Write down at once that the bases are there: the process that waits for this one may be killed before it can."""
+    record = Record(**{**job["record"], **found})
+    record = ended(record, DONE, record.reason)
+    write_atomically(Path(job["record_file"]), record.line().encode())
+
+
+def _texts(caught: list[warnings.WarningMessage]) -> list[str]:
+    texts = (" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning))
+    return list(dict.fromkeys(texts))
 
 
 def _end_with_parent() -> None:

@@ -1,7 +1,7 @@
 """What is known of each set: a small file of its own in the output folder, and the report that all of them make.
 
-Each record is written by the one process that works on its set, and moved into place whole: several machines never
-write to one file.
+Each record is written by those who work on its set alone, and moved into place whole: several machines never write to
+one file.
 """
 
 import contextlib
@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,11 @@ class Record:
         return json.dumps({name: value for name, value in asdict(self).items() if value})
 
 
+def ended(record: Record, status: str, reason: str) -> Record:
+    """A record with its end."""
+    return replace(record, status=status, reason=reason, finished=datetime.now().astimezone().isoformat("T", "seconds"))
+
+
 class Records:
     """The records of an output folder.
 
@@ -85,7 +91,7 @@ class Records:
     def read(self, place: str) -> Record | None:
         """The record of the set at a place below the output folder; None if there is none that can be read."""
         with contextlib.suppress(OSError, ValueError, TypeError):
-            return Record(**json.loads(self._file(place).read_bytes()))
+            return Record(**json.loads(self.file(place).read_bytes()))
         return None
 
     def write(self, record: Record) -> None:
@@ -94,9 +100,10 @@ class Records:
         Raises:
             OSError: It cannot be written.
         """
-        write_atomically(self._file(record.output), record.line().encode())
+        write_atomically(self.file(record.output), record.line().encode())
 
-    def _file(self, place: str) -> Path:
+    def file(self, place: str) -> Path:
+        """The file with the record of the set at a place below the output folder."""
         # Names of folders may be longer than a file's may be with a suffix, and hold anything.
         return self._sets / (hashlib.sha256(place.encode("utf-8", "surrogateescape")).hexdigest()[:40] + ".json")
 

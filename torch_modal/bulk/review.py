@@ -5,7 +5,6 @@ import re
 import shutil
 import socket
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,14 +92,14 @@ class Review:
             stamp = r.stamp(files)
             new = replace(new, inputs=r.inputs_key(files), files=[file.name for file in files])
         except OSError as error:
-            return Settled(ended(new, r.FAILED, f"its files cannot be read: {error}"), False)
+            return Settled(r.ended(new, r.FAILED, f"its files cannot be read: {error}"), False)
         if before is not None and before.inputs:
             why = r.what_changed(before, new.inputs, new.parameters) or self._why_again(before)
             if not why:
                 return Settled(before, True)
             new = replace(new, reason=why)
         if obstacle := self._obstacle(self._out / place, new.ours):
-            return Settled(ended(replace(new, inputs=""), r.REFUSED, obstacle), False)
+            return Settled(r.ended(replace(new, inputs=""), r.REFUSED, obstacle), False)
         if before is not None and before.status == r.STARTED:
             _remove_leftovers(self._out / place)
         return Task(replace(new, ours=True), files, stamp)
@@ -130,11 +129,6 @@ class Review:
         if there and not ours and not self._options.overwrite:
             return f"{folder} holds a stored set that this command did not write; --overwrite replaces it"
         return ""
-
-
-def ended(record: Record, status: str, reason: str) -> Record:
-    """A record with its end."""
-    return replace(record, status=status, reason=reason, finished=datetime.now().astimezone().isoformat("T", "seconds"))
 
 
 def _remove_leftovers(folder: Path) -> None:

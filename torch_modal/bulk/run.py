@@ -4,13 +4,13 @@ import contextlib
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from torch_modal.bulk.progress import Progress, summary
-from torch_modal.bulk.records import DONE, FAILED, Record, Records, stamp
-from torch_modal.bulk.review import Options, Review, Settled, Task, ended
+from torch_modal.bulk.records import DONE, FAILED, Record, Records, ended, stamp
+from torch_modal.bulk.review import Options, Review, Settled, Task
 from torch_modal.bulk.set_process import Outcome, SetProcess
 from torch_modal.bulk.sharing import Counts, Plan, Sharing, sharing_by_environment
 from torch_modal.bulk.tree import find_keyframe_sets, places
@@ -103,6 +103,7 @@ class _Run:
         self.review, self.sharing, self.progress = review, sharing, progress
         self.names = list(plan.places)
         self.lost: ConnectionError | None = None
+        self._last_counts = Counts(0, 0, 0)
 
     def finish(self, say: Callable[[str], None]) -> Result:
         """Take sets until there are none left, wait for the others, report."""
@@ -171,6 +172,8 @@ class _Run:
             "files": [os.path.abspath(file) for file in found.files],
             "folder": os.path.abspath(self.out / found.record.output),
             "options": extract_options,
+            "record": asdict(found.record),
+            "record_file": os.path.abspath(self.records.file(found.record.output)),
         }
         running[SetProcess(job, self.options.timeout)] = found
         return True
@@ -203,7 +206,8 @@ class _Run:
             self.progress.settled(record, self._counts())
 
     def _counts(self) -> Counts:
-        return self._reach(self.sharing.counts, Counts(0, 0, 0))
+        self._last_counts = self._reach(self.sharing.counts, self._last_counts)
+        return self._last_counts
 
     def _reach(self, ask: Callable[[], Answer], otherwise: Answer) -> Answer:
         """Ask what the processes share. Without it no more sets are taken, but those at work are brought to an end."""

@@ -261,9 +261,8 @@ def sharing_by_environment() -> Sharing:
         ConnectionError: The others were not met.
     """
     needed = ("MASTER_ADDR", "MASTER_PORT", "RANK", "WORLD_SIZE")
-    if all(os.environ.get(name) for name in needed) and os.environ["WORLD_SIZE"] != "1":
-        return Together.by_environment()
-    return Alone()
+    met = all(os.environ.get(name) for name in needed)
+    return Together.by_environment() if met and (os.environ["WORLD_SIZE"] != "1" or _parent()) else Alone()
 
 
 def _parent() -> int:
