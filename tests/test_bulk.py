@@ -34,7 +34,7 @@ import json, os, shutil, signal, sys, time
 job = json.load(open(sys.argv[1]))
 name = os.path.basename(job["folder"])
 with open(os.environ["FAKE_LOG"], "a") as log:
-    log.write(name + " " + str(os.getpid()) + " " + os.environ["OMP_NUM_THREADS"] + "\\n")
+    log.write(ascii(name)[1:-1] + " " + str(os.getpid()) + " " + os.environ["OMP_NUM_THREADS"] + "\\n")
 open(os.path.join(os.environ["TMPDIR"], "leftover"), "w").write("x")
 if "crash" in name:
     os.kill(os.getpid(), signal.SIGSEGV)
@@ -147,6 +147,15 @@ def test_bad_sets_are_reported_and_do_not_stop_the_others(bench: Bench, monkeypa
         assert any(line.startswith(f"  {status}") and f" {name}: {reason}" in line for line in summary)
     assert "  open: a bit open" in summary and summary[-1] == f"report: {bench.out / r.REPORT}"
     assert list((bench.root.parent / "scratch").iterdir()) == [], "temporary files are left"
+
+
+def test_names_that_are_no_text(bench: Bench) -> None:
+    """Names of files are bytes."""
+    name = os.fsdecode(b"refuse-\xff\n")
+    bench.add("a", name)
+    assert bench.run() == 3
+    assert bench.status() == {"a": "done", name: "refused"}
+    assert bench.run("--retry") == 3 and "refuse" in bench.computed()[-1]
 
 
 def test_each_set_has_a_line_with_the_rate_and_the_time_left(bench: Bench) -> None:

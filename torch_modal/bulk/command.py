@@ -95,10 +95,16 @@ def run(args: argparse.Namespace) -> int:
         overwrite=args.overwrite,
         cache_dir=args.cache_dir,
     )
-    say: Callable[[str], None] = (lambda _: None) if args.quiet else (lambda line: print(line, flush=True))
+    say: Callable[[str], None] = (lambda _: None) if args.quiet else _say
     with _terminated_like_interrupted():
         result = precompute_tree(args.root, args.out, options, say=say, bar=not args.quiet and sys.stderr.isatty())
     return 0 if result.complete else INCOMPLETE
+
+
+def _say(line: str) -> None:
+    """Print a line, whatever names are in it."""
+    encoding = sys.stdout.encoding or "utf-8"
+    print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 @contextlib.contextmanager
