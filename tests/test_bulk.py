@@ -298,6 +298,29 @@ def test_files_of_the_user_are_never_touched(bench: Bench) -> None:
     assert bench.run() == 0 and bench.computed() == ["a", "b"]
 
 
+def test_what_was_derived_from_a_set_is_replaced_with_it(
+    bench: Bench,
+) -> None:
+    """By the product's own way of writing."""
+    code = f"""
+        import json, sys
+        sys.path.insert(0, {str(Path(tm.__file__).parents[1])!r})
+        from torch_modal.stored import open_set, write_set
+        job, source = json.load(open(sys.argv[1])), open_set({str(bench.root.parent / "stored")!r})
+        write_set(job["folder"], source.keyframes, source.faces, source.bases, source.names)
+        json.dump({{"status": "done", "keyframes": 3, "vertices": 164}}, open(sys.argv[2], "w"))
+    """
+    bench.log.with_name("worker.py").write_text(textwrap.dedent(code))
+    bench.add("a")
+    assert bench.run() == 0
+    derived = bench.out / "a" / "between-0-1.safetensors"
+    derived.write_text("made of the set")
+    assert bench.run() == 0 and derived.exists()
+    (bench.root / "a" / "1.obj").write_text("v 5 0 0")
+    assert bench.run() == 0 and bench.report()["a"]["reason"] == "its files changed"
+    assert not derived.exists() and len(open_set(bench.out / "a")) == 3
+
+
 def test_a_foreign_report_is_not_replaced(bench: Bench) -> None:
     bench.add("a")
     bench.out.mkdir()

@@ -13,7 +13,7 @@ from torch_modal.bulk.records import Record, Records
 from torch_modal.bulk.tree import mesh_files
 from torch_modal.precompute.cache import CACHE_VERSION
 from torch_modal.precompute.modes import QUALITIES
-from torch_modal.stored import BASES_FILE, KEYFRAMES_FILE, open_set
+from torch_modal.stored import BASES_FILE, DERIVED_FILES, KEYFRAMES_FILE, open_set
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,8 @@ class Review:
         if not folder.is_dir():
             return f"{folder} exists and is no folder; move it away"
         there = {path.name for path in folder.iterdir()}
-        if others := sorted(there - {KEYFRAMES_FILE, BASES_FILE}):
+        others = sorted(there - {KEYFRAMES_FILE, BASES_FILE})
+        if others := [name for name in others if not Path(name).match(DERIVED_FILES)]:
             return f"{folder} also holds {others[0]}, which is no part of a stored set; move it away"
         if there and not ours and not self._options.overwrite:
             return f"{folder} holds a stored set that this command did not write; --overwrite replaces it"
