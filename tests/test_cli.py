@@ -296,7 +296,7 @@ def test_help_and_version() -> None:
     assert "torch-modal demo" in run("--help").stdout
 
 
-@pytest.mark.parametrize("command", ["subdivide", "modes", "demo"])
+@pytest.mark.parametrize("command", ["subdivide", "modes", "precompute", "demo"])
 def test_help_has_an_example_that_the_parser_accepts(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main([command, "--help"])

@@ -1,4 +1,4 @@
-"""The command line: ``torch-modal subdivide``, ``modes`` and ``demo``.
+"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``demo`` and ``cache``.
 
 Nothing heavy is imported before the arguments are known to make sense.
 """
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from torch_modal import commands
+from torch_modal.bulk import command as bulk
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -81,7 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; by default those of the process.
 
     Returns:
-        The exit code: 0, 1 after an error, 130 after Ctrl-C. Wrong usage leaves with ``SystemExit(2)``.
+        The exit code: 0, 1 after an error, 130 after Ctrl-C; `precompute` has one of its own when some sets have no
+        result. Wrong usage leaves with ``SystemExit(2)``.
     """
     try:
         args = _parser().parse_args(argv)
@@ -102,8 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> int:
     """Run the command; expected errors become one line."""
     try:
-        args.command(args)
-        return 0
+        return args.command(args) or 0
     except BrokenPipeError:
         raise
     except Exception as error:
@@ -184,7 +185,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND ...")
 
-    def command(name: str, run: Callable[[Any], None], summary: str, text: str, examples: str) -> Any:
+    def command(name: str, run: Callable[[Any], int | None], summary: str, text: str, examples: str) -> Any:
         sub = subparsers.add_parser(
             name, help=summary, description=text, epilog=examples, formatter_class=_Formatter, allow_abbrev=False
         )
@@ -282,6 +283,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_modes(sub)
     _add_common(sub)
+
+    sub = command("precompute", bulk.run, bulk.SUMMARY, bulk.DESCRIPTION, bulk.EXAMPLES)
+    bulk.add_arguments(sub, _number)
+    _add_modes(sub)
+    bulk.add_common(sub)
 
     sub = command("demo", commands.demo, "try it on the samples that come with it", DEMO, DEMO_EXAMPLES)
     sub.add_argument(

@@ -11,6 +11,8 @@ import sys
 # modules that the libraries below import.
 del sys.path[0]
 
+import ctypes  # noqa: E402
+import os  # noqa: E402
 import signal  # noqa: E402
 import types  # noqa: E402
 
@@ -36,6 +38,10 @@ def main(job_path: str, result_path: str) -> None:
         # hours.
         signal.alarm(min(int(timeout) + 10, 2**31 - 1))
 
+    if sys.platform == "linux":
+        pr_set_pdeathsig = 1  # or at once, where the system can be told to
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
+
     # Imported after the alarm is set, and where needed.
     if len(faces) > max_surface_faces:
         import fast_simplification
@@ -51,8 +57,15 @@ def main(job_path: str, result_path: str) -> None:
         edge_length_fac=edge_length_fac,
         epsilon=epsilon,
         stop_energy=stop_energy,
+        num_threads=_threads(),
     )
     np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))
+
+
+def _threads() -> int:
+    """As many as ``OMP_NUM_THREADS`` says, where several processes share the cores; 0, for all, if it says nothing."""
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    return int(asked) if asked.isdecimal() else 0
 
 
 def _pytetwild() -> types.ModuleType:

@@ -1,8 +1,5 @@
 """A surface filled with tetrahedra, by fTetWild in a process of its own."""
 
-import contextlib
-import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -21,6 +18,7 @@ from scipy.spatial import cKDTree
 from torch_modal.inspect_mesh import signed_volume
 from torch_modal.mesh import vertex_areas
 from torch_modal.precompute.surface import DIAGONAL, outward
+from torch_modal.processes import describe_exit, end_process, last_line
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -232,16 +230,16 @@ def _run_worker(
         try:
             code = _wait(process, timeout)
         finally:
-            _kill(process)  # also on KeyboardInterrupt
+            end_process(process)  # also on KeyboardInterrupt
         if code is None:
             raise failure.error(
                 f"no result after the timeout of {timeout:g} s",
                 "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections",
             )
         if code != 0:
-            tail = (log.read_text(errors="replace").strip().splitlines() or [""])[-1]  # of a traceback: the error
+            tail = last_line(log.read_text(errors="replace"))
             raise failure.error(
-                f"the worker process ended with {_describe_exit(code)}" + (f" ({tail})" if tail else ""),
+                f"the worker process ended with {describe_exit(code)}" + (f" ({tail})" if tail else ""),
                 "Check the surface for self-intersections and degenerate faces, or try other settings",
             )
         try:
@@ -263,28 +261,6 @@ def _wait(process: subprocess.Popen[bytes], timeout: float) -> int | None:
         except subprocess.TimeoutExpired:
             if time.monotonic() >= end:
                 return None
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End the worker and whatever it started, and take in its exit status so that no zombie stays."""
-    if process.poll() is not None:
-        return
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        if hasattr(os, "killpg"):
-            os.killpg(process.pid, signal.SIGKILL)
-        else:
-            process.kill()
-    process.wait()
-
-
-def _describe_exit(code: int) -> str:
-    """``exit code 1`` or ``signal SIGSEGV``."""
-    if code >= 0:
-        return f"exit code {code}"
-    try:
-        return f"signal {signal.Signals(-code).name}"
-    except ValueError:
-        return f"signal {-code}"
 
 
 def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: TetrahedraSettings, failure: _Failure) -> None:

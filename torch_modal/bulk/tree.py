@@ -1,0 +1,112 @@
+"""Which key-frame sets a folder tree holds, and where their bases go."""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from torch_modal.mesh_files import SUFFIXES
+
+MESH_SUFFIXES = (*SUFFIXES, ".stl")
+"""STL cannot serve as a key-frame, but it is better refused with a reason than passed over."""
+ROOT = "."
+"""Name of the set whose files lie in the root itself."""
+
+
+class Tree(NamedTuple):
+    """What was found below a folder.
+
+    Names of sets are their folders' paths below the root, with ``/`` between the parts.
+    """
+
+    sets: list[str]
+    """Folders that directly hold two or more mesh files, in natural order."""
+    left_out: dict[str, str]
+    """Folders that may have been meant as sets, and why they are none."""
+
+
+def find_keyframe_sets(root: Path, skip: Path | None = None) -> Tree:
+    """Walk a folder tree.
+
+    Hidden files and folders (a dot before the name) are passed over. Links to folders are followed, except to one that
+    they lie in.
+
+    Args:
+        root: Where to start.
+        skip: A folder that is not entered: the results of an earlier run, perhaps.
+
+    Raises:
+        OSError: The root cannot be read.
+    """
+    os.listdir(root)  # os.walk is silent about a root that is not there
+    tree = Tree([], {})
+
+    def unreadable(error: OSError) -> None:
+        tree.left_out[_name(Path(error.filename), root)] = f"cannot be read: {error.strerror}"
+
+    passed = skip.resolve() if skip is not None else None
+    for place, below, _ in os.walk(root, onerror=unreadable, followlinks=True):
+        folder = Path(place)
+        above = {folder.resolve(), *folder.resolve().parents}
+        below[:] = [name for name in below if not name.startswith(".")]
+        below[:] = [name for name in below if (folder / name).resolve() not in above | {passed}]
+        meshes = mesh_files(folder)
+        if len(meshes) > 1:
+            tree.sets.append(_name(folder, root))
+        elif meshes:
+            tree.left_out[_name(folder, root)] = f"holds one mesh only, {meshes[0].name}; a set needs two or more"
+    tree.sets.sort(key=natural)
+    return tree
+
+
+def mesh_files(folder: Path) -> list[Path]:
+    """The mesh files that lie directly in a folder, in natural order of their names.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
+    return [folder / name for name in sorted(names, key=natural) if Path(name).suffix.lower() in MESH_SUFFIXES]
+
+
+def places(names: Sequence[str], root: Path) -> dict[str, str]:
+    """Where the bases of each set go, as a path below the output folder.
+
+    That is the set's own name, so that the output mirrors the tree. A folder with sets below it cannot hold the files
+    of a set as well, and the output folder itself holds the report: such a set goes one level deeper, into a folder of
+    the same name, with ``_`` after it if that is taken.
+    """
+    above = {str(parent) for name in names for parent in PurePosixPath(name).parents if name != ROOT}
+    taken = above | set(names)
+    found = {}
+    for name in names:
+        place = name
+        if name in above or name == ROOT:
+            own = root.resolve().name or "root"
+            place = own if name == ROOT else f"{name}/{PurePosixPath(name).name}"
+            while place in taken:
+                place += "_"
+        found[name] = place
+    return found
+
+
+def same_stems(files: Iterable[Path]) -> list[Path]:
+    """Files that have their name without extension in common: probably one shape in two formats."""
+    listed = list(files)
+    n_users = Counter(file.stem for file in listed)
+    return [file for file in listed if n_users[file.stem] > 1]
+
+
+def natural(name: str) -> list[tuple[list[str | int], str]]:
+    """A key to sort by, with which ``frame-2`` comes before ``frame-10``, and a folder before what is in it."""
+    return [
+        ([int(part) if i % 2 else part.casefold() for i, part in enumerate(re.split(r"([0-9]+)", level))], level)
+        for level in name.split("/")
+    ]
+
+
+def _name(folder: Path, root: Path) -> str:
+    return folder.relative_to(root).as_posix()
