@@ -452,6 +452,13 @@ class TestTorch:
     def test_deterministic(self, layer: InBetween, bars: Shapes) -> None:
         assert torch.equal(layer(*bars.keyframes[:2], 0.3), layer(*bars.keyframes[:2], 0.3))
 
+    def test_fixed_steps_are_exported(self, small_bars: Shapes) -> None:
+        layer = InBetween(small_bars.bases[1:], small_bars.faces, gradient="unroll", max_steps=3)
+        x_a, x_b = small_bars.keyframes[1:]
+        exported = torch.export.export(layer, (x_a, x_b, times(0.3)), strict=False).module()
+        others = (1.01 * x_a, x_b + 0.1 * x_a, times(0.6))
+        torch.testing.assert_close(exported(*others), layer(*others), rtol=0, atol=1e-12)
+
     def test_dynamo_takes_the_step(self, layer: InBetween, bars: Shapes) -> None:
         member = layer.members[0]
         pair = member.space.frame.place(bars.keyframes[:1], bars.keyframes[1:2])
