@@ -159,9 +159,11 @@ class ModalShell(nn.Module):
         x = self.shape(a, placement)
         moved = self.shape(direction, placement) - placement.base
         rows, along = (y.movedim(-1, 0).contiguous() for y in (x, moved))
-        slope, _ = slopes_of(shell.measure(x), placement.references)
-        length = (length_gradient(shell.edge_vectors(rows)) * shell.edge_vectors(along)).sum(0)
-        angle = (dihedral_gradient(shell.hinge_spokes(rows)) * shell.hinge_spokes(along)).sum((0, 1))
+        edges, spokes = shell.edge_vectors(rows), shell.hinge_spokes(rows)
+        measures = Measures(edge_length(edges), dihedral_angle(spokes), shell.volume(rows))
+        slope, _ = slopes_of(measures, placement.references)
+        length = (length_gradient(edges) * shell.edge_vectors(along)).sum(0)
+        angle = (dihedral_gradient(spokes) * shell.hinge_spokes(along)).sum((0, 1))
         volume = (self.shell.volume_gradient(rows) * along).sum((0, -1))
         return (slope.length * length).sum(-1) + (slope.angle * angle).sum(-1) + slope.volume * volume
 

@@ -282,9 +282,10 @@ class ShellEnergy(nn.Module):
             x_rest: Vertex positions. *Shape:* ``(..., V, 3)``.
             stiffness: Other stiffnesses than the module's own.
         """
-        measures = self.measure(x_rest)
         rows = x_rest.movedim(-1, 0).contiguous()
-        e, a, b = self.hinge_spokes(rows)
+        spokes = self.hinge_spokes(rows)
+        measures = Measures(edge_length(self.edge_vectors(rows)), dihedral_angle(spokes), self.volume(rows))
+        e, a, b = spokes
         n1, n2 = cross(e, a), cross(b, e)
         hinge_area = 0.5 * (edge_length(n1) + edge_length(n2))
         squared = (e * e).sum(0)
