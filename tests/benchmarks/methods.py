@@ -24,6 +24,13 @@ from torch_modal.rigid import blend
 
 PEER_SECONDS = 300
 MOST_VERTICES = 15_000  # over all vertices: more take minutes a step
+# One thread, as for all others; with more, jax 0.10 waits for itself for ever on few cores and large meshes.
+PEER_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "JAX_PLATFORMS": "cpu",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+}
 
 
 class Outcome(NamedTuple):
@@ -202,7 +209,7 @@ def by_peer(case: Case, kind: str) -> Outcome:
         arrays = {"x_a": case.x_a[used].numpy(), "x_b": case.x_b[used].numpy(), "faces": number[case.faces].numpy()}
         np.savez(request, kind=kind, times=np.array(case.times), **arrays)
         command = [python, str(Path(__file__).with_name("peer_worker.py")), str(request), str(answer)]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+        environment = {**os.environ, **PEER_ENVIRONMENT}
         environment.pop("PYTHONPATH", None)
         try:
             run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PEER_SECONDS)
