@@ -89,7 +89,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--irregular", action="store_true", help="the same with irregular triangles")
     parser.add_argument("--body", nargs="+", default=[], metavar="NAME", help="others, such as 'bar bent 270'")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="NAME")
-    parser.add_argument("--only", default="", metavar="TEXT", help="only cases with this in their name")
+    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
     parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
     parser.add_argument("--results", type=Path, metavar="FILE.json", help="keep results, and go on from those there")
     parser.add_argument("--markdown", type=Path, metavar="FILE.md", help="write all tables")
@@ -112,7 +112,7 @@ def main() -> None:
     drawn: list[tuple[Case, dict[str, torch.Tensor]]] = []
     shown: list[Row] = []
     for case in chosen_cases(arguments):
-        if arguments.only not in case.name:
+        if not any(text in case.name for text in arguments.only):
             continue
         known = {row.method: row for row in rows if row.case == case.name}
         missing = [name for name in arguments.methods if name not in known or arguments.sheet]

@@ -13,6 +13,7 @@ from measures import Row, Yardstick
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+LEAST = 0.01  # per cent, where the axis of the bars begins
 WORST = 0.2  # relative edge error at the end of the colour scale
 
 
@@ -33,7 +34,7 @@ def draw_bars(rows: list[Row], path: Path) -> None:
     axes.set_xticks(
         np.arange(len(names)) + 0.4, [n if n in known else f"{n} *" for n in names], rotation=40, ha="right"
     )
-    axes.set(yscale="log", ylabel="mean edge-length error, % (* no truth: against mean lengths)")
+    axes.set(yscale="log", ylim=(LEAST, None), ylabel="mean edge-length error, % (* no truth: against mean lengths)")
     axes.legend(ncols=4, fontsize="small")
     axes.grid(axis="y", alpha=0.3)
     figure.savefig(path, dpi=110)
@@ -46,7 +47,10 @@ def bar_height(row: Row) -> float:
 
 
 def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) -> None:
-    """A row for each case, a column for each method; colours are the mean relative edge errors around a vertex."""
+    """A row for each case, a column for each method; colours are the mean relative edge errors around a vertex.
+
+    From pale (none) to dark red (``WORST`` and more).
+    """
     import pyvista
 
     drawn = [(case, shapes) for case, shapes in drawn if shapes]
@@ -67,8 +71,9 @@ def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) ->
             error = (yardstick.lengths(x) - wanted).abs() / wanted
             polygons = pyvista.PolyData.from_regular_faces(x.numpy(), case.faces.numpy())
             polygons["error"] = around_vertices(error, yardstick.edges, len(x))
-            plotter.add_mesh(polygons, clim=(0, WORST), cmap="viridis", show_scalar_bar=False, smooth_shading=False)
-            plotter.add_text(f"{name}  {100 * float(error.mean()):.1f} %\n{case.name}", font_size=6)
+            plotter.add_mesh(polygons, clim=(0, WORST), cmap="YlOrRd", show_scalar_bar=False, smooth_shading=False)
+            text = f"{name}  {100 * float(error.mean()):.1f} %\n{case.name}"
+            plotter.add_text(text, position=(6, 206), font_size=6)
             look(plotter, guide)
     plotter.screenshot(path)
     plotter.close()
@@ -89,4 +94,4 @@ def look(plotter: Any, shape: torch.Tensor) -> None:
     wide, high, thin = torch.linalg.svd(centred, full_matrices=False).Vh
     view = thin + 0.35 * high + 0.25 * wide
     plotter.view_vector(view.tolist(), viewup=high.tolist())
-    plotter.camera.zoom(1.3)
+    plotter.camera.zoom(1.1)
