@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "torch_modal"
 ORDER = [
     ["version", "errors", "files", "mesh", "inspect_mesh"],
     ["arrays", "basis", "export", "mesh_files", "rigid"],
-    ["keyframes", "picture"],
+    ["keyframes", "picture", "stored"],
     ["precompute", "precompute._tetwild_worker", "precompute.cache", "precompute.coarsening"],
     ["precompute.surface", "precompute.lanczos"],
     ["precompute.tetrahedra", "precompute.eigen"],
