@@ -7,7 +7,6 @@ import pytest
 import torch
 from conftest import Shapes
 
-from torch_modal import stored
 from torch_modal.basis import ModalBasis
 from torch_modal.stored import BASES_FILE, KEYFRAMES_FILE, StoredSet, find_sets, open_set, write_set
 
@@ -66,6 +65,9 @@ def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> No
     write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
     assert torch.equal(open_set(folder).keyframes, 2 * small_bars.keyframes)
     assert sorted(path.name for path in folder.parent.iterdir()) == ["bars"]
+    (folder / "between-0-1.safetensors").write_bytes(b"")  # made from a set, and out of date with it
+    write_set(folder, *small_bars, NAMES)
+    assert sorted(path.name for path in folder.iterdir()) == [BASES_FILE, KEYFRAMES_FILE]
     (folder / "labels.csv").write_text("mine")
     with pytest.raises(FileExistsError, match="no stored key-frame set"):
         write_set(folder, *small_bars, NAMES)
@@ -74,17 +76,18 @@ def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> No
 
 def test_a_failure_leaves_nothing_behind(small_bars: Shapes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    save, calls = stored.save_file, []
+    write, calls = Path.write_bytes, []
 
-    def full_disk(*args: object) -> None:
-        calls.append(args)
+    def full_disk(path: Path, data: bytes) -> int:
+        calls.append(path.name)
         if len(calls) == 2:
             raise OSError("No space left on device")
-        save(*args)
+        return write(path, data)
 
-    monkeypatch.setattr(stored, "save_file", full_disk)
+    monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(OSError, match="No space"):
         write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
+    assert calls == [KEYFRAMES_FILE, BASES_FILE]
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in folder.parent.iterdir()] == ["bars"]
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from torch_modal.basis import FORMAT as BASIS_FORMAT
@@ -29,6 +29,8 @@ FORMAT = "torch_modal.set"
 VERSION = "1"
 KEYFRAMES_FILE = "keyframes.safetensors"
 BASES_FILE = "bases.safetensors"
+#: Made from a set and kept beside it: replaced along with it.
+DERIVED_FILES = "between-*.safetensors"
 _PARTS = tuple(field.name for field in fields(ModalBasis))
 
 
@@ -130,9 +132,12 @@ def write_set(
         fresh.mkdir()
         shapes = {"keyframes": _plain(keyframes, torch.float64), "faces": _plain(faces, torch.int64)}
         names_json = json.dumps([str(name) for name in names])
-        save_file(shapes, fresh / KEYFRAMES_FILE, {"format": FORMAT, "version": VERSION, "names": names_json})
+        metadata = {"format": FORMAT, "version": VERSION, "names": names_json}
+        # Not safetensors' own save_file: its files are for the owner's eyes alone, whatever the umask says.
+        (fresh / KEYFRAMES_FILE).write_bytes(save_tensors(shapes, metadata))
         parts = {f"{i}.{part}": _plain(getattr(basis, part)) for i, basis in enumerate(bases) for part in _PARTS}
-        save_file(parts, fresh / BASES_FILE, {"format": BASIS_FORMAT, "version": BASIS_VERSION})
+        metadata = {"format": BASIS_FORMAT, "version": BASIS_VERSION}
+        (fresh / BASES_FILE).write_bytes(save_tensors(parts, metadata))
         if folder.exists():
             with contextlib.suppress(FileNotFoundError):  # another process may be replacing it too
                 folder.rename(old)
@@ -164,8 +169,9 @@ def _plain(x: Tensor, dtype: torch.dtype | None = None) -> Tensor:
 
 
 def _is_replaceable(folder: Path) -> bool:
-    """Whether a folder is empty or holds the files of a set, and nothing else."""
-    return folder.is_dir() and {path.name for path in folder.iterdir()} <= {KEYFRAMES_FILE, BASES_FILE}
+    """Whether a folder holds nothing but what belongs to a set."""
+    own = {KEYFRAMES_FILE, BASES_FILE}
+    return folder.is_dir() and all(path.name in own or path.match(DERIVED_FILES) for path in folder.iterdir())
 
 
 def _check_parts(keyframes: Tensor, faces: Tensor, bases: Sequence[ModalBasis], names: Sequence[str]) -> None:
