@@ -90,13 +90,15 @@ def bend(displaced: Sides, reference: Frames) -> Bend:
 def bent_sides(bending: Bend, own: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
+    The stretch is the exponential of the strain, so that a shear keeps the area, and no triangle turns over.
+
     Args:
         bending: Rotations in the coordinates of ``own``.
         own: Frames of the shape whose sides are wanted.
     """
-    xx, xy, yy = bending.strain
-    first = own.world((1 + xx) * own.length, xy * own.length)
-    second = own.world((1 + xx) * own.along + xy * own.height, xy * own.along + (1 + yy) * own.height)
+    xx, xy, yy = _exponential(*bending.strain)
+    first = own.world(xx * own.length, xy * own.length)
+    second = own.world(xx * own.along + xy * own.height, xy * own.along + yy * own.height)
     return Sides(_rotate(bending.turn, first), _rotate(bending.turn, second))
 
 
@@ -133,6 +135,15 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """*Shape:* ``(F, 3, B), (F, 3, B) -> (F, B)``."""
     return (a * b).sum(1)
+
+
+def _exponential(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of symmetric 2 x 2 matrices, entry by entry."""
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    radius = (half**2 + xy**2).clamp_min(torch.finfo(xx.dtype).tiny).sqrt()
+    scale = mean.exp()
+    even, odd = scale * radius.cosh(), scale * radius.sinh() / radius
+    return even + odd * half, odd * xy, even - odd * half
 
 
 def _norm(a: Tensor) -> Tensor:
