@@ -49,13 +49,22 @@ class _Pairwise(ShapeAugmentation):
         assert other.nearest is not None and other.given is not None
         tracked = batch.shapes.requires_grad or other.shapes.requires_grad
         known = batch.given & other.given & (batch.nearest != other.nearest) & (not tracked)
-        kinds, kind = torch.stack([batch.nearest, other.nearest, known.long()], 1).unique(dim=0, return_inverse=True)
+        # The same two key-frames in either order are solved together.
+        swap = batch.nearest > other.nearest
+        turn = swap.to(t.device)
+        x_a, x_b = (
+            torch.where(turn[:, None, None], *shapes)
+            for shapes in ((other.shapes, batch.shapes), (batch.shapes, other.shapes))
+        )
+        ends = torch.stack([batch.nearest, other.nearest], 1).sort(1).values
+        kinds, kind = torch.cat([ends, known[:, None].long()], 1).unique(dim=0, return_inverse=True)
+        times = torch.where(turn, 1 - t, t)
         shapes, order = [], []
         for number, (i, j, is_known) in enumerate(kinds.tolist()):
             rows = torch.nonzero(kind == number).flatten()
             here = rows.to(t.device)
-            pair = _Pair(space, batch.shapes[here], other.shapes[here], i, j, bool(is_known))
-            shapes.append(self.moved(pair, t[here]))
+            pair = _Pair(space, x_a[here], x_b[here], i, j, bool(is_known))
+            shapes.append(self.moved(pair, times[here]))
             order.append(rows)
         back = torch.argsort(torch.cat(order)).to(t.device)
         nearer = (t.detach() > 0.5).cpu()
@@ -83,7 +92,7 @@ class _Pairwise(ShapeAugmentation):
 
 
 class _Pair:
-    """Shapes with their partners, all with the modes of the same two key-frames."""
+    """Shapes with their partners, all with the modes of the same two key-frames, ``i <= j``."""
 
     def __init__(self, space: ShapeSpace, x_a: Tensor, x_b: Tensor, i: int, j: int, known: bool) -> None:
         self.space, self.x_a, self.x_b, self.i, self.j, self.known = space, x_a, x_b, i, j, known
@@ -168,7 +177,7 @@ class RandomExtrapolation(_Pairwise):
         before_end = pair.at(torch.where(after, 2 - t, -t))
         ends = torch.where(after[:, None, None], pair.x_b, pair.x_a)
         # Either key-frame's weights serve; those of the first spare a factorisation.
-        return mirror(ends, before_end, pair.space.reconstruction(min(pair.i, pair.j)))
+        return mirror(ends, before_end, pair.space.reconstruction(pair.i))
 
     def extra_repr(self) -> str:
         """Settings."""

@@ -240,7 +240,7 @@ class ShapeSpace:
     def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:
         """Between two key-frames themselves, from the table. *Shape:* ``(B,) -> (B, V, 3)``, in the dtype of ``t``."""
         if i > j:
-            return self.keyframe_in_between(j, i, 1 - t)
+            return self.keyframe_in_between(j, i, 1 - t)  # one table serves both ways
         if self.times is None:
             x_i, x_j = self.keyframes(t)[[i, j]]
             return _usable(self.layer(i, j, t).solve(x_i, x_j, t).shapes, i, j)
