@@ -103,7 +103,7 @@ def bars() -> Shapes:
 
 @pytest.fixture(scope="session")
 def small_bars() -> Shapes:
-    """The same with 38 vertices and 72 faces, 3 modes each: for tests against slow truth."""
+    """The same with 30 vertices and 56 faces, 3 modes each: for tests against slow truth."""
     return bent_bar((4, 2, 1), 3)
 
 
