@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
@@ -91,15 +91,48 @@ def remark(row: Row, by_name: dict[str, Row]) -> str:
 
 
 def markdown(rows: list[Row]) -> str:
-    """All cases and what comes out of them."""
+    """What comes out of all cases, and what matters most of each: a line for each case, a column for each method."""
     names = list(dict.fromkeys(row.case for row in rows))
     methods = list(dict.fromkeys(row.method for row in rows))
     found = {name: {row.method: row for row in rows if row.case == name} for name in names}
-    lines = ["| case | method | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 2) + "|"]
-    for name in names:
-        for i, row in enumerate(found[name].values()):
-            lines.append(f"| {name if i == 0 else ''} | {row.method} | " + " | ".join(cells(row, found[name])) + " |")
-    return "\n".join(["", *lines, "", *summary(found, methods), ""])
+    lines = ["", *summary(found, methods)]
+    for title, cell in PIVOTS.items():
+        table = [[cell(found[name].get(method), found[name]) for method in methods] for name in names]
+        if all(value == "-" for line in table for value in line):
+            continue
+        lines += ["", f"**{title}**", "", f"| | {' | '.join(methods)} |", "|---" * (len(methods) + 1) + "|"]
+        lines += [f"| {name} | {' | '.join(line)} |" for name, line in zip(names, table, strict=True)]
+    return "\n".join([*lines, ""])
+
+
+def _edge_error(row: Row | None, by_name: dict[str, Row]) -> str:
+    if row is None or math.isfinite(row.edge_error):
+        return percent(row.edge_error if row else NAN)
+    return percent(row.edge_drift) + (" *" if math.isfinite(row.edge_drift) else "")
+
+
+def _gap(row: Row | None, by_name: dict[str, Row]) -> str:
+    return number(gap_closed(row, by_name.get(BASELINE), by_name.get(FULL)) if row else NAN, ".3f")
+
+
+def _energy(row: Row | None, by_name: dict[str, Row]) -> str:
+    linear = by_name.get(BASELINE)
+    return number(row.energy / linear.energy if row and linear and linear.energy else NAN, ".4f")
+
+
+def _turned(row: Row | None, by_name: dict[str, Row]) -> str:
+    return f"{number(row.turned, '.0f')} / {number(row.folds, '.0f')}" if row and math.isfinite(row.folds) else "-"
+
+
+PIVOTS: dict[str, Callable[[Row | None, dict[str, Row]], str]] = {
+    "Edge error (*: no truth, drift)": _edge_error,
+    "Energy over that of linear interpolation": _energy,
+    "Gap closed": _gap,
+    "Volume": lambda row, _: number(row.volume if row else NAN, ".3f"),
+    "Faces turned / hinges folded": _turned,
+    "New crossings": lambda row, _: number(row.crossings if row else NAN, ".0f"),
+    "Milliseconds": lambda row, _: number(1e3 * row.seconds if row else NAN, ".1f"),
+}
 
 
 def summary(found: dict[str, dict[str, Row]], methods: list[str]) -> list[str]:
