@@ -34,6 +34,9 @@ setup(
         "matplotlib>=3.7",
         "tqdm>=4.65",
     ],
-    extras_require={"test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11"]},
+    extras_require={
+        "pyg": ["torch_geometric>=2.4"],
+        "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4"],
+    },
     entry_points={"console_scripts": ["torch-modal = torch_modal.cli:main"]},
 )

@@ -1,12 +1,15 @@
 """Stiffness and mass against the energies they are the Hessians of."""
 
+import itertools
+
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.sparse as sp
 import torch
 from solids import box, together
 
-from torch_modal.precompute.arap import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, lumped_mass
+from torch_modal.precompute.arap import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, consistent_mass, lumped_mass
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
 
 
@@ -29,7 +32,44 @@ def test_element_form_is_the_hessian_of_its_energy(solid: Tetrahedra) -> None:
     n = len(solid.vertices)
     u = torch.randn(3 * n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     by_autograd = torch.autograd.functional.hessian(lambda u: element_energy(u.reshape(n, 3), solid), u)
-    np.testing.assert_allclose(arap_hessian(solid).toarray(), by_autograd.numpy(), atol=1e-12)
+    np.testing.assert_allclose(arap_hessian(solid, "element").toarray(), by_autograd.numpy(), atol=1e-12)
+
+
+def edge_energy(u: torch.Tensor, solid: Tetrahedra) -> torch.Tensor:
+    """sum_e vol_e |sym grad u_e|², the gradient averaged over the tetrahedra around each edge, one edge at a time."""
+    x, tets = torch.from_numpy(solid.vertices), torch.from_numpy(solid.tets)
+    rest = (x[tets[:, 1:]] - x[tets[:, :1]]).mT
+    gradient = (u[tets[:, 1:]] - u[tets[:, :1]]).mT @ torch.linalg.inv(rest)
+    volumes = torch.linalg.det(rest).abs() / 6
+    around: dict[tuple[int, int], list[int]] = {}
+    for number, tet in enumerate(solid.tets.tolist()):
+        for edge in itertools.combinations(sorted(tet), 2):
+            around.setdefault(edge, []).append(number)
+    total = torch.zeros((), dtype=u.dtype)
+    for numbers in around.values():
+        volume = volumes[numbers].sum()
+        mean = (volumes[numbers, None, None] * gradient[numbers]).sum(dim=0) / volume
+        total = total + volume / 6 * (((mean + mean.T) / 2) ** 2).sum()
+    return total
+
+
+def test_edge_form_is_the_hessian_of_its_energy(solid: Tetrahedra) -> None:
+    n = len(solid.vertices)
+    u = torch.randn(3 * n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    by_autograd = torch.autograd.functional.hessian(lambda u: edge_energy(u.reshape(n, 3), solid), u)
+    np.testing.assert_allclose(arap_hessian(solid, "edge").toarray(), by_autograd.numpy(), atol=1e-12)
+
+
+@pytest.mark.parametrize("cells", [(4, 3, 3), (5, 4, 4), (8, 2, 2)])
+def test_edge_form_is_a_fifth_of_the_element_form_or_more(cells: tuple[int, int, int]) -> None:
+    """However fine the mesh: so averaging hides no motion, as averaging around vertices does."""
+    fine = box(cells, (cells[0] / 2, 1.0, 1.0), jitter=0.1)
+    values, vectors = np.linalg.eigh(arap_hessian(fine, "element").toarray())
+    assert values[5] < 1e-9 * values[6]
+    relative = vectors[:, 6:] / np.sqrt(values[6:])
+    ratios = np.linalg.eigvalsh(relative.T @ arap_hessian(fine, "edge") @ relative)
+    assert ratios[0] > 0.15
+    assert ratios[-1] < 1 + 1e-9
 
 
 def cotangent_weights(solid: Tetrahedra) -> dict[tuple[int, int], float]:
@@ -90,7 +130,7 @@ def test_symmetric_positive_semidefinite_with_rigid_null_space(form: str, capsul
 def test_forms_agree_on_a_pure_stretch_and_on_modes() -> None:
     fine = box((16, 4, 4), (4.0, 1.0, 1.0))
     stretch = fine.vertices * (1.0, 0.0, 0.0)  # sym grad = diag(1, 0, 0): energy = volume
-    for form, tolerance in (("element", 1e-12), ("vertex", 0.02)):
+    for form, tolerance in (("edge", 1e-12), ("element", 1e-12), ("vertex", 0.02)):
         energy = 0.5 * stretch.reshape(-1) @ (arap_hessian(fine, form) @ stretch.reshape(-1))
         assert energy == pytest.approx(4.0, rel=tolerance)
 
@@ -99,6 +139,7 @@ def test_inverted_tetrahedra_count_with_their_magnitude(solid: Tetrahedra) -> No
     turned = Tetrahedra(solid.vertices, solid.tets.copy())
     turned.tets[::3] = turned.tets[::3][:, [1, 0, 2, 3]]
     np.testing.assert_allclose(lumped_mass(turned), lumped_mass(solid))
+    np.testing.assert_allclose(consistent_mass(turned).toarray(), consistent_mass(solid).toarray())
     for form in HESSIAN_FORMS:
         np.testing.assert_allclose(
             arap_hessian(turned, form).toarray(), arap_hessian(solid, form).toarray(), atol=1e-12
@@ -111,8 +152,20 @@ def test_mass_is_the_volume() -> None:
     mass = lumped_mass(two)
     assert mass.sum() == pytest.approx(6.125)
     assert (mass > 0).all()
+    np.testing.assert_allclose(np.asarray(consistent_mass(two).sum(axis=1)).reshape(-1), mass)
+
+
+def test_consistent_mass_integrates_products_of_linear_functions() -> None:
+    brick = box((3, 2, 4), (1.0, 2.0, 3.0), jitter=0.0)
+    x, y, z = brick.vertices.T
+    m = consistent_mass(brick)
+    assert x @ (m @ x) == pytest.approx(2.0)  # ∫ x² = 1/3 * 2 * 3
+    assert y @ (m @ z) == pytest.approx(1.0 * 2.0 * 4.5)  # ∫ y z
+    half = Tetrahedra(brick.vertices, brick.tets, np.full(len(brick.tets), 0.5))
+    assert x @ (consistent_mass(half) @ x) == pytest.approx(1.0)
+    assert sp.issparse(m) and abs(m - m.T).max() < 1e-15
 
 
 def test_unknown_form(solid: Tetrahedra) -> None:
-    with pytest.raises(ValueError, match="'spokes'; give 'element' or 'vertex'"):
+    with pytest.raises(ValueError, match="'spokes'; give one of"):
         arap_hessian(solid, "spokes")

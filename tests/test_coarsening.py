@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from bodies import body
 from conftest import Shapes
 
 from torch_modal.keyframes import Keyframes
@@ -133,3 +134,15 @@ def test_coarse_energy_of_a_hand_is_near_the_fine_one(hand_path: Keyframes) -> N
     assert len(coarse.faces) == 1000
     for pair in ([0, 4], [0, 2], [2, 4]):
         assert 0.4 < energy_ratio(coarse, x[pair], faces) < 2.5
+
+
+def test_no_triangle_has_its_corners_on_a_line() -> None:
+    """Regular bars, straight and bent: cluster averages of their flat sides may lie on one line."""
+    for name in ("bar bent 90", "bar bent 180"):
+        shape = body(name)
+        keyframes, faces = np.stack([shape.pose(0.0), shape.pose(1.0)]), np.array(shape.faces)
+        coarse = coarsen(keyframes, faces, 1000)
+        corners = coarse.restrict(keyframes)[:, coarse.faces]
+        sides = corners - np.roll(corners, 1, axis=2)
+        area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
+        assert (area / (sides**2).sum(-1).max(-1)).min() > 1e-3

@@ -15,7 +15,8 @@ ORDER = [
     ["arrays", "basis", "export", "mesh_files", "rigid"],
     ["keyframes", "picture", "stored"],
     ["precompute", "precompute._tetwild_worker", "precompute.cache", "precompute.coarsening"],
-    ["precompute.surface", "precompute.lanczos"],
+    ["precompute.surface", "precompute.mass"],
+    ["precompute.lanczos"],
     ["precompute.tetrahedra", "precompute.eigen"],
     ["precompute.arap", "precompute.lattice"],
     ["precompute.embedding", "precompute.carrying"],
@@ -31,6 +32,13 @@ ORDER = [
     ["nn.in_between"],
     ["nn.mid_shape", "full_space"],
     ["sequence"],
+    ["augment", "augment.triangles", "augment.table", "augment.normals"],
+    ["augment.reconstruction"],
+    ["augment.space"],
+    ["augment.base"],
+    ["augment.between", "augment.deformation", "augment.rigid_motion"],
+    ["augment.sequential"],
+    ["adapters", "dataset", "pyg"],
     ["sample_data"],
     [""],
     ["demo"],
@@ -105,7 +113,7 @@ def test_layers_are_torch_only(module: str) -> None:
 
 
 def test_import_loads_nothing_heavy() -> None:
-    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild"]
+    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch_geometric"]
     code = f"import sys, torch_modal; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120, cwd=PACKAGE.parent

@@ -105,6 +105,15 @@ def test_takes_arrays_and_two_keyframes(scattered: Shapes) -> None:
     assert not frames.requires_grad
 
 
+def test_steps_on_the_fine_mesh_by_default(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 1)
+    options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
+    default, modal = (subdivide(pair.keyframes, pair.faces, 1, local=local, **options)[1] for local in (True, False))
+    layer = MidShape(pair.bases, pair.faces, local=True, tolerance=sequence.LOCAL_TOLERANCE, **COARSE)
+    torch.testing.assert_close(default, layer(*pair.keyframes), rtol=0, atol=1e-12)
+    assert largest(default - modal) > 1e-5
+
+
 def test_is_public() -> None:
     assert tm.subdivide is subdivide
     assert tm.keyframe_places is keyframe_places
@@ -117,7 +126,7 @@ def test_is_public() -> None:
 def test_recursion_by_hand(scattered: Shapes) -> None:
     """Two levels of the joint space are three mid-shapes with the modes of both ends."""
     pair = scattered.pick(1, 2)
-    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **COARSE)
+    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, local=False, **COARSE)
     layer = MidShape(pair.bases, pair.faces, **COARSE)
     middle = layer(*pair.keyframes)
     by_hand = [pair.keyframes[0], layer(pair.keyframes[0], middle), middle, layer(middle, pair.keyframes[1])]
@@ -192,7 +201,9 @@ def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: 
     monkeypatch.setattr(sequence._Segment, "_layer", record)
     x_a, x_b = scattered.keyframes[:2]
     pair = scattered.pick(0, 1)
-    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, space="paired", **COARSE)
+    frames = subdivide(
+        pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, local=False, space="paired", **COARSE
+    )
     i, j = torch.from_numpy(mesh.unique_edges(pair.faces.numpy())[0]).T
     lengths = [torch.linalg.norm(x[i] - x[j], dim=1) for x in (x_a, x_b, frames[2])]
     nearest = int((lengths[2] - lengths[1]).norm() < (lengths[2] - lengths[0]).norm())

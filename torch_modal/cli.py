@@ -277,8 +277,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--form",
-        choices=("element", "vertex"),
-        default="element",
+        choices=("edge", "element", "vertex"),
+        default="edge",
         help="of the energy's Hessian; vertex is the paper's (default: %(default)s)",
     )
     _add_modes(sub)

@@ -17,6 +17,9 @@ from torch_modal.rigid import blend
 
 MAX_LEVELS = 12
 
+# Where steps on the fine mesh follow, more digits of the modal solve change nothing (docs/quality.md).
+LOCAL_TOLERANCE = 1e-3
+
 
 def subdivide(
     keyframes: Any,
@@ -76,11 +79,12 @@ def subdivide(
         leave=False,
         disable=None if progress is None else not progress,
     )
+    options = {"local": local, **({"tolerance": LOCAL_TOLERANCE} if local else {}), **mid_shape}
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     with bar, torch.no_grad():
         for i in range(intervals):
             j = (i + 1) % n_keys
-            segment = _Segment((bases[i], bases[j]), working_faces, {**mid_shape, "local": local}, keyframes.device)
+            segment = _Segment((bases[i], bases[j]), working_faces, options, keyframes.device)
             shapes = torch.stack([keyframes[i], keyframes[j]])
             for _ in range(levels):
                 shapes = _interleave(shapes, segment.mid_shapes(shapes))

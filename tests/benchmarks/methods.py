@@ -108,14 +108,20 @@ def joint_fine(case: Case) -> Outcome:
 
 @method("joint + local")
 def joint_and_local(case: Case) -> Outcome:
-    """The default, with the steps on the fine mesh after it, as ``subdivide`` does."""
-    return by_layer(case, 30, local=True)
+    """The default of ``subdivide``: with steps on the fine mesh after a modal solve to 1e-3."""
+    return by_layer(case, 30, local=True, tolerance=1e-3)
+
+
+@method("joint + local, quick")
+def quick(case: Case) -> Outcome:
+    """For those in a hurry: 500 coarse faces, and a modal solve to 1e-2."""
+    return by_layer(case, 30, local=True, coarse_faces=500, tolerance=1e-2)
 
 
 @method("joint + local + polish 2")
 def joint_and_polish(case: Case) -> Outcome:
     """The same with two longer steps."""
-    return by_layer(case, 30, local=True, polish=2)
+    return by_layer(case, 30, local=True, polish=2, tolerance=1e-3)
 
 
 @method("full", half_only=True)

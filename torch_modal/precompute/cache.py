@@ -20,7 +20,7 @@ from safetensors.numpy import save as save_arrays
 
 from torch_modal.files import write_atomically
 
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 """Part of every key: raise it when an algorithm of the pre-computation changes, and old entries are left."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 SUFFIX = ".safetensors"

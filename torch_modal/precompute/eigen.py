@@ -7,6 +7,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.precompute.lanczos import lowest_eigenvectors
+from torch_modal.precompute.mass import Mass
 
 FloatArray = NDArray[np.float64]
 
@@ -44,27 +45,27 @@ class VolumeModes(NamedTuple):
     residual: float
 
 
-def rigid_motions(positions: FloatArray, mass: FloatArray) -> FloatArray:
+def rigid_motions(positions: FloatArray, mass: Mass) -> FloatArray:
     """M-orthonormal basis of the translations and infinitesimal rotations. *Shape:* ``(3N, 6)``.
 
     Args:
         positions: Rest positions, not all on one line. *Shape:* ``(N, 3)``.
-        mass: Mass of each vertex. *Shape:* ``(N,)``.
+        mass: Mass matrix.
     """
     n = len(positions)
-    centered = positions - np.average(positions, axis=0, weights=mass)
+    lumped = mass.lumped()
+    centered = positions - np.average(positions, axis=0, weights=lumped)
     # Of order 1 like the translations, so that the factorisation below is well conditioned.
-    centered = centered / np.sqrt(np.average((centered**2).sum(axis=1), weights=mass))
+    centered = centered / np.sqrt(np.average((centered**2).sum(axis=1), weights=lumped))
     motions = np.zeros((n, 3, 6))
     motions[:, :, :3] = np.eye(3)
     for axis in range(3):
         motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centered)
-    root = np.sqrt(np.repeat(mass, 3))[:, None]
-    return np.linalg.qr(root * motions.reshape(3 * n, 6))[0] / root
+    return mass.orthonormal(motions.reshape(3 * n, 6))[0]
 
 
-def lowest_modes(k: sp.csc_matrix, mass: FloatArray, positions: FloatArray, n_modes: int) -> VolumeModes:
-    """Lowest elastic modes of ``K phi = lambda M phi`` with a lumped mass.
+def lowest_modes(k: sp.csc_matrix, mass: FloatArray | sp.spmatrix, positions: FloatArray, n_modes: int) -> VolumeModes:
+    """Lowest elastic modes of ``K phi = lambda M phi``.
 
     Shift-invert block Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are
     those of ``K`` itself, which a regularised ``K + eps M`` would not give for free. Then two steps of dense
@@ -74,7 +75,7 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray, positions: FloatArray, n_mo
 
     Args:
         k: Stiffness, symmetric positive semi-definite. *Shape:* ``(3N, 3N)``.
-        mass: Mass of each vertex, positive. *Shape:* ``(N,)``.
+        mass: Mass of each vertex, positive, or a mass matrix for vertices. *Shape:* ``(N,)`` or ``(N, N)``.
         positions: Rest positions. *Shape:* ``(N, 3)``.
         n_modes: Number of elastic modes.
 
@@ -86,30 +87,28 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray, positions: FloatArray, n_mo
         ModalAnalysisError: The six zero modes are missing, the stiffness is indefinite, nothing but zero
             modes was found, or a residual is too large.
     """
-    possible = 3 * len(mass) - N_RIGID
+    possible = 3 * len(positions) - N_RIGID
     if not 1 <= n_modes <= possible:
         raise ValueError(
-            f"{n_modes} modes asked for, but {len(mass)} tetrahedral vertices have {possible} elastic modes; "
+            f"{n_modes} modes asked for, but {len(positions)} tetrahedral vertices have {possible} elastic modes; "
             f"give 1 to {possible}"
         )
-    masses = np.repeat(mass, 3)
-    if not (masses > 0).all():
-        raise ModalAnalysisError(f"{int((mass <= 0).sum())} vertices have no mass; remove unused vertices first")
-    n_pairs = min(n_modes + N_RIGID + GUARD, len(masses))
-    span = _lowest_span(k, masses, positions, n_pairs)
-
-    root = np.sqrt(masses)[:, None]
-    values = _rayleigh_ritz(k, span, root)[0]
-    rigid_eigenvalues = values[:N_RIGID]
+    inertia = Mass.of(mass)
+    if not (has_mass := inertia.lumped() > 0).all():
+        raise ModalAnalysisError(f"{int((~has_mass).sum())} vertices have no mass; remove unused vertices first")
+    n_pairs = min(n_modes + N_RIGID + GUARD, k.shape[0])
+    span = _lowest_span(k, inertia, positions, n_pairs)
+    rigid_eigenvalues = _rayleigh_ritz(k, span, inertia)[0][:N_RIGID]
 
     # The rigid part is taken out exactly: six directions of the span lose all their length, and are left
     # behind.
-    rigid = root * rigid_motions(positions, mass)
-    scaled = root * span
-    scaled -= rigid @ (rigid.T @ scaled)
-    elastic = np.linalg.svd(scaled, full_matrices=False)[0][:, : n_pairs - N_RIGID]
-    elastic -= rigid @ (rigid.T @ elastic)
-    eigenvalues, modes = _rayleigh_ritz(k, elastic / root, root)
+    rigid = rigid_motions(positions, inertia)
+    moved = inertia @ rigid
+    elastic = span - rigid @ (moved.T @ span)
+    lengths, directions = np.linalg.eigh(elastic.T @ (inertia @ elastic))
+    elastic = elastic @ (directions / np.sqrt(np.maximum(lengths, np.finfo(np.float64).tiny)))[:, N_RIGID:]
+    elastic -= rigid @ (moved.T @ elastic)
+    eigenvalues, modes = _rayleigh_ritz(k, elastic, inertia)
 
     first_elastic, n_zero = _count_zeros(eigenvalues, positions)
     if not np.abs(rigid_eigenvalues).max() < RIGID_TOLERANCE * first_elastic:
@@ -120,7 +119,7 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray, positions: FloatArray, n_mo
     eigenvalues, modes = eigenvalues[:n_modes], modes[:, :n_modes]
     modes = modes * _signs(modes)
 
-    residual = relative_residual(k, masses, eigenvalues, modes, first_elastic)
+    residual = relative_residual(k, inertia, eigenvalues, modes, first_elastic)
     if not residual < RESIDUAL_TOLERANCE:
         raise ModalAnalysisError(
             f"the modes leave a relative residual of {residual:.2e} (allowed: {RESIDUAL_TOLERANCE:g}); "
@@ -131,13 +130,13 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray, positions: FloatArray, n_mo
 
 
 def relative_residual(
-    k: sp.csc_matrix, masses: FloatArray, eigenvalues: FloatArray, modes: FloatArray, smallest: float
+    k: sp.csc_matrix, mass: Mass, eigenvalues: FloatArray, modes: FloatArray, smallest: float
 ) -> float:
     """Largest ``|K phi - lambda M phi| / (lambda |M phi|)``, Euclidean norms.
 
     A zero mode counts as if its eigenvalue were ``smallest``, the first that is not zero.
     """
-    inertia = masses[:, None] * modes
+    inertia = mass @ modes
     difference = np.linalg.norm(k @ modes - inertia * eigenvalues, axis=0)
     return float((difference / (np.maximum(eigenvalues, smallest) * np.linalg.norm(inertia, axis=0))).max())
 
@@ -175,17 +174,17 @@ def _squared_diagonal(positions: FloatArray) -> float:
     return float(((positions.max(axis=0) - positions.min(axis=0)) ** 2).sum())
 
 
-def _lowest_span(k: sp.csc_matrix, masses: FloatArray, positions: FloatArray, n_pairs: int) -> FloatArray:
+def _lowest_span(k: sp.csc_matrix, mass: Mass, positions: FloatArray, n_pairs: int) -> FloatArray:
     """M-orthonormal basis of about the ``n_pairs`` lowest eigenvectors, rigid motions included."""
     try:
-        return lowest_eigenvectors(k, masses, n_pairs, SHIFT / _squared_diagonal(positions))
+        return lowest_eigenvectors(k, mass, n_pairs, SHIFT / _squared_diagonal(positions))
     except RuntimeError as error:  # of Lanczos, or of SuperLU on a singular matrix
         raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
 
 
-def _rayleigh_ritz(k: sp.csc_matrix, span: FloatArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues and M-orthonormal vectors of ``K`` within a span; ``root`` is the square root of M."""
-    basis = np.linalg.qr(root * span)[0] / root
+def _rayleigh_ritz(k: sp.csc_matrix, span: FloatArray, mass: Mass) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues and M-orthonormal vectors of ``K`` within a span."""
+    basis = mass.orthonormal(span)[0]
     restricted = basis.T @ (k @ basis)
     values, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
     return values, basis @ rotation

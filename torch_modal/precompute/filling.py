@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshWarning
-from torch_modal.precompute.arap import lumped_mass
+from torch_modal.precompute.arap import consistent_mass
 from torch_modal.precompute.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier, self_proximity
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
@@ -72,10 +72,10 @@ class Filling:
     surface: Surface
     tetrahedra: Tetrahedra
 
-    def mass(self) -> FloatArray:
-        """Mass of each vertex, at a density of 1 in this pose. *Shape:* ``(N,)``."""
-        rest = lumped_mass(self.body.tetrahedra)
-        return rest * (solid_volumes(self.tetrahedra).sum() / rest.sum())
+    def mass(self) -> sp.csr_matrix:
+        """Mass matrix at a density of 1 in this pose. *Shape:* ``(N, N)``."""
+        rest = self.body.tetrahedra
+        return consistent_mass(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
 
     def weights(self) -> sp.csr_matrix:
         """How the surface hangs on the tetrahedra. *Shape:* ``(U, N)``."""

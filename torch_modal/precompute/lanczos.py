@@ -9,6 +9,8 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from torch_modal.precompute.mass import Mass
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -25,7 +27,7 @@ class NoConvergenceError(RuntimeError):
     """The iteration has used up its steps."""
 
 
-def lowest_eigenvectors(k: sp.csc_matrix, masses: FloatArray, n_pairs: int, shift: float) -> FloatArray:
+def lowest_eigenvectors(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> FloatArray:
     """M-orthonormal basis of the ``n_pairs`` lowest eigenvectors.
 
     Pieces that nothing connects are solved apart: their equal eigenvalues (six zeros each) would otherwise hide each
@@ -33,7 +35,7 @@ def lowest_eigenvectors(k: sp.csc_matrix, masses: FloatArray, n_pairs: int, shif
 
     Args:
         k: Stiffness, symmetric positive semi-definite, three unknowns for each vertex. *Shape:* ``(3N, 3N)``.
-        masses: Diagonal of M. *Shape:* ``(3N,)``.
+        mass: M.
         n_pairs: How many.
         shift: Positive; ``K + shift M`` is factored, which is positive definite, where ``K`` is singular.
 
@@ -46,16 +48,20 @@ def lowest_eigenvectors(k: sp.csc_matrix, masses: FloatArray, n_pairs: int, shif
     graph = _vertex_graph(k)
     n_pieces, piece = connected_components(graph, directed=False)
     if n_pieces == 1:
-        return _of_piece(k, graph, masses, n_pairs, shift)[1]
+        return _of_piece(k, graph, mass, n_pairs, shift)[1]
     values, vectors = [], []
     for index in range(n_pieces):
         vertices = np.flatnonzero(piece == index)
         own = (3 * vertices[:, None] + np.arange(3)).reshape(-1)
         wanted = min(n_pairs, len(own))
         found, small = _of_piece(
-            sp.csc_matrix(k[own][:, own]), sp.csc_matrix(graph[vertices][:, vertices]), masses[own], wanted, shift
+            sp.csc_matrix(k[own][:, own]),
+            sp.csc_matrix(graph[vertices][:, vertices]),
+            mass.of_vertices(vertices),
+            wanted,
+            shift,
         )
-        whole = np.zeros((len(masses), wanted))
+        whole = np.zeros((k.shape[0], wanted))
         whole[own] = small
         values.append(found)
         vectors.append(whole)
@@ -64,46 +70,57 @@ def lowest_eigenvectors(k: sp.csc_matrix, masses: FloatArray, n_pairs: int, shif
 
 
 def _of_piece(
-    k: sp.csc_matrix, graph: sp.csc_matrix, masses: FloatArray, n_pairs: int, shift: float
+    k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float
 ) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues and eigenvectors of a connected piece, ascending."""
-    n = len(masses)
-    root = np.sqrt(masses)
+    n = k.shape[0]
     if n < DENSE_BELOW or 2 * n_pairs > n:
-        symmetric = k.toarray() / root[:, None] / root
-        values, vectors = scipy.linalg.eigh(symmetric, subset_by_index=(0, n_pairs - 1))
-        return values, vectors / root[:, None]
+        values, vectors = scipy.linalg.eigh(
+            k.toarray(), mass.for_coordinates().toarray(), subset_by_index=(0, n_pairs - 1)
+        )
+        return values, vectors
     # An ordering of the vertices serves their three unknowns: a third less fill than one of the unknowns.
-    order = (3 * _elimination_order(graph)[:, None] + np.arange(3)).reshape(-1)
-    shifted = sp.csc_matrix((k + shift * sp.diags(masses))[order][:, order])
+    vertices = _elimination_order(graph)
+    order = (3 * vertices[:, None] + np.arange(3)).reshape(-1)
+    ordered = mass.of_vertices(vertices)
+    shifted = sp.csc_matrix(k[order][:, order] + shift * ordered.for_coordinates())
     factors = spla.splu(shifted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    ordered_root = root[order, None]
-    inverse, vectors = _block_lanczos(lambda x: ordered_root * factors.solve(ordered_root * x), n, n_pairs)
+    inverse, vectors = _block_lanczos(factors.solve, ordered, n_pairs)
     restored = np.empty_like(vectors)
-    restored[order] = vectors / ordered_root
+    restored[order] = vectors
     return 1 / inverse - shift, restored
 
 
-def _block_lanczos(apply: Callable[[FloatArray], FloatArray], n: int, n_pairs: int) -> tuple[FloatArray, FloatArray]:
-    """Largest eigenvalues of a symmetric operator, descending, and their orthonormal eigenvectors.
+def _block_lanczos(
+    solve: Callable[[FloatArray], FloatArray], mass: Mass, n_pairs: int
+) -> tuple[FloatArray, FloatArray]:
+    """Largest eigenvalues of ``A⁻¹ M``, descending, and their M-orthonormal eigenvectors.
 
-    All vectors are kept and orthogonalised against each other, twice: a few hundred of them cost less than the solves.
+    All vectors are kept, and each block is made M-orthogonal to all before it: a few hundred of them cost less than
+    the solves. As only the last two blocks have a part in a new one, but for rounding, those are taken out first.
+
+    Args:
+        solve: ``A⁻¹`` of several columns; ``A`` is symmetric positive definite.
+        mass: M.
+        n_pairs: How many.
     """
+    n = 3 * mass.matrix.shape[0]
     most = min(n // BLOCK, 40 + n_pairs) * BLOCK
-    basis = np.empty((n, most), order="F")
+    basis, weighted = np.empty((n, most), order="F"), np.empty((n, most), order="F")
     projected = np.zeros((most, most))
     # Fixed, so that equal input gives equal modes.
-    block = np.linalg.qr(np.random.default_rng(0).standard_normal((n, BLOCK)))[0]
+    block = mass.orthonormal(np.random.default_rng(0).standard_normal((n, BLOCK)))[0]
     check_at = 5 * n_pairs // 2
     for start in range(0, most, BLOCK):
         stop = start + BLOCK
         basis[:, start:stop] = block
-        image = apply(block)
-        for _ in range(2):
-            part = basis[:, :stop].T @ image
-            image -= basis[:, :stop] @ part
-            projected[:stop, start:stop] += part
-        block, coupling = np.linalg.qr(image)
+        weighted[:, start:stop] = mass @ block
+        image = solve(weighted[:, start:stop])
+        for first in (max(start - BLOCK, 0), 0):
+            part = weighted[:, first:stop].T @ image
+            image -= basis[:, first:stop] @ part
+            projected[first:stop, start:stop] += part
+        block, coupling = mass.orthonormal(image)
         if stop < check_at and stop < most:
             continue
         values, rotation = np.linalg.eigh(projected[:stop, :stop], UPLO="U")

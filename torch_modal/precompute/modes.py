@@ -36,7 +36,7 @@ def extract_modes(
     faces: Any,
     n_modes: int = 30,
     *,
-    form: HessianForm = "element",
+    form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
     mesher: Mesher = "auto",
     timeout: float = 600.0,
@@ -85,7 +85,7 @@ def extract_bases(
     faces: Any,
     n_modes: int = 30,
     *,
-    form: HessianForm = "element",
+    form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
     mesher: Mesher = "auto",
     carry: bool = True,
@@ -97,7 +97,7 @@ def extract_bases(
     """Lowest vibration modes of each key-frame.
 
     The key-frame that touches itself least is filled with tetrahedra (in a child process), which are carried to the
-    others. The as-rigid-as-possible stiffness and a lumped mass of density 1 give ``K phi = lambda M phi``, and the
+    others. The as-rigid-as-possible stiffness and a mass of density 1 give ``K phi = lambda M phi``, and the
     lowest elastic modes are restricted to the surface. Constants of the autograd graph: nothing here is
     differentiated.
 

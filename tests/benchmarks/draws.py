@@ -1,0 +1,105 @@
+"""A thousand draws of each random transform: volumes, edge strains, and how many pass through themselves anew.
+
+    OMP_NUM_THREADS=1 python tests/benchmarks/draws.py
+    OMP_NUM_THREADS=1 python tests/benchmarks/draws.py --meshes woman --intersections 250
+
+Volumes are relative to the source: the key-frame, or the two that a shape lies between, in proportion to its time. New
+intersections are pairs of faces that cross in the draw and in no source; they are found exactly, by libigl with CGAL
+(``pip install libigl``), where it is installed. ``linear`` draws the same pairs and times as ``RandomInBetween``.
+"""
+
+import argparse
+from typing import Any
+
+import torch
+from augment import MESHES, RandomLinear
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.nn.shell import enclosed_volume
+from torch_modal.sample_data import load_sample
+
+TRANSFORMS: dict[str, tm.ShapeAugmentation] = {
+    "linear": RandomLinear(p=1.0),
+    "RandomInBetween": tm.RandomInBetween(p=1.0),
+    "RandomExtrapolation": tm.RandomExtrapolation(p=1.0),
+    "RandomModalDeformation": tm.RandomModalDeformation(p=1.0),
+    "RandomModalDeformation, large": tm.RandomModalDeformation(strain=0.05, p=1.0),
+    "RandomRigidMotion": tm.RandomRigidMotion(translation=0.1, p=1.0),
+}
+
+
+def keyframes_of(name: str) -> tuple[Tensor, Tensor] | None:
+    """Key-frames and faces; None, with a word, where the data is not there."""
+    if name == "creature":
+        sample = load_sample("creature")
+        return sample.keyframes, sample.faces
+    if not MESHES[name][0].is_file():
+        print(f"(no {name}: {MESHES[name][0]} is not there)")
+        return None
+    return tm.load_keyframes(MESHES[name])
+
+
+def crossings(x: Tensor, faces: Tensor) -> set[tuple[int, int]] | None:
+    """Pairs of faces that cross; None without libigl."""
+    try:
+        from igl.copyleft.cgal import remesh_self_intersections
+    except ImportError:
+        return None
+    pairs = remesh_self_intersections(x.double().numpy(), faces.numpy(), detect_only=True)[2]
+    return {(int(a), int(b)) for a, b in pairs}
+
+
+def measure(name: str, n: int, n_intersections: int) -> None:
+    """Print a line for each transform."""
+    found = keyframes_of(name)
+    if found is None:
+        return
+    keyframes, faces = found
+    space = tm.ShapeSpace(tm.extract_bases(keyframes, faces, 30), faces)
+    pool = tm.ShapeBatch.of_keyframes(space)
+    k = len(space)
+    volumes = enclosed_volume(pool.shapes.double().movedim(-1, 0), faces)
+    old = [crossings(x, faces) for x in pool.shapes]
+    for kind, augment in TRANSFORMS.items():
+        generator = torch.Generator().manual_seed(0)
+        ratios, strains, new = [], [], []
+        finite = 0
+        for start in range(0, n, 20):
+            rows = torch.arange(start, min(start + 20, n)) % k
+            params = augment.forward_parameters(len(rows), space, generator)
+            y = augment.transform(pool.rows(rows), params, space, pool).shapes
+            finite += int(y.isfinite().flatten(1).all(1).sum())
+            partner = rows
+            source = volumes[rows]
+            if "t" in params:
+                partner = (rows + 1 + (params["partner"] * (k - 1)).long()) % k
+                source = torch.lerp(source, volumes[partner], params["t"].clamp(0, 1))
+            ratios.append(enclosed_volume(y.double().movedim(-1, 0), faces) / source)
+            strains.append(space.strain(y, pool.shapes[rows]).abs().amax(1))
+            for row in range(len(rows)):
+                if old[0] is not None and len(new) < n_intersections:
+                    mine: Any = crossings(y[row], faces)
+                    new.append(len(mine - old[int(rows[row])] - old[int(partner[row])]))
+        off = (torch.cat(ratios) - 1).abs()
+        strain = torch.cat(strains)
+        line = f"{kind:32s}{finite:7d}{100 * float(off.median()):9.2f} %{100 * float(off.max()):7.2f} %"
+        line += f"{float(strain.median()):10.3f}{float(strain.max()):8.3f}"
+        if new:
+            some = [number for number in new if number]
+            line += f"{100 * len(some) / len(new):9.1f} % of {len(new)}"
+            line += f"{sorted(some)[len(some) // 2] if some else 0:8d}"
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--meshes", nargs="+", default=["creature", "hand", "woman"])
+    parser.add_argument("--draws", type=int, default=1000)
+    parser.add_argument("--intersections", type=int, default=1000, help="draws that are searched for crossings")
+    given = parser.parse_args()
+    for each in given.meshes:
+        print(f"\n{each}")
+        print(f"{'':32s}{'finite':>7s}{'volume off':>11s}{'most':>9s}{'strain':>10s}{'most':>8s}", end="")
+        print(f"{'new crossings':>18s}{'pairs':>12s}")
+        measure(each, given.draws, given.intersections)

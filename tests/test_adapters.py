@@ -1,0 +1,142 @@
+"""Packed batches and graphs: the same shapes as from plain tensors."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import Shapes
+from torch.utils.data import DataLoader
+
+import torch_modal as tm
+
+F64 = torch.float64
+
+
+@pytest.fixture(scope="module")
+def spaces(bars: Shapes, small_bars: Shapes) -> tuple[tm.ShapeSpace, tm.ShapeSpace]:
+    return tm.ShapeSpace(bars.bases, bars.faces, dtype=F64), tm.ShapeSpace(
+        small_bars.bases, small_bars.faces, dtype=F64
+    )
+
+
+def test_packed_shapes_are_transformed_as_batches(
+    bars: Shapes, small_bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]
+) -> None:
+    large, small = spaces
+    shapes = [bars.keyframes[0], small_bars.keyframes[1], bars.keyframes[2], small_bars.keyframes[0]]
+    counts = torch.tensor([len(x) for x in shapes])
+
+    def make() -> tm.AugmentationSequential:
+        return tm.AugmentationSequential(
+            tm.RandomInBetween(p=1.0), tm.RandomModalDeformation(p=1.0), generator=torch.Generator().manual_seed(0)
+        )
+
+    packed = tm.augment_packed(make(), torch.cat(shapes), counts, [large, small, large, small])
+    found = packed.split(counts.tolist())
+    augment = make()
+    expected = augment(torch.stack(shapes[::2]), space=large), augment(torch.stack(shapes[1::2]), space=small)
+    for place in range(4):
+        assert torch.equal(found[place], expected[place % 2][place // 2])
+
+
+def test_packed_shapes_of_one_space(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
+    augment = tm.RandomRigidMotion(p=1.0, generator=torch.Generator().manual_seed(0))
+    x = bars.keyframes.clone().requires_grad_()
+    out = tm.augment_packed(augment, x.flatten(0, 1), [164] * 3, spaces[0])
+    torch.testing.assert_close(out.unflatten(0, (3, 164)), augment(x, augment.params))
+    out.square().sum().backward()
+    assert x.grad is not None
+    for wrong, message in (
+        (([164] * 2, spaces[0]), "need"),
+        (([164] * 3, [spaces[0]] * 2), "as many spaces"),
+        (([164] * 3, spaces[1]), "do not belong"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            tm.augment_packed(augment, x.flatten(0, 1), *wrong)
+
+
+def test_samples_of_all_sizes_pack_into_one_batch(bars: Shapes, small_bars: Shapes, tmp_path: Path) -> None:
+    tm.write_set(tmp_path / "a", *bars, ["0", "1", "2"])
+    tm.write_set(tmp_path / "b", *small_bars, ["0", "1", "2"])
+    data = tm.ShapeDataset(tmp_path, samples_per_set=2, faces=True, normals=True, labels=number_vertices)
+    (batch,) = DataLoader(data, batch_size=4, collate_fn=tm.collate_packed)
+    assert batch["num_verts_per_mesh"].tolist() == [164, 164, 30, 30]
+    assert batch["num_faces_per_mesh"].tolist() == [324, 324, 56, 56]
+    assert batch["mesh_to_verts_packed_first_idx"].tolist() == [0, 164, 328, 358]
+    assert batch["set"].tolist() == [0, 0, 1, 1]
+    assert batch["verts_packed"].shape == batch["normals"].shape == (388, 3)
+    faces = batch["faces_packed"].split(batch["num_faces_per_mesh"].tolist())
+    for i, (mine, own) in enumerate(zip(faces, [bars.faces] * 2 + [small_bars.faces] * 2, strict=True)):
+        assert torch.equal(batch["verts_packed"][mine], data[i]["vertices"][own])
+    assert batch["vertex_labels"].tolist() == [*range(164)] * 2 + [*range(30)] * 2
+
+
+def number_vertices(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
+    return {"vertex_labels": torch.arange(stored.n_vertices)}
+
+
+# ------------------------------------------------------------------------------------------------ PyTorch Geometric
+def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
+    geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
+    from torch_geometric.transforms import Compose, FaceToEdge
+
+    from torch_modal.pyg import RandomShape
+
+    data = geometric.data.Data(
+        pos=bars.keyframes[0],
+        face=bars.faces.T.contiguous(),
+        normal=torch.zeros(164, 3, dtype=F64),
+        x=torch.arange(164),
+        y=torch.tensor([[1.0, 0, 0]]),
+    )
+
+    def make() -> tm.AugmentationSequential:
+        return tm.AugmentationSequential(
+            tm.RandomInBetween(p=1.0, blend_labels=True),
+            tm.RandomModalDeformation(p=1.0),
+            generator=torch.Generator().manual_seed(2),
+            space=spaces[0],
+        )
+
+    transform = RandomShape(make(), y=torch.eye(3))
+    found = Compose([transform, FaceToEdge(remove_faces=False)])(data)
+    assert torch.equal(data.pos, bars.keyframes[0]), "the graph that came has changed"
+    assert found.edge_index.shape[0] == 2
+    assert torch.equal(found.x, data.x)
+    assert torch.equal(found.face, data.face)
+    pool = tm.ShapeBatch.of_keyframes(spaces[0], data.pos)
+    expected = make()(bars.keyframes[:1], pool=pool)
+    torch.testing.assert_close(found.pos, expected[0])
+    torch.testing.assert_close(found.normal, tm.vertex_normals(expected, bars.faces)[0])
+    t = transform.augmentation.params[0]["t"]
+    assert found.y.shape == (1, 3)
+    assert float(found.y[0, 0]) == pytest.approx(1 - float(t), abs=1e-6)
+    assert "RandomInBetween" in repr(transform)
+
+    alone = RandomShape(tm.RandomModalDeformation(p=1.0), space=spaces[0])
+    moved = alone(data)
+    assert torch.equal(moved.y, data.y)
+    assert not torch.equal(moved.pos, data.pos)
+    with pytest.raises(ValueError, match=r"shape \(164, 3\); got \(30, 3\)"):
+        alone(geometric.data.Data(pos=torch.zeros(30, 3)))
+    with pytest.raises(ValueError, match="needs key-frames"):
+        RandomShape(tm.RandomModalDeformation())
+
+
+def test_graphs_from_the_dataset(bars: Shapes, tmp_path: Path) -> None:
+    geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
+    from torch_modal.pyg import as_data
+
+    tm.write_set(tmp_path / "a", *bars, ["0", "1", "2"])
+    data = tm.ShapeDataset(tmp_path, samples_per_set=3, faces=True, normals=True, labels=graph_labels)
+    graphs = [as_data(sample) for sample in data.__getitems__([0, 1, 2])]
+    batch = geometric.data.Batch.from_data_list(graphs)
+    assert batch.pos.shape == batch.normal.shape == (3 * 164, 3)
+    assert torch.equal(batch.face[:, 324:648].T - 164, bars.faces)
+    assert batch.y.shape == (3,)
+    assert torch.equal(batch.vertex_labels, torch.arange(164).repeat(3))
+    torch.testing.assert_close(graphs[1].pos, data[1]["vertices"])
+
+
+def graph_labels(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
+    return {**number_vertices(stored), "shape_labels": torch.arange(len(stored))}

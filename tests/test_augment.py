@@ -1,0 +1,568 @@
+"""Random transforms: their conventions, and what the shapes are that they give."""
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from conftest import Shapes, random_rotation
+
+import torch_modal as tm
+from torch_modal.augment.deformation import deform, linear_strain
+from torch_modal.augment.table import interpolate
+from torch_modal.nn.shell import enclosed_volume
+from torch_modal.rigid import best_fit
+from torch_modal.sample_data import load_sample
+
+F64 = torch.float64
+
+KINDS: dict[str, Callable[..., tm.ShapeAugmentation]] = {
+    "between": tm.RandomInBetween,
+    "extrapolation": tm.RandomExtrapolation,
+    "deformation": tm.RandomModalDeformation,
+    "rigid": tm.RandomRigidMotion,
+}
+each_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.fixture(scope="session")
+def space(bars: Shapes) -> tm.ShapeSpace:
+    return tm.ShapeSpace(bars.bases, bars.faces, dtype=F64)
+
+
+def seeded(number: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(number)
+
+
+def volume(x: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    return enclosed_volume(x.movedim(-1, 0), faces)
+
+
+# ---------------------------------------------------------------------------------------------------- conventions
+@each_kind
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_shapes_and_dtypes_follow_the_input(bars: Shapes, space: tm.ShapeSpace, kind: str, dtype: torch.dtype) -> None:
+    x = bars.keyframes.to(dtype)
+    augment = KINDS[kind](p=1.0, generator=seeded(), space=space)
+    out = augment(x)
+    assert (out.shape, out.dtype, out.requires_grad) == (x.shape, dtype, False)
+    assert bool(out.isfinite().all())
+    assert not torch.equal(out, x)
+    pool = tm.ShapeBatch.of_keyframes(space, x)
+    assert augment(x[0], pool=pool).shape == (1, *x.shape[1:])
+    single = KINDS[kind](p=1.0, keepdim=True, generator=seeded(), space=space)
+    assert single(x[0], pool=pool).shape == x.shape[1:]
+    # The same seed gives the same draw in either precision.
+    again = KINDS[kind](p=1.0, generator=seeded(), space=space)
+    torch.testing.assert_close(again(bars.keyframes).to(dtype), out, rtol=0, atol=2e-4 if dtype is torch.float32 else 0)
+
+
+@each_kind
+def test_parameters_can_be_read_and_replayed(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
+    x = bars.keyframes[[0, 1, 2, 0, 1, 2]]
+    x = x + 0.02 * torch.arange(6)[:, None, None] * torch.sin(x)  # no two are the same
+    augment = KINDS[kind](p=0.5, generator=seeded(3), space=space)
+    first = augment(x)
+    params = augment.params
+    assert {len(value) for value in params.values()} == {6}
+    chosen = params["batch_prob"]
+    assert 0 < int(chosen.sum()) < 6
+    # Those that the draw leaves out stay to the last bit, the others move.
+    assert torch.equal(first[~chosen], x[~chosen])
+    assert bool(((first - x)[chosen].abs().amax((1, 2)) > 1e-3).all())
+    second = augment(x)
+    assert not torch.equal(second, first)
+    assert torch.equal(augment(x, params), first)
+    assert augment.params is params
+    # A shape's result does not depend on which others are transformed.
+    alone = {**params, "batch_prob": torch.arange(6) == int(chosen.nonzero()[0])}
+    torch.testing.assert_close(augment(x, alone)[alone["batch_prob"]], first[alone["batch_prob"]], rtol=0, atol=1e-8)
+
+
+@each_kind
+def test_same_on_batch(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
+    augment = KINDS[kind](p=1.0, same_on_batch=True, generator=seeded(), space=space)
+    augment(bars.keyframes)
+    for value in augment.params.values():
+        assert torch.equal(value, value[:1].expand_as(value))
+    if kind in ("deformation", "rigid"):
+        out = augment(bars.keyframes[[1, 1, 1]])
+        torch.testing.assert_close(out, out[:1].expand_as(out), rtol=0, atol=1e-9)
+
+
+@each_kind
+def test_probability_zero_changes_nothing(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
+    assert torch.equal(KINDS[kind](p=0.0, space=space)(bars.keyframes), bars.keyframes)
+
+
+@each_kind
+def test_copies_and_pickles(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
+    augment = KINDS[kind](p=1.0, generator=seeded(), space=space)
+    clone, sent = copy.deepcopy(augment), pickle.loads(pickle.dumps(augment))
+    expected = augment(bars.keyframes)
+    assert torch.equal(clone(bars.keyframes), expected)
+    assert torch.equal(sent(bars.keyframes), expected)
+    assert "p=1.0" in repr(augment)
+
+
+def test_without_a_generator_the_global_one_is_used(bars: Shapes, space: tm.ShapeSpace) -> None:
+    augment = tm.RandomRigidMotion(p=1.0)
+    torch.manual_seed(5)
+    first = augment(bars.keyframes)
+    torch.manual_seed(5)
+    assert torch.equal(augment(bars.keyframes), first)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: tm.RandomRigidMotion(p=1.5), "probability"),
+        (lambda: tm.RandomInBetween(t=(0.2, 1.2)), r"t is a range .* within \[0, 1\]"),
+        (lambda: tm.RandomExtrapolation(beyond=(0.3, 0.1)), "beyond is a range"),
+        (lambda: tm.RandomModalDeformation(max_strain=1.0), "max_strain"),
+        (lambda: tm.RandomModalDeformation(strain=-0.1), "strain is a range"),
+        (lambda: tm.RandomRigidMotion(degrees=270), "degrees is a range"),
+        (lambda: tm.RandomRigidMotion(axis=(0, 0, 0)), "an axis has a length"),
+        (lambda: tm.RandomRigidMotion(translation=-1), "translation"),
+        (lambda: tm.AugmentationSequential(data_keys=["normals"]), "'shapes' among them"),
+        (lambda: tm.AugmentationSequential(data_keys=["shapes", "colours"]), "colours"),
+    ],
+)
+def test_wrong_settings(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_wrong_calls(bars: Shapes, space: tm.ShapeSpace) -> None:
+    x = bars.keyframes
+    deformation = tm.RandomModalDeformation(p=1.0)
+    with pytest.raises(ValueError, match="needs key-frames and modes"):
+        deformation(x)
+    with pytest.raises(ValueError, match=r"\(B, 164, 3\).*got \(3, 163, 3\)"):
+        deformation(x[:, 1:], space=space)
+    with pytest.raises(ValueError, match=r"got .* of torch\.int64"):
+        deformation(x.long(), space=space)
+    deformation(x, space=space)
+    with pytest.raises(ValueError, match="2 shapes need parameters with 2 rows"):
+        deformation(x[:2], deformation.params, space=space)
+    with pytest.raises(ValueError, match="a pool holds the 3 key-frames"):
+        tm.RandomInBetween(p=1.0)(x, space=space, pool=tm.ShapeBatch(x[:2]))
+    with pytest.raises(ValueError, match="no in-between"):
+        mirrored = x * torch.tensor([1.0, 1, -1], dtype=F64)
+        tm.RandomInBetween(p=1.0, t=(0.5, 0.5))(torch.stack([x[0], mirrored[0]]), space=space)
+
+
+# ----------------------------------------------------------------------------------------------------- in-between
+def test_in_between_is_the_layers(bars: Shapes, space: tm.ShapeSpace) -> None:
+    """Partner and time read from the parameters, the shape from the layer itself."""
+    augment = tm.RandomInBetween(p=1.0, generator=seeded(), space=space)
+    x = bars.keyframes + 0.01 * torch.sin(bars.keyframes)
+    out = augment(x)
+    for own in range(3):
+        other = (own + 1 + int(2 * augment.params["partner"][own])) % 3
+        layer = tm.InBetween(
+            [bars.bases[own], bars.bases[other]], bars.faces, coarse_faces=space.coarse_faces, tolerance=space.tolerance
+        )
+        expected = layer(x[own], x[other], augment.params["t"][own])[0]
+        torch.testing.assert_close(out[own], expected, rtol=0, atol=1e-4)
+    assert len({(own + 1 + int(2 * p)) % 3 for own, p in enumerate(augment.params["partner"])}) > 1
+
+
+def test_key_frames_of_a_pool_are_interpolated_from_a_table(bars: Shapes, space: tm.ShapeSpace) -> None:
+    exact = tm.ShapeSpace(bars.bases, bars.faces, dtype=F64, times=None)
+    t = torch.tensor([0.0, 0.03, 0.3, 0.51, 0.77, 0.99, 1.0], dtype=F64)
+    for i, j in ((0, 1), (2, 0)):
+        solved = exact.keyframe_in_between(i, j, t)
+        read = space.keyframe_in_between(i, j, t)
+        linear = torch.lerp(bars.keyframes[i], bars.keyframes[j], t[:, None, None])
+        assert float((read - solved).norm(dim=-1).max()) < 0.02 * float((linear - solved).norm(dim=-1).max())
+        assert float((read - solved).norm(dim=-1).max()) < 2e-4 * 4  # of a bar of length 4
+        assert torch.equal(read[0], bars.keyframes[i])
+        assert torch.equal(read[-1], bars.keyframes[j])
+    augment = tm.RandomInBetween(p=1.0, generator=seeded(), space=space)
+    pool = tm.ShapeBatch.of_keyframes(space, bars.keyframes)
+    batch = augment.transform(pool.rows(torch.tensor([2, 2])), params := augment.forward_parameters(2), None, pool)
+    for row in range(2):
+        partner = (2 + 1 + int(2 * params["partner"][row])) % 3
+        expected = space.keyframe_in_between(2, partner, params["t"][row : row + 1])[0]
+        assert torch.equal(batch.shapes[row], expected)
+
+
+def test_interpolation_is_cubic() -> None:
+    t = torch.linspace(0, 1, 9, dtype=F64)
+    curve = torch.stack([t**3 - t, 2 * t**2, 1 + t], 1)[:, None]
+    fine = torch.linspace(0, 1, 50, dtype=F64)
+    expected = torch.stack([fine**3 - fine, 2 * fine**2, 1 + fine], 1)[:, None]
+    torch.testing.assert_close(interpolate(curve, fine), expected)
+    assert torch.equal(interpolate(curve, t), curve)
+    times = torch.rand(4, dtype=F64, generator=seeded()).requires_grad_()
+    assert torch.autograd.gradcheck(lambda t: interpolate(curve, t), [times])
+
+
+def test_a_single_shape_has_no_partner(bars: Shapes, space: tm.ShapeSpace) -> None:
+    x = bars.keyframes[:1]
+    assert torch.equal(tm.RandomInBetween(p=1.0, space=space)(x), x)
+
+
+def test_nearest_key_frame_is_found_through_rigid_motions(bars: Shapes, space: tm.ShapeSpace) -> None:
+    turned = bars.keyframes @ random_rotation(seeded()).T + torch.tensor([5.0, -3.0, 1.0], dtype=F64)
+    assert space.nearest(turned).tolist() == [0, 1, 2]
+    between = torch.lerp(bars.keyframes[0], bars.keyframes[2], 0.8)[None]
+    assert space.nearest(between).tolist() == [2]
+
+
+def test_times_and_partners_are_uniform(space: tm.ShapeSpace) -> None:
+    params = tm.RandomInBetween(t=(0.2, 0.6), p=0.3, space=space).forward_parameters(4000, generator=seeded())
+    t = params["t"]
+    assert (float(t.min()), float(t.max())) == (pytest.approx(0.2, abs=1e-3), pytest.approx(0.6, abs=1e-3))
+    assert float(t.mean()) == pytest.approx(0.4, abs=0.01)
+    assert float(params["batch_prob"].double().mean()) == pytest.approx(0.3, abs=0.03)
+    t = tm.RandomExtrapolation(beyond=(0.1, 0.2), space=space).forward_parameters(4000, generator=seeded())["t"]
+    assert bool((((t >= -0.2) & (t <= -0.1)) | ((t >= 1.1) & (t <= 1.2))).all())
+    assert float((t > 0).double().mean()) == pytest.approx(0.5, abs=0.03)
+
+
+# --------------------------------------------------------------------------------------------------- extrapolation
+def extrapolated(space: tm.ShapeSpace, x: torch.Tensor, t: float) -> torch.Tensor:
+    """The first of two shapes, at a time on the way to the second."""
+    augment = tm.RandomExtrapolation(p=1.0, space=space)
+    params = {
+        "batch_prob": torch.tensor([True, False]),
+        "partner": torch.zeros(2, dtype=F64),
+        "t": torch.full((2,), t, dtype=F64),
+    }
+    return augment(x, params)[0]
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 1), (1, 0), (2, 1)])
+def test_extrapolation_goes_on_smoothly(bars: Shapes, space: tm.ShapeSpace, i: int, j: int) -> None:
+    x = bars.keyframes[[i, j]]
+    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, coarse_faces=space.coarse_faces, tolerance=1e-10)
+    for end, sign in ((x[0], -1), (x[1], 1)):
+        gaps = []
+        for step in (1e-2, 1e-3):
+            t_end = 0.0 if sign < 0 else 1.0
+            beyond = extrapolated(space, x, t_end + sign * step) - end
+            before = end - layer(x[0], x[1], t_end - sign * step)[0]
+            gaps.append(float((beyond - before).norm() / before.norm()))
+        assert gaps[0] < 0.05
+        assert gaps[1] == pytest.approx(gaps[0] / 10, rel=0.5)
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 1), (1, 0), (0, 2)])
+def test_the_end_is_the_in_between_of_start_and_extrapolation(
+    bars: Shapes, space: tm.ShapeSpace, i: int, j: int
+) -> None:
+    """What defines an extrapolation, by the layer, which has no part in making it beyond the end."""
+    x = bars.keyframes[[i, j]]
+    s = 0.2
+    found = extrapolated(space, x, 1 + s)
+    linear = x[1] + s * (x[1] - x[0])
+    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, coarse_faces=space.coarse_faces)
+    back, linear_back = (layer(x[0], y, 1 / (1 + s))[0] for y in (found, linear))
+    moved = float((found - x[1]).norm())
+    assert float((back - x[1]).norm()) < 0.2 * moved
+    assert float((back - x[1]).norm()) < 0.5 * float((linear_back - x[1]).norm())
+    expected = volume(x[1], bars.faces)
+    assert float(volume(found, bars.faces) / expected) == pytest.approx(1, abs=0.02)
+
+
+# ----------------------------------------------------------------------------------------------------- deformation
+def test_amplitudes_are_thermal(bars: Shapes, space: tm.ShapeSpace) -> None:
+    """Small draws, projected on the modes: variance 1 / lambda, and the edge strain that is asked for."""
+    basis = bars.bases[0]
+    n, strain = 2000, 1e-4
+    augment = tm.RandomModalDeformation(strain=strain, p=1.0, generator=seeded(), space=space)
+    x = bars.keyframes[:1].expand(n, -1, -1)
+    moved = augment(x) - x
+    # Aligned in the end: rigid motions are projected out beside the modes.
+    columns = torch.cat([basis.modes, basis.rigid_modes]).flatten(1)
+    found = torch.linalg.lstsq(columns.T, moved.flatten(1).T).solution[: basis.n_modes]
+    energies = found.var(1) * basis.eigenvalues
+    torch.testing.assert_close(energies / energies.mean(), torch.ones_like(energies), rtol=0, atol=0.12)
+    correlation = torch.corrcoef(found) - torch.eye(basis.n_modes, dtype=F64)
+    assert float(correlation.abs().max()) < 0.12
+    assert float(space.strain(x + moved, x).square().mean().sqrt()) == pytest.approx(strain, rel=0.03)
+
+
+def test_strain_is_bounded_and_the_bound_reached(bars: Shapes, space: tm.ShapeSpace) -> None:
+    x = bars.keyframes[[0, 1, 2]].repeat(30, 1, 1)
+    for dtype, bound in ((torch.float32, 0.15), (torch.float64, 0.4)):
+        augment = tm.RandomModalDeformation(strain=0.5, max_strain=bound, p=1.0, generator=seeded(), space=space)
+        y = augment(x.to(dtype))
+        largest = space.strain(y, x.to(dtype)).abs().amax(1)
+        assert float(largest.max()) <= bound
+        assert float(largest.min()) > 0.75 * bound
+
+
+def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
+    """The straight bar along its softest mode: strains stay those of the linear estimate, which itself shears."""
+    x = bars.keyframes[:1]
+    reference = space.reference(0, x)
+    amplitudes = torch.zeros(1, 8, dtype=F64)
+    amplitudes[0, 0] = 1.0
+    amplitudes = amplitudes * (0.5 / linear_strain(amplitudes, reference, space.edges))
+    bent = deform(x, amplitudes, reference, space.reconstruction(0))
+    straight = x + (reference.modes.mT @ amplitudes.mT).reshape(x.shape)
+    initial = volume(x, bars.faces)
+    assert float(volume(straight, bars.faces) / initial) > 1.35
+    assert float(volume(bent, bars.faces) / initial) == pytest.approx(1, abs=0.025)
+    rms = [float(space.strain(y, x).square().mean().sqrt()) for y in (straight, bent)]
+    assert rms[1] < 0.65 * rms[0]
+    # It really is bent far: the ends of the axis turn by a right angle against each other.
+    left, right = (x[0, :, 0] < -1.6), (x[0, :, 0] > 1.6)
+    turns = [best_fit(x[0, end], bent[0, end], torch.ones(int(end.sum()), dtype=F64)).rotation for end in (left, right)]
+    angle = torch.arccos(((turns[0].T @ turns[1]).trace() - 1) / 2)
+    assert float(angle) > 1.5
+    # And small ones are the modes themselves, up to the rigid motion that they are aligned by.
+    small = deform(x, 1e-4 * amplitudes, reference, space.reconstruction(0))
+    rigid = bars.bases[0].rigid_modes.flatten(1)
+    difference = ((small - x) * 1e4 - (straight - x)).flatten()
+    difference = difference - rigid.T @ (rigid @ difference)
+    assert float(difference.norm()) < 2e-3 * float((straight - x).norm())
+
+
+def test_deformation_moves_along_with_the_shape(bars: Shapes, space: tm.ShapeSpace) -> None:
+    rotation = random_rotation(seeded())
+    move = torch.tensor([3.0, -1.0, 2.0], dtype=F64)
+    augment = tm.RandomModalDeformation(strain=0.03, p=1.0, generator=seeded(), space=space)
+    for x in (bars.keyframes, torch.lerp(bars.keyframes, bars.keyframes.roll(1, 0), 0.2)):
+        y = augment(x)
+        turned = augment(x @ rotation.T + move, augment.params)
+        torch.testing.assert_close(turned, y @ rotation.T + move)
+        # It deforms only: the best rigid motion back to where it came from is none.
+        for row, nearest in enumerate(space.nearest(x).tolist()):
+            back = best_fit(y[row], x[row], space.reconstruction(nearest).areas)
+            torch.testing.assert_close(back.rotation, torch.eye(3, dtype=F64), rtol=0, atol=1e-9)
+            torch.testing.assert_close(back.source, back.target)
+
+
+def test_modes_that_do_not_deform_are_left_out(bars: Shapes) -> None:
+    basis = bars.bases[0]
+    drift = torch.zeros_like(basis.modes[:1])
+    drift[..., 0] = 1.0
+    loose = tm.ModalBasis(
+        basis.reference,
+        torch.cat([torch.full((1,), 1e-13, dtype=F64), basis.eigenvalues]),
+        torch.cat([drift, basis.modes]),
+        basis.rigid_eigenvalues,
+    )
+    modes = tm.ShapeSpace(loose, bars.faces).reference(0, basis.reference).modes
+    expected = tm.ShapeSpace(basis, bars.faces).reference(0, basis.reference).modes
+    assert not bool(modes[0].any())
+    torch.testing.assert_close(modes[1:], expected)
+
+
+# ---------------------------------------------------------------------------------------------------- rigid motion
+def test_rigid_motions_are_rigid(bars: Shapes) -> None:
+    x = bars.keyframes.repeat(20, 1, 1)
+    augment = tm.RandomRigidMotion(translation=0.3, p=1.0, generator=seeded())
+    y = augment(x)
+    torch.testing.assert_close(torch.cdist(y[:, ::9], y[:, ::9]), torch.cdist(x[:, ::9], x[:, ::9]))
+    torch.testing.assert_close(volume(y, bars.faces), volume(x, bars.faces))
+    moves = (y.mean(1) - x.mean(1)) / (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True)
+    assert float(moves.abs().max()) <= 0.3
+    assert float(moves.abs().max()) > 0.27
+
+
+def rotations(augment: tm.RandomRigidMotion, n: int = 4000) -> torch.Tensor:
+    x = torch.cat([torch.eye(3, dtype=F64), -torch.eye(3, dtype=F64)]).expand(n, 6, 3)
+    return augment(x)[:, :3].mT
+
+
+def test_rotations_are_uniform_by_default() -> None:
+    """Moments of the Haar measure: E R = 0, E R_ij R_kl = delta delta / 3, and 1 + 2 cos has variance one."""
+    found = rotations(tm.RandomRigidMotion(p=1.0, generator=seeded())).flatten(1)
+    assert float(found.mean(0).abs().max()) < 0.03
+    assert float((found.T @ found / len(found) - torch.eye(9, dtype=F64) / 3).abs().max()) < 0.03
+    assert float(found[:, ::4].sum(1).var()) == pytest.approx(1, abs=0.06)
+
+
+def test_rotations_about_an_axis() -> None:
+    found = rotations(tm.RandomRigidMotion(degrees=(10, 50), axis=(0, 2, 0), p=1.0, generator=seeded()))
+    torch.testing.assert_close(found[:, 1, 1], torch.ones(4000, dtype=F64))
+    angle = torch.atan2(found[:, 0, 2], found[:, 0, 0]).rad2deg()
+    assert (float(angle.min()), float(angle.max())) == (pytest.approx(10, abs=0.1), pytest.approx(50, abs=0.1))
+    tilted = rotations(tm.RandomRigidMotion(degrees=30, p=1.0, generator=seeded()))
+    cosine = (tilted.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    assert float(cosine.min()) == pytest.approx(np.cos(np.pi / 6), abs=1e-3)
+
+
+# ------------------------------------------------------------------------------------------------------ gradients
+@each_kind
+def test_gradients_flow_to_the_shapes(small_bars: Shapes, kind: str) -> None:
+    space = tm.ShapeSpace(small_bars.bases, small_bars.faces, dtype=F64, tolerance=1e-12)
+    options = {"deformation": {"strain": 0.05, "max_strain": 0.9}}.get(kind, {})
+    augment = KINDS[kind](p=1.0, generator=seeded(1), space=space, **options)
+    x = (small_bars.keyframes[:2] + 0.05 * torch.sin(3 * small_bars.keyframes[:2])).requires_grad_()
+    params = augment.forward_parameters(2)
+    assert torch.autograd.gradcheck(lambda x: augment(x, params), [x], fast_mode=True, atol=1e-4, rtol=1e-3)
+
+
+def test_gradients_flow_to_parameters(small_bars: Shapes) -> None:
+    space = tm.ShapeSpace(small_bars.bases, small_bars.faces, dtype=F64)
+    deformation = tm.RandomModalDeformation(strain=0.05, max_strain=0.9, p=1.0, generator=seeded(), space=space)
+    params = deformation.forward_parameters(3)
+    noise = params["noise"].clone().requires_grad_()
+    x = small_bars.keyframes
+    assert torch.autograd.gradcheck(lambda noise: deformation(x, {**params, "noise": noise}), [noise])
+    motion = tm.RandomRigidMotion(p=1.0, generator=seeded())
+    params = motion.forward_parameters(3)
+    turn = params["rotation"].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda turn: motion(x, {**params, "rotation": turn}), [turn])
+
+
+# ----------------------------------------------------------------------------------------------------- composition
+def test_composition_is_its_transforms_one_after_the_other(bars: Shapes, space: tm.ShapeSpace) -> None:
+    parts = [tm.RandomInBetween(p=0.7), tm.RandomModalDeformation(p=0.7), tm.RandomRigidMotion(p=0.7)]
+    augment = tm.AugmentationSequential(*parts, generator=seeded(), space=space)
+    x = bars.keyframes
+    out = augment(x)
+    step = x
+    for part, params in zip(parts, augment.params, strict=True):
+        step = part(step, params, space=space)
+    torch.testing.assert_close(out, step, rtol=0, atol=1e-9)
+    assert torch.equal(augment(x, params=augment.params), out)
+    assert not torch.equal(augment(x), out)
+    with pytest.raises(ValueError, match="3 transforms need as many"):
+        augment(x, params=augment.params[:2])
+
+
+def test_labels_go_along(bars: Shapes, space: tm.ShapeSpace) -> None:
+    x = bars.keyframes
+    v = x.shape[1]
+    part = (x[0, :, 0] > 0).long().expand(3, v)
+    pose = torch.tensor([10, 20, 30])
+    keys = ["shape_labels", "shapes", "vertex_labels", "normals"]
+    augment = tm.AugmentationSequential(
+        tm.RandomInBetween(p=1.0), tm.RandomModalDeformation(p=1.0), data_keys=keys, generator=seeded(), space=space
+    )
+    new_pose, y, new_part, normals = augment(pose, x, part, None)
+    assert torch.equal(new_part, part)
+    torch.testing.assert_close(normals, tm.vertex_normals(y, bars.faces))
+    between = augment.params[0]
+    partner = (torch.arange(3) + 1 + (2 * between["partner"]).long()) % 3
+    expected = torch.where(between["t"] > 0.5, pose[partner], pose)
+    assert torch.equal(new_pose, expected)
+    assert not torch.equal(new_pose, pose)
+
+
+def test_labels_are_blended_if_asked(bars: Shapes, space: tm.ShapeSpace) -> None:
+    augment = tm.AugmentationSequential(
+        tm.RandomInBetween(p=1.0, blend_labels=True),
+        data_keys=["shapes", "shape_labels"],
+        generator=seeded(),
+        space=space,
+    )
+    one_hot = torch.eye(3, dtype=F64)
+    _, soft = augment(bars.keyframes, one_hot)
+    t = augment.params[0]["t"]
+    partner = (torch.arange(3) + 1 + (2 * augment.params[0]["partner"]).long()) % 3
+    torch.testing.assert_close(soft, (1 - t)[:, None] * one_hot + t[:, None] * one_hot[partner])
+    with pytest.raises(ValueError, match="one-hot"):
+        augment(bars.keyframes, torch.arange(3))
+    beyond = tm.AugmentationSequential(
+        tm.RandomExtrapolation(p=1.0, blend_labels=True),
+        data_keys=["shapes", "shape_labels"],
+        generator=seeded(),
+        space=space,
+    )
+    _, hard = beyond(bars.keyframes, one_hot)
+    assert torch.equal(hard.sort(1).values, torch.tensor([[0.0, 0, 1]], dtype=F64).expand(3, 3))
+
+
+def test_one_shape_with_its_labels(bars: Shapes, space: tm.ShapeSpace) -> None:
+    for keepdim, lead in ((True, ()), (False, (1,))):
+        augment = tm.AugmentationSequential(
+            tm.RandomModalDeformation(p=1.0),
+            data_keys=["shapes", "vertex_labels", "shape_labels", "normals"],
+            keepdim=keepdim,
+            space=space,
+        )
+        part, pose = torch.arange(164), torch.tensor(7)
+        y, new_part, new_pose, normals = augment(bars.keyframes[0], part, pose, None)
+        assert y.shape == normals.shape == (*lead, 164, 3)
+        assert torch.equal(new_part.reshape(-1), part)
+        assert new_pose.shape == lead
+
+
+def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) -> None:
+    augment = tm.AugmentationSequential(tm.RandomRigidMotion(), data_keys=["shapes", "vertex_labels"])
+    with pytest.raises(ValueError, match="got 1 arguments"):
+        augment(bars.keyframes)
+    with pytest.raises(ValueError, match=r"vertex_labels begin with the shape \(3, 164\)"):
+        augment(bars.keyframes, torch.zeros(3, 7))
+    with pytest.raises(ValueError, match="normals need faces"):
+        tm.AugmentationSequential(tm.RandomRigidMotion(), data_keys=["shapes", "normals"])(bars.keyframes, None)
+    with pytest.raises(ValueError, match="times is 3"):
+        tm.ShapeSpace(bars.bases, bars.faces, times=3)
+    with pytest.raises(ValueError, match="one connectivity"):
+        tm.ShapeSpace([bars.bases[0], Shapes(*_other(bars)).bases[0]], bars.faces)
+
+
+def _other(bars: Shapes) -> tuple[torch.Tensor, torch.Tensor, list[tm.ModalBasis]]:
+    basis = bars.bases[0]
+    smaller = tm.ModalBasis(basis.reference[1:], basis.eigenvalues, basis.modes[:, 1:], basis.rigid_eigenvalues)
+    return bars.keyframes, bars.faces, [smaller]
+
+
+# --------------------------------------------------------------------------------------------------------- normals
+def test_normals() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    x, faces = torch.tensor(np.array(ball.vertices)), torch.tensor(np.array(ball.faces))
+    normals = tm.vertex_normals(torch.stack([x, 2 * x + 1]), faces)
+    assert float((normals - x).norm(dim=-1).max()) < 0.02
+    # Two faces at a right angle, one of three times the area; and a vertex without a face.
+    x = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -3], [5, 5, 5]], dtype=F64)
+    found = tm.vertex_normals(x[None], torch.tensor([[0, 1, 2], [0, 1, 3]]))[0]
+    expected = torch.tensor([0.0, 3.0, 1.0], dtype=F64) / 10**0.5
+    torch.testing.assert_close(found[0], expected)
+    assert found[4].tolist() == [0, 0, 0]
+
+
+# ---------------------------------------------------------------------------------------------------- many draws
+def check_draws(shapes: Shapes, n: int) -> None:
+    """All finite, strains within the bound, and volumes near those of what the shapes came from."""
+    space = tm.ShapeSpace(shapes.bases, shapes.faces)
+    pool = tm.ShapeBatch.of_keyframes(space)
+    k = len(space)
+    volumes = volume(pool.shapes.double(), shapes.faces)
+    for kind, make in KINDS.items():
+        augment = make(p=1.0, space=space)
+        generator = seeded(7)
+        ratios = []
+        for start in range(0, n, 50):
+            rows = torch.arange(start, min(start + 50, n)) % k
+            batch, params = pool.rows(rows), augment.forward_parameters(len(rows), None, generator)
+            y = augment.transform(batch, params, None, pool).shapes
+            assert bool(y.isfinite().all()), kind
+            source = volumes[rows]
+            if kind in ("between", "extrapolation"):
+                partner = (rows + 1 + (params["partner"] * (k - 1)).long()) % k
+                source = torch.lerp(source, volumes[partner], params["t"].clamp(0, 1))
+            ratios.append(volume(y.double(), shapes.faces) / source)
+            if kind == "deformation":
+                assert float(space.strain(y, batch.shapes).abs().max()) <= 0.2
+        off = (torch.cat(ratios) - 1).abs()
+        assert float(off.max()) < 0.10, kind
+        assert float(off.median()) < 0.03, kind
+
+
+def test_draws_of_bars(bars: Shapes) -> None:
+    check_draws(bars, 150)
+
+
+@pytest.fixture(scope="module")
+def creature() -> Shapes:
+    sample = load_sample("creature")
+    return Shapes(sample.keyframes, sample.faces, tm.extract_bases(sample.keyframes, sample.faces, 30, progress=False))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["creature", "hands", "women"])
+def test_a_thousand_draws(name: str, request: pytest.FixtureRequest) -> None:
+    check_draws(request.getfixturevalue(name), 1000)

@@ -1,0 +1,259 @@
+"""Rotations and strains of triangles against truth by hand, and the Poisson problem against known shapes."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from conftest import Shapes, random_rotation
+
+from torch_modal.augment.between import mirror
+from torch_modal.augment.reconstruction import Reconstruction
+from torch_modal.augment.triangles import Bend, Sides, bend, bent_sides, frames, mirrored_sides, sides
+from torch_modal.rigid import _exp, best_fit
+
+F64 = torch.float64
+
+
+def columns(x: torch.Tensor) -> torch.Tensor:
+    """*Shape:* ``(V, 3) -> (V, 3, 1)``."""
+    return x[..., None]
+
+
+def test_frames_are_orthonormal_and_give_the_sides_back(bars: Shapes) -> None:
+    given = sides(bars.keyframes.permute(1, 2, 0), bars.faces)
+    own = frames(given)
+    axes = torch.stack([own.e1, own.e2, own.normal], 1).movedim(-1, 0)
+    identity = torch.eye(3, dtype=F64).expand(3, len(bars.faces), 3, 3)
+    torch.testing.assert_close(axes @ axes.mT, identity)
+    torch.testing.assert_close(own.world(own.length, torch.zeros_like(own.length)), given.first)
+    torch.testing.assert_close(own.world(own.along, own.height), given.second)
+
+
+def test_a_rotation_field_is_a_turn_without_strain(bars: Shapes) -> None:
+    x, faces = columns(bars.keyframes[1]), bars.faces
+    omega = torch.tensor([0.3, -0.2, 0.5], dtype=F64)
+    field = torch.linalg.cross(omega.expand(len(x), 3), x[..., 0])[..., None] + 7.0
+    found = bend(sides(field, faces), frames(sides(x, faces)))
+    torch.testing.assert_close(found.turn, omega[None, :, None].expand_as(found.turn))
+    for entry in found.strain:
+        torch.testing.assert_close(entry, torch.zeros_like(entry), atol=1e-12, rtol=0)
+
+
+def test_a_linear_field_has_its_symmetric_part_as_strain() -> None:
+    # A triangle in the plane z = 0 whose first side is along x, so that its frame is that of the world.
+    x = columns(torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1.5, 0]], dtype=F64))
+    faces = torch.tensor([[0, 1, 2]])
+    gradient = torch.tensor([[0.1, 0.3, 0], [-0.2, 0.4, 0], [0.05, -0.07, 0]], dtype=F64)
+    found = bend(sides(columns(x[..., 0] @ gradient.T), faces), frames(sides(x, faces)))
+    xx, xy, yy = (float(entry) for entry in found.strain)
+    assert (xx, xy, yy) == pytest.approx((0.1, 0.05, 0.4))
+    # The normal turns so that it stays normal: about x by dw/dy, about -y by dw/dx; about z by the spin.
+    assert found.turn.flatten().tolist() == pytest.approx([-0.07, -0.05, 0.5 * (-0.2 - 0.3)])
+
+
+def test_turns_become_finite_rotations(bars: Shapes) -> None:
+    x, faces = columns(bars.keyframes[0]), bars.faces
+    own = frames(sides(x, faces))
+    zero = torch.zeros_like(own.length)
+    for omega in ([0.0, 0.0, 0.0], [2.0, -1.0, 0.7], [1e-9, 0.0, 0.0]):
+        turn = torch.tensor(omega, dtype=F64)[None, :, None].expand_as(own.e1)
+        found = bent_sides(Bend(turn, (zero, zero, zero)), own)
+        rotation = _exp(torch.tensor(omega, dtype=F64))
+        for mine, its in zip(found, sides(x, faces), strict=True):
+            torch.testing.assert_close(mine[..., 0], its[..., 0] @ rotation.T)
+    stretched = bent_sides(Bend(torch.zeros_like(own.e1), (zero + 0.5, zero, zero + 0.5)), own)
+    for mine, its in zip(stretched, sides(x, faces), strict=True):
+        torch.testing.assert_close(mine, np.exp(0.5) * its)
+
+
+def test_the_stretch_is_the_exponential_of_the_strain() -> None:
+    x = columns(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=F64))
+    own = frames(sides(x, torch.tensor([[0, 1, 2]])))
+    for strain in ([[0.3, 0.2], [0.2, -0.1]], [[0.0, 0.4], [0.4, 0.0]], [[-3.0, 0.0], [0.0, -3.0]]):
+        given = torch.tensor(strain, dtype=F64)
+        entries = (given[0, 0].reshape(1, 1), given[0, 1].reshape(1, 1), given[1, 1].reshape(1, 1))
+        found = bent_sides(Bend(torch.zeros(1, 3, 1, dtype=F64), entries), own)
+        expected = torch.linalg.matrix_exp(given)
+        torch.testing.assert_close(found.first[0, :2, 0], expected[:, 0])
+        torch.testing.assert_close(found.second[0, :2, 0], expected[:, 1])
+
+
+def test_mirrored_sides_turn_back_and_stretch_the_other_way(bars: Shapes) -> None:
+    x, faces = columns(bars.keyframes[1]), bars.faces
+    rotation = _exp(torch.tensor([0.5, 1.0, -0.8], dtype=F64))
+    turned = columns(x[..., 0] @ rotation.T)
+    found = mirrored_sides(frames(sides(x, faces)), frames(sides(turned, faces)))
+    for mine, its in zip(found, sides(columns(x[..., 0] @ rotation), faces), strict=True):
+        torch.testing.assert_close(mine, its)
+    found = mirrored_sides(frames(sides(x, faces)), frames(sides(3.0 * x, faces)))
+    for mine, its in zip(found, sides(x, faces), strict=True):
+        torch.testing.assert_close(mine, 0.25 * its)
+
+
+def test_mirrored_sides_of_a_shear_follow_the_matrix_function() -> None:
+    x = columns(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=F64))
+    faces = torch.tensor([[0, 1, 2]])
+    m = torch.tensor([[1.2, 0.4], [-0.3, 0.8]], dtype=F64)
+    other = torch.zeros(3, 3, 1, dtype=F64)
+    other[1:, :2, 0] = m.T
+    found = mirrored_sides(frames(sides(x, faces)), frames(sides(other, faces)))
+    u, s, vh = np.linalg.svd(m.numpy())
+    stretch = vh.T @ np.diag(4 / (1 + s) ** 2) @ vh
+    expected = (u @ vh).T @ stretch
+    np.testing.assert_allclose(found.first[0, :2, 0], expected[:, 0], atol=1e-12)
+    np.testing.assert_allclose(found.second[0, :2, 0], expected[:, 1], atol=1e-12)
+    np.testing.assert_allclose(found.second[0, 2, 0], 0, atol=1e-12)
+
+
+def test_a_triangle_without_area_stays_finite() -> None:
+    x = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 0, 0]], dtype=F64)
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1]])
+    own = frames(sides(columns(x), faces))
+    field = torch.randn(4, 3, 1, dtype=F64, generator=torch.Generator().manual_seed(0))
+    found = bend(sides(field, faces), own)
+    for part in (*own, found.turn, *found.strain, *mirrored_sides(own, own)):
+        assert bool(part.isfinite().all())
+
+
+# ------------------------------------------------------------------------------------------------ reconstruction
+def test_reconstruction_returns_a_shape_from_its_sides(bars: Shapes) -> None:
+    solver = Reconstruction(bars.keyframes[0], bars.faces)
+    rest = bars.keyframes.permute(1, 2, 0)
+    torch.testing.assert_close(solver(sides(rest, bars.faces), rest), rest)
+    # Weighted by one key-frame, it returns any shape, its centroid where the rest has it.
+    other = rest.roll(1, -1)
+    found = solver(sides(other, bars.faces), rest)
+    shift = found - other
+    torch.testing.assert_close(shift, shift[:1].expand_as(shift))
+    weights = solver.areas / solver.areas.sum()
+    torch.testing.assert_close(torch.einsum("v,vcb->cb", weights, found), torch.einsum("v,vcb->cb", weights, rest))
+
+
+def test_reconstruction_is_the_least_squares_solution(small_bars: Shapes) -> None:
+    """Against a dense solve of the same sum of squares, for sides that no shape has."""
+    x, faces = small_bars.keyframes[0], small_bars.faces
+    solver = Reconstruction(x, faces)
+    generator = torch.Generator().manual_seed(0)
+    wanted = Sides(*(torch.randn(len(faces), 3, 1, dtype=F64, generator=generator) for _ in range(2)))
+    found = solver(wanted, columns(x))[..., 0]
+    rows, targets = [], []
+    between = {(0, 1): wanted.first, (0, 2): wanted.second, (1, 2): wanted.second - wanted.first}
+    for f, face in enumerate(faces.tolist()):
+        for (a, b), target in between.items():
+            row = torch.zeros(len(x), dtype=F64)
+            row[face[b]] += 1
+            row[face[a]] -= 1
+            weight = solver.weights[f, 3 - a - b].sqrt()
+            rows.append(weight * row)
+            targets.append(weight * target[f, :, 0])
+    expected = torch.linalg.lstsq(torch.stack(rows), torch.stack(targets), driver="gelsd").solution
+    torch.testing.assert_close(found - found.mean(0), expected - expected.mean(0))
+
+
+def test_weights_are_cotangents_within_bounds(small_bars: Shapes) -> None:
+    x, faces = small_bars.keyframes[0], small_bars.faces
+    solver = Reconstruction(x, faces)
+    angles = trimesh.Trimesh(x.numpy(), faces.numpy(), process=False).face_angles
+    np.testing.assert_allclose(solver.weights, np.clip(0.5 / np.tan(angles), 0.02, 20), rtol=1e-9)
+
+
+def test_gradients_go_through_the_solve(small_bars: Shapes) -> None:
+    solver = Reconstruction(small_bars.keyframes[0], small_bars.faces)
+
+    def shape(first: torch.Tensor, second: torch.Tensor, rest: torch.Tensor) -> torch.Tensor:
+        return solver(Sides(first, second), rest)
+
+    rest = small_bars.keyframes[:2].permute(1, 2, 0).contiguous()
+    first, second = sides(rest, small_bars.faces)
+    inputs = [part.clone().requires_grad_() for part in (first, second, rest)]
+    assert torch.autograd.gradcheck(shape, inputs)
+    assert torch.autograd.gradgradcheck(shape, inputs)
+
+
+def test_a_loose_piece_goes_along_with_its_neighbourhood() -> None:
+    """A ball in front of a bending bar keeps its place beside the bar's end, and a stray vertex stays."""
+    bar = trimesh.creation.box((4.0, 1, 1))
+    bar = bar.subdivide().subdivide().subdivide()
+    bar.merge_vertices()
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.2)
+    ball.apply_translation([1.9, 0.8, 0])
+    both = trimesh.util.concatenate([ball, bar])
+    x = torch.tensor(np.concatenate([both.vertices, [[9.0, 9, 9]]]))
+    faces = torch.tensor(both.faces)
+    angle = 1.2
+    radius = 4.0 / angle
+    along, up, deep = x[:-1].unbind(1)
+    bent = torch.stack(
+        [(radius - up) * torch.sin(along / radius), radius - (radius - up) * torch.cos(along / radius), deep], 1
+    )
+    solver = Reconstruction(x, faces)
+    assert len(solver.pieces) == 2
+    assert len(solver.pieces[0]) == len(bar.vertices)
+    target = torch.cat([bent, x[-1:]])
+    found = solver(sides(columns(target), faces), columns(x))[..., 0]
+    assert torch.equal(found[-1], x[-1])
+    motion = best_fit(
+        found[len(ball.vertices) : -1], bent[len(ball.vertices) :], torch.ones(len(bar.vertices)).double()
+    )
+    offset = motion.apply(found[:-1]) - bent
+    assert float(offset[len(ball.vertices) :].abs().max()) < 1e-9
+    # The piece follows a rigid fit of its surroundings: off by their bending, not by the half radian that they turn.
+    assert float(offset[: len(ball.vertices)].norm(dim=1).max()) < 0.06
+
+
+# -------------------------------------------------------------------------------------------------------- mirror
+def test_mirror_continues_a_bend(generator: torch.Generator) -> None:
+    """A thin bar bent by an angle, mirrored in the straight one, is bent by the opposite angle."""
+    bar = trimesh.creation.box((4.0, 0.2, 0.2)).subdivide().subdivide().subdivide().subdivide()
+    bar.merge_vertices()
+    x, faces = torch.tensor(np.array(bar.vertices)), torch.tensor(np.array(bar.faces))
+
+    def bent(angle: float) -> torch.Tensor:
+        radius = 4.0 / angle
+        along, up, deep = x.unbind(1)
+        return torch.stack(
+            [(radius - up) * torch.sin(along / radius), radius - (radius - up) * torch.cos(along / radius), deep], 1
+        )
+
+    solver = Reconstruction(x, faces)
+    found = mirror(x[None], bent(0.8)[None], solver)[0]
+    truth = bent(-0.8)
+    error = best_fit(found, truth, solver.areas).apply(found) - truth
+    linear = 2 * x - bent(0.8)
+    linear_error = best_fit(linear, truth, solver.areas).apply(linear) - truth
+    assert float(error.norm(dim=1).max()) < 2e-3
+    assert float(linear_error.norm(dim=1).max()) > 0.05
+    # Its rigid motion is mirrored too: turned back, and moved on.
+    rotation, move = random_rotation(generator), torch.tensor([1.0, 2.0, 3.0], dtype=F64)
+    centre = (solver.areas[:, None] * x).sum(0) / solver.areas.sum()
+    moved = (x - centre) @ rotation.T + centre + move
+    torch.testing.assert_close(mirror(x[None], moved[None], solver)[0], (x - centre) @ rotation + centre - move)
+
+
+def test_mirror_is_the_linear_one_for_small_steps(bars: Shapes) -> None:
+    x = bars.keyframes[1]
+    solver = Reconstruction(x, bars.faces)
+    field = torch.sin(x)
+    errors = []
+    for size in (1e-2, 1e-3, 1e-4):
+        found = mirror(x[None], (x + size * field)[None], solver)[0]
+        errors.append(float((found - (x - size * field)).norm() / (size * field).norm()))
+    # Position and velocity are continuous at the ends: what differs is of second order.
+    assert errors[1] == pytest.approx(errors[0] / 10, rel=0.1)
+    assert errors[2] == pytest.approx(errors[1] / 10, rel=0.1)
+    assert errors[2] < 1e-3
+
+
+def test_frames_have_gradients(small_bars: Shapes) -> None:
+    x = small_bars.keyframes[1][..., None].clone().requires_grad_()
+    faces = small_bars.faces[:6]
+    still = frames(sides(small_bars.keyframes[0][..., None], faces))
+
+    def wanted(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        own = frames(sides(x, faces))
+        bending = bend(sides(0.3 * x, faces), still)
+        first = bent_sides(bending, own)
+        second = mirrored_sides(still, own)
+        return first.first + second.first, first.second + second.second
+
+    assert torch.autograd.gradcheck(wanted, [x])

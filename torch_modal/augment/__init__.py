@@ -1,0 +1,1 @@
+"""Random transforms of shapes that keep their labels right."""
