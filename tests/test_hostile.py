@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import torch_modal as tm
 from torch_modal.precompute.cache import cache_content
+from torch_modal.precompute.parallel import n_cpus
 
 ROOT = Path(tm.__file__).parents[1]
 TESTS = Path(__file__).parent
@@ -117,6 +118,26 @@ def test_ctrl_c_in_the_middle_leaves_nothing_behind(
     _, errors = process.communicate(timeout=60)
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
     assert not Path(f"/proc/{worker}").exists()
+    assert cache_content(tmp_path / "cache").n_entries == 0
+
+
+@POSIX
+def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
+    if not Path("/proc/self/stat").exists():
+        pytest.skip("workers are found through /proc, which this system does not have")
+    process = start(tmp_path / "cache", CALL.replace("1.2)]), f, 10", "1.2)]), f, 10, settings='fine', carry=False"))
+    try:
+        end = time.monotonic() + 60
+        while len(workers := workers_of(process.pid)) < min(2, n_cpus()):
+            assert process.poll() is None and time.monotonic() < end
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.communicate()
+    assert errors.splitlines()[-1] == "KeyboardInterrupt"
+    assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
     assert cache_content(tmp_path / "cache").n_entries == 0
 
 

@@ -1,5 +1,6 @@
 """Modes: the eigenproblem against independent truth, and the way from key-frames to bases."""
 
+import threading
 import warnings
 from pathlib import Path
 
@@ -12,10 +13,11 @@ from conftest import COARSE
 from solids import box, surface, together
 
 from torch_modal.keyframes import MeshError, MeshWarning
-from torch_modal.precompute import filling, lanczos, modes
+from torch_modal.precompute import filling, lanczos, parallel, solving
 from torch_modal.precompute.arap import HESSIAN_FORMS, arap_hessian, consistent_mass, lumped_mass
 from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
+from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -62,10 +64,10 @@ def test_agrees_with_dense_eigh(form: str, cells: tuple[int, int, int]) -> None:
     solid = box(cells, (5.0, 1.0, 1.0))
     k = arap_hessian(solid, form)
     assert (k.shape[0] > lanczos.DENSE_BELOW) == (cells[0] == 10)
-    for mass, m in (
-        (consistent_mass(solid), inertia(solid).toarray()),
-        (lumped_mass(solid), np.diag(np.repeat(lumped_mass(solid), 3))),
-    ):
+    masses = [(consistent_mass(solid), inertia(solid).toarray())]
+    if form == "element":
+        masses.append((lumped_mass(solid), np.diag(np.repeat(lumped_mass(solid), 3))))
+    for mass, m in masses:
         values, vectors = scipy.linalg.eigh(k.toarray(), m)
         result = lowest_modes(k, mass, solid.vertices, 25)
         assert_same_modes(result, values, vectors, m)
@@ -213,7 +215,7 @@ def test_cached_modes_are_the_same_and_not_recomputed(
     keyframes = np.stack([boxed[0], boxed[0] * (1.0, 1.0, 1.01)])
     first = extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path))
     assert len(list(tmp_path.iterdir())) == 4
-    monkeypatch.setattr(modes, "lowest_modes", None)
+    monkeypatch.setattr(solving, "lowest_modes", None)
     monkeypatch.setattr(filling, "tetrahedralize", None)
     for basis, again in zip(first, extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path)), strict=True):
         np.testing.assert_array_equal(basis.modes, again.modes)
@@ -245,10 +247,57 @@ def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(MeshError, match=r"key-frame 1: the surface is flat"):
         extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, cache=False)
     monkeypatch.setattr(filling, "tetrahedralize", fail)
-    with pytest.raises(TetrahedralizationError, match="key-frame 0: no luck"):
+    with pytest.raises(TetrahedralizationError, match=r"key-frame [01]: no luck"):
         extract_bases(np.stack([vertices, vertices]), faces, 4, mesher="tetwild", cache=False)
     with pytest.raises(TetrahedralizationError, match=r"^no luck"):
         extract_modes(vertices, faces, 4, mesher="tetwild", cache=False)
+
+
+def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit by bit: carried and solved one after another, or four at a time with one factorisation for all."""
+    vertices, faces = boxed
+    keyframes = np.stack([vertices * (1.0, 1.0, 1.0 + 0.02 * i) for i in range(6)])
+    found = []
+    for cpus in (1, 4, 4):
+        monkeypatch.setattr(parallel, "n_cpus", lambda cpus=cpus: cpus)
+        found.append(extract_bases(keyframes, faces, 5, cache=False))
+    for alone, one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(alone.modes, one.modes)
+        np.testing.assert_array_equal(one.modes, other.modes)
+        np.testing.assert_array_equal(alone.reference, one.reference)
+
+
+def test_keyframes_are_meshed_at_the_same_time(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = boxed
+    fill, together = filling.tetrahedralize, threading.Barrier(3)
+
+    def wait_for_the_others(*args: object, **kwargs: object) -> Tetrahedra:
+        together.wait(timeout=30)  # passes only if three are in here
+        return fill(*args, **kwargs)
+
+    monkeypatch.setattr(parallel, "n_cpus", lambda: 3)
+    monkeypatch.setattr(filling, "tetrahedralize", wait_for_the_others)
+    assert len(extract_bases(np.stack([vertices] * 3), faces, 4, carry=False, cache=False)) == 3
+
+
+def test_one_failure_ends_the_other_workers(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = boxed
+    begun, stopped = threading.Event(), []
+
+    def fill(points: np.ndarray, *args: object, stop: threading.Event, **kwargs: object) -> Tetrahedra:
+        if np.ptp(points[:, 2]) > 50:  # the stretched one
+            assert begun.wait(30)
+            raise TetrahedralizationError("no luck")
+        begun.set()
+        stopped.append(stop.wait(30))
+        raise StoppedError
+
+    monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
+    monkeypatch.setattr(filling, "tetrahedralize", fill)
+    keyframes = np.stack([vertices, vertices * (1, 1, 5)])
+    with pytest.raises(TetrahedralizationError, match="key-frame 1: no luck"):
+        extract_bases(keyframes, faces, 4, mesher="tetwild", carry=False, cache=False)
+    assert stopped == [True]
 
 
 @pytest.mark.parametrize("n_modes", [0, -1, 2.5, True, 10_000])

@@ -98,7 +98,7 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray | sp.spmatrix, positions: Fl
         raise ModalAnalysisError(f"{int((~has_mass).sum())} vertices have no mass; remove unused vertices first")
     n_pairs = min(n_modes + N_RIGID + GUARD, k.shape[0])
     span = _lowest_span(k, inertia, positions, n_pairs)
-    rigid_eigenvalues = _rayleigh_ritz(k, span, inertia)[0][:N_RIGID]
+    rigid_eigenvalues = _rayleigh_ritz(k, span)[0][:N_RIGID]
 
     # The rigid part is taken out exactly: six directions of the span lose all their length, and are left
     # behind.
@@ -108,7 +108,7 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray | sp.spmatrix, positions: Fl
     lengths, directions = np.linalg.eigh(elastic.T @ (inertia @ elastic))
     elastic = elastic @ (directions / np.sqrt(np.maximum(lengths, np.finfo(np.float64).tiny)))[:, N_RIGID:]
     elastic -= rigid @ (moved.T @ elastic)
-    eigenvalues, modes = _rayleigh_ritz(k, elastic, inertia)
+    eigenvalues, modes = _rayleigh_ritz(k, inertia.orthonormal(elastic)[0])
 
     first_elastic, n_zero = _count_zeros(eigenvalues, positions)
     if not np.abs(rigid_eigenvalues).max() < RIGID_TOLERANCE * first_elastic:
@@ -182,9 +182,8 @@ def _lowest_span(k: sp.csc_matrix, mass: Mass, positions: FloatArray, n_pairs: i
         raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
 
 
-def _rayleigh_ritz(k: sp.csc_matrix, span: FloatArray, mass: Mass) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues and M-orthonormal vectors of ``K`` within a span."""
-    basis = mass.orthonormal(span)[0]
+def _rayleigh_ritz(k: sp.csc_matrix, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues and eigenvectors of ``K`` within the span of an M-orthonormal basis."""
     restricted = basis.T @ (k @ basis)
     values, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
     return values, basis @ rotation

@@ -1,8 +1,8 @@
 """Key-frames filled with tetrahedra: meshed once for the whole set where that works."""
 
-import warnings
+import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -10,7 +10,6 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from torch_modal.errors import MeshWarning
 from torch_modal.precompute.arap import consistent_mass
 from torch_modal.precompute.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier, self_proximity
@@ -38,19 +37,32 @@ class Body:
     Attributes:
         surface: The key-frame.
         tetrahedra: In the units of the surface.
+        problem: Why they are not those of the mesher that was wanted first; None if they are.
     """
 
     surface: Surface
     tetrahedra: Tetrahedra
+    problem: str | None = None
+    _lock: threading.RLock = field(default_factory=threading.RLock, init=False, repr=False, compare=False)
 
-    @cached_property
+    @property
     def neighbours(self) -> Neighbours:
         """What each point of the surface hangs on."""
+        with self._lock:
+            return self._neighbours
+
+    @property
+    def carrier(self) -> Carrier:
+        """What takes the tetrahedra to other key-frames."""
+        with self._lock:
+            return self._carrier
+
+    @cached_property
+    def _neighbours(self) -> Neighbours:
         return find_neighbours(self.surface.points, self.tetrahedra, self.surface.normals)
 
     @cached_property
-    def carrier(self) -> Carrier:
-        """What takes the tetrahedra to other key-frames."""
+    def _carrier(self) -> Carrier:
         weights = fit_weights(self.surface.points, self.tetrahedra.vertices, self.neighbours)
         return Carrier(self.tetrahedra, self.surface.points, self.surface.faces, weights)
 
@@ -90,42 +102,40 @@ class Filling:
 
 @dataclass(frozen=True)
 class Filler:
-    """How surfaces are filled with tetrahedra.
+    """How surfaces are filled with tetrahedra; by several threads at once if need be.
 
     Attributes:
         settings: How fine the tetrahedra are.
         mesher: ``"tetwild"``, ``"lattice"``, or ``"auto"``: the first, and the second where the first fails.
         timeout: Seconds that the child process of fTetWild may take.
         cache: Where tetrahedra are kept.
+        stop: Set when they are no longer wanted: children are killed then.
     """
 
     settings: TetrahedraSettings
     mesher: Mesher
     timeout: float
     cache: Cache
+    stop: threading.Event = field(default_factory=threading.Event)
 
     def body(self, surface: Surface) -> Body:
         """The surface with tetrahedra of its own.
 
         Raises:
             TetrahedralizationError: No mesher could fill it.
-
-        Warns:
-            MeshWarning: fTetWild failed, and the lattice took its place.
         """
+        problem = None
         if self.mesher != "lattice":
             try:
                 return Body(surface, self._kept("tetwild", surface, self._by_tetwild))
             except TetrahedralizationError as error:
                 if self.mesher == "tetwild":
                     raise
-                warnings.warn(
-                    f"fTetWild failed, so a lattice of cubes takes its place: {error}", MeshWarning, stacklevel=3
-                )
-        return Body(surface, self._kept("lattice", surface, self._by_lattice))
+                problem = str(error)
+        return Body(surface, self._kept("lattice", surface, self._by_lattice), problem)
 
     def _by_tetwild(self, surface: Surface) -> Tetrahedra:
-        return tetrahedralize(surface.points, surface.faces, self.settings, timeout=self.timeout)
+        return tetrahedralize(surface.points, surface.faces, self.settings, timeout=self.timeout, stop=self.stop)
 
     def _by_lattice(self, surface: Surface) -> Tetrahedra:
         return lattice(surface, self.settings.edge_length(surface.points, surface.faces))

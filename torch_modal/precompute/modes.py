@@ -1,28 +1,24 @@
-"""From key-frames to modal bases: tetrahedra, stiffness, lowest modes, restriction to the surface."""
+"""From key-frames to modal bases: the calls that users make, what they check and what they warn about."""
 
-import contextlib
 import warnings
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from tqdm import tqdm
 
 from torch_modal.basis import ModalBasis
-from torch_modal.keyframes import MeshError, MeshWarning, check_keyframes, require_solid
-from torch_modal.precompute.arap import HESSIAN_FORMS, HessianForm, arap_hessian
+from torch_modal.keyframes import MeshWarning, check_keyframes, require_solid
+from torch_modal.precompute.arap import HESSIAN_FORMS, HessianForm
 from torch_modal.precompute.cache import Cache
-from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, VolumeModes, lowest_modes
-from torch_modal.precompute.filling import MESHERS, Body, Filler, Filling, Mesher, meshing_order
+from torch_modal.precompute.eigen import N_RIGID
+from torch_modal.precompute.filling import MESHERS, Filler, Mesher
+from torch_modal.precompute.parallel import StoppedError
+from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
 from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, TetrahedraSettings
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings
 
 QUALITIES = {
     "fast": TetrahedraSettings(),
@@ -138,97 +134,31 @@ def extract_bases(
     _check_n_modes(n_modes, len(np.unique(triangles)))
     surfaces: list[Surface] = []
     for index, shape in enumerate(shapes):
-        with _naming_keyframe(index, len(shapes)):
+        with naming_keyframe(index, len(shapes)):
             require_solid(shape, triangles)
             surfaces.append(Surface.of(shape, triangles))
 
-    kept = Cache.at(cache_dir, enabled=cache)
-    filler = Filler(_settings(settings), mesher, timeout, kept)
+    filler = Filler(_settings(settings), mesher, timeout, Cache.at(cache_dir, enabled=cache))
     with tqdm(total=2 * len(shapes), disable=None if progress is None else not progress, leave=False) as bar:
 
         def report(index: int, stage: str) -> None:
+            if filler.stop.is_set():
+                raise StoppedError
             bar.set_description(f"key-frame {index + 1}/{len(shapes)}: {stage}")
 
-        fillings = _fill(surfaces, filler, carry, report, bar.update)
-        bases = []
-        for index, (shape, filling) in enumerate(zip(shapes, fillings, strict=True)):
-            report(index, "modes")
-            with _naming_keyframe(index, len(shapes)):
-                bases.append(_basis(shape, filling, n_modes, form, kept))
-            bar.update()
-    return bases
-
-
-@contextlib.contextmanager
-def _naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
-    """Say in an error which of several key-frames it is about."""
-    try:
-        yield
-    except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
-        if n_keyframes == 1:
-            raise
-        raise type(error)(f"key-frame {index}: {error}") from error
-
-
-def _fill(
-    surfaces: list[Surface],
-    filler: Filler,
-    carry: bool,
-    report: Callable[[int, str], None],
-    done: Callable[[], object],
-) -> list[Filling]:
-    """Tetrahedra of every key-frame: made for one and carried to the others, unless they do not survive that."""
-    fillings: dict[int, Filling] = {}
-    first: Body | None = None
-    for index in meshing_order(surfaces) if carry and len(surfaces) > 1 else range(len(surfaces)):
-        surface = surfaces[index]
-        with _naming_keyframe(index, len(surfaces)):
-            filling = None
-            if carry and first is not None:
-                report(index, "carrying tetrahedra")
-                filling = filler.carried(first, surface)
-            if filling is None:
-                report(index, "tetrahedra")
-                body = filler.body(surface)
-                first = first or body
-                filling = Filling(body, surface, body.tetrahedra)
-        fillings[index] = filling
-        done()
-    return [fillings[index] for index in range(len(surfaces))]
-
-
-def _basis(shape: FloatArray, filling: Filling, n_modes: int, form: HessianForm, cache: Cache) -> ModalBasis:
-    """Modes of the tetrahedra, restricted to the surface, in the caller's units."""
-    tetrahedra, surface = filling.tetrahedra, filling.surface
-
-    def compute() -> dict[str, NDArray[Any]]:
-        solid = lowest_modes(arap_hessian(tetrahedra, form), filling.mass(), tetrahedra.vertices, n_modes)
-        return {
-            "eigenvalues": solid.eigenvalues,
-            "modes": _restrict(filling.weights(), solid),
-            "rigid_eigenvalues": solid.rigid_eigenvalues,
-            "n_zero": np.array([solid.n_zero]),
-        }
-
-    result = cache.get("modes", filling.content(), {"n_modes": int(n_modes), "form": form}, compute)
-    n_zero = int(result["n_zero"][0])
-    if n_zero > N_RIGID:
-        _warn_of_loose_pieces(tetrahedra, n_zero)
-    modes = np.zeros((n_modes, *shape.shape))
-    # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
-    modes[:, surface.used] = result["modes"] * surface.scale**1.5
-    return ModalBasis(
-        reference=torch.from_numpy(shape.copy()),
-        eigenvalues=torch.from_numpy(result["eigenvalues"] * surface.scale**2),
-        modes=torch.from_numpy(modes),
-        rigid_eigenvalues=torch.from_numpy(result["rigid_eigenvalues"] * surface.scale**2),
-    )
-
-
-def _restrict(weights: sp.csr_matrix, solid: VolumeModes) -> FloatArray:
-    """Modes at the surface points, ``(k, U, 3)``, from columns with interleaved coordinates."""
-    n, k = solid.modes.shape[0] // 3, solid.modes.shape[1]
-    return (weights @ solid.modes.reshape(n, 3 * k)).reshape(-1, 3, k).transpose(2, 0, 1)
+        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, report, bar.update)
+        solved = work.solve_carried() if carry and len(shapes) > 1 else work.solve_each()
+    for index, one in enumerate(solved):
+        _warn(f"key-frame {index}: " if len(shapes) > 1 else "", one)
+    return [
+        ModalBasis(
+            reference=torch.from_numpy(shape.copy()),
+            eigenvalues=torch.from_numpy(one.eigenvalues),
+            modes=torch.from_numpy(one.modes),
+            rigid_eigenvalues=torch.from_numpy(one.rigid_eigenvalues),
+        )
+        for shape, one in zip(shapes, solved, strict=True)
+    ]
 
 
 def _settings(settings: TetrahedraSettings | str) -> TetrahedraSettings:
@@ -250,13 +180,26 @@ def _check_n_modes(n_modes: int, n_used: int) -> None:
         )
 
 
-def _warn_of_loose_pieces(tetrahedra: Tetrahedra, n_zero: int) -> None:
+def _warn(name: str, solved: Solved) -> None:
+    """Say what a caller should know about a key-frame, when all threads have ended."""
+    filling, n_zero = solved.filling, solved.n_zero
+    if filling.body.problem is not None and filling.surface is filling.body.surface:
+        warnings.warn(
+            f"{name}fTetWild failed, so a lattice of cubes takes its place: {filling.body.problem}",
+            MeshWarning,
+            stacklevel=3,
+        )
+    if n_zero > N_RIGID:
+        warnings.warn(
+            f"{name}the shape has {_n_pieces(filling.tetrahedra)} loose pieces, or parts hung on an edge or a vertex: "
+            f"{n_zero - N_RIGID} of its first modes move them without deforming them; join them, or ask for that many "
+            "more modes",
+            MeshWarning,
+            stacklevel=3,
+        )
+
+
+def _n_pieces(tetrahedra: Tetrahedra) -> int:
     n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
     pairs = (np.ones(3 * t), (np.repeat(tetrahedra.tets[:, 0], 3), tetrahedra.tets[:, 1:].reshape(-1)))
-    n_pieces = connected_components(sp.coo_matrix(pairs, shape=(n, n)), directed=False)[0]
-    warnings.warn(
-        f"the shape has {n_pieces} loose pieces, or parts hung on an edge or a vertex: {n_zero - N_RIGID} "
-        "of its first modes move them without deforming them; join them, or ask for that many more modes",
-        MeshWarning,
-        stacklevel=4,
-    )
+    return connected_components(sp.coo_matrix(pairs, shape=(n, n)), directed=False)[0]

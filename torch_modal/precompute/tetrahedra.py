@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zipfile
 from dataclasses import asdict, dataclass, replace
@@ -17,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from torch_modal.inspect_mesh import signed_volume
 from torch_modal.mesh import vertex_areas
+from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.surface import DIAGONAL, outward
 from torch_modal.processes import describe_exit, end_process, last_line
 
@@ -102,6 +104,7 @@ def tetrahedralize(
     settings: TetrahedraSettings | None = None,
     *,
     timeout: float = 600.0,
+    stop: threading.Event | None = None,
 ) -> Tetrahedra:
     """Fill a closed surface with tetrahedra.
 
@@ -116,6 +119,7 @@ def tetrahedralize(
             ``(F, 3)``.
         settings: How fine the tetrahedra are.
         timeout: Seconds after which the child process is killed.
+        stop: It is killed as soon as somebody sets this, too.
 
     Returns:
         Tetrahedra in the units of ``vertices``: positive volumes, every vertex used.
@@ -123,6 +127,7 @@ def tetrahedralize(
     Raises:
         TetrahedralizationError: The child process crashed, took longer than ``timeout``, or gave no
             tetrahedra or ones that do not fill the surface.
+        StoppedError: Somebody set ``stop``.
     """
     settings = settings or TetrahedraSettings()
     used, compact = np.unique(faces, return_inverse=True)
@@ -134,7 +139,7 @@ def tetrahedralize(
     failure = _Failure(len(vertices), len(faces))
     compact = outward(surface, compact.reshape(-1, 3))
     settings = replace(settings, edge_length_fac=settings.edge_length(surface, compact))
-    raw = _run_worker(surface, compact, settings, timeout, failure)
+    raw = _run_worker(surface, compact, settings, timeout, stop or threading.Event(), failure)
     tetrahedra = without_debris(oriented(raw))
     _check_fills(tetrahedra, surface, settings, failure)
     return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
@@ -205,7 +210,12 @@ class _Failure(NamedTuple):
 
 
 def _run_worker(
-    surface: FloatArray, faces: IntArray, settings: TetrahedraSettings, timeout: float, failure: _Failure
+    surface: FloatArray,
+    faces: IntArray,
+    settings: TetrahedraSettings,
+    timeout: float,
+    stop: threading.Event,
+    failure: _Failure,
 ) -> Tetrahedra:
     """Hand the surface to the worker process, wait for it, read what it wrote."""
     if not sys.executable:
@@ -228,7 +238,7 @@ def _run_worker(
                 start_new_session=True,
             )
         try:
-            code = _wait(process, timeout)
+            code = _wait(process, timeout, stop)
         finally:
             end_process(process)  # also on KeyboardInterrupt
         if code is None:
@@ -249,16 +259,18 @@ def _run_worker(
             raise failure.error(f"the worker process left no readable result ({error})", "Try again") from error
 
 
-def _wait(process: subprocess.Popen[bytes], timeout: float) -> int | None:
+def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Event) -> int | None:
     """The exit code, or None after ``timeout`` seconds.
 
-    Polled, as a wait with a timeout in one piece cannot be interrupted by Ctrl-C on every platform.
+    Polled: for ``stop``, and as a wait in one piece cannot be interrupted by Ctrl-C on every platform.
     """
     end = time.monotonic() + timeout
     while True:
         try:
-            return process.wait(timeout=min(max(end - time.monotonic(), 0.0), 0.5))
+            return process.wait(timeout=min(max(end - time.monotonic(), 0.0), 0.2))
         except subprocess.TimeoutExpired:
+            if stop.is_set():
+                raise StoppedError from None
             if time.monotonic() >= end:
                 return None
 

@@ -1,0 +1,74 @@
+"""Several key-frames at once, in threads: the mesher has processes of its own, and SuperLU and BLAS free the GIL."""
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from typing import TypeVar
+
+Result = TypeVar("Result")
+
+
+class StoppedError(Exception):
+    """What a thread ends with when another has failed, or on Ctrl-C. No caller of the package ever meets it."""
+
+
+def n_cpus() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def run_all(work: Callable[[int], Result], n: int, stop: threading.Event) -> list[Result]:
+    """The results of ``work(0)`` to ``work(n - 1)``, as many at a time as there are processors.
+
+    The first error ends everything: ``stop`` is set, what has not begun is not begun, and the error is raised once the
+    running calls have returned. So it is with Ctrl-C, which only the calling thread is told of.
+
+    Args:
+        work: Looks at ``stop`` from time to time if it takes long, and then raises `StoppedError`.
+        n: How many.
+        stop: Set when the results are no longer wanted.
+    """
+    n_threads = min(n, n_cpus())
+    if n_threads < 2:
+        return [work(index) for index in range(n)]
+    with ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
+        futures = [pool.submit(work, index) for index in range(n)]
+        try:
+            for future in as_completed(futures):
+                future.result()
+        except BaseException:
+            stop.set()
+            for future in futures:
+                future.cancel()
+            raise
+    return [future.result() for future in futures]
+
+
+class Budget:
+    """A quantity, of memory say, that threads share: they wait for their part of it.
+
+    Args:
+        total: How much there is. Who wants more than that gets all of it, alone.
+    """
+
+    def __init__(self, total: int) -> None:
+        self._total = self._left = total
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def part(self, amount: int) -> Iterator[None]:
+        """Hold some of it."""
+        amount = min(amount, self._total)
+        with self._changed:
+            self._changed.wait_for(lambda: self._left >= amount)
+            self._left -= amount
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._left += amount
+                self._changed.notify_all()

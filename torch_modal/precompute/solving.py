@@ -1,0 +1,163 @@
+"""The way of each key-frame of a set to its modes, several of them at once."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from torch_modal.errors import MeshError
+from torch_modal.precompute.arap import HessianForm, arap_hessian
+from torch_modal.precompute.cache import Cache
+from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
+from torch_modal.precompute.filling import Filler, Filling, meshing_order
+from torch_modal.precompute.parallel import Budget, run_all
+from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.tetrahedra import TetrahedralizationError
+
+FloatArray = NDArray[np.float64]
+
+VERTICES_AT_ONCE = 30_000
+"""Tetrahedral vertices of all eigenproblems that are solved at the same time: about 2 GiB."""
+
+
+class Solved(NamedTuple):
+    """A key-frame's modes in the caller's units, and how they came about.
+
+    Attributes:
+        eigenvalues: Ascending. *Shape:* ``(k,)``.
+        modes: At the vertices of the key-frame, zero at those that no face uses. *Shape:* ``(k, V, 3)``.
+        rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
+        filling: The tetrahedra that they are the modes of.
+        n_zero: How many eigenvalues are zero, the six rigid ones included.
+    """
+
+    eigenvalues: FloatArray
+    modes: FloatArray
+    rigid_eigenvalues: FloatArray
+    filling: Filling
+    n_zero: int
+
+
+@dataclass(frozen=True)
+class KeyframeSet:
+    """Key-frames to be solved.
+
+    Attributes:
+        surfaces: As the pre-computation sees them.
+        n_vertices: Of each, those included that no face uses.
+        filler: Gives them tetrahedra.
+        n_modes: Number of elastic modes of each.
+        form: Form of the Hessian.
+        report: Called with the index of a key-frame and the stage that it enters.
+        done: Called twice for each key-frame: when it has its tetrahedra, and when it has its modes.
+    """
+
+    surfaces: list[Surface]
+    n_vertices: int
+    filler: Filler
+    n_modes: int
+    form: HessianForm
+    report: Callable[[int, str], None]
+    done: Callable[[], object]
+    _memory: Budget = field(default_factory=lambda: Budget(VERTICES_AT_ONCE))
+
+    def solve_each(self) -> list[Solved]:
+        """With tetrahedra of its own for each."""
+        return run_all(lambda index: self._solved(index, self._own(index)), len(self.surfaces), self.filler.stop)
+
+    def solve_carried(self) -> list[Solved]:
+        """With the tetrahedra of the one that touches itself least, carried to those where they survive that."""
+        first = meshing_order(self.surfaces)[0]
+        own = self._own(first)
+
+        def solve(index: int) -> Solved:
+            return self._solved(index, own if index == first else self._carried(own, index) or self._own(index))
+
+        return run_all(solve, len(self.surfaces), self.filler.stop)
+
+    def _own(self, index: int) -> Filling:
+        """A key-frame with tetrahedra of its own."""
+        surface = self.surfaces[index]
+        with self._naming(index):
+            self.report(index, "tetrahedra")
+            body = self.filler.body(surface)
+        self.done()
+        return Filling(body, surface, body.tetrahedra)
+
+    def _carried(self, other: Filling, index: int) -> Filling | None:
+        """A key-frame with those of another, or None if they do not survive that."""
+        with self._naming(index):
+            self.report(index, "carrying tetrahedra")
+            filling = self.filler.carried(other.body, self.surfaces[index])
+        if filling is not None:
+            self.done()
+        return filling
+
+    def _solved(self, index: int, filling: Filling) -> Solved:
+        """The modes of a key-frame."""
+        with self._naming(index), self._memory.part(len(filling.tetrahedra.vertices)):
+            self.report(index, "modes")
+            solved = solve(self.n_vertices, filling, self.n_modes, self.form, self.filler.cache)
+        self.done()
+        return solved
+
+    def _naming(self, index: int) -> contextlib.AbstractContextManager[None]:
+        return naming_keyframe(index, len(self.surfaces))
+
+
+@contextlib.contextmanager
+def naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
+    """Say in an error which of several key-frames it is about."""
+    try:
+        yield
+    except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
+        if n_keyframes == 1:
+            raise
+        raise type(error)(f"key-frame {index}: {error}") from error
+
+
+def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, cache: Cache) -> Solved:
+    """Modes of the tetrahedra, restricted to the surface, in the caller's units.
+
+    Args:
+        n_vertices: Of the key-frame, those included that no face uses.
+        filling: Its tetrahedra.
+        n_modes: Number of elastic modes.
+        form: Form of the Hessian.
+        cache: Where modes are kept.
+
+    Raises:
+        ModalAnalysisError: The modes failed a check.
+    """
+    tetrahedra, surface = filling.tetrahedra, filling.surface
+
+    def compute() -> dict[str, NDArray[Any]]:
+        solid = lowest_modes(arap_hessian(tetrahedra, form), filling.mass(), tetrahedra.vertices, n_modes)
+        return {
+            "eigenvalues": solid.eigenvalues,
+            "modes": _restrict(filling.weights(), solid),
+            "rigid_eigenvalues": solid.rigid_eigenvalues,
+            "n_zero": np.array([solid.n_zero]),
+        }
+
+    result = cache.get("modes", filling.content(), {"n_modes": int(n_modes), "form": form}, compute)
+    modes = np.zeros((n_modes, n_vertices, 3))
+    # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
+    modes[:, surface.used] = result["modes"] * surface.scale**1.5
+    return Solved(
+        result["eigenvalues"] * surface.scale**2,
+        modes,
+        result["rigid_eigenvalues"] * surface.scale**2,
+        filling,
+        int(result["n_zero"][0]),
+    )
+
+
+def _restrict(weights: sp.csr_matrix, solid: VolumeModes) -> FloatArray:
+    """Modes at the surface points, ``(k, U, 3)``, from columns with interleaved coordinates."""
+    n, k = solid.modes.shape[0] // 3, solid.modes.shape[1]
+    return (weights @ solid.modes.reshape(n, 3 * k)).reshape(-1, 3, k).transpose(2, 0, 1)
