@@ -104,8 +104,8 @@ def coarsen(keyframes: FloatArray, faces: IntArray, n_faces: int = 1000) -> Coar
     """Partition the vertices of all key-frames by the edge collapses of one of them.
 
     Every key-frame is tried as the one that the collapses are chosen on; the partition is kept whose triangles stay
-    fattest over all of them, as thin coarse triangles exaggerate bending and collapse on the way. Regular meshes of flat
-    sides can end in triangles whose corners lie on a line: then somewhat more faces are tried.
+    fattest over all of them, as thin coarse triangles exaggerate bending and collapse on the way. Regular meshes of
+    flat sides can end in triangles whose corners lie on a line: then somewhat more faces are tried.
 
     Args:
         keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
