@@ -226,6 +226,10 @@ def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
     assert_same(batches(tm.ShapeDataset(tmp_path)), first)
     tm.ShapeDataset(tmp_path, times=9)[0]
     assert [path.stat().st_mtime_ns for path in tables] != times
+    # A folder's tables of other shapes are not taken for one's own.
+    moved = bars.pick(1, 0, 2)
+    shapes = tm.ShapeSpace(moved.bases, moved.faces, folder=tmp_path / "set").table(0, 1)
+    assert torch.equal(shapes[0], bars.keyframes[1].float())
     # Where nothing can be written, nothing is.
     for path in tables:
         path.unlink()

@@ -176,8 +176,7 @@ class RandomExtrapolation(_Pairwise):
         after = t > 0.5
         before_end = pair.at(torch.where(after, 2 - t, -t))
         ends = torch.where(after[:, None, None], pair.x_b, pair.x_a)
-        # Either key-frame's weights serve; those of the first spare a factorisation.
-        return mirror(ends, before_end, pair.space.reconstruction(pair.i))
+        return mirror(ends, before_end, pair.space.reconstruction)
 
     def extra_repr(self) -> str:
         """Settings."""

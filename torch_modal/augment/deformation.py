@@ -87,11 +87,12 @@ class RandomModalDeformation(ShapeAugmentation):
     def _deformed(self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, index: int) -> Tensor:
         """Shapes that are nearest to one key-frame. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
         reference = space.reference(index, x)
-        reconstruction = space.reconstruction(index)
+        reconstruction = space.reconstruction
         with torch.no_grad():
             scale, deformed = self._bounded(x.detach(), amplitudes.detach(), space, reference, reconstruction)
-        if torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad):
-            deformed = deform(x, scale[:, None] * amplitudes, reference, reconstruction)
+        if not (torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)):
+            return deformed
+        deformed = deform(x, scale[:, None] * amplitudes, reference, reconstruction)
         # Nothing is left to chance: what does not come within the bound stays as it was.
         with torch.no_grad():
             within = (space.strain(deformed, x).abs() <= self.max_strain).all(1) & (scale > 0)
@@ -100,7 +101,7 @@ class RandomModalDeformation(ShapeAugmentation):
     def _bounded(
         self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, reference: Reference, reconstruction: Reconstruction
     ) -> tuple[Tensor, Tensor]:
-        """How far each draw may go, ``(B,)``, and the shapes that this gives."""
+        """How far each draw may go, ``(B,)``, and the shapes that this gives; where nothing helps, those that came."""
         bound = (1 - _ROUNDING) * self.max_strain
         expected = linear_strain(amplitudes, reference, space.edges.to(x.device))
         scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)

@@ -1,5 +1,6 @@
 """What augmentations know of a connectivity: its key-frames, their modes, and what is made from them when needed."""
 
+import hashlib
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -22,8 +23,9 @@ from torch_modal.stored import StoredSet
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8
 
-# What one space keeps of each kind; the rest is made again when it is needed.
-_N_LAYERS, _N_TABLES, _N_REFERENCES = 4, 16, 4
+# What one space keeps of each kind; the rest is made again when it is needed. Fewer than a batch needs would make all
+# of them again for each batch.
+_N_LAYERS, _N_TABLES, _N_REFERENCES = 32, 64, 16
 
 
 class Recent:
@@ -89,7 +91,7 @@ class ShapeSpace:
         dtype: torch.dtype = torch.float32,
         folder: str | os.PathLike[str] | None = None,
     ) -> None:
-        self.bases = [bases] if isinstance(bases, ModalBasis) else list(bases)
+        self.bases = [basis.to("cpu") for basis in ([bases] if isinstance(bases, ModalBasis) else bases)]
         if not self.bases:
             raise ValueError("a shape space needs one basis or more")
         sizes = {basis.n_vertices for basis in self.bases}
@@ -98,7 +100,7 @@ class ShapeSpace:
         if times is not None and times < 4:
             raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between anew")
         # What is wrong with the faces is said here, and repaired as everywhere.
-        self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces
+        self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.coarse_faces = coarse_faces
         self.tolerance = tolerance
         self.times = times
@@ -113,11 +115,11 @@ class ShapeSpace:
 
     def _forget(self) -> None:
         self._layers, self._tables, self._references = Recent(_N_LAYERS), Recent(_N_TABLES), Recent(_N_REFERENCES)
-        self._reconstructions = Recent(_N_REFERENCES)
         self._edges: Tensor | None = None
+        self._reconstruction: Reconstruction | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        made = ("_layers", "_tables", "_references", "_reconstructions", "_edges")
+        made = ("_layers", "_tables", "_references", "_reconstruction", "_edges")
         return {name: value for name, value in self.__dict__.items() if name not in made}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -142,7 +144,7 @@ class ShapeSpace:
     def edges(self) -> Tensor:
         """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
         if self._edges is None:
-            self._edges = torch.from_numpy(mesh.unique_edges(self.faces.cpu().numpy())[0])
+            self._edges = torch.from_numpy(mesh.unique_edges(self.faces.numpy())[0])
         return self._edges
 
     def keyframes(self, like: Tensor | None = None) -> Tensor:
@@ -156,7 +158,7 @@ class ShapeSpace:
             return torch.zeros(len(x), dtype=torch.int64)
         with torch.no_grad():
             x = x.detach()
-            weights = self.reconstruction(0).areas.to(x)
+            weights = self.reconstruction.areas.to(x)
             distances = [
                 ((best_fit(key.expand_as(x), x, weights).apply(key) - x) ** 2).sum(-1) @ weights
                 for key in self.keyframes(x)
@@ -171,9 +173,12 @@ class ShapeSpace:
         return (after / before.clamp_min(torch.finfo(x.dtype).tiny) - 1).mT
 
     # ------------------------------------------------------------------------------------------- made when needed
-    def reconstruction(self, index: int) -> Reconstruction:
-        """The Poisson problem of the connectivity, weighted by a key-frame."""
-        return self._reconstructions.get(index, lambda: Reconstruction(self.bases[index].reference, self.faces))
+    @property
+    def reconstruction(self) -> Reconstruction:
+        """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
+        if self._reconstruction is None:
+            self._reconstruction = Reconstruction(self.bases[0].reference, self.faces)
+        return self._reconstruction
 
     def reference(self, index: int, like: Tensor) -> Reference:
         """A key-frame for modal deformation, in the dtype and on the device of another tensor."""
@@ -190,7 +195,7 @@ class ShapeSpace:
             slopes = ((modes[:, j] - modes[:, i]) * side).sum(-1) / side.square().sum(-1).clamp_min(1e-300)
             expected = slopes.square().mean(1).sum().sqrt()
             modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
-            own = frames(sides(x[..., None], self.faces.cpu()))
+            own = frames(sides(x[..., None], self.faces))
             return Reference(x.to(like), modes.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
 
         return self._references.get((index, like.dtype, like.device), make)
@@ -215,12 +220,13 @@ class ShapeSpace:
                 "coarse_faces": str(self.coarse_faces),
                 "tolerance": str(self.tolerance),
                 "dtype": str(self.dtype),
+                "bases": self._content(i, j),
             }
             path = None if self.folder is None else self.folder / f"between-{i}-{j}.safetensors"
             kept = None if path is None else read_table(path, settings)
             if kept is not None:
                 return kept
-            x_i, x_j = (self.bases[key].reference.double().cpu() for key in (i, j))
+            x_i, x_j = (self.bases[key].reference.double() for key in (i, j))
             with torch.no_grad():
                 layer = InBetween(
                     [self.bases[i], self.bases[j]],
@@ -235,6 +241,14 @@ class ShapeSpace:
             return table
 
         return self._tables.get((i, j), make)
+
+    def _content(self, i: int, j: int) -> str:
+        """A hash of the key-frames and their eigenvalues, by which a table is known to be theirs."""
+        digest = hashlib.sha256()
+        for basis in (self.bases[i], self.bases[j]):
+            for part in (basis.reference, basis.eigenvalues):
+                digest.update(part.contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     # -------------------------------------------------------------------------------------------------- in-betweens
     def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:
