@@ -13,7 +13,7 @@ columns mean). Times are processor seconds on one thread, best of several: compa
 import argparse
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cases
@@ -27,6 +27,9 @@ from timing import untimed
 
 REFERENCE = "full"
 """The method whose optimum tells which way faces look where there is no truth; it comes first."""
+
+RETRIED = ("not available", "failed")
+"""Notes of rows that are tried again."""
 
 
 def run(case: Case, names: list[str], shapes: dict[str, torch.Tensor]) -> Iterator[Row]:
@@ -79,8 +82,8 @@ def chosen_cases(arguments: argparse.Namespace) -> Iterator[Case]:
     yield from cases.bodies(arguments.body)
 
 
-def parse() -> argparse.Namespace:
-    """The command line."""
+def parse(words: Sequence[str] | None) -> argparse.Namespace:
+    """The command line, or words in its place."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="frames of a motion, or two key-frames")
     parser.add_argument("--shared", action="store_true", help="all data sets that are kept beside the project")
@@ -95,26 +98,25 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--markdown", type=Path, metavar="FILE.md", help="write all tables")
     parser.add_argument("--bars", type=Path, metavar="FILE.png", help="draw the errors as bars")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     named = ("folders", "shared", "samples", "bodies", "irregular", "body")
     if not any(getattr(arguments, name) for name in named):
         parser.error("name a folder of frames, or --shared, --samples, --bodies, --irregular or --body")
     return arguments
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Run what is missing, print and write tables."""
-    arguments = parse()
+    arguments = parse(words)
     if arguments.peer_python:
         os.environ["TORCH_MODAL_PEER_PYTHON"] = str(arguments.peer_python)
-    torch.set_num_threads(1)
     rows = load_rows(arguments.results)
     drawn: list[tuple[Case, dict[str, torch.Tensor]]] = []
     shown: list[Row] = []
     for case in chosen_cases(arguments):
         if not any(text in case.name for text in arguments.only):
             continue
-        known = {row.method: row for row in rows if row.case == case.name}
+        known = {row.method: row for row in rows if row.case == case.name and not row.note.startswith(RETRIED)}
         missing = [name for name in arguments.methods if name not in known or arguments.sheet]
         shapes: dict[str, torch.Tensor] = {}
         if missing:
@@ -137,4 +139,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)
     main()
