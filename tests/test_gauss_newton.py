@@ -211,7 +211,7 @@ def test_one_bad_sample_spoils_no_other(layer: MidShape, bars: Shapes) -> None:
     assert solution.converged.tolist() == [True, False, True]
     assert solution.gradient_norm[1].isnan()
     for i in (0, 2):
-        torch.testing.assert_close(solution.amplitudes[i], alone.amplitudes[i], rtol=0, atol=1e-8)
+        torch.testing.assert_close(solution.amplitudes[i], alone.amplitudes[i], rtol=0, atol=1e-7)
         assert solution.n_steps[i] == alone.n_steps[i]
 
 
