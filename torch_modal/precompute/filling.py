@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from torch_modal.precompute.arap import consistent_mass
+from torch_modal.precompute.arap import mass_matrix
 from torch_modal.precompute.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier, self_proximity
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
@@ -87,7 +87,7 @@ class Filling:
     def mass(self) -> sp.csr_matrix:
         """Mass matrix at a density of 1 in this pose. *Shape:* ``(N, N)``."""
         rest = self.body.tetrahedra
-        return consistent_mass(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
+        return mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
 
     def weights(self) -> sp.csr_matrix:
         """How the surface hangs on the tetrahedra. *Shape:* ``(U, N)``."""

@@ -19,7 +19,7 @@ DENSE_BELOW = 600
 BLOCK = 8
 """Vectors in one step. Solves for several at once are three times as fast, and an eigenvalue may have as many equal
 ones; a single starting vector meets only one of each (and the rest by rounding)."""
-TOLERANCE = 1e-9
+TOLERANCE = 1e-8
 """Largest residual of a wanted pair of the inverted problem, relative to its eigenvalue."""
 
 
@@ -128,7 +128,7 @@ def _block_lanczos(
         residuals = np.linalg.norm(coupling @ rotation[start:stop], axis=0)
         if (residuals <= TOLERANCE * np.abs(values)).all():
             return values, basis[:, :stop] @ rotation
-        check_at = stop + 4 * BLOCK
+        check_at = stop + 2 * BLOCK
     raise NoConvergenceError(f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns")
 
 
