@@ -10,6 +10,7 @@ import scipy.linalg
 import scipy.sparse as sp
 import torch
 from conftest import COARSE
+from quadratic import quadratic_modes
 from solids import box, surface, together
 
 from torch_modal.keyframes import MeshError, MeshWarning
@@ -108,6 +109,20 @@ def test_vibrations_of_a_bar() -> None:
     # Averaged around edges, hardly: less with two cells across than otherwise with four.
     assert coarse > 1.4
     assert np.abs(np.array(ratios["edge"]) - 1).max() < min(0.25, fine - 1)
+
+
+def test_coarse_tetrahedra_against_quadratic_ones() -> None:
+    """A plate on a block, one cell thin: what the default gives on them is what ten nodes each give, nearly."""
+    solid = box((8, 4, 4), (4.0, 2.0, 2.0), jitter=0.1)
+    centres = solid.vertices[solid.tets].mean(axis=1)
+    kept = solid.tets[(centres[:, 0] < 2.0) | (centres[:, 2] < 0.5)]
+    used, compact = np.unique(kept, return_inverse=True)
+    solid = Tetrahedra(solid.vertices[used], compact.reshape(-1, 4))
+    truth = quadratic_modes(solid, 12)
+    edge, element = (solve(solid, 12, form).eigenvalues / truth.eigenvalues for form in ("edge", "element"))
+    assert np.abs(edge - 1).max() < 0.25
+    assert np.abs(edge - 1).mean() < 0.1
+    assert element.max() > 2.0, "the plate bends too stiffly with linear tetrahedra"
 
 
 def test_eigenvalues_and_modes_scale_with_the_unit() -> None:
