@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "torch_modal"
 ORDER = [
     ["version", "errors", "files", "mesh", "inspect_mesh"],
     ["arrays", "basis", "export", "mesh_files", "rigid"],
+    ["drawing"],
     ["keyframes", "picture"],
     ["precompute", "precompute._tetwild_worker", "precompute.cache", "precompute.coarsening", "precompute.parallel"],
     ["precompute.surface", "precompute.mass"],
