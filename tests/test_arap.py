@@ -9,7 +9,7 @@ import scipy.sparse as sp
 import torch
 from solids import box, together
 
-from torch_modal.precompute.arap import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, consistent_mass, lumped_mass
+from torch_modal.precompute.arap import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, lumped_mass, mass_matrix
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
 
 
@@ -139,7 +139,7 @@ def test_inverted_tetrahedra_count_with_their_magnitude(solid: Tetrahedra) -> No
     turned = Tetrahedra(solid.vertices, solid.tets.copy())
     turned.tets[::3] = turned.tets[::3][:, [1, 0, 2, 3]]
     np.testing.assert_allclose(lumped_mass(turned), lumped_mass(solid))
-    np.testing.assert_allclose(consistent_mass(turned).toarray(), consistent_mass(solid).toarray())
+    np.testing.assert_allclose(mass_matrix(turned).toarray(), mass_matrix(solid).toarray())
     for form in HESSIAN_FORMS:
         np.testing.assert_allclose(
             arap_hessian(turned, form).toarray(), arap_hessian(solid, form).toarray(), atol=1e-12
@@ -152,17 +152,18 @@ def test_mass_is_the_volume() -> None:
     mass = lumped_mass(two)
     assert mass.sum() == pytest.approx(6.125)
     assert (mass > 0).all()
-    np.testing.assert_allclose(np.asarray(consistent_mass(two).sum(axis=1)).reshape(-1), mass)
+    np.testing.assert_allclose(np.asarray(mass_matrix(two).sum(axis=1)).reshape(-1), mass)
 
 
-def test_consistent_mass_integrates_products_of_linear_functions() -> None:
-    brick = box((3, 2, 4), (1.0, 2.0, 3.0), jitter=0.0)
+def test_mass_matrix_is_half_consistent_and_half_lumped() -> None:
+    brick = box((3, 2, 4), (1.0, 2.0, 3.0))
     x, y, z = brick.vertices.T
-    m = consistent_mass(brick)
-    assert x @ (m @ x) == pytest.approx(2.0)  # ∫ x² = 1/3 * 2 * 3
-    assert y @ (m @ z) == pytest.approx(1.0 * 2.0 * 4.5)  # ∫ y z
+    m, lumped = mass_matrix(brick), lumped_mass(brick)
+    # A consistent mass integrates products of linear functions exactly.
+    assert x @ (m @ x) == pytest.approx(2.0 / 2 + lumped @ x**2 / 2)  # ∫ x² = 1/3 * 2 * 3
+    assert y @ (m @ z) == pytest.approx(9.0 / 2 + lumped @ (y * z) / 2)
     half = Tetrahedra(brick.vertices, brick.tets, np.full(len(brick.tets), 0.5))
-    assert x @ (consistent_mass(half) @ x) == pytest.approx(1.0)
+    np.testing.assert_allclose(mass_matrix(half).toarray(), m.toarray() / 2)
     assert sp.issparse(m) and abs(m - m.T).max() < 1e-15
 
 

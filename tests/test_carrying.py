@@ -7,7 +7,7 @@ from bodies import bend
 from solids import box, surface
 
 from torch_modal.precompute import filling, modes
-from torch_modal.precompute.arap import arap_hessian, consistent_mass
+from torch_modal.precompute.arap import arap_hessian, mass_matrix
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, self_proximity
 from torch_modal.precompute.eigen import lowest_modes
@@ -59,7 +59,7 @@ def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) ->
     carried = Filling(Body(bar, BAR), Surface(points, COMPACT, USED, 1.0), carrier.carry(points).tetrahedra)
     truth = Tetrahedra(bent(BAR.vertices, np.pi), BAR.tets)
     found = lowest_modes(arap_hessian(carried.tetrahedra), carried.mass(), carried.tetrahedra.vertices, 8)
-    wanted = lowest_modes(arap_hessian(truth), consistent_mass(truth), truth.vertices, 8)
+    wanted = lowest_modes(arap_hessian(truth), mass_matrix(truth), truth.vertices, 8)
     np.testing.assert_allclose(found.eigenvalues, wanted.eigenvalues, rtol=0.05)
     np.testing.assert_allclose(carried.weights() @ carried.tetrahedra.vertices, points, atol=1e-10)
     assert carried.mass().sum() == pytest.approx(np.abs(tet_volumes(truth)).sum(), rel=0.01)

@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "torch_modal"
 ORDER = [
     ["version", "errors", "files", "mesh", "inspect_mesh", "processes"],
     ["arrays", "basis", "export", "mesh_files", "rigid"],
+    ["drawing"],
     ["keyframes", "picture", "stored"],
     ["precompute", "precompute._tetwild_worker", "precompute.cache", "precompute.coarsening", "precompute.parallel"],
     ["precompute.surface", "precompute.mass"],

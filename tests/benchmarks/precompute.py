@@ -1,9 +1,10 @@
 """What the pre-computation costs and gives, as ratios measured in one run, with nothing taken from a cache.
 
-    python tests/benchmarks/precompute.py [--samples DIR] [--data DIR] [--parts speed memory carrying capture]
+    python tests/benchmarks/precompute.py [--samples DIR] [--data DIR] [--parts speed memory carrying solvers capture]
 
-Each line says what is asked for, in brackets. Times are wall-clock and processor seconds of this run and its children;
-compare the ratios, and the processor seconds if the machine is shared.
+Each line says what is asked for, in brackets. ``--parts capture`` prints the table of modes against fine references:
+half an hour, most of it for the references, which ``--keep DIR`` keeps for the next time. Times are wall-clock and
+processor seconds of this run and its children; compare the ratios, and the processor seconds if the machine is shared.
 """
 
 import argparse
@@ -19,26 +20,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 import torch
+from capture import table
 from numpy.typing import NDArray
+from solvers import solvers
 
 import torch_modal as tm
-from torch_modal.mesh import unique_edges, vertex_areas
-from torch_modal.precompute.arap import arap_hessian, hat_gradients, lumped_mass
-from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
-from torch_modal.precompute.modes import QUALITIES
-from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
+from torch_modal.mesh import unique_edges
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ROOT = Path(__file__).parents[2]
 BARE = {"edge_length_fac": 0.03, "epsilon": 2e-3}
-FULL = TetrahedraSettings(edge_length_fac=0.03, epsilon=2e-3, stop_energy=10.0, max_surface_faces=10**8)
-REFERENCE = TetrahedraSettings(edge_length_fac=0.0125, epsilon=5e-4, stop_energy=10.0, max_surface_faces=10**8)
 N_MODES = 30
+PARTS = ("speed", "memory", "carrying", "solvers", "capture")
+MORE = {"hand": "mh-hand-path", "woman": "mh-woman"}
 
 
 class Cost(NamedTuple):
@@ -90,34 +86,35 @@ def sample(folder: Path, pattern: str = "key-*") -> tuple[FloatArray, IntArray]:
     return keyframes.numpy(), faces.numpy()
 
 
-def speed(keyframes: FloatArray, faces: IntArray) -> None:
-    """Bases of six key-frames against one bare call of the mesher on one of them."""
-    keyframes, faces = refined(keyframes, faces, 8431)
-
-    def bare(folder: str) -> None:
-        # In a process of its own like ours: it replaces signal handlers. Its start counts for both.
-        code = (
-            "import json, sys, numpy as np, pytetwild\nd = np.load(sys.argv[1])\n"
-            "pytetwild.tetrahedralize(d['v'], d['f'].astype(np.int32), **json.loads(sys.argv[2]))"
-        )
-        subprocess.run([sys.executable, "-c", code, "bare.npz", json.dumps(BARE)], check=True, cwd=folder)
-
+def bare_call(vertices: FloatArray, faces: IntArray) -> Cost:
+    """One call of the mesher, in a process of its own like ours: it replaces signal handlers. Its start counts."""
+    code = (
+        "import json, sys, numpy as np, pytetwild\nd = np.load(sys.argv[1])\n"
+        "pytetwild.tetrahedralize(d['v'], d['f'].astype(np.int32), **json.loads(sys.argv[2]))"
+    )
+    command = [sys.executable, "-c", code, "bare.npz", json.dumps(BARE)]
     with tempfile.TemporaryDirectory() as folder:
-        np.savez(Path(folder) / "bare.npz", v=keyframes[0], f=faces)
-        reference = measured(lambda: bare(folder))
-    n = keyframes.shape[1]
-    print(f"one bare pytetwild call, {n} vertices: {reference.wall:.1f} s, {reference.processor:.1f} cpu")
+        np.savez(Path(folder) / "bare.npz", v=vertices, f=faces)
+        return measured(lambda: subprocess.run(command, check=True, cwd=folder))
+
+
+def speed(name: str, keyframes: FloatArray, faces: IntArray) -> None:
+    """Bases of all key-frames against one bare call of the mesher on one of them."""
+    reference = bare_call(keyframes[0], faces)
+    what = f"{len(keyframes)} bases of 50 modes, {name}, {keyframes.shape[1]} vertices"
+    print(f"{name}, one bare pytetwild call: {reference.wall:.1f} s, {reference.processor:.1f} cpu")
     ways: list[tuple[str, float | None, dict[str, Any]]] = [
         ("carried (default)", 0.7, {}),
         ("lattice", 0.4, {"mesher": "lattice"}),
         ("own tetrahedra for each", None, {"carry": False}),
     ]
-    for name, bound, chosen in ways:
+    for way, bound, chosen in ways:
         cost = measured(lambda chosen=chosen: tm.extract_bases(keyframes, faces, 50, cache=False, **chosen))
         asked = "" if bound is None else f" [at most {bound}]"
         print(
-            f"six bases of 50 modes, {name}: {cost.wall:.1f} s, {cost.processor:.1f} cpu; against the bare call: "
-            f"{cost.wall / reference.wall:.2f} wall{asked}, {cost.processor / reference.processor:.2f} cpu"
+            f"{what}, {way}: {cost.wall:.1f} s, {cost.processor:.1f} cpu; against the bare call: "
+            f"{cost.wall / reference.wall:.2f} wall{asked}, {cost.processor / reference.processor:.2f} cpu",
+            flush=True,
         )
 
 
@@ -164,79 +161,25 @@ def carrying(sets: dict[str, tuple[FloatArray, IntArray, list[tuple[int, int]]]]
             )
 
 
-def clamped_weights(surface: Surface, tetrahedra: Tetrahedra) -> sp.csr_matrix:
-    """The usual embedding: barycentric coordinates in the closest tetrahedron, negative ones set to zero."""
-    tets = closest_tetrahedra(surface.points, tetrahedra)
-    corners = tetrahedra.tets[tets]
-    offset = surface.points - tetrahedra.vertices[corners].mean(axis=1)
-    weights = np.clip(0.25 + np.einsum("vi,vai->va", offset, hat_gradients(tetrahedra)[tets]), 0, None)
-    weights /= weights.sum(axis=1, keepdims=True)
-    rows = np.repeat(np.arange(len(corners)), 4)
-    shape = (len(corners), len(tetrahedra.vertices))
-    return sp.csr_matrix((weights.reshape(-1), (rows, corners.reshape(-1))), shape=shape)
-
-
-def capture(name: str, vertices: FloatArray, faces: IntArray) -> None:
-    """How much of the mode space of a fine reference other settings hold, and how rough their modes are."""
-    surface = Surface.of(vertices, faces)
-    areas = np.repeat(np.sqrt(vertex_areas(surface.points, surface.faces)), 3)[:, None]
-    shell = tm.ShellEnergy(torch.from_numpy(surface.faces.copy()))
-    rest = torch.from_numpy(surface.points)
-
-    def at_surface(weights: sp.csr_matrix, modes: FloatArray) -> FloatArray:
-        n = len(modes) // 3
-        return (weights @ modes.reshape(n, -1)).reshape(3 * len(surface.points), -1)
-
-    def roughness(modes: FloatArray) -> FloatArray:
-        moved = [0.1 * column / np.sqrt((column**2).mean()) for column in modes.T]
-        return np.array([float(shell(rest + torch.from_numpy(u.reshape(-1, 3)), rest)) for u in moved])
-
-    axes = np.eye(3)
-    rigid = [np.broadcast_to(axis, surface.points.shape) for axis in axes]
-    rigid += [np.cross(axis, surface.points) for axis in axes]
-    rigid_span = np.linalg.qr(areas * np.stack([r.reshape(-1) for r in rigid], axis=1))[0]
-
-    def span(modes: FloatArray) -> FloatArray:
-        weighted = areas * modes
-        return np.linalg.qr(weighted - rigid_span @ (rigid_span.T @ weighted))[0]
-
-    found = {}
-    ways = {"reference": REFERENCE, "fast": QUALITIES["fast"], "full": FULL, "fine": QUALITIES["fine"]}
-    for way, settings in ways.items():
-        start = time.perf_counter()
-        tetrahedra = tetrahedralize(surface.points, surface.faces, settings)
-        seconds = time.perf_counter() - start
-        solid = lowest_modes(arap_hessian(tetrahedra), lumped_mass(tetrahedra), tetrahedra.vertices, N_MODES)
-        smooth = at_surface(embed_surface(surface.points, tetrahedra, surface.normals), solid.modes)
-        found[way] = (smooth, seconds, len(tetrahedra.vertices))
-        if way == "fast":
-            clamped = at_surface(clamped_weights(surface, tetrahedra), solid.modes)
-            found["fast, clamped"] = (clamped, seconds, len(tetrahedra.vertices))
-    reference = found["reference"][0]
-    fine_span, fine_roughness = span(reference), roughness(reference)
-    for way, (modes, seconds, n) in found.items():
-        held = float(((span(modes).T @ fine_span) ** 2).sum() / N_MODES)
-        rough = float(np.median(roughness(modes) / fine_roughness))
-        print(
-            f"{name}, {way}: {seconds:.1f} s of meshing, {n} vertices; captured {held:.3f} [at least 0.95], median "
-            f"shell energy of a mode {rough:.2f} of the reference's"
-        )
-
-
 def main() -> None:
     """Run the parts asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--samples", type=Path, default=ROOT / "torch_modal" / "samples")
     more = ROOT.parent / "shared" / "data"
     parser.add_argument("--data", type=Path, default=more, help="more meshes, if they are there")
-    parser.add_argument("--parts", nargs="+", default=["speed", "memory", "carrying", "capture"])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--runs", type=int, default=3, help="of the default in the table of captured modes")
+    parser.add_argument("--keep", type=Path, help="folder in which references are kept")
     parser.add_argument("--in-child", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     creature = sample(arguments.samples / "creature")
     if "speed" in arguments.parts:
-        speed(*creature)
+        speed("creature, split edges", *refined(*creature, 8431))
+        speed("creature", *creature)
+        if arguments.data.is_dir():
+            speed("woman", *sample(arguments.data / MORE["woman"], "0*"))
     if "memory" in arguments.parts:
         memory(*creature)
     if "carrying" in arguments.parts:
@@ -245,15 +188,18 @@ def main() -> None:
             "sculpted hand": (*sample(arguments.samples / "hand"), [(0, 1)]),
         }
         if arguments.data.is_dir():
-            sets["hand"] = (*sample(arguments.data / "mh-hand-path", "0*"), [(0, 8), (0, 4), (4, 8)])
-            sets["woman"] = (*sample(arguments.data / "mh-woman", "0*"), [(0, 1), (0, 2), (1, 2)])
+            sets["hand"] = (*sample(arguments.data / MORE["hand"], "0*"), [(0, 8), (0, 4), (4, 8)])
+            sets["woman"] = (*sample(arguments.data / MORE["woman"], "0*"), [(0, 1), (0, 2), (1, 2)])
         carrying(sets)
+    if "solvers" in arguments.parts:
+        solvers(creature[0][0], creature[1])
     if "capture" in arguments.parts:
-        capture("creature", creature[0][0], creature[1])
+        meshes = [("creature", creature[0][0], creature[1])]
         if arguments.data.is_dir():
-            for name in ("mh-hand-path", "mh-woman"):
-                keyframes, faces = sample(arguments.data / name, "0*")
-                capture(name, keyframes[0], faces)
+            for name in ("hand", "woman"):
+                keyframes, faces = sample(arguments.data / MORE[name], "0*")
+                meshes.append((name, keyframes[0], faces))
+        table(meshes, arguments.runs, arguments.keep)
 
 
 if __name__ == "__main__":

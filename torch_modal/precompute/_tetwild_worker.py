@@ -14,9 +14,13 @@ del sys.path[0]
 import ctypes  # noqa: E402
 import os  # noqa: E402
 import signal  # noqa: E402
+import traceback  # noqa: E402
 import types  # noqa: E402
 
 import numpy as np  # noqa: E402
+
+MESHER_RAISED = 3
+"""Exit code; tetrahedra.py, which this script cannot import, has the same."""
 
 
 def main(job_path: str, result_path: str) -> None:
@@ -51,14 +55,20 @@ def main(job_path: str, result_path: str) -> None:
             np.ascontiguousarray(vertices), faces, target_count=max_surface_faces, agg=7
         )
 
-    points, tets = _pytetwild().tetrahedralize(
-        np.ascontiguousarray(vertices, dtype=np.float64),
-        np.ascontiguousarray(faces, dtype=np.int32),
-        edge_length_fac=edge_length_fac,
-        epsilon=epsilon,
-        stop_energy=stop_energy,
-        num_threads=_threads(),
-    )
+    tetrahedralize = _pytetwild().tetrahedralize
+    try:
+        points, tets = tetrahedralize(
+            np.ascontiguousarray(vertices, dtype=np.float64),
+            np.ascontiguousarray(faces, dtype=np.int32),
+            edge_length_fac=edge_length_fac,
+            epsilon=epsilon,
+            stop_energy=stop_energy,
+            num_threads=_threads(),
+        )
+    except (RuntimeError, ValueError):
+        # Told apart from a missing library or too little memory: the parent remembers it.
+        traceback.print_exc()
+        sys.exit(MESHER_RAISED)
     np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))
 
 

@@ -88,25 +88,47 @@ class Cache:
         Warns:
             CacheWarning: The folder cannot be written.
         """
+        kept = self.find(kind, inputs, parameters)
+        return self.keep(kind, inputs, parameters, compute()) if kept is None else kept
+
+    def find(self, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Arrays | None:
+        """The kept result, if there is one; arguments as for :meth:`get`."""
+        return None if self.folder is None else _read(self._path(self.folder, kind, inputs, parameters))
+
+    def keep(
+        self,
+        kind: str,
+        inputs: Mapping[str, NDArray[Any]],
+        parameters: Mapping[str, Any],
+        result: Mapping[str, NDArray[Any]],
+    ) -> Arrays:
+        """Keep a result, instead of what was kept before; arguments as for :meth:`get`.
+
+        Returns:
+            The arrays of the result.
+
+        Warns:
+            CacheWarning: The folder cannot be written.
+        """
         if self.folder is None:
-            return dict(compute())
-        key = content_key(kind, inputs, parameters)
-        path = self.folder / f"{kind}-{key}{SUFFIX}"
-        kept = _read(path)
-        if kept is not None:
-            return kept
-        arrays = {name: np.ascontiguousarray(array) for name, array in compute().items()}
+            return dict(result)
+        arrays = {name: np.ascontiguousarray(array) for name, array in result.items()}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            path = self._path(self.folder, kind, inputs, parameters)
             write_atomically(path, save_arrays({**arrays, _DIGEST: _digest(arrays)}))
         except OSError as error:
             warnings.warn(
                 f"cannot keep {kind} in the cache folder {self.folder} ({error}); set {CACHE_VARIABLE} or "
                 "cache_dir to a folder that can be written",
                 CacheWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
         return arrays
+
+    @staticmethod
+    def _path(folder: Path, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Path:
+        return folder / f"{kind}-{content_key(kind, inputs, parameters)}{SUFFIX}"
 
 
 class CacheContent(NamedTuple):

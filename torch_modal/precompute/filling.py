@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from torch_modal.precompute.arap import consistent_mass
+from torch_modal.precompute.arap import mass_matrix
 from torch_modal.precompute.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier, self_proximity
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
@@ -87,7 +87,7 @@ class Filling:
     def mass(self) -> sp.csr_matrix:
         """Mass matrix at a density of 1 in this pose. *Shape:* ``(N, N)``."""
         rest = self.body.tetrahedra
-        return consistent_mass(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
+        return mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
 
     def weights(self) -> sp.csr_matrix:
         """How the surface hangs on the tetrahedra. *Shape:* ``(U, N)``."""
@@ -135,19 +135,40 @@ class Filler:
         return Body(surface, self._kept("lattice", surface, self._by_lattice), problem)
 
     def _by_tetwild(self, surface: Surface) -> Tetrahedra:
-        return tetrahedralize(surface.points, surface.faces, self.settings, timeout=self.timeout, stop=self.stop)
+        """By fTetWild, unless it is known to fail: nobody should wait for the same failure twice."""
+        inputs, parameters = _content(surface), asdict(self.settings)
+        if (failure := self.cache.find("failure", inputs, parameters)) is not None:
+            self._raise_known(failure)
+        try:
+            return tetrahedralize(surface.points, surface.faces, self.settings, timeout=self.timeout, stop=self.stop)
+        except TetrahedralizationError as error:
+            if error.fails_until > 0:
+                reason = np.frombuffer(str(error).encode(), dtype=np.uint8)
+                self.cache.keep(
+                    "failure", inputs, parameters, {"reason": reason, "fails_until": np.array([error.fails_until])}
+                )
+            raise
+
+    def _raise_known(self, failure: Arrays) -> None:
+        """Raise what an earlier run found, if the timeout is no longer than it was."""
+        fails_until = float(failure["fails_until"][0])
+        if self.timeout > fails_until:
+            return
+        longer = f"give a timeout of more than {fails_until:g} s, " if np.isfinite(fails_until) else ""
+        raise TetrahedralizationError(
+            f"{failure['reason'].tobytes().decode()}. An earlier run found this for the same surface and settings, and "
+            f"it was not tried again; to try again, {longer}clear the cache in {self.cache.folder} (torch-modal cache "
+            "--clear), or do without it"
+        )
 
     def _by_lattice(self, surface: Surface) -> Tetrahedra:
         return lattice(surface, self.settings.edge_length(surface.points, surface.faces))
 
     def _kept(self, mesher: str, surface: Surface, make: Callable[[Surface], Tetrahedra]) -> Tetrahedra:
-        arrays = self.cache.get(
-            "tetrahedra",
-            {"points": surface.points, "faces": surface.faces},
-            {**asdict(self.settings), "mesher": mesher},
-            lambda: _as_arrays(make(surface)),
+        parameters = {**asdict(self.settings), "mesher": mesher}
+        return Tetrahedra(
+            **self.cache.get("tetrahedra", _content(surface), parameters, lambda: _as_arrays(make(surface)))
         )
-        return Tetrahedra(**arrays)
 
     def carried(self, body: Body, surface: Surface) -> Filling | None:
         """The body in the pose of another key-frame, or None if its tetrahedra do not survive that."""
@@ -161,6 +182,11 @@ class Filler:
         if not kept["is_good"][0]:
             return None
         return Filling(body, surface, body.tetrahedra._replace(vertices=kept["vertices"]))
+
+
+def _content(surface: Surface) -> Arrays:
+    """What tetrahedra depend on, for the cache."""
+    return {"points": surface.points, "faces": surface.faces}
 
 
 def _as_arrays(tetrahedra: Tetrahedra) -> dict[str, NDArray[Any]]:

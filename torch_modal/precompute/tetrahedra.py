@@ -1,5 +1,6 @@
 """A surface filled with tetrahedra, by fTetWild in a process of its own."""
 
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,9 +27,14 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
-EDGES_PER_THICKNESS = 0.55
+EDGES_PER_THICKNESS = 0.65
 EDGE_RANGE = (0.018, 0.04)
 """Slender shapes need finer tetrahedra: with one across a limb it is far too stiff. Bulky ones would get too many."""
+
+MESHER_RAISED = 3
+"""Exit code of the worker when the mesher itself raised, and not, say, its import."""
+_OWN_FAILURES = {MESHER_RAISED, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGABRT", "SIGFPE", "SIGBUS"))}
+"""Ends that are fTetWild's doing. Others, such as SIGKILL, come from outside."""
 
 DEBRIS = 0.01
 """Largest volume of a piece that is dropped if it only hangs on others, as a fraction of the whole."""
@@ -53,8 +59,8 @@ class TetrahedraSettings:
     """How fine the tetrahedra are. The defaults take 3 to 5 s on meshes of 3k to 27k faces.
 
     Attributes:
-        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about half of the
-            mean thickness (twice the volume over the area), from 0.018 to 0.04.
+        edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two
+            thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04.
         epsilon: How far the tetrahedra may leave the surface, as a fraction of the bounding-box diagonal.
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is
             10).
@@ -95,7 +101,14 @@ class TetrahedraSettings:
 
 
 class TetrahedralizationError(RuntimeError):
-    """No usable tetrahedra came out; the message says for which mesh, why, and what to do."""
+    """No usable tetrahedra came out; the message says for which mesh, why, and what to do.
+
+    Attributes:
+        fails_until: The same call fails again with any timeout up to this, in seconds: infinity where the mesher
+            cannot do it, zero where it was not its fault.
+    """
+
+    fails_until: float = 0.0
 
 
 def tetrahedralize(
@@ -204,9 +217,11 @@ class _Failure(NamedTuple):
     n_vertices: int
     n_faces: int
 
-    def error(self, why: str, advice: str) -> TetrahedralizationError:
+    def error(self, why: str, advice: str, fails_until: float = np.inf) -> TetrahedralizationError:
         mesh = f"a mesh of {self.n_vertices} vertices and {self.n_faces} faces"
-        return TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {why}. {advice}")
+        error = TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {why}. {advice}")
+        error.fails_until = fails_until
+        return error
 
 
 def _run_worker(
@@ -220,7 +235,7 @@ def _run_worker(
     """Hand the surface to the worker process, wait for it, read what it wrote."""
     if not sys.executable:
         raise failure.error(
-            "sys.executable is empty, so no worker process can be started", "Run in a normal interpreter"
+            "sys.executable is empty, so no worker process can be started", "Run in a normal interpreter", 0.0
         )
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
         job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
@@ -245,18 +260,20 @@ def _run_worker(
             raise failure.error(
                 f"no result after the timeout of {timeout:g} s",
                 "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections",
+                timeout,
             )
         if code != 0:
             tail = last_line(log.read_text(errors="replace"))
             raise failure.error(
                 f"the worker process ended with {describe_exit(code)}" + (f" ({tail})" if tail else ""),
                 "Check the surface for self-intersections and degenerate faces, or try other settings",
+                np.inf if code in _OWN_FAILURES else 0.0,
             )
         try:
             with np.load(result) as arrays:
                 return Tetrahedra(arrays["vertices"], arrays["tets"])
         except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise failure.error(f"the worker process left no readable result ({error})", "Try again") from error
+            raise failure.error(f"the worker process left no readable result ({error})", "Try again", 0.0) from error
 
 
 def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Event) -> int | None:
