@@ -25,7 +25,7 @@ ORDER = [
     ["precompute.solving"],
     ["precompute.modes"],
     ["nn", "nn.shell"],
-    ["nn.curvature"],
+    ["nn.curvature", "nn.linearised"],
     ["nn.modal_shell"],
     ["nn.surface"],
     ["nn.frame", "nn.gauss_newton"],

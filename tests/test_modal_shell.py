@@ -8,8 +8,9 @@ from torch import Tensor
 from torch.func import hessian, jacfwd
 
 from torch_modal.nn import curvature
-from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement, Reference
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.nn.linearised import Reference
+from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement
+from torch_modal.nn.shell import Measures, Rest, ShellEnergy
 
 N, BATCH = 5, 3
 MOEBIUS = [[i, (i + 1) % 7, (i + 2) % 7] if i % 2 == 0 else [(i + 1) % 7, i, (i + 2) % 7] for i in range(7)]
@@ -97,6 +98,32 @@ def test_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) ->
     assert relative(got.gauss_newton, truth) > 1e-2, "at rest there would be nothing to see"
     assert got.second_order is not None
     assert relative(got.gauss_newton + got.second_order, truth) < 1e-11
+
+
+@pytest.mark.parametrize("extra", [False, True])
+def test_pull_back_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) -> None:
+    case = Case(*surface_of, extra)
+    place, rests = case.placement, [reference.rest for reference in case.placement.references]
+    along = torch.randn(case.a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    leaves = [place.base, *([place.extra] if extra else []), *case.pulls]
+    leaves += [tensor for rest in rests for measures in rest for tensor in measures]
+    leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+
+    values = iter(leaves)
+    base, own = next(values), next(values) if extra else None
+    pulls = [next(values) for _ in rests]
+    fields = [[Measures(*(next(values) for _ in range(3))) for _ in range(2)] for _ in rests]
+    tracked = [Reference(Rest(*parts), pull) for parts, pull in zip(fields, pulls, strict=True)]
+    moved = Placement(base, own, tracked)
+    slope = (case.modal.derivatives(case.a, moved, second_order=False).gradient * along).sum()
+    truth = torch.autograd.grad(slope, leaves)
+
+    got = case.modal.pull_back(case.a, along, place)
+    found = [got.base, *([got.extra] if extra else []), *(reference.pull for reference in got.references)]
+    found += [tensor for reference in got.references for measures in reference.rest for tensor in measures]
+    for value, wanted in zip(found, truth, strict=True):
+        assert value is not None
+        assert relative(value, wanted) < 1e-11
 
 
 @pytest.mark.parametrize("stiffness", [(500.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 1000.0)])

@@ -8,9 +8,9 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
-from torch_modal.nn.modal_shell import Reference, energy_of
+from torch_modal.nn.linearised import Reference, energy_of, gradient, linearise
 from torch_modal.nn.shell import ShellEnergy
-from torch_modal.nn.surface import RIDGE, ConvexHessian, gradient, linearise, relax
+from torch_modal.nn.surface import RIDGE, ConvexHessian, relax
 
 BATCH = 2
 

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from torch_modal import mesh
 from torch_modal.nn.frame import DIAGONAL
-from torch_modal.nn.modal_shell import Reference, energy_of
+from torch_modal.nn.linearised import Linearised, Reference, energy_of, gradient, linearise
 from torch_modal.nn.shell import Measures, Rest, ShellEnergy, cross, dihedral_hessian, length_hessian, pick, wrap_angle
-from torch_modal.nn.surface import Linearised, gradient, linearise
 from torch_modal.rigid import best_fit
 
 STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)

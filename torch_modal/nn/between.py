@@ -13,7 +13,7 @@ from torch_modal.nn.frame import DIAGONAL, Frame, Pair
 from torch_modal.nn.gauss_newton import GaussNewtonStep, Solution, Status
 from torch_modal.nn.implicit import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.joint import JointSpace
-from torch_modal.nn.modal_shell import Reference
+from torch_modal.nn.linearised import Reference
 from torch_modal.nn.paired import PairedSpace
 from torch_modal.nn.shell import ShellEnergy, Stiffness, enclosed_volume, per_sample
 from torch_modal.nn.surface import relax

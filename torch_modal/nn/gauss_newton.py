@@ -34,8 +34,8 @@ class AmplitudeEnergy(Protocol):
     def second_order(self, a: Tensor, placement: Any) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
 
-    def slope(self, a: Tensor, direction: Tensor, placement: Any) -> Tensor:
-        """Derivative of the energy along a direction. *Shape:* ``(B, n), (B, n) -> (B,)``."""
+    def pull_back(self, a: Tensor, direction: Tensor, placement: Any) -> Any:
+        """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
 
 
 class Step(NamedTuple):

@@ -59,7 +59,8 @@ class _ArgMin(torch.autograd.Function):
         amplitudes, status, *inputs = ctx.saved_tensors
         energy = minimisation.step.energy
         converged = status == Status.CONVERGED
-        derivatives = energy.derivatives(amplitudes, minimisation.placement(*inputs), second_order=True)
+        placement = minimisation.placement(*inputs)
+        derivatives = energy.derivatives(amplitudes, placement, second_order=True)
         hessian = minimisation.step.ridged(derivatives.gauss_newton + derivatives.second_order)
         hessian = torch.where(converged[:, None, None], hessian, torch.eye(len(hessian[0])).to(hessian))
         adjoint = torch.linalg.solve(hessian, grad_amplitudes)
@@ -67,12 +68,15 @@ class _ArgMin(torch.autograd.Function):
 
         wanted = [i for i, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
 
+        to_placement = _tensors(energy.pull_back(amplitudes, adjoint, placement))
+
         def slope(*variables: Tensor) -> Tensor:
-            """The energy's slope along the adjoint, of all samples."""
+            """The energy's slope along the adjoint, of all samples, up to what does not change with the inputs."""
             changed = list(inputs)
             for i, variable in zip(wanted, variables, strict=True):
                 changed[i] = variable
-            return energy.slope(amplitudes, adjoint, minimisation.placement(*changed)).sum()
+            moved = _tensors(minimisation.placement(*changed))
+            return sum((g * value).sum() for g, value in zip(to_placement, moved, strict=True))  # type: ignore
 
         grads: list[Tensor | None] = [None] * len(inputs)
         if wanted:
@@ -92,6 +96,13 @@ class _ArgMin(torch.autograd.Function):
             flat.append(batched.flatten(0, 1))
         output = _ArgMin.apply(minimisation, *flat)  # usable is the first of them
         return tuple(value.unflatten(0, (n, -1)) for value in output), (0,) * len(output)
+
+
+def _tensors(tree: Any) -> list[Tensor]:
+    """The tensors in nested tuples and lists, in order."""
+    if isinstance(tree, Tensor):
+        return [tree]
+    return [tensor for part in tree or () for tensor in _tensors(part)]
 
 
 def solve_implicit(minimisation: Minimisation, usable: Tensor, inputs: tuple[Tensor, ...]) -> Solution:

@@ -11,15 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.nn.curvature import Curvature
-from torch_modal.nn.shell import (
-    Measures,
-    Rest,
-    ShellEnergy,
-    dihedral_angle,
-    dihedral_gradient,
-    edge_length,
-    length_gradient,
-)
+from torch_modal.nn.linearised import Reference, energy_of, gather, gradient, linearise, slopes_of
+from torch_modal.nn.shell import Measures, Rest, ShellEnergy
 
 
 class Derivatives(NamedTuple):
@@ -33,34 +26,6 @@ class Derivatives(NamedTuple):
     """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
     resolution: Tensor
     """Gradient norm that the rounding of the positions alone explains. *Shape:* ``(B,)``."""
-
-
-class Reference(NamedTuple):
-    """A rest shape that pulls, and how strongly."""
-
-    rest: Rest
-    pull: Tensor
-    """Factor of its energy. *Shape:* ``(B,)``."""
-
-
-def slopes_of(measures: Measures, references: Sequence[Reference]) -> tuple[Measures, Measures]:
-    """First and second derivative of the energy in each measure, summed over the references."""
-    slopes, curvatures = [], []
-    for rest, pull in references:
-        differences = ShellEnergy.differences(measures, rest)
-        pulls = (pull[:, None], pull[:, None], pull)
-        doubled = [2 * p * w for p, w in zip(pulls, rest.weights, strict=True)]
-        slopes.append([w * d for w, d in zip(doubled, differences, strict=True)])
-        curvatures.append(doubled)
-    return (
-        Measures(*(sum(parts) for parts in zip(*slopes, strict=True))),
-        Measures(*(sum(parts) for parts in zip(*curvatures, strict=True))),
-    )
-
-
-def energy_of(shell: ShellEnergy, measures: Measures, references: Sequence[Reference]) -> Tensor:
-    """Energy of shapes that were measured, summed over the references. *Shape:* ``(..., B)``."""
-    return sum(pull * shell.energy(measures, rest) for rest, pull in references)  # type: ignore[return-value]
 
 
 class Placement(NamedTuple):
@@ -116,12 +81,10 @@ class ModalShell(nn.Module):
         """
         shell = self.shell
         x = self.shape(a, placement)
-        rows = x.movedim(-1, 0).contiguous()
-        edges, spokes = shell.edge_vectors(rows), shell.hinge_spokes(rows)
-        measures = Measures(edge_length(edges), dihedral_angle(spokes), shell.volume(rows))
-        slope, curvature = slopes_of(measures, placement.references)
+        at = linearise(shell, x.movedim(-1, 0).contiguous(), placement.references)
+        slope, curvature = at.slope, at.curvature
 
-        to_volume = self.shell.volume_gradient(rows).movedim(0, -1).flatten(1)
+        to_volume = at.to_volume.movedim(0, -1).flatten(1)
         volume_row = to_volume @ self.columns.flatten(0, 1)
         edge_extra = hinge_extra = None
         if placement.extra is not None:
@@ -129,20 +92,20 @@ class ModalShell(nn.Module):
             edge_extra = shell.edge_vectors(extra_rows)
             hinge_extra = shell.hinge_spokes(extra_rows).flatten(0, 1)
             volume_row = torch.cat([volume_row, (to_volume * placement.extra.flatten(1)).sum(-1, True)], -1)
-        gradient = slope.volume[:, None] * volume_row
+        to_amplitudes = slope.volume[:, None] * volume_row
         gauss_newton = curvature.volume[:, None, None] * volume_row[:, :, None] * volume_row[:, None, :]
         for local, slopes, curvatures, columns, extra in (
-            (length_gradient(edges), slope.length, curvature.length, self.edge_columns, edge_extra),
-            (dihedral_gradient(spokes).flatten(0, 1), slope.angle, curvature.angle, self.hinge_columns, hinge_extra),
+            (at.to_edges, slope.length, curvature.length, self.edge_columns, edge_extra),
+            (at.to_hinges.flatten(0, 1), slope.angle, curvature.angle, self.hinge_columns, hinge_extra),
         ):
             to_gradient, to_gauss_newton = _normal_equations(local, slopes, curvatures, columns, extra)
-            gradient, gauss_newton = gradient + to_gradient, gauss_newton + to_gauss_newton
+            to_amplitudes, gauss_newton = to_amplitudes + to_gradient, gauss_newton + to_gauss_newton
         stiffness = curvature.length.sum(-1) + curvature.angle.sum(-1) + curvature.volume
         stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
         resolution = rounding * (stiffest * stiffness).sqrt()
         curved = self.second_order(a, placement) if second_order else None
-        return Derivatives(gradient, gauss_newton, curved, resolution)
+        return Derivatives(to_amplitudes, gauss_newton, curved, resolution)
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
@@ -150,22 +113,50 @@ class ModalShell(nn.Module):
         slope, _ = slopes_of(self.shell.measure(x), placement.references)
         return self.curvature(self.shell, self.columns, x.movedim(-1, 0).contiguous(), slope, placement.extra)
 
-    def slope(self, a: Tensor, direction: Tensor, placement: Placement) -> Tensor:
-        """Derivative of the energy along a direction of amplitudes: what the adjoint is differentiated through.
+    def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
+        """Gradient of ``direction . dE/da`` in all that the placement holds, at amplitudes that stay.
 
-        *Shape:* ``(B, n), (B, n) -> (B,)``.
+        Written out, as ``torch.func`` takes twice as long through the derivatives of the angles.
+
+        Args:
+            a: Amplitudes. *Shape:* ``(B, n)``.
+            direction: In the amplitudes, of each sample. *Shape:* ``(B, n)``.
+            placement: The space of each sample and its references.
+
+        Returns:
+            One gradient in the place of each tensor.
         """
-        shell = self.shell
-        x = self.shape(a, placement)
-        moved = self.shape(direction, placement) - placement.base
-        rows, along = (y.movedim(-1, 0).contiguous() for y in (x, moved))
-        edges, spokes = shell.edge_vectors(rows), shell.hinge_spokes(rows)
-        measures = Measures(edge_length(edges), dihedral_angle(spokes), shell.volume(rows))
-        slope, _ = slopes_of(measures, placement.references)
-        length = (length_gradient(edges) * shell.edge_vectors(along)).sum(0)
-        angle = (dihedral_gradient(spokes) * shell.hinge_spokes(along)).sum((0, 1))
-        volume = (self.shell.volume_gradient(rows) * along).sum((0, -1))
-        return (slope.length * length).sum(-1) + (slope.angle * angle).sum(-1) + slope.volume * volume
+        shell, n = self.shell, self.columns.shape[-1]
+        rows = self.shape(a, placement).movedim(-1, 0).contiguous()
+        moved = (self.shape(direction, placement) - placement.base).movedim(-1, 0).contiguous()
+        at = linearise(shell, rows, placement.references)
+        rate = Measures(
+            (at.to_edges * shell.edge_vectors(moved)).sum(0),
+            (at.to_hinges * shell.hinge_spokes(moved)).sum((0, 1)),
+            (at.to_volume * moved).sum((0, -1)),
+        )
+        bent = [c * r for c, r in zip(at.curvature, rate, strict=True)]
+        pushed = gather(shell, bent[0] * at.to_edges, bent[1] * at.to_hinges, bent[2], at.to_volume)
+        pushed = pushed + self.curvature.push(shell, self.curvature.blocks(shell, rows, at.slope), moved)
+        to_base, to_extra = pushed.movedim(0, -1), None
+        if placement.extra is not None:
+            own = gradient(shell, at).movedim(0, -1)
+            to_extra = a[:, n, None, None] * to_base + direction[:, n, None, None] * own
+        return Placement(
+            to_base, to_extra, [self._to_reference(at.measures, rate, one) for one in placement.references]
+        )
+
+    @staticmethod
+    def _to_reference(measures: Measures, rate: Measures, reference: Reference) -> Reference:
+        """Gradient of ``sum_q 2 p w_q (q - q_rest) rate_q`` in the rest measures, the weights and the pull."""
+        rest, pull = reference
+        differences = ShellEnergy.differences(measures, rest)
+        to_weights, to_rest, to_pull = [], [], torch.zeros_like(pull)
+        for p, r, w, d in zip((pull[:, None], pull[:, None], pull), rate, rest.weights, differences, strict=True):
+            to_weights.append(2 * p * r * d)
+            to_rest.append(-2 * p * r * w)
+            to_pull = to_pull + (2 * r * w * d).reshape(len(pull), -1).sum(-1)
+        return Reference(Rest(Measures(*to_rest), Measures(*to_weights)), to_pull)
 
 
 def _normal_equations(

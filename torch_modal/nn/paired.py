@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.nn.frame import Columns, Frame, Pair
-from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement, Reference
+from torch_modal.nn.linearised import Reference
+from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement
 from torch_modal.nn.shell import ShellEnergy, Stiffness
 
 
@@ -76,13 +77,15 @@ class PairedShell(nn.Module):
         curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
 
-    def slope(self, a: Tensor, direction: Tensor, placement: PairedPlacement) -> Tensor:
-        """Derivative of the energy along a direction of amplitudes. *Shape:* ``(B, n), (B, n) -> (B,)``."""
-        strain = sum(
-            shell.slope(part, along, place)
+    def pull_back(self, a: Tensor, direction: Tensor, placement: PairedPlacement) -> PairedPlacement:
+        """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
+        first, second = (
+            shell.pull_back(part, along, place)
             for (shell, part, place), along in zip(self._ends(a, placement), self.split(direction), strict=True)
         )
-        return strain + 2 * placement.mu * (direction * (a @ self.gap_gram + placement.linear)).sum(-1)
+        to_mu = 2 * (direction * (a @ self.gap_gram + placement.linear)).sum(-1)
+        to_linear = 2 * placement.mu[:, None] * direction
+        return PairedPlacement(first, second, to_linear, torch.zeros_like(placement.constant), to_mu)
 
     def second_order(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""

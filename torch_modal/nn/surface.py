@@ -1,60 +1,18 @@
 """Eq. 5 with every vertex free: gradient, and a convex Hessian that is applied without being assembled."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_modal.nn.modal_shell import Reference, energy_of, slopes_of
-from torch_modal.nn.shell import Measures, ShellEnergy, dihedral_angle, dihedral_gradient, edge_length, length_gradient
+from torch_modal.nn.linearised import Linearised, Reference, energy_of, gather, gradient, linearise
+from torch_modal.nn.shell import ShellEnergy, edge_length
 
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
 
 # What is tried where a whole step goes uphill.
 STEP_LENGTHS = (0.5, 0.25, 0.1, 0.03)
-
-
-class Linearised(NamedTuple):
-    """Derivatives of everything that Eq. 5 measures, at given shapes. Components come first."""
-
-    slope: Measures
-    """First derivative of the energy in each measure."""
-    curvature: Measures
-    """Second derivative."""
-    edges: Tensor
-    """*Shape:* ``(3, B, E)``."""
-    spokes: Tensor
-    """*Shape:* ``(3, 3, B, H)``."""
-    to_edges: Tensor
-    """Gradients of the lengths. *Shape:* ``(3, B, E)``."""
-    to_hinges: Tensor
-    """Gradients of the angles in the spokes. *Shape:* ``(3, 3, B, H)``."""
-    to_volume: Tensor
-    """*Shape:* ``(3, B, V)``."""
-
-
-def linearise(shell: ShellEnergy, rows: Tensor, references: Sequence[Reference]) -> Linearised:
-    """Measure shapes and differentiate. *Shape:* ``(3, B, V)``."""
-    edges, spokes = shell.edge_vectors(rows), shell.hinge_spokes(rows)
-    measures = Measures(edge_length(edges), dihedral_angle(spokes), shell.volume(rows))
-    slope, curvature = slopes_of(measures, references)
-    local = length_gradient(edges), dihedral_gradient(spokes)
-    return Linearised(slope, curvature, edges, spokes, *local, shell.volume_gradient(rows))
-
-
-def gradient(shell: ShellEnergy, at: Linearised) -> Tensor:
-    """Gradient of the energy. *Shape:* ``(3, B, V)``."""
-    return _gather(shell, at.slope.length * at.to_edges, at.slope.angle * at.to_hinges, at.slope.volume, at.to_volume)
-
-
-def _gather(shell: ShellEnergy, on_edges: Tensor, on_hinges: Tensor, factor: Tensor, to_volume: Tensor) -> Tensor:
-    """From edge vectors and spokes to vertices."""
-    to_e, to_a, to_b = on_hinges
-    parts = [-on_edges, on_edges, -(to_e + to_a + to_b), to_e, to_a, to_b]
-    index = torch.cat([shell.edges.T.flatten(), shell.hinges.T.flatten()])
-    return (factor[:, None] * to_volume).index_add(-1, index, torch.cat(parts, -1))
 
 
 class ConvexHessian:
@@ -79,7 +37,7 @@ class ConvexHessian:
         on_edges = self.across * edges + (self.along * (at.to_edges * edges).sum(0)) * at.to_edges
         on_hinges = (at.curvature.angle * (at.to_hinges * spokes).sum((0, 1))) * at.to_hinges
         swelling = at.curvature.volume * (at.to_volume * rows).sum((0, -1))
-        return _gather(shell, on_edges, on_hinges, swelling, at.to_volume)
+        return gather(shell, on_edges, on_hinges, swelling, at.to_volume)
 
     def inverse_diagonal(self) -> Tensor:
         """Inverses of the 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``."""
