@@ -28,7 +28,7 @@ ORDER = [
     ["nn.curvature", "nn.linearised"],
     ["nn.modal_shell"],
     ["nn.surface"],
-    ["nn.frame", "nn.gauss_newton"],
+    ["nn.frame", "nn.gauss_newton", "nn.guess"],
     ["nn.joint", "nn.paired", "nn.implicit"],
     ["nn.between"],
     ["nn.in_between"],

@@ -91,3 +91,24 @@ def test_agrees_with_trimesh(capsule: tuple[np.ndarray, np.ndarray]) -> None:
     np.testing.assert_array_equal(np.sort(rows[key, :2], 1), closed.face_adjacency_edges[theirs])
     np.testing.assert_array_equal(np.sort(rows[key, 2:], 1), np.sort(closed.face_adjacency_unshared[theirs], 1))
     assert mesh.vertex_areas(vertices, faces).sum() == pytest.approx(closed.area, rel=1e-12)
+
+
+def test_neighbours_share_an_edge() -> None:
+    fan = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [1, 0, 7], [0, 1, 8]])
+    assert {tuple(pair) for pair in mesh.face_neighbours(fan)} == {(0, 1), (0, 3), (3, 4)}
+
+
+def test_spanning_forest_takes_what_is_cheap() -> None:
+    pairs = np.array([[0, 1], [1, 2], [0, 2], [3, 4], [0, 1], [2, 5]])
+    parents, piece = mesh.spanning_forest(7, pairs, np.array([9.0, 1.0, 2.0, 1.0, 5.0, 1.0]))
+    assert {tuple(sorted(pair)) for pair in enumerate(parents) if pair[0] != pair[1]} == {
+        (1, 2),
+        (0, 2),
+        (3, 4),
+        (2, 5),
+    }
+    assert len(set(piece[[0, 1, 2, 5]])) == 1
+    assert len(set(piece)) == 3
+    # The second connection of 0 and 1 is not added to the first: at 5 it would be taken if that of 0 and 2 were dearer.
+    parents, _ = mesh.spanning_forest(7, pairs, np.array([9.0, 1.0, 6.0, 1.0, 5.0, 1.0]))
+    assert (0, 1) in {tuple(sorted(pair)) for pair in enumerate(parents)}

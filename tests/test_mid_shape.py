@@ -284,18 +284,17 @@ def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
     ("ends", "truth", "bound"), [((0, 4), 2, 0.05), ((0, 2), 1, 0.011), ((2, 4), 3, 0.016)], ids=["0-8", "0-4", "4-8"]
 )
 def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands: Shapes) -> None:
-    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %.
+    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %, in 6 to 11, 4 and 6 to 8 steps.
 
-    In 17 to 21, 5 to 8 and 8 to 10 steps: the mesher is not deterministic.
+    They vary with the meshing, which is not deterministic.
     """
     pair = hands.pick(*ends)
     found = MidShape(pair.bases, pair.faces).solve(*pair.keyframes)
     wanted = hands.keyframes[truth]
     shell = ShellEnergy(hands.faces)
-    if ends != (0, 4):  # on some meshings the widest span ends STALLED, at a collapsed triangle; its shape is as good
-        assert found.solution.converged
-        assert found.solution.gradient_norm <= 1e-8
-        assert found.solution.n_steps <= 25
+    assert found.solution.converged
+    assert found.solution.gradient_norm <= 1e-8
+    assert found.solution.n_steps <= 20
     assert edge_error(found.shapes, wanted, hands.faces) <= bound
     assert float(shell.measure(found.shapes).volume) == pytest.approx(float(shell.measure(wanted).volume), rel=0.03)
 

@@ -1,7 +1,9 @@
-"""Connectivity of triangle meshes: edges, hinges, boundaries. NumPy only."""
+"""Connectivity of triangle meshes: edges, hinges, boundaries, neighbours. NumPy and SciPy only."""
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 IntArray = NDArray[np.int64]
 
@@ -71,6 +73,39 @@ def edge_index(edges: IntArray, i: IntArray, j: IntArray) -> IntArray:
     n = int(edges.max()) + 1
     keys = edges[:, 0] * n + edges[:, 1]
     return np.searchsorted(keys, np.minimum(i, j) * n + np.maximum(i, j)).astype(np.int64)
+
+
+def face_neighbours(faces: IntArray) -> IntArray:
+    """Pairs of faces at one edge; where there are three or more, each with the next. *Shape:* ``(n, 2)``."""
+    directed, _ = _half_edges(faces)
+    edge = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(edge, kind="stable")
+    same = np.diff(edge[order]) == 0
+    return np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(faces), axis=1)
+
+
+def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tuple[IntArray, IntArray]:
+    """The cheapest connections that hold all together.
+
+    Args:
+        n: Number of nodes.
+        pairs: Connections, the smaller node first. *Shape:* ``(m, 2)``.
+        costs: Above zero. *Shape:* ``(m,)``.
+
+    Returns:
+        The parent of each node, its own for a root; the connected piece of each. *Shape:* ``(n,)`` each.
+    """
+    # Two nodes may be connected twice: entries of a sparse matrix would add up.
+    order = np.lexsort((costs, pairs[:, 1], pairs[:, 0]))
+    first = np.unique(pairs[order], axis=0, return_index=True)[1]
+    rows, columns = pairs[order][first].T
+    tree = minimum_spanning_tree(sparse.coo_matrix((costs[order][first], (rows, columns)), shape=(n, n)).tocsr())
+    _, piece = connected_components(tree, directed=False)
+    parents = np.arange(n)
+    for root in np.unique(piece, return_index=True)[1]:
+        found, before = breadth_first_order(tree, root, directed=False)
+        parents[found[1:]] = before[found[1:]]
+    return parents.astype(np.int64), piece.astype(np.int64)
 
 
 def face_index(faces: IntArray, i: IntArray, j: IntArray, k: IntArray) -> tuple[IntArray, NDArray[np.float64]]:

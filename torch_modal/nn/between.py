@@ -66,7 +66,9 @@ class Between(nn.Module):
         frame = Frame(bases, faces, coarse_faces)
         shell = ShellEnergy(frame.coarse_faces)
         if space == "joint":
-            self.space: Any = JointSpace(frame, shell, frame.modes(bases))
+            ends = frame.place(*(basis.reference[None].to(frame.scale) for basis in bases))
+            references = torch.cat([ends.first, ends.second])
+            self.space: Any = JointSpace(frame, shell, frame.modes(bases), references)
         elif space == "paired":
             self.space = PairedSpace(frame, shell, frame.modes(bases))
         else:
@@ -100,7 +102,7 @@ class Between(nn.Module):
         problem = self.problem(pair, t)
         space = self.space
         minimisation = Minimisation(
-            self.step, space.placement, space.require, space.n_unknowns, max_steps, tolerance, report
+            self.step, space.placement, space.guess, space.require, space.n_unknowns, max_steps, tolerance, report
         )
         solve = solve_implicit if gradient == "implicit" else solve_unrolled
         solution = solve(minimisation, usable, problem.inputs)

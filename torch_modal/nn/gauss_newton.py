@@ -17,6 +17,9 @@ GOOD_AGREEMENT = 0.5
 # A Gauss-Newton step that takes the energy below this fraction needs no help from the second-order term.
 GOOD_DECREASE = 0.8
 
+# Of saddle-free Newton steps, relative to Gauss-Newton's Hessian.
+LEAST_CURVATURE = 0.1
+
 # Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
 ROUNDING_MARGIN = 4.0
 ENERGY_ROUNDING = 64.0
@@ -51,6 +54,11 @@ class Step(NamedTuple):
     """Decrease of the energy that the quadratic model expects of the whole step. *Shape:* ``(B,)``."""
     moved: Tensor
     """False where no step was found that does not go uphill. *Shape:* ``(B,)``, bool."""
+    newton: Tensor
+    """Where a whole Newton step leads; NaN where none was asked for or the Hessian is indefinite.
+
+    *Shape:* ``(B, n)``.
+    """
 
 
 class Status(IntEnum):
@@ -90,8 +98,8 @@ class GaussNewtonStep(nn.Module):
     """One damped step of every sample of a batch, never uphill.
 
     The residual at the optimum is large: Gauss-Newton alone gains a digit every six steps there, and the full Hessian
-    alone is indefinite far from it. Both directions are tried, at several step lengths, in one batched evaluation of
-    the energy; the lowest wins. A sample where none is lower stays where it is.
+    alone is often indefinite far from it. Both directions are tried, at several step lengths, in one batched evaluation
+    of the energy; the lowest wins. A sample where none is lower stays where it is.
 
     Args:
         energy: What is minimised.
@@ -141,16 +149,18 @@ class GaussNewtonStep(nn.Module):
 
     def take(self, a: Tensor, energy: Tensor, derivatives: Derivatives, placement: Any) -> Step:
         """The best of the candidate steps from a point whose derivatives are known."""
-        directions = self.directions(derivatives)
-        best, lowest = self._lowest(a, directions, placement)
+        plain = self.directions(derivatives)
+        directions = self._past_saddles(plain, derivatives)
+        best, lowest = self.lowest(a, directions, placement)
         promised = self._promised(directions, derivatives)
         poor = energy - lowest < GOOD_AGREEMENT * promised
         if bool(poor.any()):
-            shorter, energies = self._lowest(a, self._shortened(directions), placement)
+            shorter, energies = self.lowest(a, self._shortened(directions), placement)
             improves = poor & (energies < lowest)
             best = torch.where(improves[:, None], shorter, best)
             lowest = torch.where(improves, energies, lowest)
-        return self._unless_uphill(a, energy, best, lowest, promised, derivatives)
+        newton = torch.full_like(a, torch.nan) if derivatives.second_order is None else a + plain[1]
+        return self._unless_uphill(a, energy, best, lowest, promised, newton, derivatives)
 
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, trying both directions at all lengths, without a branch that depends on data.
@@ -161,9 +171,36 @@ class GaussNewtonStep(nn.Module):
         """
         derivatives = self.energy.derivatives(a, placement)
         directions = self.directions(derivatives)
-        best, lowest = self._lowest(a, torch.cat([directions, self._shortened(directions)]), placement)
+        best, lowest = self.lowest(a, torch.cat([directions, self._shortened(directions)]), placement)
         promised = self._promised(directions, derivatives)
-        return self._unless_uphill(a, self.energy.value(a, placement), best, lowest, promised, derivatives)
+        value = self.energy.value(a, placement)
+        return self._unless_uphill(a, value, best, lowest, promised, a + directions[-1], derivatives)
+
+    def _past_saddles(self, directions: Tensor, derivatives: Derivatives) -> Tensor:
+        """The directions, with saddle-free Newton (Dauphin et al. 2014) where the full Hessian is indefinite.
+
+        Negative eigenvalues are turned positive, so that what Newton's method would climb is run down. They are taken
+        relative to Gauss-Newton's Hessian, which is the scale of this problem. Near triangles that are about to
+        collapse, Gauss-Newton's direction alone crawls along such a ridge for dozens of steps.
+        """
+        if derivatives.second_order is None:
+            return directions
+        indefinite = ~directions[1].isfinite().all(-1) & derivatives.second_order.isfinite().all(-1).all(-1)
+        chosen = torch.nonzero(indefinite).flatten()
+        if not len(chosen):
+            return directions
+        factor, _ = torch.linalg.cholesky_ex(self.ridged(derivatives.gauss_newton[chosen]))
+
+        def whitened(columns: Tensor) -> Tensor:
+            return torch.linalg.solve_triangular(factor, columns, upper=False)
+
+        relative = whitened(whitened(derivatives.second_order[chosen]).mT)
+        finite = relative.isfinite().all(-1).all(-1)[:, None, None]
+        eigenvalues, vectors = torch.linalg.eigh(torch.where(finite, 0.5 * (relative + relative.mT), 0))
+        curvatures = (1 + eigenvalues).abs().clamp_min(LEAST_CURVATURE)
+        slope = vectors.mT @ whitened(derivatives.gradient[chosen, :, None])
+        step = torch.linalg.solve_triangular(factor.mT, -vectors @ (slope / curvatures[..., None]), upper=True)
+        return directions.index_put((torch.ones_like(chosen), chosen), step.squeeze(-1))
 
     @staticmethod
     def _shortened(directions: Tensor) -> Tensor:
@@ -178,15 +215,22 @@ class GaussNewtonStep(nn.Module):
 
     @staticmethod
     def _unless_uphill(
-        a: Tensor, energy: Tensor, best: Tensor, lowest: Tensor, promised: Tensor, derivatives: Derivatives
+        a: Tensor,
+        energy: Tensor,
+        best: Tensor,
+        lowest: Tensor,
+        promised: Tensor,
+        newton: Tensor,
+        derivatives: Derivatives,
     ) -> Step:
         # At the optimum the energy is flat to rounding while the gradient still has digits to gain.
         moved = lowest <= energy + 4 * torch.finfo(energy.dtype).eps * energy.abs()
         norm = derivatives.gradient.norm(dim=-1)
-        return Step(torch.where(moved[:, None], best, a), torch.where(moved, lowest, energy), norm, promised, moved)
+        reached = torch.where(moved[:, None], best, a)
+        return Step(reached, torch.where(moved, lowest, energy), norm, promised, moved, newton)
 
-    def _lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-        """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low."""
+    def lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+        """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low; ``a`` if nowhere finite."""
         usable = steps.isfinite().all(-1)
         candidates = a + torch.where(usable[..., None], steps, 0)
         energies = self.energy.value(candidates, placement)
@@ -214,13 +258,14 @@ def minimise(
     energy = step.energy.value(a, placement)
     start = torch.full_like(energy, torch.inf)
     slow = torch.zeros_like(energy, dtype=torch.bool)
+    last = torch.zeros_like(slow)
     for k in range(max_steps + 1):
         derivatives = step.energy.derivatives(a, placement, second_order=False)
         norm = derivatives.gradient.norm(dim=-1)
         if k == 0:
             start = norm
         status = torch.full_like(rows, Status.OUT_OF_STEPS)
-        status[norm <= torch.maximum(tolerance * start, step.floor(derivatives))] = Status.CONVERGED
+        status[last | (norm <= torch.maximum(tolerance * start, step.floor(derivatives)))] = Status.CONVERGED
         status[~(norm.isfinite() & energy.isfinite())] = Status.INVALID
         leaving = (status != Status.OUT_OF_STEPS) | (k == max_steps)
         if not bool(leaving.all()):
@@ -228,9 +273,11 @@ def minimise(
             if bool(needing.any()):
                 derivatives = derivatives._replace(second_order=_second_order(step.energy, a, placement, needing))
             taken = step.take(a, energy, derivatives, placement)
-            # Where all that is left to gain drowns in the rounding of the energy, the minimum is found.
+            # Where all that is left to gain drowns in the rounding of the energy, nothing compares steps any more: a
+            # whole Newton step is taken, and is the last.
             drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
-            stuck = ~leaving & slow & ~taken.moved
+            last = slow & drowned & taken.newton.isfinite().all(-1)
+            stuck = ~leaving & slow & ~taken.moved & ~last
             status[stuck] = torch.where(drowned, Status.CONVERGED, Status.STALLED)[stuck]
             leaving = leaving | stuck
         relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
@@ -240,11 +287,11 @@ def minimise(
         if bool(leaving.all()):
             break
         slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)
-        result.n_steps[rows[~leaving & taken.moved]] += 1
-        a, energy = taken.amplitudes, taken.energy
+        result.n_steps[rows[~leaving & (taken.moved | last)]] += 1
+        a, energy = torch.where(last[:, None], taken.newton, taken.amplitudes), taken.energy
         if bool(leaving.any()):
             stay = torch.nonzero(~leaving).flatten()
-            rows, a, energy, start, slow = (values[stay] for values in (rows, a, energy, start, slow))
+            rows, a, energy, start, slow, last = (values[stay] for values in (rows, a, energy, start, slow, last))
             placement = _pick(placement, stay)
     return result
 

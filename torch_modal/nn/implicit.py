@@ -16,6 +16,8 @@ class Minimisation(NamedTuple):
     step: GaussNewtonStep
     placement: Callable[..., Any]
     """From the inputs to what the energy knows of each sample."""
+    guess: Callable[..., Tensor]
+    """Amplitudes to start from, from the inputs."""
     require: Callable[..., None]
     """Raises where the inputs have no solution."""
     n_unknowns: int
@@ -37,8 +39,10 @@ class _ArgMin(torch.autograd.Function):
     @staticmethod
     def forward(minimisation: Minimisation, usable: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         minimisation.require(*inputs)
-        start = inputs[0].new_zeros(len(inputs[0]), minimisation.n_unknowns)
         placement = minimisation.placement(*inputs)
+        zero = inputs[0].new_zeros(len(inputs[0]), minimisation.n_unknowns)
+        # Never a start that is worse than linear interpolation: what comes out must not be, either.
+        start, _ = minimisation.step.lowest(zero, torch.stack([zero, minimisation.guess(*inputs)]), placement)
         solution = minimise(minimisation.step, start, placement, minimisation.max_steps, minimisation.tolerance)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         if minimisation.report is not None:
@@ -119,7 +123,7 @@ def solve_implicit(minimisation: Minimisation, usable: Tensor, inputs: tuple[Ten
 def solve_unrolled(minimisation: Minimisation, usable: Tensor, inputs: tuple[Tensor, ...]) -> Solution:
     """Take exactly ``max_steps`` steps; gradients flow back through all of them.
 
-    Nothing here depends on data but what is computed: no early end, no report.
+    Nothing here depends on data but what is computed: no early end, no report, no choice of where to start.
 
     Args:
         minimisation: What is minimised.

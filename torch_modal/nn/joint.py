@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.nn.frame import Frame, Pair
+from torch_modal.nn.guess import LocalRotations
 from torch_modal.nn.linearised import Reference
 from torch_modal.nn.modal_shell import ModalShell, Placement
 from torch_modal.nn.shell import Measures, Rest, ShellEnergy, Stiffness
@@ -33,13 +34,15 @@ class JointSpace(nn.Module):
         frame: Frame of the two bases.
         shell: Energy on the frame's coarse mesh.
         modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
+        references: Shapes that the modes belong to, in the frame. *Shape:* ``(2, V, 3)``.
     """
 
-    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor]) -> None:
+    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor], references: Tensor) -> None:
         super().__init__()
         self.frame = frame
         self.columns = frame.elastic_columns(torch.cat(list(modes)))
         self.energy = ModalShell(shell, self.columns.coarse)
+        self.rotations = LocalRotations(shell, self.energy.edge_columns, frame.coarsen(references))
 
     @property
     def n_unknowns(self) -> int:
@@ -62,6 +65,10 @@ class JointSpace(nn.Module):
             for i, pull in enumerate((1 - t, t))
         ]
         return Placement(torch.lerp(first, second, t[:, None, None]), difference, references)
+
+    def guess(self, first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> Tensor:
+        """Where the minimisation may start, from the inputs of a problem. *Shape:* ``(B, n)``."""
+        return self.rotations(self.energy.shell, self.energy.edge_columns, first, second, difference, t)
 
     @staticmethod
     def require(first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> None:

@@ -1,0 +1,82 @@
+"""Where the minimisation starts: edges of triangles that turn part of the way."""
+
+import math
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+
+from torch_modal.nn.guess import LocalRotations
+from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.shell import ShellEnergy
+
+T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
+
+
+def ribbon(turn: float, n: int = 13) -> tuple[Tensor, Tensor]:
+    """Rigid plates, each turned against the last one about the edge between them: the last by ``turn`` in all."""
+    angles = torch.linspace(0, turn, n, dtype=torch.float64)
+    steps = torch.stack([angles.cos(), torch.zeros_like(angles), angles.sin()], -1)
+    spine = torch.cat([torch.zeros(1, 3, dtype=torch.float64), steps.cumsum(0)])
+    x = torch.cat([spine, spine + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)])
+    i = torch.arange(n)
+    m = n + 1
+    faces = torch.cat([torch.stack([i, i + 1, i + m], -1), torch.stack([i + 1, i + 1 + m, i + m], -1)])
+    return x, faces
+
+
+def guess_of(first: Tensor, second: Tensor, faces: Tensor) -> tuple[LocalRotations, ShellEnergy]:
+    shell = ShellEnergy(faces)
+    columns = torch.zeros(len(shell.edges), 3, 1, dtype=first.dtype)
+    return LocalRotations(shell, columns, torch.stack([first, second])), shell
+
+
+def edges(x: Tensor, shell: ShellEnergy) -> Tensor:
+    return x[..., shell.edges[:, 1], :] - x[..., shell.edges[:, 0], :]
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 170, 250, 340])
+def test_plates_turn_at_constant_speed(degrees: int) -> None:
+    """Beyond half a turn too, where a plate alone would take the other way round."""
+    turn = math.radians(degrees)
+    (x_a, faces), (x_b, _) = ribbon(0.0), ribbon(turn)
+    guess, shell = guess_of(x_a, x_b, faces)
+    found = guess.edges_between(shell, x_a.expand(len(T), -1, -1), x_b.expand(len(T), -1, -1), T)
+    for t, row in zip(T, found, strict=True):
+        torch.testing.assert_close(row, edges(ribbon(float(t) * turn)[0], shell), rtol=0, atol=1e-12)
+    half_scale = guess.edges_between(shell, x_a[None], 2 * x_b[None], T[2:3])[0]
+    torch.testing.assert_close(half_scale, 1.5 * edges(ribbon(0.5 * turn)[0], shell), rtol=0, atol=1e-12)
+
+
+def test_pieces_have_a_sense_of_their_own() -> None:
+    (x_a, faces), (x_b, _), (x_c, _) = ribbon(0.0), ribbon(math.radians(250)), ribbon(math.radians(-250))
+    both, twice = torch.cat([x_a, x_a + 5]), torch.cat([faces, faces + len(x_a)])
+    moved = torch.cat([x_b, x_c + 5])
+    guess, shell = guess_of(both, moved, twice)
+    found = guess.edges_between(shell, both[None], moved[None], T[2:3])[0]
+    wanted = torch.cat([ribbon(math.radians(125))[0], ribbon(math.radians(-125))[0]])
+    torch.testing.assert_close(found, edges(wanted, shell), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_triangles_without_area_are_survived(dtype: torch.dtype) -> None:
+    (x_a, faces), (x_b, _) = ribbon(0.0), ribbon(2.0)
+    x_a[3], x_b[5] = x_a[4], 0.5 * (x_b[4] + x_b[6])
+    x_a, x_b = x_a.to(dtype), x_b.to(dtype)
+    guess, shell = guess_of(x_a, x_b, faces)
+    assert guess.edges_between(shell, x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype)).isfinite().all()
+
+
+@pytest.mark.parametrize(("ends", "bound"), [((0, 4), 1.15), ((0, 2), 1.03), ((2, 4), 1.15)], ids=["0-8", "0-4", "4-8"])
+def test_starts_near_the_end_on_a_hand(ends: tuple[int, int], bound: float, hands: Shapes) -> None:
+    """Linear interpolation has 11.8, 3.7 and 6.6 times its energy; fingers turn by up to 300 degrees."""
+    pair = hands.pick(*ends)
+    layer = MidShape(pair.bases, pair.faces)
+    member = layer.in_between.members[0]
+    space, x = member.space, pair.keyframes[:, None]
+    problem = member.problem(space.frame.place(x[0], x[1]), T[2:3])
+    a, placement = space.guess(*problem.inputs), space.placement(*problem.inputs)
+    least = float(layer.solve(*pair.keyframes).solution.energy)
+    assert float(space.energy.value(a, placement)) < bound * least
+    assert float(space.energy.value(torch.zeros_like(a), placement)) > 3 * least
