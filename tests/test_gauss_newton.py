@@ -174,6 +174,18 @@ def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes) -> None:
     np.testing.assert_allclose(solution.amplitudes[0].numpy(), truth.x, atol=1e-5 * np.abs(truth.x).max())
 
 
+def test_least_gain_ends_it_early(layer: MidShape, bars: Shapes) -> None:
+    placed, a = problem(layer, bars, [0.3, 1.0, 1.6])
+    whole, short = minimise(layer.step, a, placed), minimise(layer.step, a, placed, least_gain=0.03)
+    assert short.converged.all()
+    assert (short.n_steps < whole.n_steps).all()
+    assert (short.energy < 1.02 * whole.energy).all()
+    assert (short.energy > whole.energy).all()
+    torch.testing.assert_close(layer.step.energy.value(short.amplitudes, placed), short.energy)
+    one = minimise(layer.step, a, placed, least_gain=1.0 - 1e-9)  # a step cannot promise more than there is
+    assert one.n_steps.tolist() == [1, 1, 1]
+
+
 def test_converges_and_says_so(layer: MidShape, bars: Shapes) -> None:
     placed, a = problem(layer, bars, [0.3, 1.0, 1.6])
     solution = minimise(layer.step, a, placed)

@@ -89,6 +89,7 @@ class Between(nn.Module):
         gradient: str,
         max_steps: int,
         tolerance: float,
+        least_gain: float,
         report: Callable[[Solution], None] | None,
     ) -> InBetweenResult:
         """Solve. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``."""
@@ -102,7 +103,15 @@ class Between(nn.Module):
         problem = self.problem(pair, t)
         space = self.space
         minimisation = Minimisation(
-            self.step, space.placement, space.guess, space.require, space.n_unknowns, max_steps, tolerance, report
+            self.step,
+            space.placement,
+            space.guess,
+            space.require,
+            space.n_unknowns,
+            max_steps,
+            tolerance,
+            least_gain,
+            report,
         )
         solve = solve_implicit if gradient == "implicit" else solve_unrolled
         solution = solve(minimisation, usable, problem.inputs)

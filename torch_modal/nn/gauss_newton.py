@@ -65,7 +65,7 @@ class Status(IntEnum):
     """How the minimisation of a sample ended."""
 
     CONVERGED = 0
-    """The gradient is within the tolerance, or as small as the rounding of positions and energy lets it be."""
+    """The gradient is within the tolerance, or as small as rounding lets it be, or ``least_gain`` ended it."""
     OUT_OF_STEPS = 1
     """There was more to gain."""
     STALLED = 2
@@ -239,7 +239,12 @@ class GaussNewtonStep(nn.Module):
 
 
 def minimise(
-    step: GaussNewtonStep, a: Tensor, placement: Any, max_steps: int = 40, tolerance: float = 1e-8
+    step: GaussNewtonStep,
+    a: Tensor,
+    placement: Any,
+    max_steps: int = 40,
+    tolerance: float = 1e-8,
+    least_gain: float = 0.0,
 ) -> Solution:
     """Repeat the step until every sample has converged, or cannot go on.
 
@@ -252,6 +257,8 @@ def minimise(
         placement: What the energy knows of each sample.
         max_steps: Give up after that many.
         tolerance: Bound on the gradient norm, relative to its value at the start.
+        least_gain: Where a step promises less than this part of the energy, it is the last one. The gradient norm of
+            the solution is then the one before that step.
     """
     result = _blank_solution(a)
     rows = torch.arange(len(a), device=a.device)
@@ -280,6 +287,11 @@ def minimise(
             stuck = ~leaving & slow & ~taken.moved & ~last
             status[stuck] = torch.where(drowned, Status.CONVERGED, Status.STALLED)[stuck]
             leaving = leaving | stuck
+            enough = ~leaving & taken.moved & (taken.promised < least_gain * energy.abs())
+            status[enough] = Status.CONVERGED
+            result.n_steps[rows[enough]] += 1
+            a, energy = torch.where(enough[:, None], taken.amplitudes, a), torch.where(enough, taken.energy, energy)
+            leaving = leaving | enough
         relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
         left = Solution(a, energy, relative, result.n_steps[rows], status)
         for whole, part in zip(result, left, strict=True):

@@ -23,6 +23,7 @@ class Minimisation(NamedTuple):
     n_unknowns: int
     max_steps: int
     tolerance: float
+    least_gain: float
     report: Callable[[Solution], None] | None
     """Told how it went."""
 
@@ -43,7 +44,8 @@ class _ArgMin(torch.autograd.Function):
         zero = inputs[0].new_zeros(len(inputs[0]), minimisation.n_unknowns)
         # Never a start that is worse than linear interpolation: what comes out must not be, either.
         start, _ = minimisation.step.lowest(zero, torch.stack([zero, minimisation.guess(*inputs)]), placement)
-        solution = minimise(minimisation.step, start, placement, minimisation.max_steps, minimisation.tolerance)
+        limits = minimisation.max_steps, minimisation.tolerance, minimisation.least_gain
+        solution = minimise(minimisation.step, start, placement, *limits)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         if minimisation.report is not None:
             minimisation.report(solution)
