@@ -494,7 +494,7 @@ class TestExceptions:
         ):
             with pytest.raises(ValueError, match=message):
                 InBetween(bars.bases[:2], bars.faces, **options)
-        with pytest.raises(ValueError, match="from 0 to less than 1; got 1.5"):
+        with pytest.raises(ValueError, match="less than 1; got 1"):
             InBetween(bars.bases[0], bars.faces, least_gain=1.5)
         with pytest.raises(ValueError, match="needs two bases, got 1"):
             InBetween(bars.bases[:1], bars.faces)
