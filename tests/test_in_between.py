@@ -6,6 +6,7 @@ import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -113,11 +114,12 @@ class TestValues:
         back = InBetween(bars.bases, bars.faces, pairs=[(2, 0)], coarse_faces=200)
         assert back(bars.keyframes[2], bars.keyframes[0], 0.5).shape == (1, *bars.keyframes.shape[1:])
 
+    @pytest.mark.parametrize("rotations", [False, True])
     @pytest.mark.parametrize("dtype, bound", [(DOUBLE, 1e-10), (torch.float32, 1e-4)])
     def test_batch_equals_loop(
-        self, bars: Shapes, generator: torch.Generator, dtype: torch.dtype, bound: float
+        self, bars: Shapes, generator: torch.Generator, dtype: torch.dtype, bound: float, rotations: bool
     ) -> None:
-        layer = InBetween(bars.bases[1:], bars.faces, coarse_faces=200, tolerance=1e-11).to(dtype)
+        layer = InBetween(bars.bases[1:], bars.faces, coarse_faces=200, tolerance=1e-11, rotations=rotations).to(dtype)
         noise = 0.02 * torch.randn(5, *bars.keyframes.shape[1:], generator=generator, dtype=DOUBLE)
         x_a, x_b = ((x + noise).to(dtype) for x in bars.keyframes[1:])
         x_b = torch.lerp(x_a, x_b, torch.linspace(0.05, 1, 5, dtype=dtype)[:, None, None])
@@ -142,6 +144,29 @@ class TestValues:
         torch.testing.assert_close(together, alone, rtol=0, atol=1e-10)
         single = copy.deepcopy(layers[1]).float()(x_a.float(), x_b.float(), at.float())
         assert float((single - together).abs().max()) < 1e-3 * diagonal(x_a)
+
+    def test_a_blend_by_rotations_leaves_less_to_do(self, bars: Shapes) -> None:
+        x_a, x_b = bars.keyframes[1:]
+        shell, scale = ShellEnergy(bars.faces), 100 / diagonal(x_a)
+
+        def energy(x: Tensor) -> float:
+            return float(sum(shell(scale * x, scale * end) for end in (x_a, x_b)))
+
+        without, layer = (InBetween(bars.bases[1:], bars.faces, coarse_faces=200, rotations=r) for r in (False, True))
+        assert energy(layer(x_a, x_b, 0.5)[0]) < energy(without(x_a, x_b, 0.5)[0])
+        x = layer(x_a, x_b, times(0.0, 0.5, 1.0))
+        assert torch.equal(x[0], x_a)
+        assert torch.equal(x[2], x_b)
+        torch.testing.assert_close(layer(x_a, x_a + 1, 0.5)[0], x_a + 0.5, rtol=0, atol=1e-9)
+
+    def test_a_blend_that_is_worse_than_straight_lines_is_not_taken(
+        self, bars: Shapes, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        layer, without = (InBetween(bars.bases[1:], bars.faces, coarse_faces=200, rotations=r) for r in (True, False))
+        for spoilt in (lambda x, *_: 3 * x, lambda x, *_: x * torch.nan):
+            monkeypatch.setattr(type(layer.members[0].space.blend), "forward", lambda self, *args, f=spoilt: f(*args))
+            found = layer(*bars.keyframes[1:], 0.4)
+            torch.testing.assert_close(found, without(*bars.keyframes[1:], 0.4), rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize("polish", [-1, 1.5])
     def test_a_number_of_steps_is_whole(self, bars: Shapes, polish: float) -> None:
@@ -177,11 +202,13 @@ class TestGradients:
 
         return value
 
-    def inputs(self, shapes: Shapes, space: str, generator: torch.Generator) -> dict[str, Tensor]:
+    def inputs(
+        self, shapes: Shapes, space: str, generator: torch.Generator, roughness: float = 0.1
+    ) -> dict[str, Tensor]:
         x_a, x_b = shapes.keyframes[1:]
         # Stretched, squeezed and roughened: lengths that no shape can have at once leave a large residual.
         x_b = x_b * torch.tensor([1.5, 0.7, 1.2], dtype=DOUBLE)
-        x_b = x_b + 0.1 * torch.randn(x_b.shape, generator=generator, dtype=DOUBLE)
+        x_b = x_b + roughness * torch.randn(x_b.shape, generator=generator, dtype=DOUBLE)
         x_b = x_b @ random_rotation(generator).mT + 1
         values = {"mu": 3.0, "alpha": 400.0, "beta": 20.0, "gamma": 5e4, "t": 0.5 if space == "paired" else 0.37}
         inputs = {name: torch.tensor(value, dtype=DOUBLE) for name, value in values.items()}
@@ -205,23 +232,19 @@ class TestGradients:
             )
             assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5), name
 
-    def test_through_the_steps_on_the_fine_mesh(self, large: Shapes, generator: torch.Generator) -> None:
-        """Local interpolation and polish are part of the function that is differentiated."""
+    @pytest.mark.parametrize("fine", [{"local": True, "polish": 1}, {"rotations": True}], ids=["steps", "rotations"])
+    def test_through_what_happens_on_the_fine_mesh(
+        self, large: Shapes, generator: torch.Generator, fine: dict[str, Any]
+    ) -> None:
+        """Local interpolation, polish and the blend by local rotations are part of what is differentiated."""
         weights = torch.randn(large.keyframes.shape[1:], generator=generator, dtype=DOUBLE)
-        inputs = self.inputs(large, "joint", generator)
+        # The blend is not taken between rough shapes: straight lines are better there.
+        inputs = self.inputs(large, "joint", generator, roughness=0.01 if "rotations" in fine else 0.1)
         del inputs["mu"]
 
-        def value(local: bool = True, **inputs: Tensor) -> Tensor:
+        def value(options: dict[str, Any] = fine, **inputs: Tensor) -> Tensor:
             constants = {name: inputs[name] for name in ("alpha", "beta", "gamma")}
-            layer = InBetween(
-                large.bases[1:],
-                large.faces,
-                coarse_faces=200,
-                tolerance=1e-13,
-                local=local,
-                polish=int(local),
-                **constants,
-            )
+            layer = InBetween(large.bases[1:], large.faces, coarse_faces=200, tolerance=1e-13, **constants, **options)
             return (layer(inputs["x_a"], inputs["x_b"], inputs["t"]) * weights).sum()
 
         leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
@@ -233,7 +256,7 @@ class TestGradients:
                 lambda y, name=name: value(**{**inputs, name: y}), x, direction, DIFFERENCE_STEPS[name]
             )
             assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5), name
-        (without,) = torch.autograd.grad(value(local=False, **leaves), leaves["x_a"])
+        (without,) = torch.autograd.grad(value({}, **leaves), leaves["x_a"])
         assert float((without - gradients[0]).norm()) > 1e-2 * float(without.norm())
 
     def test_the_gauss_newton_hessian_would_not_do(
@@ -257,9 +280,9 @@ class TestGradients:
         (wrong,) = torch.autograd.grad(y, x_a)
         assert float((wrong - exact).norm() / exact.norm()) > 1e-2
 
-    @pytest.mark.parametrize("space", ["joint", "paired"])
-    def test_gradcheck_and_gradgradcheck(self, small_bars: Shapes, space: str) -> None:
-        layer = InBetween(small_bars.bases[1:], small_bars.faces, space, tolerance=1e-14)
+    @pytest.mark.parametrize(("space", "rotations"), [("joint", False), ("joint", True), ("paired", False)])
+    def test_gradcheck_and_gradgradcheck(self, small_bars: Shapes, space: str, rotations: bool) -> None:
+        layer = InBetween(small_bars.bases[1:], small_bars.faces, space, tolerance=1e-14, rotations=rotations)
         x_a, x_b = (x.clone().requires_grad_() for x in small_bars.keyframes[1:])
         t = torch.tensor([0.5], dtype=DOUBLE) if space == "paired" else times(0.3, 0.6).requires_grad_()
         with warnings.catch_warnings():
@@ -412,8 +435,9 @@ class TestSingleSamples:
 
 
 class TestTorch:
-    def test_func_transforms(self, small_bars: Shapes, generator: torch.Generator) -> None:
-        layer = InBetween(small_bars.bases[:2], small_bars.faces)
+    @pytest.mark.parametrize("rotations", [False, True])
+    def test_func_transforms(self, small_bars: Shapes, generator: torch.Generator, rotations: bool) -> None:
+        layer = InBetween(small_bars.bases[:2], small_bars.faces, rotations=rotations)
         x_a, x_b = small_bars.keyframes[:2]
         batch = x_a + 0.01 * torch.randn(3, *x_a.shape, generator=generator, dtype=DOUBLE)
         t = times(0.3, 0.6)
@@ -439,12 +463,16 @@ class TestTorch:
         torch.testing.assert_close(called, other(x_a, x_b, 0.5), rtol=0, atol=1e-8)
         assert float((called - layer(x_a, x_b, 0.5)).abs().max()) > 1e-4
 
-    def test_copies_are_equal(self, layer: InBetween, bars: Shapes, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("rotations", [False, True])
+    def test_copies_are_equal(self, bars: Shapes, tmp_path: Path, rotations: bool) -> None:
+        def new() -> InBetween:
+            return InBetween(bars.bases[:2], bars.faces, coarse_faces=200, rotations=rotations)
+
+        layer, loaded, stored = new(), new(), new()
         expected = layer(*bars.keyframes[:2], 0.5)
-        loaded = InBetween(bars.bases[:2], bars.faces, coarse_faces=200)
+        loaded(*bars.keyframes[:2] + 1, 0.2)  # nothing that was made for other buffers is kept
         loaded.load_state_dict(layer.state_dict())
         save_file(layer.state_dict(), tmp_path / "layer.safetensors")  # refuses tensors that share memory
-        stored = InBetween(bars.bases[:2], bars.faces, coarse_faces=200)
         stored.load_state_dict(load_file(tmp_path / "layer.safetensors"))
         for twin in (stored, copy.deepcopy(layer), pickle.loads(pickle.dumps(layer)), loaded):
             assert torch.equal(twin(*bars.keyframes[:2], 0.5), expected)

@@ -109,7 +109,7 @@ def test_steps_on_the_fine_mesh_by_default(scattered: Shapes) -> None:
     pair = scattered.pick(0, 1)
     options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
     default, modal = (subdivide(pair.keyframes, pair.faces, 1, local=local, **options)[1] for local in (True, False))
-    layer = MidShape(pair.bases, pair.faces, local=True, least_gain=sequence.LEAST_GAIN, **COARSE)
+    layer = MidShape(pair.bases, pair.faces, local=True, rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE)
     torch.testing.assert_close(default, layer(*pair.keyframes), rtol=0, atol=1e-12)
     assert largest(default - modal) > 1e-5
 
@@ -127,7 +127,7 @@ def test_recursion_by_hand(scattered: Shapes) -> None:
     """Two levels of the joint space are three mid-shapes with the modes of both ends."""
     pair = scattered.pick(1, 2)
     frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, local=False, **COARSE)
-    layer = MidShape(pair.bases, pair.faces, least_gain=sequence.LEAST_GAIN, **COARSE)
+    layer = MidShape(pair.bases, pair.faces, rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE)
     middle = layer(*pair.keyframes)
     by_hand = [pair.keyframes[0], layer(pair.keyframes[0], middle), middle, layer(middle, pair.keyframes[1])]
     for frame, truth in zip(frames, by_hand, strict=False):

@@ -84,6 +84,12 @@ def face_neighbours(faces: IntArray) -> IntArray:
     return np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(faces), axis=1)
 
 
+def vertex_pieces(edges: IntArray, n: int) -> IntArray:
+    """Which connected piece each of ``n`` vertices belongs to; one without an edge is a piece. *Shape:* ``(n,)``."""
+    graph = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
 def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tuple[IntArray, IntArray]:
     """The cheapest connections that hold all together.
 

@@ -54,7 +54,7 @@ def subdivide(
         local: Whether each mid-shape takes a few steps on the fine mesh, for what the modes cannot reach.
         progress: Whether to show progress bars. Default: on a terminal only.
         **mid_shape: Further options of :class:`torch_modal.MidShape`: ``space``, ``coarse_faces``, ``polish``, ...;
-            ``least_gain`` is 0.03 here, in the joint space.
+            In the joint space ``rotations`` is true here, and ``least_gain`` 0.03.
 
     Returns:
         The sequence in the caller's coordinates, dtype and device, the key-frames bit for bit at their places. *Shape:*
@@ -82,7 +82,8 @@ def subdivide(
         disable=None if progress is None else not progress,
     )
     paired = mid_shape.get("space") == "paired"
-    options = {"local": local, "least_gain": 0.0 if paired else LEAST_GAIN, **mid_shape}
+    joint = {} if paired else {"rotations": True, "least_gain": LEAST_GAIN}
+    options = {"local": local, **joint, **mid_shape}
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     with bar, torch.no_grad():
         for i in range(intervals):

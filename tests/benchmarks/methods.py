@@ -24,6 +24,7 @@ from torch_modal.rigid import blend
 from torch_modal.sequence import LEAST_GAIN
 
 PEER_SECONDS = 180
+SUBDIVIDE = {"rotations": True, "least_gain": LEAST_GAIN}
 MOST_VERTICES = 15_000  # over all vertices: more take minutes a step
 # One thread, as for all others; with more, jax 0.10 waits for itself for ever on few cores and large meshes.
 PEER_ENVIRONMENT = {
@@ -97,7 +98,7 @@ def paired(case: Case) -> Outcome:
 
 @method("joint")
 def joint(case: Case) -> Outcome:
-    """The default: 30 modes of each end, 1,000 coarse faces."""
+    """The default of the layers: 30 modes of each end, 1,000 coarse faces, to the last digit."""
     return by_layer(case, 30)
 
 
@@ -107,28 +108,28 @@ def joint_fine(case: Case) -> Outcome:
     return by_layer(case, 80, coarse_faces=3000)
 
 
-@method("joint, quick")
-def quick(case: Case) -> Outcome:
-    """As ``subdivide(local=False)`` has it: a step that promises less than 3 % of the energy is the last."""
-    return by_layer(case, 30, least_gain=LEAST_GAIN)
+@method("joint + rotations")
+def rotations(case: Case) -> Outcome:
+    """As ``subdivide(local=False)`` has it: onto a blend by local rotations, and not to the last digit."""
+    return by_layer(case, 30, **SUBDIVIDE)
 
 
-@method("joint + local")
-def joint_and_local(case: Case) -> Outcome:
+@method("subdivide")
+def subdivide(case: Case) -> Outcome:
     """The default of ``subdivide``: the same, with steps on the fine mesh after it."""
-    return by_layer(case, 30, local=True, least_gain=LEAST_GAIN)
+    return by_layer(case, 30, local=True, **SUBDIVIDE)
 
 
-@method("joint + local + polish 2")
-def joint_and_polish(case: Case) -> Outcome:
+@method("subdivide, polish 2")
+def polished(case: Case) -> Outcome:
     """The same with two longer steps."""
-    return by_layer(case, 30, local=True, polish=2, least_gain=LEAST_GAIN)
+    return by_layer(case, 30, local=True, polish=2, **SUBDIVIDE)
 
 
 @method("full", half_only=True)
 def full(case: Case) -> Outcome:
     """The optimum over all vertices: the best of what a modal and a linear start lead to."""
-    starts = InBetweens(case, 30, {"local": True})()
+    starts = InBetweens(case, 30, {"rotations": True, "local": True})()
     return by_full_space(
         case,
         lambda x_a, x_b, t, k: min(

@@ -1,19 +1,16 @@
 """Vertices from the sides that triangles ask for: a Poisson problem, factorised once for a connectivity."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from torch_modal import mesh
 from torch_modal.augment.triangles import Sides
 from torch_modal.rigid import best_fit
+from torch_modal.sparse_solve import SparseSolver, graph_laplacian
 
 # Cotangents of slivers: a side counts neither for nothing nor for everything. Positive weights also make the matrix
 # definite whatever the triangles.
@@ -42,7 +39,8 @@ class Reconstruction:
         weights = _side_weights(shape, triangles)
         self.weights = torch.from_numpy(weights)
         self.areas = torch.from_numpy(mesh.vertex_areas(shape, triangles))
-        laplacian = _laplacian(triangles, weights, len(shape))
+        across = np.concatenate([triangles[:, [(corner + 1) % 3, (corner + 2) % 3]] for corner in range(3)])
+        laplacian = graph_laplacian(across, weights.T.reshape(-1), len(shape))
         used = np.unique(triangles)
         self.unused = torch.from_numpy(np.setdiff1d(np.arange(len(shape)), used))
         labels = connected_components(laplacian, directed=False)[1]
@@ -51,9 +49,8 @@ class Reconstruction:
         self.pieces = [torch.from_numpy(piece) for piece in pieces]
         self.anchors = [torch.from_numpy(_nearest(shape[pieces[0]], shape[piece], pieces[0])) for piece in pieces[1:]]
         # The equations fix each piece up to a translation: one vertex of each is held, and the piece placed afterwards.
-        self.free = np.setdiff1d(used, [piece[0] for piece in pieces])
-        inner = laplacian[self.free][:, self.free].tocsc()
-        self._factor = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        free = np.setdiff1d(used, [piece[0] for piece in pieces])
+        self.solver = SparseSolver(laplacian, free)
 
     def __call__(self, wanted: Sides, rest: Tensor) -> Tensor:
         """The shape, its centroid where that of ``rest`` is. Vertices that no face uses stay.
@@ -70,14 +67,8 @@ class Reconstruction:
         third = opposite_0[:, None, None] * (second - first)
         at_1, at_2 = opposite_2[:, None, None] * first - third, opposite_1[:, None, None] * second + third
         right = torch.zeros_like(rest).index_add(0, faces.T.flatten(), torch.cat([-at_1 - at_2, at_1, at_2]))
-        solved = _Solve.apply(self, right.flatten(1)).unflatten(1, (3, -1))
+        solved = self.solver(right.flatten(1)).unflatten(1, (3, -1))
         return self._placed(solved, rest)
-
-    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The symmetric operator from right-hand sides to vertices. *Shape:* ``(V, n) -> (V, n)``."""
-        out = np.zeros_like(right)
-        out[self.free] = self._factor.solve(right[self.free])
-        return out
 
     def _placed(self, x: Tensor, rest: Tensor) -> Tensor:
         out = rest
@@ -97,19 +88,6 @@ class Reconstruction:
         return out
 
 
-class _Solve(torch.autograd.Function):
-    """:meth:`Reconstruction.solve` for tensors of any dtype and device."""
-
-    @staticmethod
-    def forward(ctx: Any, operator: Reconstruction, right: Tensor) -> Tensor:
-        ctx.operator = operator
-        return torch.from_numpy(operator.solve(right.detach().double().cpu().numpy())).to(right)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor]:
-        return None, _Solve.apply(ctx.operator, grads[0])
-
-
 def _side_weights(shape: NDArray[np.float64], faces: mesh.IntArray) -> NDArray[np.float64]:
     """Half the cotangent at each corner: the weight of the side across it. *Shape:* ``(F, 3)``."""
     corners = shape[faces]
@@ -117,13 +95,6 @@ def _side_weights(shape: NDArray[np.float64], faces: mesh.IntArray) -> NDArray[n
     twice_area = np.linalg.norm(np.cross(u, v), axis=-1)
     tiny = np.finfo(np.float64).tiny
     return np.clip(0.5 * (u * v).sum(-1) / np.maximum(twice_area, tiny), *_WEIGHT_RANGE)
-
-
-def _laplacian(faces: mesh.IntArray, weights: NDArray[np.float64], n: int) -> sparse.csr_matrix:
-    i, j = (np.concatenate([faces[:, (corner + side) % 3] for corner in range(3)]) for side in (1, 2))
-    half = sparse.coo_matrix((weights.T.reshape(-1), (i, j)), shape=(n, n))
-    adjacency = (half + half.T).tocsr()
-    return (sparse.diags(np.asarray(adjacency.sum(1)).reshape(-1)) - adjacency).tocsr()
 
 
 def _nearest(points: NDArray[np.float64], piece: NDArray[np.float64], indices: mesh.IntArray) -> mesh.IntArray:

@@ -59,6 +59,7 @@ class Between(nn.Module):
         mu: float | Tensor,
         stiffness: Sequence[float | Tensor],
         coarse_faces: int,
+        rotations: bool,
         local: bool,
         polish: int,
     ) -> None:
@@ -68,7 +69,7 @@ class Between(nn.Module):
         if space == "joint":
             ends = frame.place(*(basis.reference[None].to(frame.scale) for basis in bases))
             references = torch.cat([ends.first, ends.second])
-            self.space: Any = JointSpace(frame, shell, frame.modes(bases), references)
+            self.space: Any = JointSpace(frame, shell, frame.modes(bases), references, rotations)
         elif space == "paired":
             self.space = PairedSpace(frame, shell, frame.modes(bases))
         else:

@@ -44,6 +44,8 @@ class InBetween(nn.Module):
         unconverged: What happens when samples did not converge: ``"warn"`` warns and lets no gradient flow through
             their amplitudes, ``"raise"`` raises where gradients are recorded. With ``gradient="unroll"`` only
             :meth:`solve` tells.
+        rotations: Whether the modes are added to a blend by local rotations of the triangles, in place of linear
+            interpolation: less is then left for them to do. Joint space only. It solves a sparse system on the CPU.
         local: Whether all vertices take a few steps on the fine mesh at the end, for what the modes cannot reach:
             fingertips, hooves, creases. Gradients go through these steps; they cost memory in proportion to V.
         polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
@@ -69,6 +71,7 @@ class InBetween(nn.Module):
         least_gain: float = 0.0,
         gradient: str = "implicit",
         unconverged: str = "warn",
+        rotations: bool = False,
         local: bool = False,
         polish: int = 0,
     ) -> None:
@@ -88,7 +91,9 @@ class InBetween(nn.Module):
         if not self.pairs or any(not 0 <= i < len(bases) for pair in self.pairs for i in pair):
             raise ValueError(f"pairs hold indices of {len(bases)} bases, got {self.pairs}")
         self.members = nn.ModuleList(
-            Between([bases[i], bases[j]], faces, space, mu, (alpha, beta, gamma), coarse_faces, local, polish)
+            Between(
+                [bases[i], bases[j]], faces, space, mu, (alpha, beta, gamma), coarse_faces, rotations, local, polish
+            )
             for i, j in self.pairs
         )
         self.max_steps = max_steps

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Frame, Pair
-from torch_modal.nn.guess import LocalRotations
-from torch_modal.nn.linearised import Reference
+from torch_modal.nn.guess import Guess
+from torch_modal.nn.linearised import Reference, energy_of
 from torch_modal.nn.modal_shell import ModalShell, Placement
 from torch_modal.nn.shell import Measures, Rest, ShellEnergy, Stiffness
 
@@ -19,30 +20,36 @@ class JointProblem(NamedTuple):
     inputs: tuple[Tensor, ...]
     """What the minimiser depends on, for :meth:`JointSpace.placement`. *Shape of each:* ``(B, ...)``."""
     base: Tensor
-    """Linear interpolation on the fine mesh. *Shape:* ``(B, V, 3)``."""
+    """The fine shape that the modes are added to. *Shape:* ``(B, V, 3)``."""
     difference: Tensor
     """The fine column of the last amplitude. *Shape:* ``(B, V, 3)``."""
 
 
 class JointSpace(nn.Module):
-    r"""In-betweens ``x(a) = (1-t) x_a + t x_b + [Phi_a, Phi_b, x_b - x_a] a``.
+    r"""In-betweens ``x(a) = base + [Phi_a, Phi_b, x_b - x_a] a``.
 
-    What is minimised is :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)`, with Eq. 5 for ``d``. Linear interpolation is
-    ``a = 0``, so that the energy of the result is never above its.
+    What is minimised is :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)`, with Eq. 5 for ``d``. The base is linear
+    interpolation, or the blend by local rotations where that has less energy, so that the energy of the result is never
+    above that of linear interpolation.
 
     Args:
         frame: Frame of the two bases.
         shell: Energy on the frame's coarse mesh.
         modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
         references: Shapes that the modes belong to, in the frame. *Shape:* ``(2, V, 3)``.
+        rotations: Whether there is a blend by local rotations.
     """
 
-    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor], references: Tensor) -> None:
+    def __init__(
+        self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor], references: Tensor, rotations: bool
+    ) -> None:
         super().__init__()
         self.frame = frame
         self.columns = frame.elastic_columns(torch.cat(list(modes)))
         self.energy = ModalShell(shell, self.columns.coarse)
-        self.rotations = LocalRotations(shell, self.energy.edge_columns, frame.coarsen(references))
+        # With the blend as the base there is nothing left to guess.
+        self.blend = RotationBlend(ShellEnergy(frame.faces), references) if rotations else None
+        self.first_guess = None if rotations else Guess(shell, self.energy.edge_columns, frame.coarsen(references))
 
     @property
     def n_unknowns(self) -> int:
@@ -51,27 +58,44 @@ class JointSpace(nn.Module):
 
     def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> JointProblem:
         """Set up the in-betweens of a batch at the times ``t``; ``mu`` plays no part. *Shape of each:* ``(B,)``."""
-        base = torch.lerp(pair.first, pair.second, t[:, None, None])
-        difference = self._difference(pair)
-        coarse = (self.frame.coarsen(x) for x in (pair.first, pair.second, difference))
-        return JointProblem((*coarse, t, alpha, beta, gamma), base, difference)
+        base, difference = torch.lerp(pair.first, pair.second, t[:, None, None]), self._difference(pair)
+        first, second, coarse_base, coarse_difference = (
+            self.frame.coarsen(x) for x in (pair.first, pair.second, base, difference)
+        )
+        if self.blend is not None:
+            blend = self.blend(pair.first, pair.second, t)
+            coarse_blend = self.frame.coarsen(blend)
+            references = self._references(first, second, t, alpha, beta, gamma)
+            shell = self.energy.shell
+            energies = [energy_of(shell, shell.measure(x), references).detach() for x in (coarse_base, coarse_blend)]
+            better = (energies[1] < energies[0])[:, None, None]
+            base, coarse_base = torch.where(better, blend, base), torch.where(better, coarse_blend, coarse_base)
+        return JointProblem((first, second, coarse_difference, coarse_base, t, alpha, beta, gamma), base, difference)
 
-    def placement(self, first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> Placement:
+    def placement(
+        self, first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor
+    ) -> Placement:
         """The minimisation on the coarse mesh, from the inputs of a problem."""
+        return Placement(base, difference, self._references(first, second, t, *stiffness))
+
+    def _references(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> list[Reference]:
         # Both at once: what a single sample costs is the number of operations.
         measures, weights = self.energy.shell.rest(torch.stack([first, second]), Stiffness(*stiffness))
-        references = [
+        return [
             Reference(Rest(Measures(*(m[i] for m in measures)), Measures(*(w[i] for w in weights))), pull)
             for i, pull in enumerate((1 - t, t))
         ]
-        return Placement(torch.lerp(first, second, t[:, None, None]), difference, references)
 
-    def guess(self, first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> Tensor:
+    def guess(
+        self, first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor
+    ) -> Tensor:
         """Where the minimisation may start, from the inputs of a problem. *Shape:* ``(B, n)``."""
-        return self.rotations(self.energy.shell, self.energy.edge_columns, first, second, difference, t)
+        if self.first_guess is None:
+            return first.new_zeros(len(first), self.n_unknowns)
+        return self.first_guess(self.energy.shell, self.energy.edge_columns, first, second, difference, t)
 
     @staticmethod
-    def require(first: Tensor, second: Tensor, difference: Tensor, t: Tensor, *stiffness: Tensor) -> None:
+    def require(first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor) -> None:
         """Times in [0, 1].
 
         Raises:

@@ -7,8 +7,9 @@ import torch
 from conftest import Shapes
 from torch import Tensor
 
-from torch_modal.nn.guess import LocalRotations
+from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.rotations import LocalRotations
 from torch_modal.nn.shell import ShellEnergy
 
 T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
@@ -26,10 +27,9 @@ def ribbon(turn: float, n: int = 13) -> tuple[Tensor, Tensor]:
     return x, faces
 
 
-def guess_of(first: Tensor, second: Tensor, faces: Tensor) -> tuple[LocalRotations, ShellEnergy]:
+def rotations_of(first: Tensor, second: Tensor, faces: Tensor) -> tuple[LocalRotations, ShellEnergy]:
     shell = ShellEnergy(faces)
-    columns = torch.zeros(len(shell.edges), 3, 1, dtype=first.dtype)
-    return LocalRotations(shell, columns, torch.stack([first, second])), shell
+    return LocalRotations(shell, torch.stack([first, second])), shell
 
 
 def edges(x: Tensor, shell: ShellEnergy) -> Tensor:
@@ -41,11 +41,11 @@ def test_plates_turn_at_constant_speed(degrees: int) -> None:
     """Beyond half a turn too, where a plate alone would take the other way round."""
     turn = math.radians(degrees)
     (x_a, faces), (x_b, _) = ribbon(0.0), ribbon(turn)
-    guess, shell = guess_of(x_a, x_b, faces)
-    found = guess.edges_between(shell, x_a.expand(len(T), -1, -1), x_b.expand(len(T), -1, -1), T)
+    rotations, shell = rotations_of(x_a, x_b, faces)
+    found = rotations(x_a.expand(len(T), -1, -1), x_b.expand(len(T), -1, -1), T).movedim(0, -1)
     for t, row in zip(T, found, strict=True):
         torch.testing.assert_close(row, edges(ribbon(float(t) * turn)[0], shell), rtol=0, atol=1e-12)
-    half_scale = guess.edges_between(shell, x_a[None], 2 * x_b[None], T[2:3])[0]
+    half_scale = rotations(x_a[None], 2 * x_b[None], T[2:3])[:, 0].mT
     torch.testing.assert_close(half_scale, 1.5 * edges(ribbon(0.5 * turn)[0], shell), rtol=0, atol=1e-12)
 
 
@@ -53,8 +53,8 @@ def test_pieces_have_a_sense_of_their_own() -> None:
     (x_a, faces), (x_b, _), (x_c, _) = ribbon(0.0), ribbon(math.radians(250)), ribbon(math.radians(-250))
     both, twice = torch.cat([x_a, x_a + 5]), torch.cat([faces, faces + len(x_a)])
     moved = torch.cat([x_b, x_c + 5])
-    guess, shell = guess_of(both, moved, twice)
-    found = guess.edges_between(shell, both[None], moved[None], T[2:3])[0]
+    rotations, shell = rotations_of(both, moved, twice)
+    found = rotations(both[None], moved[None], T[2:3])[:, 0].mT
     wanted = torch.cat([ribbon(math.radians(125))[0], ribbon(math.radians(-125))[0]])
     torch.testing.assert_close(found, edges(wanted, shell), rtol=0, atol=1e-12)
 
@@ -64,8 +64,53 @@ def test_triangles_without_area_are_survived(dtype: torch.dtype) -> None:
     (x_a, faces), (x_b, _) = ribbon(0.0), ribbon(2.0)
     x_a[3], x_b[5] = x_a[4], 0.5 * (x_b[4] + x_b[6])
     x_a, x_b = x_a.to(dtype), x_b.to(dtype)
-    guess, shell = guess_of(x_a, x_b, faces)
-    assert guess.edges_between(shell, x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype)).isfinite().all()
+    rotations, _ = rotations_of(x_a, x_b, faces)
+    assert rotations(x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype)).isfinite().all()
+
+
+@pytest.mark.parametrize("degrees", [0, 120, 300])
+def test_blend_is_the_shape_of_these_edges(degrees: int) -> None:
+    """Two ribbons that touch in nothing but a vertex, one apart, and a vertex of no face: each at its place."""
+    turn = math.radians(degrees)
+    x_a, faces = ribbon(0.0)
+    first, second, halfway = (
+        torch.cat([ribbon(s * turn)[0], ribbon(s * -turn)[0] + torch.tensor([0, 0, 40 * s]), torch.full((1, 3), s)])
+        for s in (0.0, 1.0, 0.5)
+    )
+    faces = torch.cat([faces, faces + len(x_a)])
+    shell = ShellEnergy(faces)
+    blend = RotationBlend(shell, torch.stack([first, second]))
+    found = blend(first[None], second[None], T[2:3])[0]
+    torch.testing.assert_close(edges(found, shell), edges(halfway, shell), rtol=0, atol=1e-9)
+    for piece in (slice(0, len(x_a)), slice(len(x_a), -1), slice(-1, None)):
+        centre = 0.5 * (first + second)[piece].mean(0)
+        torch.testing.assert_close(found[piece].mean(0), centre, rtol=0, atol=1e-9)
+
+
+def test_pieces_that_share_a_vertex_stay_together() -> None:
+    (x, faces), other = ribbon(0.0), ribbon(1.0)[0]
+    joined = torch.cat([faces, torch.where(faces == 0, 0, faces + len(x) - 1)])
+    first = torch.cat([x, x[1:] * torch.tensor([-1.0, 1.0, 1.0])])
+    second = torch.cat([other, other[1:] * torch.tensor([-1.0, 1.0, 1.0])])
+    shell = ShellEnergy(joined)
+    blend = RotationBlend(shell, torch.stack([first, second]))
+    half = ribbon(0.5)[0]
+    wanted = torch.cat([half, half[1:] * torch.tensor([-1.0, 1.0, 1.0])])
+    torch.testing.assert_close(
+        edges(blend(first[None], second[None], T[2:3])[0], shell), edges(wanted, shell), rtol=0, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("degrees", [0, 1e-7, 1, 120, 300])
+def test_derivatives(degrees: float, generator: torch.Generator) -> None:
+    """Where nothing turns, too: most of a shape does not."""
+    (x_a, faces), (x_b, _) = ribbon(0.0, 5), ribbon(math.radians(degrees), 5)
+    roughness = 0.0 if degrees == 0 else 0.01
+    x_b = x_b + roughness * torch.randn(x_b.shape, generator=generator, dtype=torch.float64)
+    rotations, _ = rotations_of(x_a, x_b, faces)
+    inputs = tuple(x.clone().requires_grad_() for x in (x_a[None], x_b[None], T[1:2]))
+    assert torch.autograd.gradcheck(rotations, inputs, eps=1e-6, atol=1e-7, rtol=1e-6)
+    assert torch.autograd.gradgradcheck(rotations, inputs, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 @pytest.mark.parametrize(("ends", "bound"), [((0, 4), 1.15), ((0, 2), 1.03), ((2, 4), 1.15)], ids=["0-8", "0-4", "4-8"])

@@ -1,0 +1,71 @@
+"""A shape between two key-frames by local rotations, with every vertex free: what the modes then improve."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torch_modal import mesh
+from torch_modal.nn.rotations import LocalRotations
+from torch_modal.nn.shell import ShellEnergy, pick
+from torch_modal.sparse_solve import SparseSolver, graph_laplacian
+
+
+class RotationBlend(nn.Module):
+    r"""Vertices of :math:`\min_x \sum_e |e(x) - \bar e|^2 / l_e`, with edges from :class:`LocalRotations`.
+
+    The weights are those of references, so that one factorisation serves all shapes
+    (:class:`~torch_modal.sparse_solve.SparseSolver`, on the CPU). Each piece of the surface keeps the centroid of
+    linear interpolation; vertices that no face uses are pieces of their own.
+
+    Args:
+        shell: The energy on the fine mesh.
+        references: Two shapes near the key-frames. *Shape:* ``(2, V, 3)``.
+    """
+
+    edges: Tensor
+    vertex_piece: Tensor
+    shares: Tensor
+    free: Tensor
+
+    def __init__(self, shell: ShellEnergy, references: Tensor) -> None:
+        super().__init__()
+        n = references.shape[-2]
+        self.rotations = LocalRotations(shell, references)
+        self.register_buffer("edges", shell.edges.clone())
+        piece = mesh.vertex_pieces(shell.edges.cpu().numpy(), n)
+        self.register_buffer("vertex_piece", torch.from_numpy(piece))
+        self.register_buffer("shares", (1 / torch.bincount(self.vertex_piece).to(references))[piece])
+        # One vertex of each piece is held, and the piece placed afterwards.
+        free = torch.ones(n, dtype=torch.bool)
+        free[np.unique(piece, return_index=True)[1]] = False
+        self.register_buffer("free", free)
+        self._solver: SparseSolver | None = None
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        super()._load_from_state_dict(*args)
+        self._solver = None
+
+    @property
+    def solver(self) -> SparseSolver:
+        """The Laplacian's inverse, of what the buffers say now."""
+        if self._solver is None:
+            edges, weights = self.edges.cpu().numpy(), self.rotations.per_length.double().cpu().numpy()
+            laplacian = graph_laplacian(edges, weights, len(self.free))
+            self._solver = SparseSolver(laplacian, torch.nonzero(self.free).flatten().cpu().numpy())
+        return self._solver
+
+    def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+        """The shape at the time ``t``. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``."""
+        pulls = self.rotations(first, second, t) * self.rotations.per_length
+        both = torch.cat([-pulls, pulls], -1)
+        right = both.new_zeros(*both.shape[:-1], len(self.free)).index_add(-1, self.edges.T.flatten(), both)
+        x = self.solver(right.movedim(0, -1))
+        return x + self._centroids(torch.lerp(first, second, t[:, None, None]) - x)
+
+    def _centroids(self, x: Tensor) -> Tensor:
+        """The mean over the piece of each vertex. *Shape:* ``(B, V, 3)``."""
+        rows = (x * self.shares[:, None]).movedim(-1, 0).contiguous()
+        sums = torch.zeros_like(rows).index_add(-1, self.vertex_piece, rows)
+        return pick(sums, self.vertex_piece).movedim(0, -1)

@@ -1,0 +1,72 @@
+"""Sparse symmetric systems for tensors: factorised once by SciPy, differentiable, the same for every sample."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+from torch import Tensor
+
+
+class SparseSolver:
+    """The inverse of a sparse symmetric positive definite matrix.
+
+    SciPy's sparse LU in float64 on the CPU: tensors on a GPU go there and back. Backward solves once more. The
+    factorisation is made at the first use, and again after pickling.
+
+    Args:
+        matrix: *Shape:* ``(V, V)``.
+        free: Unknowns to solve for; the others are zero. Default: all.
+    """
+
+    def __init__(self, matrix: sparse.spmatrix, free: NDArray[np.int64] | None = None) -> None:
+        self.n = matrix.shape[0]
+        self.free = np.arange(self.n) if free is None else free
+        self._inner = sparse.csc_matrix(matrix if free is None else matrix.tocsr()[free][:, free])
+        self._factor: SuperLU | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the factorisation, which cannot be pickled."""
+        return {**self.__dict__, "_factor": None}
+
+    def __call__(self, right: Tensor) -> Tensor:
+        """Solve for one or more columns. *Shape:* ``(..., V, m) -> (..., V, m)``."""
+        return _Solve.apply(self, right)
+
+    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same for arrays. *Shape:* ``(V, m) -> (V, m)``."""
+        if self._factor is None:
+            options = {"SymmetricMode": True}
+            self._factor = splu(self._inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        out = np.zeros_like(right)
+        out[self.free] = self._factor.solve(right[self.free])
+        return out
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(solver: SparseSolver, right: Tensor) -> Tensor:
+        columns = right.detach().double().cpu().movedim(-2, 0)
+        solved = solver.solve(np.ascontiguousarray(columns.flatten(1).numpy()))
+        return torch.from_numpy(solved).reshape(columns.shape).movedim(0, -2).to(right).contiguous()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.solver = inputs[0]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor]:
+        return None, _Solve.apply(ctx.solver, grads[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], solver: SparseSolver, right: Tensor) -> tuple[Tensor, int]:
+        return _Solve.apply(solver, right.movedim(in_dims[1], 0)), 0
+
+
+def graph_laplacian(edges: NDArray[np.int64], weights: NDArray[np.float64], n: int) -> sparse.csr_matrix:
+    """``sum_e w_e (x_i - x_j)^2`` as a matrix. *Shape:* ``(E, 2), (E,) -> (n, n)``."""
+    half = sparse.coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
+    adjacency = (half + half.T).tocsr()
+    return (sparse.diags(np.asarray(adjacency.sum(1)).reshape(-1)) - adjacency).tocsr()
