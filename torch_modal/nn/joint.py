@@ -65,9 +65,9 @@ class JointSpace(nn.Module):
         if self.blend is not None:
             blend = self.blend(pair.first, pair.second, t)
             coarse_blend = self.frame.coarsen(blend)
-            references = self._references(first, second, t, alpha, beta, gamma)
-            shell = self.energy.shell
-            energies = [energy_of(shell, shell.measure(x), references).detach() for x in (coarse_base, coarse_blend)]
+            with torch.no_grad():
+                references, shell = self._references(first, second, t, alpha, beta, gamma), self.energy.shell
+                energies = [energy_of(shell, shell.measure(x), references) for x in (coarse_base, coarse_blend)]
             better = (energies[1] < energies[0])[:, None, None]
             base, coarse_base = torch.where(better, blend, base), torch.where(better, coarse_blend, coarse_base)
         return JointProblem((first, second, coarse_difference, coarse_base, t, alpha, beta, gamma), base, difference)
