@@ -1,11 +1,11 @@
-"""What the number of modes and of coarse faces buys, with and without the steps on the fine mesh.
+"""What the number of modes and of coarse faces buys, with and without what is done on the fine mesh.
 
     python tests/benchmarks/choices.py [--modes 10 20 30 50 80] [--coarse-faces 300 1000 3000]
 
 One line for each choice, over the spans of the hand, two pairs of the figure and the samples: the part of the energy
 between linear interpolation and the best that was found that is gone (mean and least), the geometric mean of the
 edge-length error over that of linear interpolation where a truth is known, and the processor time over that of the
-default without local interpolation (30 modes, 1,000 faces). The best that was found stands in for the optimum over all
+default of the layers (30 modes, 1,000 faces). The best that was found stands in for the optimum over all
 vertices: four times ten long steps on the fine mesh after 80 modes and 3,000 faces.
 """
 
@@ -13,15 +13,21 @@ import argparse
 import math
 from itertools import product
 from statistics import fmean, geometric_mean
+from typing import Any
 
 import cases
 import torch
 from cases import Case
 from measures import Yardstick
-from methods import InBetweens, linear
+from methods import SUBDIVIDE, InBetweens, linear
 from timing import timed
 
-DEFAULT = (30, 1000, False)
+WAYS: dict[str, dict[str, Any]] = {
+    "joint": {},
+    "joint + rotations": SUBDIVIDE,
+    "subdivide": {"local": True, **SUBDIVIDE},
+}
+DEFAULT = (30, 1000, "joint")
 
 
 def chosen() -> list[Case]:
@@ -38,33 +44,35 @@ def main() -> None:
     parser.add_argument("--coarse-faces", nargs="+", type=int, default=[300, 1000, 3000])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    choices = list(product(arguments.modes, arguments.coarse_faces, (False, True)))
+    choices = list(product(arguments.modes, arguments.coarse_faces, WAYS))
     choices += [DEFAULT] * (DEFAULT not in choices)
-    found: dict[tuple[int, int, bool], list[tuple[float, float, float]]] = {choice: [] for choice in choices}
+    found: dict[tuple[int, int, str], list[tuple[float, float, float]]] = {choice: [] for choice in choices}
     for case in chosen():
         print(f"{case.name} ...", flush=True)
         yardstick = Yardstick(case)
         halfway = case.at([cases.HALF])
         straight = linear(halfway).frames[0]
-        best = InBetweens(halfway, 80, {"coarse_faces": 3000, "local": True, "polish": 40})().shapes[0]
+        best = InBetweens(halfway, 80, {"coarse_faces": 3000, "rotations": True, "local": True, "polish": 40})().shapes[
+            0
+        ]
         most, least = yardstick.energy(straight), yardstick.energy(best)
-        for n_modes, coarse_faces, local in choices:
-            layer = InBetweens(halfway, n_modes, {"coarse_faces": coarse_faces, "local": local})
+        for n_modes, coarse_faces, way in choices:
+            layer = InBetweens(halfway, n_modes, {"coarse_faces": coarse_faces, **WAYS[way]})
             result, seconds = timed(layer)
             shape = result.shapes[0]
             error = float("nan")
             if cases.HALF in case.truths:
                 error = yardstick.edge_error(shape, cases.HALF) / yardstick.edge_error(straight, cases.HALF)
             gap = (most - yardstick.energy(shape)) / (most - least)
-            found[n_modes, coarse_faces, local].append((gap, error, seconds))
-    print("\n| modes | coarse faces | local | gap closed: mean | least | edge error over linear | time |")
+            found[n_modes, coarse_faces, way].append((gap, error, seconds))
+    print("\n| modes | coarse faces | | gap closed: mean | least | edge error over linear | time |")
     print("|---|---|---|---|---|---|---|")
-    for (n_modes, coarse_faces, local), rows in found.items():
+    for (n_modes, coarse_faces, way), rows in found.items():
         gaps, errors, seconds = zip(*rows, strict=True)
         known = [error for error in errors if not math.isnan(error)]
         times = [s / reference[2] for s, reference in zip(seconds, found[DEFAULT], strict=True)]
         print(
-            f"| {n_modes} | {coarse_faces} | {'yes' if local else 'no'} | {fmean(gaps):.3f} | {min(gaps):.3f} | "
+            f"| {n_modes} | {coarse_faces} | {way} | {fmean(gaps):.3f} | {min(gaps):.3f} | "
             f"{geometric_mean(known):.3f} | {geometric_mean(times):.2f} |"
         )
 
