@@ -13,15 +13,15 @@ from torch_modal.nn.frame import DIAGONAL, Frame, Pair
 from torch_modal.nn.gauss_newton import GaussNewtonStep, Solution, Status
 from torch_modal.nn.implicit import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.joint import JointSpace
-from torch_modal.nn.linearised import Reference
+from torch_modal.nn.linearised import references_between
 from torch_modal.nn.paired import PairedSpace
-from torch_modal.nn.shell import ShellEnergy, Stiffness, enclosed_volume, per_sample
+from torch_modal.nn.shell import ShellEnergy, enclosed_volume, per_sample
 from torch_modal.nn.surface import relax
 
 # Newton steps of the local interpolation, and products with the Hessian in each: what closes 97 % of the gap in energy
 # between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
 LOCAL_STEPS = 2
-LOCAL_PRODUCTS = 5
+LOCAL_PRODUCTS = 3
 POLISH_PRODUCTS = 20
 
 # Vertices of all samples that are relaxed at a time: more would not fit into caches.
@@ -140,8 +140,7 @@ class Between(nn.Module):
 
     def _relax(self, x: Tensor, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> Tensor:
         shell: Any = self.fine_shell
-        rest = [shell.rest(end, Stiffness(*stiffness)) for end in (first, second)]
-        references = [Reference(rest[0], 1 - t), Reference(rest[1], t)]
+        references = references_between(shell, first, second, t, *stiffness)
         if self.local:
             x = relax(shell, x, references, LOCAL_STEPS, LOCAL_PRODUCTS)
         return relax(shell, x, references, self.polish, POLISH_PRODUCTS)

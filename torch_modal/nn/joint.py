@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.guess import Guess
-from torch_modal.nn.linearised import Reference, energy_of
+from torch_modal.nn.linearised import energy_of, references_between
 from torch_modal.nn.modal_shell import ModalShell, Placement
-from torch_modal.nn.shell import Measures, Rest, ShellEnergy, Stiffness
+from torch_modal.nn.shell import ShellEnergy
 
 
 class JointProblem(NamedTuple):
@@ -66,7 +66,8 @@ class JointSpace(nn.Module):
             blend = self.blend(pair.first, pair.second, t)
             coarse_blend = self.frame.coarsen(blend)
             with torch.no_grad():
-                references, shell = self._references(first, second, t, alpha, beta, gamma), self.energy.shell
+                shell = self.energy.shell
+                references = references_between(shell, first, second, t, alpha, beta, gamma)
                 energies = [energy_of(shell, shell.measure(x), references) for x in (coarse_base, coarse_blend)]
             better = (energies[1] < energies[0])[:, None, None]
             base, coarse_base = torch.where(better, blend, base), torch.where(better, coarse_blend, coarse_base)
@@ -76,15 +77,7 @@ class JointSpace(nn.Module):
         self, first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor
     ) -> Placement:
         """The minimisation on the coarse mesh, from the inputs of a problem."""
-        return Placement(base, difference, self._references(first, second, t, *stiffness))
-
-    def _references(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> list[Reference]:
-        # Both at once: what a single sample costs is the number of operations.
-        measures, weights = self.energy.shell.rest(torch.stack([first, second]), Stiffness(*stiffness))
-        return [
-            Reference(Rest(Measures(*(m[i] for m in measures)), Measures(*(w[i] for w in weights))), pull)
-            for i, pull in enumerate((1 - t, t))
-        ]
+        return Placement(base, difference, references_between(self.energy.shell, first, second, t, *stiffness))
 
     def guess(
         self, first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor

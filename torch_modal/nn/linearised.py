@@ -10,6 +10,7 @@ from torch_modal.nn.shell import (
     Measures,
     Rest,
     ShellEnergy,
+    Stiffness,
     dihedral_angle,
     dihedral_gradient,
     edge_length,
@@ -23,6 +24,26 @@ class Reference(NamedTuple):
     rest: Rest
     pull: Tensor
     """Factor of its energy. *Shape:* ``(B,)``."""
+
+
+def references_between(
+    shell: ShellEnergy, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor
+) -> list[Reference]:
+    """Both key-frames as references of the in-between at ``t``. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``.
+
+    Args:
+        shell: The energy.
+        first: Key-frames at 0.
+        second: Key-frames at 1.
+        t: Times.
+        *stiffness: ``alpha``, ``beta`` and ``gamma``. *Shape of each:* ``(B,)``.
+    """
+    # Both at once: what a single sample costs is the number of operations.
+    measures, weights = shell.rest(torch.stack([first, second]), Stiffness(*stiffness))
+    return [
+        Reference(Rest(Measures(*(m[i] for m in measures)), Measures(*(w[i] for w in weights))), pull)
+        for i, pull in enumerate((1 - t, t))
+    ]
 
 
 def slopes_of(measures: Measures, references: Sequence[Reference]) -> tuple[Measures, Measures]:
