@@ -252,9 +252,9 @@ class TestGradients:
         for name, gradient in zip(inputs, gradients, strict=True):
             x = inputs[name]
             direction = torch.randn(x.shape, generator=generator, dtype=DOUBLE) if x.dim() else torch.ones_like(x)
-            expected = central_difference(
-                lambda y, name=name: value(**{**inputs, name: y}), x, direction, DIFFERENCE_STEPS[name]
-            )
+            # Small: the Hessian of the steps has kinks, where an edge is neither stretched nor squeezed.
+            step = 1e-6 if x.dim() else DIFFERENCE_STEPS[name]
+            expected = central_difference(lambda y, name=name: value(**{**inputs, name: y}), x, direction, step)
             assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5), name
         (without,) = torch.autograd.grad(value({}, **leaves), leaves["x_a"])
         assert float((without - gradients[0]).norm()) > 1e-2 * float(without.norm())
