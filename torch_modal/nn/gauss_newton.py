@@ -20,6 +20,9 @@ GOOD_DECREASE = 0.8
 # Of saddle-free Newton steps, relative to Gauss-Newton's Hessian.
 LEAST_CURVATURE = 0.1
 
+# Where the gradient has grown by this factor after what should have been the last Newton step, it was not the last.
+GROWN = 10.0
+
 # Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
 ROUNDING_MARGIN = 4.0
 ENERGY_ROUNDING = 64.0
@@ -265,14 +268,15 @@ def minimise(
     energy = step.energy.value(a, placement)
     start = torch.full_like(energy, torch.inf)
     slow = torch.zeros_like(energy, dtype=torch.bool)
-    last = torch.zeros_like(slow)
+    last, before = torch.zeros_like(slow), start
     for k in range(max_steps + 1):
         derivatives = step.energy.derivatives(a, placement, second_order=False)
         norm = derivatives.gradient.norm(dim=-1)
         if k == 0:
             start = norm
         status = torch.full_like(rows, Status.OUT_OF_STEPS)
-        status[last | (norm <= torch.maximum(tolerance * start, step.floor(derivatives)))] = Status.CONVERGED
+        found = norm <= torch.maximum(tolerance * start, step.floor(derivatives))
+        status[found | (last & (norm <= GROWN * before))] = Status.CONVERGED
         status[~(norm.isfinite() & energy.isfinite())] = Status.INVALID
         leaving = (status != Status.OUT_OF_STEPS) | (k == max_steps)
         if not bool(leaving.all()):
@@ -301,9 +305,11 @@ def minimise(
         slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)
         result.n_steps[rows[~leaving & (taken.moved | last)]] += 1
         a, energy = torch.where(last[:, None], taken.newton, taken.amplitudes), taken.energy
+        before = norm
         if bool(leaving.any()):
             stay = torch.nonzero(~leaving).flatten()
-            rows, a, energy, start, slow, last = (values[stay] for values in (rows, a, energy, start, slow, last))
+            kept = (rows, a, energy, start, slow, last, before)
+            rows, a, energy, start, slow, last, before = (values[stay] for values in kept)
             placement = _pick(placement, stay)
     return result
 
