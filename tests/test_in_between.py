@@ -519,6 +519,7 @@ class TestExceptions:
             ({"unconverged": "hide"}, "'warn' or 'raise'"),
             ({"space": "outer"}, "'joint' or 'paired'"),
             ({"pairs": [(0, 9)]}, "indices of 2 bases"),
+            ({"space": "paired", "rotations": True}, "needs space='joint'"),
         ):
             with pytest.raises(ValueError, match=message):
                 InBetween(bars.bases[:2], bars.faces, **options)
