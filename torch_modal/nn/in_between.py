@@ -83,8 +83,8 @@ class InBetween(nn.Module):
             raise ValueError(f"gradient is 'implicit' or 'unroll', got {gradient!r}")
         if unconverged not in ("warn", "raise"):
             raise ValueError(f"unconverged is 'warn' or 'raise', got {unconverged!r}")
-        if rotations and space != "joint":
-            raise ValueError(f"rotations=True needs space='joint', got {space!r}: Eq. 4 starts from the key-frames")
+        if rotations and space == "paired":
+            raise ValueError("rotations=True needs space='joint': Eq. 4 of the paired space starts from the key-frames")
         if not 0 <= least_gain < 1:
             raise ValueError(f"least_gain is a part of the energy, from 0 to less than 1; got {least_gain!r}")
         if not isinstance(polish, int) or polish < 0:
