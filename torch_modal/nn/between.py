@@ -21,7 +21,7 @@ from torch_modal.nn.surface import relax
 # Newton steps of the local interpolation, and products with the Hessian in each: what closes 97 % of the gap in energy
 # between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
 LOCAL_STEPS = 2
-LOCAL_PRODUCTS = 3
+LOCAL_PRODUCTS = 4
 POLISH_PRODUCTS = 20
 
 # Vertices of all samples that are relaxed at a time: more would not fit into caches.

@@ -16,8 +16,8 @@ class Minimisation(NamedTuple):
     step: GaussNewtonStep
     placement: Callable[..., Any]
     """From the inputs to what the energy knows of each sample."""
-    guess: Callable[..., Tensor]
-    """Amplitudes to start from, from the inputs."""
+    guess: Callable[..., Tensor | None]
+    """Amplitudes to start from, from the inputs; None for zeros."""
     require: Callable[..., None]
     """Raises where the inputs have no solution."""
     n_unknowns: int
@@ -41,9 +41,11 @@ class _ArgMin(torch.autograd.Function):
     def forward(minimisation: Minimisation, usable: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         minimisation.require(*inputs)
         placement = minimisation.placement(*inputs)
-        zero = inputs[0].new_zeros(len(inputs[0]), minimisation.n_unknowns)
-        # Never a start that is worse than linear interpolation: what comes out must not be, either.
-        start, _ = minimisation.step.lowest(zero, torch.stack([zero, minimisation.guess(*inputs)]), placement)
+        start = inputs[0].new_zeros(len(inputs[0]), minimisation.n_unknowns)
+        guess = minimisation.guess(*inputs)
+        if guess is not None:
+            # Never a start that is worse than linear interpolation: what comes out must not be, either.
+            start, _ = minimisation.step.lowest(start, torch.stack([torch.zeros_like(guess), guess]), placement)
         limits = minimisation.max_steps, minimisation.tolerance, minimisation.least_gain
         solution = minimise(minimisation.step, start, placement, *limits)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))

@@ -81,10 +81,10 @@ class JointSpace(nn.Module):
 
     def guess(
         self, first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor
-    ) -> Tensor:
-        """Where the minimisation may start, from the inputs of a problem. *Shape:* ``(B, n)``."""
+    ) -> Tensor | None:
+        """Where the minimisation may start, from the inputs of a problem; None: at zeros. *Shape:* ``(B, n)``."""
         if self.first_guess is None:
-            return first.new_zeros(len(first), self.n_unknowns)
+            return None
         return self.first_guess(self.energy.shell, self.energy.edge_columns, first, second, difference, t)
 
     @staticmethod

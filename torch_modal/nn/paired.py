@@ -134,9 +134,9 @@ class PairedSpace(nn.Module):
             places.append(Placement(coarse, None, [Reference(rest, torch.ones_like(t))]))
         return PairedPlacement(places[0], places[1], linear, constant, mu)
 
-    def guess(self, first: Tensor, *others: Tensor) -> Tensor:
-        """Where the minimisation may start: at the key-frames, as in the paper. *Shape:* ``(B, n)``."""
-        return first.new_zeros(len(first), self.n_unknowns)
+    @staticmethod
+    def guess(*inputs: Tensor) -> None:
+        """Where the minimisation may start: at zeros, which are the key-frames, as in the paper."""
 
     @staticmethod
     def require(
