@@ -17,7 +17,7 @@ setup(
     license="MIT",
     python_requires=">=3.10",
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
-    package_data={"torch_modal": ["py.typed", "samples/*/*.ply"]},
+    package_data={"torch_modal": ["py.typed", "*.pyi", "samples/*/*.ply"]},
     install_requires=[
         "torch>=2.4",
         "numpy>=1.24",
@@ -33,10 +33,11 @@ setup(
         "pygltflib>=1.16",
         "matplotlib>=3.7",
         "tqdm>=4.65",
+        "lazy_loader>=0.4",
     ],
     extras_require={
         "pyg": ["torch_geometric>=2.4"],
         "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4"],
     },
-    entry_points={"console_scripts": ["torch-modal = torch_modal.cli:main"]},
+    entry_points={"console_scripts": ["torch-modal = torch_modal.cli.main:main"]},
 )

@@ -10,6 +10,6 @@ root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 
 case " $* " in
-*" --out "* | *" --out="*) exec "$python" -m torch_modal.cli demo "$@" ;;
-*) exec "$python" -m torch_modal.cli demo --out "$root/out/demo" --overwrite "$@" ;;
+*" --out "* | *" --out="*) exec "$python" -m torch_modal demo "$@" ;;
+*) exec "$python" -m torch_modal demo --out "$root/out/demo" --overwrite "$@" ;;
 esac

@@ -13,13 +13,14 @@ import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, surface
 
-from torch_modal.basis import ModalBasis
-from torch_modal.keyframes import Keyframes, load_keyframes
+from torch_modal.keyframes.check import Keyframes
+from torch_modal.keyframes.load import load_keyframes
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.mid_shape import MidShape
-from torch_modal.precompute.arap import arap_hessian, lumped_mass
+from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases
+from torch_modal.precompute.stiffness import arap_hessian, lumped_mass
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
 
 # The only releases for Python 3.10; their logarithm of a rotation has no gradient at no turn and at half a turn.

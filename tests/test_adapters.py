@@ -80,7 +80,7 @@ def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> No
     geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
     from torch_geometric.transforms import Compose, FaceToEdge
 
-    from torch_modal.pyg import RandomShape
+    from torch_modal.data.pyg import RandomShape
 
     data = geometric.data.Data(
         pos=bars.keyframes[0],
@@ -125,7 +125,7 @@ def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> No
 
 def test_graphs_from_the_dataset(bars: Shapes, tmp_path: Path) -> None:
     geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
-    from torch_modal.pyg import as_data
+    from torch_modal.data.pyg import as_data
 
     tm.write_set(tmp_path / "a", *bars, ["0", "1", "2"])
     data = tm.ShapeDataset(tmp_path, samples_per_set=3, faces=True, normals=True, labels=graph_labels)

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 import torch
 from solids import box, together
 
-from torch_modal.precompute.arap import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, lumped_mass, mass_matrix
+from torch_modal.precompute.stiffness import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, lumped_mass, mass_matrix
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
 
 

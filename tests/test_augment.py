@@ -12,11 +12,11 @@ import trimesh
 from conftest import Shapes, random_rotation
 
 import torch_modal as tm
-from torch_modal.augment.deformation import deform, linear_strain
-from torch_modal.augment.table import interpolate
-from torch_modal.nn.shell import enclosed_volume
-from torch_modal.rigid import best_fit
-from torch_modal.sample_data import load_sample
+from torch_modal.data.deformation import deform, linear_strain
+from torch_modal.data.samples import load_sample
+from torch_modal.data.table import interpolate
+from torch_modal.energy.shell import enclosed_volume
+from torch_modal.geometry.rigid import best_fit
 
 F64 = torch.float64
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from torch_modal.basis import ModalBasis
+from torch_modal.precompute.basis import ModalBasis
 
 V, K = 20, 5
 
@@ -90,7 +90,7 @@ def test_load_refuses_what_is_no_basis(basis: ModalBasis, tmp_path: Path) -> Non
         ModalBasis.load(path)
 
     tensors = {name: getattr(basis, name) for name in ("reference", "eigenvalues", "modes", "rigid_eigenvalues")}
-    good = {"format": "torch_modal.basis", "version": "1"}
+    good = {"format": "torch_modal.precompute.basis", "version": "1"}
     for metadata in (None, {"format": "pt"}):
         save_file(tensors, path, metadata)
         with pytest.raises(ValueError, match="holds no modal basis"):

@@ -5,8 +5,8 @@ import pytest
 from bodies import BAR, BODIES, WALL, Body, bend, body, squeeze, twist
 from scipy.spatial import cKDTree
 
-from torch_modal import mesh
-from torch_modal.inspect_mesh import consistent_winding, degenerate_faces, repeated_faces, signed_volume
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.inspect import consistent_winding, degenerate_faces, repeated_faces, signed_volume
 
 HOLLOW = [name for name in BODIES if name.startswith(("tube", "vessel"))]
 
@@ -21,7 +21,7 @@ def lengths(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", BODIES)
 def test_one_manifold_surface_of_the_promised_size(name: str, jittered: bool) -> None:
     shape = body(name, jittered)
-    edges, counts = mesh.unique_edges(shape.faces)
+    edges, counts = connectivity.unique_edges(shape.faces)
     assert 2000 <= len(shape.rest) <= 4000
     assert np.array_equal(np.unique(shape.faces), np.arange(len(shape.rest)))
     assert not degenerate_faces(shape.faces).any() and not repeated_faces(shape.faces).any()
@@ -88,7 +88,7 @@ def test_bar_bent_by_hand() -> None:
 def test_edges_of_a_bent_body_have_the_lengths_of_chords(name: str, time: float) -> None:
     shape = body(name)
     angle = np.radians(float(name.split()[-1])) * time
-    edges, _ = mesh.unique_edges(shape.faces)
+    edges, _ = connectivity.unique_edges(shape.faces)
     start, stop = shape.rest[edges[:, 0]], shape.rest[edges[:, 1]]
     level = np.abs(start[:, 1] - stop[:, 1]) < 1e-12  # both ends on one arc
     radius = BAR / angle - start[:, 1]
@@ -99,7 +99,7 @@ def test_edges_of_a_bent_body_have_the_lengths_of_chords(name: str, time: float)
 
 def test_sheet_is_rolled_without_stretch() -> None:
     shape = body("sheet rolled 270")
-    edges, _ = mesh.unique_edges(shape.faces)
+    edges, _ = connectivity.unique_edges(shape.faces)
     assert np.abs(lengths(shape.pose(1.0), edges) / lengths(shape.rest, edges) - 1).max() < 3e-4
 
 
@@ -178,7 +178,7 @@ def test_limb_is_slender_and_moves_alone() -> None:
 def test_irregular_is_the_same_surface_otherwise_triangulated(name: str) -> None:
     regular, other = body(name), body(name, jittered=True)
     assert len(regular.rest) == len(other.rest) and len(regular.faces) == len(other.faces)
-    edges = [mesh.unique_edges(shape.faces)[0] for shape in (regular, other)]
+    edges = [connectivity.unique_edges(shape.faces)[0] for shape in (regular, other)]
     assert len(set(map(tuple, edges[0])) ^ set(map(tuple, edges[1]))) > 0.1 * len(edges[0])  # edges were turned
     spread = [np.std(lengths(shape.rest, e)) for shape, e in zip((regular, other), edges, strict=True)]
     assert spread[1] > 1.5 * spread[0]
@@ -188,7 +188,7 @@ def test_irregular_is_the_same_surface_otherwise_triangulated(name: str) -> None
         assert signed_volume(other.rest, other.faces) == pytest.approx(BAR, rel=1e-12)  # flat sides stay flat
     if name.startswith("sheet"):
         assert (other.rest[:, 1] == 0).all()
-        assert np.array_equal(mesh.boundary_edges(other.faces), mesh.boundary_edges(regular.faces))
+        assert np.array_equal(connectivity.boundary_edges(other.faces), connectivity.boundary_edges(regular.faces))
     again = body(name, jittered=True)
     assert np.array_equal(again.rest, other.rest) and np.array_equal(again.faces, other.faces)
 

@@ -17,15 +17,15 @@ import torch
 from conftest import Shapes, listen_to_ctrl_c
 
 import torch_modal as tm
-from torch_modal import cli
 from torch_modal.bulk import _set_worker, review, set_process
 from torch_modal.bulk import records as r
 from torch_modal.bulk.progress import Progress, printable
 from torch_modal.bulk.records import Record, Records
 from torch_modal.bulk.run import default_workers
 from torch_modal.bulk.sharing import Counts
-from torch_modal.export import save_frames
-from torch_modal.stored import BASES_FILE, find_sets, open_set, write_set
+from torch_modal.cli import main as cli
+from torch_modal.data.stored import BASES_FILE, find_sets, open_set, write_set
+from torch_modal.io.write import save_frames
 
 # In place of the process that computes a set: the set's name says what becomes of it. It is the product's own engine
 # that starts it, keeps its time and reads what it left.
@@ -305,7 +305,7 @@ def test_what_was_derived_from_a_set_is_replaced_with_it(
     code = f"""
         import json, sys
         sys.path.insert(0, {str(Path(tm.__file__).parents[1])!r})
-        from torch_modal.stored import open_set, write_set
+        from torch_modal.data.stored import open_set, write_set
         job, source = json.load(open(sys.argv[1])), open_set({str(bench.root.parent / "stored")!r})
         write_set(job["folder"], source.keyframes, source.faces, source.bases, source.names)
         json.dump({{"status": "done", "keyframes": 3, "vertices": 164}}, open(sys.argv[2], "w"))
@@ -508,7 +508,7 @@ def test_when_the_command_ends_so_do_its_processes(
         save_frames(np.stack([capsule[0], 1.1 * capsule[0]]), capsule[1], root / name)
     search = os.pathsep.join([str(tmp_path / "path"), str(Path(tm.__file__).parents[1])])
     process = subprocess.Popen(
-        [sys.executable, "-m", "torch_modal.cli", "precompute", str(root), "--out", str(out), "--workers", "1"],
+        [sys.executable, "-m", "torch_modal", "precompute", str(root), "--out", str(out), "--workers", "1"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

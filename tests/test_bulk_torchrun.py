@@ -18,8 +18,8 @@ import trimesh
 
 import torch_modal as tm
 from torch_modal.bulk import records as r
-from torch_modal.export import save_frames
-from torch_modal.stored import BASES_FILE, find_sets, open_set
+from torch_modal.data.stored import BASES_FILE, find_sets, open_set
+from torch_modal.io.write import save_frames
 
 pytestmark = [
     pytest.mark.slow,
@@ -92,7 +92,7 @@ class Cluster:
                 where = ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}", "--rdzv-id", "x"]
                 where += ["--rdzv-conf", f"is_host={int(rank == 0)}", "--local-addr", "127.0.0.1"]
             command = [sys.executable, "-m", "torch.distributed.run", "--nnodes", "2", "--nproc-per-node", "1", *where]
-            command += ["-m", "torch_modal.cli", "precompute", str(self.root), "--out", str(self.out)]
+            command += ["-m", "torch_modal", "precompute", str(self.root), "--out", str(self.out)]
             command += ["--workers", "1", "--mesher", "tetwild", "--modes", "6", "--timeout", "60"]
             with self._said(rank).open("wb") as said:
                 agent = subprocess.Popen(

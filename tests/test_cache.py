@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_modal.files import write_atomically
+from torch_modal.io.files import write_atomically
 from torch_modal.precompute import cache as cache_module
 from torch_modal.precompute.cache import (
     Cache,

@@ -7,12 +7,12 @@ from bodies import bend
 from solids import box, surface
 
 from torch_modal.precompute import filling, modes
-from torch_modal.precompute.arap import arap_hessian, mass_matrix
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, self_proximity
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import embed_surface
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
+from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tet_volumes
 

@@ -14,13 +14,14 @@ import torch
 from conftest import listen_to_ctrl_c
 
 import torch_modal as tm
-from torch_modal import cli, demo
-from torch_modal.export import save_frames
+from torch_modal.cli import demo
+from torch_modal.cli import main as cli
+from torch_modal.data.samples import load_sample
+from torch_modal.io.write import save_frames
 from torch_modal.precompute import filling
 from torch_modal.precompute import modes as modes_module
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
-from torch_modal.sample_data import load_sample
 
 FAST = ["--modes", "6", "--levels", "1", "--coarse-faces", "200"]
 
@@ -73,7 +74,7 @@ def misused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
 
 
 def run(*argv: str, **options: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "torch_modal.cli", *argv]
+    command = [sys.executable, "-m", "torch_modal", *argv]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)  # type: ignore[call-overload]
 
 
@@ -263,7 +264,7 @@ def test_interrupt_says_one_line_and_leaves_with_130(meshes: list[str], tmp_path
     out, scratch = tmp_path / "out", tmp_path / "scratch"
     scratch.mkdir()
     process = subprocess.Popen(
-        [sys.executable, "-m", "torch_modal.cli", "modes", *meshes, "--no-cache", "--out", str(out)],
+        [sys.executable, "-m", "torch_modal", "modes", *meshes, "--no-cache", "--out", str(out)],
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "TMPDIR": str(scratch)},
@@ -284,7 +285,7 @@ def test_closed_pipe_is_quiet() -> None:
     """Nobody reads what --help prints."""
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "torch_modal.cli", "--help"]
+    command = [sys.executable, "-m", "torch_modal", "--help"]
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     os.close(write)
     assert done.stderr == ""

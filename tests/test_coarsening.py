@@ -6,8 +6,8 @@ import torch
 from bodies import body
 from conftest import Shapes
 
-from torch_modal.keyframes import Keyframes
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.keyframes.check import Keyframes
 from torch_modal.precompute import coarsening
 from torch_modal.precompute.coarsening import Coarsening, coarsen
 

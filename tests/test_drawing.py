@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torch_modal import drawing
+from torch_modal.view import drawing
 
 BALL = trimesh.creation.icosphere(2)
 

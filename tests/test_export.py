@@ -1,4 +1,4 @@
-"""Files written by torch_modal.export, read back with other libraries' readers."""
+"""Files written by torch_modal.io.write, read back with other libraries' readers."""
 
 import json
 import os
@@ -14,8 +14,8 @@ import pytest
 import torch
 import trimesh
 
-from torch_modal import export
-from torch_modal.export import save_animation, save_frames
+from torch_modal.io import write as export
+from torch_modal.io.write import save_animation, save_frames
 
 HAND = Path(__file__).parents[1].parent / "shared" / "data" / "mh-hand-path"
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -319,7 +319,7 @@ def test_normals_have_unit_length_everywhere(tmp_path):
 
 
 def test_the_import_is_light():
-    code = "import sys, torch_modal.export, torch_modal.picture; print(*sys.modules)"
+    code = "import sys, torch_modal.io.write, torch_modal.view.picture; print(*sys.modules)"
     root = str(Path(export.__file__).parents[1])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert not {"pyvista", "vtkmodules", "matplotlib", "pygltflib"} & set(done.stdout.split())

@@ -3,12 +3,12 @@
 import pytest
 import torch
 from conftest import Shapes
+from full_space import full_space
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.full_space import full_space
-from torch_modal.nn.shell import ShellEnergy
-from torch_modal.rigid import blend
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.rigid import blend
 
 
 def energy(faces: Tensor, x: Tensor, x_a: Tensor, x_b: Tensor, t: float = 0.5) -> Tensor:

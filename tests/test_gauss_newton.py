@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 from torch import Tensor
 from torch.func import jacfwd
 
-from torch_modal.nn.gauss_newton import GaussNewtonStep, Solution, minimise
 from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.modal_shell import Derivatives, Placement
+from torch_modal.nn.modal_energy import Derivatives, Placement
+from torch_modal.nn.solver import GaussNewtonStep, Solution, minimise
 
 
 class LeastSquares:

@@ -1,6 +1,7 @@
 """Imports go one way, and what is heavy is loaded by those who need it only."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -9,49 +10,9 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "torch_modal"
 
-# From the ground up: a module may import those in earlier lines only, at the top of the file or inside functions.
-ORDER = [
-    ["version", "errors", "files", "mesh", "inspect_mesh", "processes", "sparse_solve"],
-    ["arrays", "basis", "export", "mesh_files", "rigid"],
-    ["drawing"],
-    ["keyframes", "picture", "stored"],
-    ["precompute", "precompute._tetwild_worker", "precompute.cache", "precompute.coarsening", "precompute.parallel"],
-    ["precompute.surface", "precompute.mass"],
-    ["precompute.lanczos"],
-    ["precompute.tetrahedra", "precompute.eigen"],
-    ["precompute.arap", "precompute.lattice"],
-    ["precompute.embedding", "precompute.carrying"],
-    ["precompute.filling"],
-    ["precompute.solving"],
-    ["precompute.modes"],
-    ["nn", "nn.shell"],
-    ["nn.curvature", "nn.linearised", "nn.rotations"],
-    ["nn.modal_shell"],
-    ["nn.surface"],
-    ["nn.frame", "nn.gauss_newton", "nn.blend", "nn.guess"],
-    ["nn.joint", "nn.paired", "nn.implicit"],
-    ["nn.between"],
-    ["nn.in_between"],
-    ["nn.mid_shape", "full_space"],
-    ["sequence"],
-    ["augment", "augment.triangles", "augment.table", "augment.normals"],
-    ["augment.reconstruction"],
-    ["augment.space"],
-    ["augment.base"],
-    ["augment.between", "augment.deformation", "augment.rigid_motion"],
-    ["augment.sequential"],
-    ["adapters", "dataset", "pyg"],
-    ["sample_data"],
-    [""],
-    ["demo"],
-    ["bulk", "bulk.records", "bulk.sharing", "bulk.tree"],
-    ["bulk._set_worker", "bulk.progress", "bulk.review", "bulk.set_process"],
-    ["bulk.run"],
-    ["bulk.command"],
-    ["commands"],
-    ["cli"],
-]
-RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
+# From the ground up: a module imports from its own floor and lower ones, at the top of the file or inside functions.
+FLOORS = ["version", "errors", "geometry", "io", "keyframes", "precompute", "energy", "nn", "sequence", "data", "view"]
+FLOORS += ["", "bulk", "cli", "__main__"]
 MODULES = sorted(
     str(path.relative_to(PACKAGE).with_suffix("")).replace("/", ".").removesuffix("__init__").removesuffix(".")
     for path in PACKAGE.rglob("*.py")
@@ -81,36 +42,46 @@ def is_own(name: str) -> bool:
 
 
 def own(module: str) -> set[str]:
-    return {name for name in imported(module) if name in RANK}
+    return {name for name in imported(module) if name in MODULES}
 
 
-def test_every_module_has_its_place() -> None:
-    assert set(MODULES) <= set(RANK), f"give {sorted(set(MODULES) - set(RANK))} a line in ORDER"
-    assert "precompute.modes" in own("sequence"), "imports are not seen"
-    assert "mesh" in own("nn.frame"), "from torch_modal import mesh is not seen"
+def floor(module: str) -> int:
+    return FLOORS.index(module.split(".")[0])
+
+
+def test_every_module_has_its_floor() -> None:
+    assert {module.split(".")[0] for module in MODULES} == set(FLOORS)
+    assert "precompute.modes" in own("sequence.subdivide"), "imports are not seen"
+    assert "geometry.connectivity" in own("nn.frame"), "from torch_modal.geometry import connectivity is not seen"
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda name: name or "torch_modal")
-def test_imports_go_one_way(module: str) -> None:
-    backwards = sorted(name for name in own(module) if RANK[name] >= RANK[module])
-    assert not backwards, f"{module or '__init__'} imports {backwards}, which stand no lower"
+def test_imports_go_down(module: str) -> None:
+    upwards = sorted(name for name in own(module) if floor(name) > floor(module))
+    assert not upwards, f"{module or '__init__'} imports {upwards}, which stand on higher floors"
+
+
+def test_no_imports_go_round() -> None:
+    graphlib.TopologicalSorter({module: own(module) - {module} for module in MODULES}).prepare()
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("precompute")])
 def test_precompute_does_not_know_the_layers(module: str) -> None:
     assert not {name for name in own(module) if name.startswith("nn")}
-    if module not in ("precompute", "precompute.modes"):
-        assert "torch" not in {name.split(".")[0] for name in imported(module)}, "modes.py alone makes tensors"
+    if module not in ("precompute", "precompute.basis", "precompute.modes"):
+        assert "torch" not in {name.split(".")[0] for name in imported(module)}, (
+            "modes.py alone makes tensors, for basis.py"
+        )
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("nn")])
 def test_layers_are_torch_only(module: str) -> None:
     packages = {name.split(".")[0] for name in imported(module)}
     assert not packages & FOREIGN_TO_LAYERS
-    if module not in ("nn.curvature", "nn.frame", "nn.blend"):
+    if module not in ("nn.frame", "nn.blend"):
         assert "numpy" not in packages
-    # Only the frame, made once, looks into the other room.
-    allowed = {"precompute.coarsening"} if module == "nn.frame" else set()
+    # Bases are what comes in; only the frame, made once, looks further into the other room.
+    allowed = {"precompute.basis", "precompute.coarsening"} if module == "nn.frame" else {"precompute.basis"}
     assert {name for name in own(module) if name.startswith("precompute")} <= allowed
 
 

@@ -15,11 +15,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
 
+from torch_modal.energy.shell import ShellEnergy
 from torch_modal.nn.between import ConvergenceError, ConvergenceWarning
-from torch_modal.nn.gauss_newton import Status
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.nn.solver import Status
 
 DOUBLE = torch.float64
 
@@ -268,7 +268,7 @@ class TestGradients:
         x_a = inputs["x_a"].clone().requires_grad_()
         y = value(**{**inputs, "x_a": x_a})
         (exact,) = torch.autograd.grad(y, x_a, retain_graph=True)
-        from torch_modal.nn.modal_shell import ModalShell
+        from torch_modal.nn.modal_energy import ModalShell
 
         without = ModalShell.derivatives
 

@@ -10,15 +10,9 @@ import pytest
 import torch
 import trimesh
 
-from torch_modal.inspect_mesh import signed_volume
-from torch_modal.keyframes import (
-    Keyframes,
-    MeshError,
-    MeshWarning,
-    check_keyframes,
-    load_keyframes,
-    require_solid,
-)
+from torch_modal.geometry.inspect import signed_volume
+from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes, require_solid
+from torch_modal.keyframes.load import load_keyframes
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 

@@ -9,10 +9,10 @@ from solids import box, surface
 
 from torch_modal.errors import MeshWarning
 from torch_modal.precompute import filling
-from torch_modal.precompute.arap import arap_hessian, lumped_mass, mass_matrix
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.lattice import lattice
 from torch_modal.precompute.modes import extract_bases, extract_modes
+from torch_modal.precompute.stiffness import arap_hessian, lumped_mass, mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings, solid_volumes, tet_volumes
 

@@ -11,13 +11,13 @@ from conftest import Shapes, placement_of, random_rotation
 from torch import Tensor
 from torch.func import functional_call
 
-from torch_modal import mesh
-from torch_modal.basis import ModalBasis
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.rigid import best_fit, blend
 from torch_modal.nn.between import ConvergenceWarning
 from torch_modal.nn.in_between import DEFAULT_MU
 from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.shell import ShellEnergy
-from torch_modal.rigid import best_fit, blend
+from torch_modal.precompute.basis import ModalBasis
 
 SPACES = ["joint", "paired"]
 
@@ -34,7 +34,7 @@ def diagonal(x: Tensor) -> float:
 
 
 def linear(x_a: Tensor, x_b: Tensor, faces: Tensor) -> Tensor:
-    weights = torch.from_numpy(mesh.vertex_areas(x_a.numpy(), faces.numpy()))
+    weights = torch.from_numpy(connectivity.vertex_areas(x_a.numpy(), faces.numpy()))
     return blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
 
 
@@ -275,7 +275,7 @@ def test_coincident_vertices_are_survived(bars: Shapes) -> None:
 
 def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
     """Mean over edges of the relative error of their length."""
-    i, j = torch.from_numpy(mesh.unique_edges(faces.numpy())[0]).T
+    i, j = torch.from_numpy(connectivity.unique_edges(faces.numpy())[0]).T
     lengths = torch.linalg.norm(truth[i] - truth[j], dim=1)
     return float(((torch.linalg.norm(x[i] - x[j], dim=1) - lengths).abs() / lengths).mean())
 

@@ -7,10 +7,10 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
-from torch_modal.nn import curvature
-from torch_modal.nn.linearised import Reference
-from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement
-from torch_modal.nn.shell import Measures, Rest, ShellEnergy
+from torch_modal.energy import curvature
+from torch_modal.energy.linearised import Reference
+from torch_modal.energy.shell import Measures, Rest, ShellEnergy
+from torch_modal.nn.modal_energy import Derivatives, ModalShell, Placement
 
 N, BATCH = 5, 3
 MOEBIUS = [[i, (i + 1) % 7, (i + 2) % 7] if i % 2 == 0 else [(i + 1) % 7, i, (i + 2) % 7] for i in range(7)]

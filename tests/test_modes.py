@@ -13,12 +13,12 @@ from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
 from solids import box, surface, together
 
-from torch_modal.keyframes import MeshError, MeshWarning
+from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.precompute import filling, lanczos, parallel, solving
-from torch_modal.precompute.arap import HESSIAN_FORMS, arap_hessian, lumped_mass, mass_matrix
 from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.parallel import StoppedError
+from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, lumped_mass, mass_matrix
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
 
 Mesh = tuple[np.ndarray, np.ndarray]

@@ -6,14 +6,14 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev
 
-from torch_modal import mesh
+from torch_modal.energy.shell import ShellEnergy, per_sample
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.rigid import blend
 from torch_modal.nn.frame import Frame, Pair
-from torch_modal.nn.gauss_newton import GaussNewtonStep, minimise
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.paired import PairedPlacement, PairedProblem, PairedSpace
-from torch_modal.nn.shell import ShellEnergy, per_sample
-from torch_modal.rigid import blend
+from torch_modal.nn.solver import GaussNewtonStep, minimise
 
 MU = 0.3
 
@@ -97,7 +97,9 @@ def test_mid_shape_is_the_mean_of_both(setting: Setting) -> None:
 
 def test_small_mu_is_linear_interpolation(bars: Shapes) -> None:
     x_a, x_b = bars.keyframes[1:]
-    areas = torch.stack([torch.from_numpy(mesh.vertex_areas(x.numpy(), bars.faces.numpy())) for x in (x_a, x_b)])
+    areas = torch.stack(
+        [torch.from_numpy(connectivity.vertex_areas(x.numpy(), bars.faces.numpy())) for x in (x_a, x_b)]
+    )
     weights = (areas / areas.sum(1, keepdim=True)).sum(0)
     mean = blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
     distances = []
@@ -144,12 +146,12 @@ def test_hand_lies_between_linear_and_joint(ends: tuple[int, int], truth: int, h
     """With the default mu: better than linear, worse than the joint space."""
     pair = hands.pick(*ends)
     x_a, x_b = pair.keyframes
-    weights = torch.from_numpy(mesh.vertex_areas(x_a.numpy(), hands.faces.numpy()))
+    weights = torch.from_numpy(connectivity.vertex_areas(x_a.numpy(), hands.faces.numpy()))
     shapes = {"linear": blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)}
     for space in ("paired", "joint"):
         # On some meshings the wider spans end STALLED, at a collapsed triangle; the shape is as good.
         shapes[space] = MidShape(pair.bases, pair.faces, space).solve(x_a, x_b).shapes
-    i, j = torch.from_numpy(mesh.unique_edges(hands.faces.numpy())[0]).T
+    i, j = torch.from_numpy(connectivity.unique_edges(hands.faces.numpy())[0]).T
     lengths = {name: torch.linalg.norm(x[i] - x[j], dim=1) for name, x in shapes.items()}
     wanted = torch.linalg.norm(hands.keyframes[truth][i] - hands.keyframes[truth][j], dim=1)
     errors = {name: float(((length - wanted).abs() / wanted).mean()) for name, length in lengths.items()}

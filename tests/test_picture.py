@@ -11,8 +11,8 @@ import trimesh
 from PIL import Image
 from scipy import ndimage
 
-from torch_modal import drawing, picture
-from torch_modal.picture import render_sequence
+from torch_modal.view import drawing, picture
+from torch_modal.view.picture import render_sequence
 
 WOMAN = Path(__file__).parents[1].parent / "shared" / "data" / "mh-woman"
 CRASH = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"

@@ -14,7 +14,7 @@ from tables import gap_closed, geometric_mean, markdown, worse_than
 from timing import timed, untimed
 
 import torch_modal as tm
-from torch_modal.rigid import RigidMotion
+from torch_modal.geometry.rigid import RigidMotion
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from torch_modal.rigid import RigidMotion, best_fit, best_rotation, blend, centroid
+from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid
 
 EYE = torch.eye(3, dtype=torch.float64)
 

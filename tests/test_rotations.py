@@ -7,10 +7,10 @@ import torch
 from conftest import Shapes
 from torch import Tensor
 
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.rotations import LocalRotations
-from torch_modal.nn.shell import ShellEnergy
 
 T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
 
@@ -29,7 +29,7 @@ def ribbon(turn: float, n: int = 13) -> tuple[Tensor, Tensor]:
 
 def rotations_of(first: Tensor, second: Tensor, faces: Tensor) -> tuple[LocalRotations, ShellEnergy]:
     shell = ShellEnergy(faces)
-    return LocalRotations(shell, torch.stack([first, second])), shell
+    return LocalRotations(shell.faces, shell.edges, torch.stack([first, second])), shell
 
 
 def edges(x: Tensor, shell: ShellEnergy) -> Tensor:

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from torch_modal import keyframe_places, linear_sequence, load_keyframes
-from torch_modal.inspect_mesh import consistent_winding, degenerate_faces, flat_faces, repeated_faces, signed_volume
-from torch_modal.mesh import unique_edges
-from torch_modal.sample_data import FOLDER, SAMPLES, load_sample, sample_files
+from torch_modal.data.samples import FOLDER, SAMPLES, load_sample, sample_files
+from torch_modal.geometry.connectivity import unique_edges
+from torch_modal.geometry.inspect import consistent_winding, degenerate_faces, flat_faces, repeated_faces, signed_volume
 
 ROOT = Path(__file__).parents[1]
 

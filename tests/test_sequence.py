@@ -9,10 +9,11 @@ from conftest import Shapes, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal import mesh, sequence
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.rigid import blend
 from torch_modal.nn.mid_shape import MidShape
-from torch_modal.rigid import blend
-from torch_modal.sequence import keyframe_places, linear_sequence, subdivide
+from torch_modal.sequence import subdivide as sequence
+from torch_modal.sequence.subdivide import keyframe_places, linear_sequence, subdivide
 
 COARSE = {"coarse_faces": 150}
 
@@ -163,7 +164,7 @@ def test_fill_is_exact_on_a_rigid_motion(levels: int, bars: Shapes) -> None:
     move = torch.tensor([5.0, 0.0, -3.0], dtype=torch.float64)
     zero = torch.zeros((), dtype=torch.float64)
     skew = torch.stack([zero, -axis[2], axis[1], axis[2], zero, -axis[0], -axis[1], axis[0], zero]).reshape(3, 3)
-    weights = torch.from_numpy(mesh.vertex_areas(x.numpy(), bars.faces.numpy()))
+    weights = torch.from_numpy(connectivity.vertex_areas(x.numpy(), bars.faces.numpy()))
     centre = (weights[:, None] * x).sum(0) / weights.sum()
 
     def at(t: float) -> Tensor:
@@ -181,7 +182,7 @@ def test_fill_lies_on_the_geodesics_between_subdivided_shapes(scattered: Shapes)
     options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
     shapes = subdivide(pair.keyframes, pair.faces, 1, **options)
     filled = subdivide(pair.keyframes, pair.faces, 1, n_frames=7, **options)
-    weights = torch.from_numpy(mesh.vertex_areas(pair.keyframes[0].numpy(), pair.faces.numpy()))
+    weights = torch.from_numpy(connectivity.vertex_areas(pair.keyframes[0].numpy(), pair.faces.numpy()))
     for i, frame in enumerate(filled):
         position = 2 * i / 6
         left = min(int(position), 1)
@@ -204,7 +205,7 @@ def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: 
     frames = subdivide(
         pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, local=False, space="paired", **COARSE
     )
-    i, j = torch.from_numpy(mesh.unique_edges(pair.faces.numpy())[0]).T
+    i, j = torch.from_numpy(connectivity.unique_edges(pair.faces.numpy())[0]).T
     lengths = [torch.linalg.norm(x[i] - x[j], dim=1) for x in (x_a, x_b, frames[2])]
     nearest = int((lengths[2] - lengths[1]).norm() < (lengths[2] - lengths[0]).norm())
     assert used == [(0, 1), (0, nearest), (nearest, 1)]

@@ -12,14 +12,8 @@ from torch import Tensor
 from torch.autograd import gradcheck
 from torch.func import functional_call, grad, vmap
 
-from torch_modal.nn.shell import (
-    ShellEnergy,
-    dihedral_angle,
-    dihedral_gradient,
-    edge_length,
-    length_gradient,
-    wrap_angle,
-)
+from torch_modal.energy.shell import ShellEnergy, dihedral_angle, dihedral_gradient, length_gradient, wrap_angle
+from torch_modal.geometry.vectors import norm
 
 TRIANGLE = torch.tensor([[0, 1, 2]])
 HINGE = torch.tensor([[0, 1, 2], [1, 0, 3]])
@@ -239,7 +233,7 @@ def test_closed_forms_are_the_gradients(generator: torch.Generator) -> None:
     (truth,) = torch.autograd.grad(dihedral_angle(spokes).sum(), spokes)
     torch.testing.assert_close(dihedral_gradient(spokes), truth, atol=1e-10, rtol=1e-10)
     edges = torch.randn(3, 50, dtype=torch.float64, generator=generator, requires_grad=True)
-    (truth,) = torch.autograd.grad(edge_length(edges).sum(), edges)
+    (truth,) = torch.autograd.grad(norm(edges).sum(), edges)
     torch.testing.assert_close(length_gradient(edges), truth, atol=1e-14, rtol=1e-14)
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from conftest import Shapes
 
-from torch_modal.basis import ModalBasis
-from torch_modal.stored import BASES_FILE, KEYFRAMES_FILE, StoredSet, find_sets, open_set, write_set
+from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, StoredSet, find_sets, open_set, write_set
+from torch_modal.precompute.basis import ModalBasis
 
 NAMES = ("straight.obj", "bent.obj", "twisted.obj")
 

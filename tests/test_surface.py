@@ -8,9 +8,9 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
-from torch_modal.nn.linearised import Reference, energy_of, gradient, linearise
-from torch_modal.nn.shell import ShellEnergy
-from torch_modal.nn.surface import RIDGE, ConvexHessian, relax
+from torch_modal.energy.linearised import Reference, energy_of, gradient, linearise
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.nn.relax import RIDGE, ConvexHessian, relax
 
 BATCH = 2
 

@@ -6,10 +6,10 @@ import torch
 import trimesh
 from conftest import Shapes, random_rotation
 
-from torch_modal.augment.between import mirror
-from torch_modal.augment.reconstruction import Reconstruction
-from torch_modal.augment.triangles import Bend, Sides, bend, bent_sides, frames, mirrored_sides, sides
-from torch_modal.rigid import _exp, best_fit
+from torch_modal.data.random_in_between import mirror
+from torch_modal.geometry.poisson import Reconstruction
+from torch_modal.geometry.rigid import _exp, best_fit
+from torch_modal.geometry.triangle_frames import Bend, Sides, bend, bent_sides, frames, mirrored_sides, sides
 
 F64 = torch.float64
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from quadratic import at_points, quadratic_modes
 
 import torch_modal as tm
-from torch_modal.mesh import vertex_areas
-from torch_modal.precompute.arap import HessianForm, arap_hessian, hat_gradients, lumped_mass, mass_matrix
+from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.precompute.cache import Arrays, Cache
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
 from torch_modal.precompute.lattice import lattice
 from torch_modal.precompute.modes import QUALITIES
+from torch_modal.precompute.stiffness import HessianForm, arap_hessian, hat_gradients, lumped_mass, mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 import torch_modal as tm
-from torch_modal.mesh_files import SUFFIXES
-from torch_modal.sample_data import load_sample
+from torch_modal.data.samples import load_sample
+from torch_modal.io.read import SUFFIXES
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
 from bodies import BODIES, body

@@ -17,8 +17,8 @@ from augment import MESHES, RandomLinear
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.nn.shell import enclosed_volume
-from torch_modal.sample_data import load_sample
+from torch_modal.data.samples import load_sample
+from torch_modal.energy.shell import enclosed_volume
 
 TRANSFORMS: dict[str, tm.ShapeAugmentation] = {
     "linear": RandomLinear(p=1.0),

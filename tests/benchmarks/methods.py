@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from cases import HALF, Case
+from full_space import full_space
 from timing import timed
 
 import torch_modal as tm
-from torch_modal.rigid import blend
-from torch_modal.sequence import LEAST_GAIN
+from torch_modal.geometry.rigid import blend
+from torch_modal.sequence.subdivide import LEAST_GAIN
 
 PEER_SECONDS = 180
 SUBDIVIDE = {"rotations": True, "least_gain": LEAST_GAIN}
@@ -133,7 +134,7 @@ def full(case: Case) -> Outcome:
     return by_full_space(
         case,
         lambda x_a, x_b, t, k: min(
-            (tm.full_space(x_a, x_b, case.faces, t, start=start) for start in (starts.shapes[k], None)),
+            (full_space(x_a, x_b, case.faces, t, start=start) for start in (starts.shapes[k], None)),
             key=lambda result: result.energies[-1],
         ),
     )
@@ -142,7 +143,7 @@ def full(case: Case) -> Outcome:
 @method("global Froehlich-Botsch", half_only=True)
 def example_based(case: Case) -> Outcome:
     """One reference with interpolated lengths, angles and volume, over all vertices, from a linear start."""
-    return by_full_space(case, lambda x_a, x_b, t, k: tm.full_space(x_a, x_b, case.faces, t, example_based=True))
+    return by_full_space(case, lambda x_a, x_b, t, k: full_space(x_a, x_b, case.faces, t, example_based=True))
 
 
 @method("morphomatics")

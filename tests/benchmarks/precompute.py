@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from solvers import solvers
 
 import torch_modal as tm
-from torch_modal.mesh import unique_edges
+from torch_modal.geometry.connectivity import unique_edges
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

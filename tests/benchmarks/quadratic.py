@@ -7,8 +7,8 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from torch_modal.precompute.arap import hat_gradients
 from torch_modal.precompute.embedding import closest_tetrahedra
+from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
 
 EDGES = tuple(itertools.combinations(range(4), 2))

@@ -18,9 +18,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.precompute import lanczos
-from torch_modal.precompute.arap import arap_hessian, mass_matrix
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.lattice import lattice
+from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra
 

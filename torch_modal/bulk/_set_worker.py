@@ -20,7 +20,7 @@ from typing import Any
 from torch_modal.bulk.records import DONE, FAILED, REFUSED, Record, ended
 from torch_modal.bulk.tree import same_stems
 from torch_modal.errors import MeshError
-from torch_modal.files import write_atomically
+from torch_modal.io.files import write_atomically
 
 MESHER_SHARE = 0.5
 """Part of the set's time that the mesher may take, so that its failure can still be told, or made good."""
@@ -57,9 +57,9 @@ def main(job_path: str, result_path: str) -> None:
 
 def _compute(job: dict[str, Any], found: dict[str, Any]) -> None:
     # Imported here, where an error of the import is told like others.
-    from torch_modal.keyframes import load_keyframes
+    from torch_modal.data.stored import write_set
+    from torch_modal.keyframes.load import load_keyframes
     from torch_modal.precompute.modes import extract_bases
-    from torch_modal.stored import write_set
 
     files = [Path(file) for file in job["files"]]
     if twice := same_stems(files):

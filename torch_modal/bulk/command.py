@@ -28,7 +28,7 @@ examples:
   torch-modal precompute shapes --out bases --workers 4 --timeout 120 --retry
 on two machines that share their files, the work shared by a counter in PyTorch's TCPStore:
   torchrun --nnodes 2 --nproc-per-node 1 --rdzv-backend c10d --rdzv-endpoint HOST:29400 \\
-      -m torch_modal.cli precompute shapes --out bases"""
+      -m torch_modal precompute shapes --out bases"""
 
 INCOMPLETE = 3
 """Exit status when some sets have no bases."""

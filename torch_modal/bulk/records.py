@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from torch_modal.files import write_atomically
+from torch_modal.io.files import write_atomically
 
 STATE = ".precompute"
 REPORT = "precompute-report.jsonl"

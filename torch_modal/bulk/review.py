@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 from torch_modal.bulk import records as r
 from torch_modal.bulk.records import Record, Records
 from torch_modal.bulk.tree import mesh_files
+from torch_modal.data.stored import BASES_FILE, DERIVED_FILES, KEYFRAMES_FILE, open_set
 from torch_modal.precompute.cache import CACHE_VERSION
 from torch_modal.precompute.modes import QUALITIES
-from torch_modal.stored import BASES_FILE, DERIVED_FILES, KEYFRAMES_FILE, open_set
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch_modal.bulk.review import Options, Review, Settled, Task
 from torch_modal.bulk.set_process import Outcome, SetProcess
 from torch_modal.bulk.sharing import Counts, Plan, Sharing, sharing_by_environment
 from torch_modal.bulk.tree import find_keyframe_sets, places
-from torch_modal.stored import BASES_FILE
+from torch_modal.data.stored import BASES_FILE
 
 POLL = 0.05
 Answer = TypeVar("Answer")
@@ -50,7 +50,7 @@ def precompute_tree(
 
     Args:
         root: The folder tree. See :func:`~torch_modal.bulk.tree.find_keyframe_sets` for what a set is.
-        out: Gets a folder for each set, see :mod:`torch_modal.stored`, and the report.
+        out: Gets a folder for each set, see :mod:`torch_modal.data.stored`, and the report.
         options: How.
         say: Takes lines: one for each set unless there is a bar, and the summary.
         bar: Whether a bar shows how far it is.

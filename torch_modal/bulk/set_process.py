@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torch_modal.bulk.records import CRASHED, FAILED, TIMEOUT
-from torch_modal.processes import describe_exit, end_process, last_line
+from torch_modal.io.processes import describe_exit, end_process, last_line
 
 PACKAGE_ROOT = str(Path(__file__).resolve().parents[2])
 BOOT = """\

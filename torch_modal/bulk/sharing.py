@@ -10,7 +10,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch_modal.files import write_atomically
+from torch_modal.io.files import write_atomically
 
 MEETING = timedelta(minutes=10)
 """How long processes wait for each other at the start."""

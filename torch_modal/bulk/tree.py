@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from torch_modal.mesh_files import SUFFIXES
+from torch_modal.io.read import SUFFIXES
 
 MESH_SUFFIXES = (*SUFFIXES, ".stl")
 """STL cannot serve as a key-frame, but it is better refused with a reason than passed over."""

@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal import mesh
-from torch_modal.basis import ModalBasis
+from torch_modal.energy.linearised import references_between
+from torch_modal.energy.shell import ShellEnergy, enclosed_volume, per_sample
+from torch_modal.geometry import connectivity
+from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.frame import DIAGONAL, Frame, Pair
-from torch_modal.nn.gauss_newton import GaussNewtonStep, Solution, Status
-from torch_modal.nn.implicit import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.joint import JointSpace
-from torch_modal.nn.linearised import references_between
 from torch_modal.nn.paired import PairedSpace
-from torch_modal.nn.shell import ShellEnergy, enclosed_volume, per_sample
-from torch_modal.nn.surface import relax
+from torch_modal.nn.relax import relax
+from torch_modal.nn.solver import GaussNewtonStep, Solution, Status
+from torch_modal.precompute.basis import ModalBasis
 
 # Newton steps of the local interpolation, and products with the Hessian in each: what closes 97 % of the gap in energy
 # between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
@@ -74,7 +74,7 @@ class Between(nn.Module):
             self.space = PairedSpace(frame, shell, frame.modes(bases))
         else:
             raise ValueError(f"space is 'joint' or 'paired', got {space!r}")
-        self.closed = len(mesh.boundary_edges(frame.faces.numpy())) == 0
+        self.closed = len(connectivity.boundary_edges(frame.faces.numpy())) == 0
         # Registered here alone: a module that hangs at two places confuses torch.func.functional_call.
         self.alpha, self.beta, self.gamma = stiffness
         self.mu = mu

@@ -6,17 +6,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torch_modal import mesh
-from torch_modal.nn.rotations import LocalRotations
-from torch_modal.nn.shell import ShellEnergy, pick
-from torch_modal.sparse_solve import SparseSolver, graph_laplacian
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
+from torch_modal.geometry.vectors import pick
 
 
 class RotationBlend(nn.Module):
     r"""Vertices of :math:`\min_x \sum_e |e(x) - \bar e|^2 / l_e`, with edges from :class:`LocalRotations`.
 
     The weights are those of references, so that one factorisation serves all shapes
-    (:class:`~torch_modal.sparse_solve.SparseSolver`, on the CPU). Each piece of the surface keeps the centroid of
+    (:class:`~torch_modal.geometry.sparse.SparseSolver`, on the CPU). Each piece of the surface keeps the centroid of
     linear interpolation; vertices that no face uses are pieces of their own.
 
     Args:
@@ -32,9 +33,9 @@ class RotationBlend(nn.Module):
     def __init__(self, shell: ShellEnergy, references: Tensor) -> None:
         super().__init__()
         n = references.shape[-2]
-        self.rotations = LocalRotations(shell, references)
+        self.rotations = LocalRotations(shell.faces, shell.edges, references)
         self.register_buffer("edges", shell.edges.clone())
-        piece = mesh.vertex_pieces(shell.edges.cpu().numpy(), n)
+        piece = connectivity.vertex_pieces(shell.edges.cpu().numpy(), n)
         self.register_buffer("vertex_piece", torch.from_numpy(piece))
         self.register_buffer("shares", (1 / torch.bincount(self.vertex_piece).to(references))[piece])
         # One vertex of each piece is held, and the piece placed afterwards.

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from torch_modal.nn.rotations import LocalRotations
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.local_rotations import LocalRotations
 
 # Directions that move no edge (coincident key-frames) get no amplitude.
 RIDGE = 1e-9
@@ -23,7 +23,7 @@ class Guess(nn.Module):
 
     def __init__(self, shell: ShellEnergy, edge_columns: Tensor, references: Tensor) -> None:
         super().__init__()
-        self.rotations = LocalRotations(shell, references)
+        self.rotations = LocalRotations(shell.faces, shell.edges, references)
         columns = edge_columns.flatten(0, 1)
         self.register_buffer("gram", columns.mT @ (columns * self.rotations.per_length.repeat_interleave(3)[:, None]))
 

@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.basis import ModalBasis
 from torch_modal.nn.between import Between, InBetweenResult, report
-from torch_modal.nn.gauss_newton import Solution
+from torch_modal.nn.solver import Solution
+from torch_modal.precompute.basis import ModalBasis
 
 # The best of a grid over three spans of a hand (tests/benchmarks/quality.py); it depends on the mesh.
 DEFAULT_MU = 1.0

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.energy.linearised import energy_of, references_between
+from torch_modal.energy.shell import ShellEnergy
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.guess import Guess
-from torch_modal.nn.linearised import energy_of, references_between
-from torch_modal.nn.modal_shell import ModalShell, Placement
-from torch_modal.nn.shell import ShellEnergy
+from torch_modal.nn.modal_energy import ModalShell, Placement
 
 
 class JointProblem(NamedTuple):

@@ -5,10 +5,10 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from torch_modal.basis import ModalBasis
 from torch_modal.nn.between import InBetweenResult
-from torch_modal.nn.gauss_newton import Solution
 from torch_modal.nn.in_between import DEFAULT_MU, InBetween
+from torch_modal.nn.solver import Solution
+from torch_modal.precompute.basis import ModalBasis
 
 
 class MidShape(nn.Module):

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.energy.linearised import Reference
+from torch_modal.energy.shell import ShellEnergy, Stiffness
 from torch_modal.nn.frame import Columns, Frame, Pair
-from torch_modal.nn.linearised import Reference
-from torch_modal.nn.modal_shell import Derivatives, ModalShell, Placement
-from torch_modal.nn.shell import ShellEnergy, Stiffness
+from torch_modal.nn.modal_energy import Derivatives, ModalShell, Placement
 
 
 class PairedPlacement(NamedTuple):

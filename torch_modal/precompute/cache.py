@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
-from torch_modal.files import write_atomically
+from torch_modal.io.files import write_atomically
 
 CACHE_VERSION = 3
 """Part of every key: raise it when an algorithm of the pre-computation changes, and old entries are left."""

@@ -8,8 +8,8 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from torch_modal.mesh import vertex_areas
-from torch_modal.precompute.arap import hat_gradients
+from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.surface import DIAGONAL, Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes, tet_volumes
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from torch_modal.mesh import IntArray
+from torch_modal.geometry.connectivity import IntArray
 
 FloatArray = NDArray[np.float64]
 

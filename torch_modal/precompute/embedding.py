@@ -7,7 +7,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from torch_modal.precompute.arap import hat_gradients
+from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
 FloatArray = NDArray[np.float64]

@@ -10,11 +10,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from torch_modal.precompute.arap import mass_matrix
 from torch_modal.precompute.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier, self_proximity
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
 from torch_modal.precompute.lattice import lattice
+from torch_modal.precompute.stiffness import mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,

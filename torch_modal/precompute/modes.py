@@ -9,14 +9,14 @@ import torch
 from scipy.sparse.csgraph import connected_components
 from tqdm import tqdm
 
-from torch_modal.basis import ModalBasis
-from torch_modal.keyframes import MeshWarning, check_keyframes, require_solid
-from torch_modal.precompute.arap import HESSIAN_FORMS, HessianForm
+from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
+from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.eigen import N_RIGID
 from torch_modal.precompute.filling import MESHERS, Filler, Mesher
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
+from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings
 
@@ -45,7 +45,7 @@ def extract_modes(
         vertices: Positions, tensor or array, any units. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes, k.
-        form: Form of the Hessian, see :func:`~torch_modal.precompute.arap.arap_hessian`.
+        form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
         mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
             than one cell; ``"auto"`` takes the first, and the second where the first fails.
@@ -101,7 +101,7 @@ def extract_bases(
         keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes of each, k.
-        form: Form of the Hessian, see :func:`~torch_modal.precompute.arap.arap_hessian`.
+        form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
         mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
             than one cell; ``"auto"`` takes the first, and the second where the first fails.

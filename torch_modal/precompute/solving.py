@@ -10,11 +10,11 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
-from torch_modal.precompute.arap import HessianForm, arap_hessian
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.filling import Filler, Filling, meshing_order
 from torch_modal.precompute.parallel import Budget, run_all
+from torch_modal.precompute.stiffness import HessianForm, arap_hessian
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
-from torch_modal.inspect_mesh import signed_volume
+from torch_modal.geometry.inspect import signed_volume
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

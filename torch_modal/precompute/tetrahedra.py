@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.inspect_mesh import signed_volume
-from torch_modal.mesh import vertex_areas
+from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.geometry.inspect import signed_volume
+from torch_modal.io.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.surface import DIAGONAL, outward
-from torch_modal.processes import describe_exit, end_process, last_line
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -1,1 +1,0 @@
-"""Random transforms of shapes that keep their labels right."""

@@ -1,0 +1,193 @@
+"""What the commands of the command line do, from parsed arguments to files and lines.
+
+Each refuses what it could not write before it imports anything heavy, and before any work.
+"""
+
+import argparse
+import os
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+OUTPUT_SUFFIXES = (".obj", ".ply", ".off", ".glb", ".gltf", ".stl", ".png", ".pdf", ".safetensors")
+"""Of files: an ``--out`` that ends so is not meant as a folder."""
+
+
+def subdivide(args: argparse.Namespace) -> None:
+    """Run ``torch-modal subdivide``."""
+    if len(args.meshes) < 2:
+        args.fail("subdivide needs two key-frames or more")
+    if args.mu is not None and args.space != "paired":
+        args.fail("--mu is the similarity weight of --space paired; the joint space has none")
+    if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
+        args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
+    single = _is_file(args, ".glb")
+    animation = args.out if single else args.out / "animation.glb"
+    files = [animation, *([args.picture] if args.picture else [])]
+    pattern = None if single else f"frame-*.{args.format}"
+    _check_output(args, files, pattern)
+
+    import torch_modal as tm
+
+    places = tm.keyframe_places(len(args.meshes), args.levels, cyclic=args.cyclic, n_frames=args.frames)
+    keyframes, faces = tm.load_keyframes(args.meshes)
+    progress = False if args.quiet else None
+    bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
+    options = {} if args.mu is None else {"mu": args.mu}
+    frames = tm.subdivide(
+        keyframes,
+        faces,
+        args.levels,
+        bases=bases,
+        cyclic=args.cyclic,
+        n_frames=args.frames,
+        progress=progress,
+        space=args.space,
+        coarse_faces=args.coarse_faces,
+        local=args.local,
+        polish=args.polish,
+        **options,
+    )
+    report = _reporter(args)
+    report(f"{len(keyframes)} key-frames of {keyframes.shape[1]} vertices -> {len(frames)} frames")
+    keys = [place for place in places if place < len(frames)]
+    if not single:
+        written = tm.save_frames(frames, faces, args.out, fmt=args.format, overwrite=args.overwrite)
+        report(f"frames:    {written[0]} to {written[-1].name}")
+        _warn_of_leftovers(args.out, pattern, written)
+    tm.save_animation(
+        frames, faces, animation, args.fps, keyframe_indices=keys, cyclic=args.cyclic, overwrite=args.overwrite
+    )
+    report(f"animation: {animation}")
+    if args.picture:
+        rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
+        tm.render_sequence(rows, faces, args.picture, keyframe_indices=keys, overwrite=args.overwrite)
+        report(f"picture:   {args.picture}")
+
+
+def modes(args: argparse.Namespace) -> None:
+    """Run ``torch-modal modes``."""
+    if _is_file(args, ".safetensors"):
+        if len(args.meshes) > 1:
+            args.fail(f"--out {args.out} is one file, but there are {len(args.meshes)} meshes; name a folder")
+        files = [args.out]
+    else:
+        files = [args.out / f"{mesh.stem}.safetensors" for mesh in args.meshes]
+        if len(set(files)) < len(files):
+            args.fail("two meshes have the same file name, so their bases would too; take them one by one")
+    _check_output(args, files)
+
+    import torch_modal as tm
+
+    keyframes, faces = tm.load_keyframes(args.meshes)
+    bases = tm.extract_bases(
+        keyframes,
+        faces,
+        args.modes,
+        form=args.form,
+        **_precompute_options(args),
+    )
+    report = _reporter(args)
+    shown = min(8, args.modes)
+    report(f"{'lowest elastic modes':24s}" + "".join(f"{i + 1:>10d}" for i in range(shown)))
+    for file, mesh, basis in zip(files, args.meshes, bases, strict=True):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        basis.save(file)
+        values = basis.eigenvalues[:shown].tolist()
+        first = next((value for value in basis.eigenvalues.tolist() if value > 0), 1.0)
+        report(f"{mesh.name:24s}" + "".join(f"{value:>10.3g}" for value in values))
+        report(f"{'  frequency / first':24s}" + "".join(f"{(value / first) ** 0.5:>10.3f}" for value in values))
+    report("eigenvalues are squared frequencies, for stiffness and density 1, in 1 / (unit of the mesh)^2")
+    report(f"bases: {files[0]}" + (f" to {files[-1].name}" if len(files) > 1 else ""))
+
+
+def demo(args: argparse.Namespace) -> None:
+    """Run ``torch-modal demo``."""
+    names = [args.sample] if args.sample else ["creature", "hand"]
+    if args.out.suffix.lower() in OUTPUT_SUFFIXES:
+        args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
+    _check_output(args, [args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")])
+
+    from torch_modal.cli.demo import run_demo
+
+    run_demo(
+        names,
+        args.out,
+        levels=args.levels,
+        n_modes=args.modes,
+        precompute=_precompute_options(args),
+        report=_reporter(args),
+    )
+
+
+def cache(args: argparse.Namespace) -> None:
+    """Run ``torch-modal cache``."""
+    from torch_modal.precompute.cache import cache_content, clear_cache, default_cache_dir
+
+    n_entries, n_bytes = (clear_cache if args.clear else cache_content)(args.cache_dir)
+    there = "removed from" if args.clear else "in"
+    print(f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB {there} {args.cache_dir or default_cache_dir()}")
+
+
+def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:
+    """What `extract_bases` is told besides the key-frames."""
+    return {
+        "mesher": args.mesher,
+        "settings": args.quality,
+        "cache_dir": args.cache_dir,
+        "cache": not args.no_cache,
+        "progress": False if args.quiet else None,
+    }
+
+
+def _reporter(args: argparse.Namespace) -> Callable[[str], None]:
+    """Print a line at once, unless --quiet."""
+    return (lambda _: None) if args.quiet else (lambda line: print(line, flush=True))
+
+
+# ---------------------------------------------------------------------------------------------------- output
+def _is_file(args: argparse.Namespace, suffix: str) -> bool:
+    """Whether --out names a file of this suffix rather than a folder."""
+    given = args.out.suffix.lower()
+    if given != suffix and given in OUTPUT_SUFFIXES:
+        args.fail(f"--out is a file ending in {suffix} or a folder, got {args.out.name!r}")
+    return given == suffix
+
+
+def _check_output(args: argparse.Namespace, files: list[Path], pattern: str | None = None) -> None:
+    """Refuse, before any work, what could not or must not be written at the end.
+
+    Args:
+        args: Their ``out``, ``overwrite`` and, where there are any, ``meshes``.
+        files: Files that will be written.
+        pattern: Names of further files in the folder ``out``.
+    """
+    inputs = {mesh.resolve() for mesh in getattr(args, "meshes", [])}
+    existing = [file for file in files if file.exists() or file.resolve() in inputs]
+    if pattern is not None and args.out.is_dir():
+        existing += sorted(args.out.glob(pattern))
+    for file in existing:
+        if file.resolve() in inputs:
+            _refuse(f"{file} is one of the key-frames; choose another --out")
+        if file.is_dir():
+            _refuse(f"{file} is a folder; a file is to be written there")
+        if not args.overwrite:
+            _refuse(f"{file} exists; --overwrite replaces it")
+    for folder in dict.fromkeys(file.parent for file in files):
+        there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+        if not there.is_dir():
+            _refuse(f"{there} is a file, so nothing can be written below it; choose another --out")
+        if not os.access(there, os.W_OK):
+            _refuse(f"the folder {there} cannot be written; choose another --out")
+
+
+def _refuse(reason: str) -> NoReturn:
+    raise ValueError(reason)
+
+
+def _warn_of_leftovers(folder: Path, pattern: str | None, written: list[Path]) -> None:
+    """Frames of an earlier, longer run would pass for the end of this one."""
+    left = sorted(set(folder.glob(pattern or "")) - set(written))
+    if left:
+        warnings.warn(f"{folder} also holds {len(left)} frames of an earlier run, from {left[0].name}", stacklevel=2)

@@ -1,0 +1,353 @@
+"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``demo`` and ``cache``.
+
+Nothing heavy is imported before the arguments are known to make sense.
+"""
+
+import argparse
+import contextlib
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch_modal.bulk import command as bulk
+from torch_modal.cli import commands
+from torch_modal.version import __version__
+
+PROGRAM = "torch-modal"
+
+DESCRIPTION = """\
+Fill key-frame meshes with physically plausible shapes in between.
+
+Key-frames are triangle meshes (OBJ, PLY, OFF, GLB, GLTF) with the same faces and
+the same vertex order, in any units. Results are in the same units and coordinates."""
+
+MAIN_EXAMPLES = """\
+start here:
+  torch-modal demo                                        try it on the samples that come with it
+  torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
+  torch-modal subdivide --help                            all that can be set"""
+
+SUBDIVIDE = """\
+Fill a sequence of key-frames.
+
+Each level puts a new shape between all neighbours, so L levels turn every interval
+into 2**L. The key-frames themselves stay as they are, at their places."""
+
+SUBDIVIDE_EXAMPLES = """\
+examples:
+  one animated file, with a picture beside linear interpolation:
+    torch-modal subdivide open.obj fist.obj --out hand.glb --picture hand.png
+  a cycle of six key-frames as 96 numbered OBJ files and animation.glb in a folder:
+    torch-modal subdivide gait-?.ply --cyclic --levels 4 --out gait --format obj"""
+
+MODES = """\
+Compute the vibration modes of key-frames: the lowest elastic modes of the solid
+that each surface encloses, restricted to the surface.
+
+They are what `subdivide` computes first. Read the files with
+torch_modal.ModalBasis.load. The mesher is not deterministic: without the cache,
+two runs give slightly different modes."""
+
+MODES_EXAMPLES = """\
+examples:
+  torch-modal modes horse.obj --out horse.safetensors
+  torch-modal modes gait-?.ply --modes 50 --out bases"""
+
+DEMO = """\
+Run the main job on the samples that come with the package: a galloping creature
+(a cycle of six key-frames) and a closing hand (two key-frames).
+
+For each it writes an animation (GLB) and a picture of the sequence beside linear
+interpolation and the truth, and prints how far both are from the true frames."""
+
+DEMO_EXAMPLES = """\
+example:
+  torch-modal demo --sample hand --out hand-demo"""
+
+CACHE = """\
+Say how large the cache is, where tetrahedra and modes are kept between runs."""
+
+CACHE_EXAMPLES = """\
+example:
+  torch-modal cache --clear"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments; by default those of the process.
+
+    Returns:
+        The exit code: 0, 1 after an error, 130 after Ctrl-C; `precompute` has one of its own when some sets have no
+        result. Wrong usage leaves with ``SystemExit(2)``.
+    """
+    try:
+        args = _parser().parse_args(argv)
+        with _warnings_as_lines():
+            code = _run(args)
+        sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        _say("interrupted")
+        return 130
+    except BrokenPipeError:
+        # The reader (head, less) has what it wanted. Python flushes once more at exit: into nothing.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _run(args: argparse.Namespace) -> int:
+    """Run the command; expected errors become one line."""
+    try:
+        return args.command(args) or 0
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        if args.debug or not isinstance(error, _expected_errors()):
+            raise
+        _say(f"error: {_one_line(error)}")
+        return 1
+
+
+def _expected_errors() -> tuple[type[Exception], ...]:
+    """What input, files and machine can cause; anything else is a bug and shows its traceback."""
+    expected: list[type[Exception]] = [ValueError, OSError, MemoryError]
+    # Their modules are heavy: if one was never imported, it raised nothing.
+    for module, name in (
+        ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
+        ("torch_modal.precompute.eigen", "ModalAnalysisError"),
+    ):
+        if module in sys.modules:
+            expected.append(getattr(sys.modules[module], name))
+    return tuple(expected)
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, MemoryError):
+        return "out of memory; take fewer levels or a smaller mesh"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _say(message: str) -> None:
+    print(f"{PROGRAM}: {message}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Show each warning about input or result once, as one line; leave those of libraries to developers."""
+    seen = set()
+
+    def show(message: Warning | str, category: type[Warning], *_: Any) -> None:
+        text = " ".join(str(message).split())
+        if issubclass(category, UserWarning) and text not in seen:
+            seen.add(text)
+            _say(f"warning: {text}")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
+
+
+# ------------------------------------------------------------------------------------------------- arguments
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=30, width=100)
+
+
+def _number(kind: Callable[[str], Any], low: float, above: bool = False) -> Callable[[str], Any]:
+    """An argument type: a finite number of at least (or above) a bound."""
+
+    def convert(text: str) -> Any:
+        wanted = f"a {'whole ' if kind is int else ''}number {'above' if above else 'of at least'} {low:g}"
+        try:
+            value = kind(text)
+        except ValueError:
+            value = float("nan")
+        if not (low < value if above else low <= value) or value == float("inf"):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
+        return value
+
+    return convert
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM, description=DESCRIPTION, epilog=MAIN_EXAMPLES, formatter_class=_Formatter
+    )
+    parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
+    subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND ...")
+
+    def command(name: str, run: Callable[[Any], int | None], summary: str, text: str, examples: str) -> Any:
+        sub = subparsers.add_parser(
+            name, help=summary, description=text, epilog=examples, formatter_class=_Formatter, allow_abbrev=False
+        )
+        sub.set_defaults(command=run, fail=sub.error)
+        return sub
+
+    sub = command("subdivide", commands.subdivide, "key-frames in, a dense sequence out", SUBDIVIDE, SUBDIVIDE_EXAMPLES)
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
+    sub.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE_OR_FOLDER",
+        help="FILE.glb: the animation alone; a folder: numbered frames and animation.glb",
+    )
+    sub.add_argument(
+        "--levels",
+        type=_number(int, 0),
+        metavar="L",
+        default=3,
+        help="how often the number of intervals doubles (default: %(default)s, 8 frames an interval)",
+    )
+    sub.add_argument(
+        "--frames",
+        type=_number(int, 2),
+        metavar="N",
+        help="number of frames of the result, filled in linearly between the levels' shapes (default: all of those)",
+    )
+    sub.add_argument("--cyclic", action="store_true", help="the last key-frame leads on to the first")
+    sub.add_argument(
+        "--coarse-faces",
+        type=_number(int, 4),
+        default=1000,
+        metavar="N",
+        help="faces of the coarse mesh on which the energy is measured; more is slower (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--space",
+        choices=("joint", "paired"),
+        default="joint",
+        help="where in-betweens are sought: joint, or paired as in the paper (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--mu",
+        type=_number(float, 0, above=True),
+        metavar="X",
+        help="how strongly --space paired pulls its two shapes together (default: 1)",
+    )
+    sub.add_argument(
+        "--no-local",
+        dest="local",
+        action="store_false",
+        help="leave out the steps on the fine mesh that mend what the modes cannot reach",
+    )
+    sub.add_argument(
+        "--polish",
+        type=_number(int, 0),
+        metavar="N",
+        default=0,
+        help="further steps on the fine mesh, towards the optimum over all vertices (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--format", choices=("ply", "obj", "off"), default="ply", help="of the frames (default: %(default)s)"
+    )
+    sub.add_argument(
+        "--fps",
+        type=_number(float, 0, above=True),
+        metavar="X",
+        default=24.0,
+        help="frames a second of the animation (default: 24)",
+    )
+    sub.add_argument(
+        "--picture",
+        type=Path,
+        metavar="FILE",
+        help="also draw the sequence beside linear interpolation, as .png or .pdf",
+    )
+    _add_modes(sub)
+    _add_common(sub)
+
+    sub = command("modes", commands.modes, "vibration modes of key-frames, as safetensors", MODES, MODES_EXAMPLES)
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
+    sub.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE_OR_FOLDER",
+        help="FILE.safetensors for one mesh, or a folder for a file of each mesh's name",
+    )
+    sub.add_argument(
+        "--form",
+        choices=("edge", "element", "vertex"),
+        default="edge",
+        help="of the energy's Hessian; vertex is the paper's (default: %(default)s)",
+    )
+    _add_modes(sub)
+    _add_common(sub)
+
+    sub = command("precompute", bulk.run, bulk.SUMMARY, bulk.DESCRIPTION, bulk.EXAMPLES)
+    bulk.add_arguments(sub, _number)
+    _add_modes(sub)
+    bulk.add_common(sub)
+
+    sub = command("demo", commands.demo, "try it on the samples that come with it", DEMO, DEMO_EXAMPLES)
+    sub.add_argument(
+        "--out",
+        type=Path,
+        default=Path("torch-modal-demo"),
+        metavar="FOLDER",
+        help="where the files go (default: %(default)s)",
+    )
+    sub.add_argument("--sample", choices=("creature", "hand"), help="only this one (default: both)")
+    sub.add_argument(
+        "--levels",
+        type=_number(int, 1),
+        metavar="L",
+        default=3,
+        help="how often the number of intervals doubles (default: %(default)s, 8 frames an interval)",
+    )
+    _add_modes(sub)
+    _add_common(sub)
+
+    sub = command("cache", commands.cache, "size of the cache of tetrahedra and modes", CACHE, CACHE_EXAMPLES)
+    sub.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
+    sub.add_argument(
+        "--cache-dir", metavar="DIR", help="another folder (default: TORCH_MODAL_CACHE, or the user's cache folder)"
+    )
+    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return parser
+
+
+def _add_modes(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--modes",
+        type=_number(int, 1),
+        default=30,
+        metavar="N",
+        help="elastic modes of each key-frame; 20 to 100 are usual (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--mesher",
+        choices=("auto", "tetwild", "lattice"),
+        default="auto",
+        help="what fills the surfaces: fTetWild, a lattice of cubes (deterministic, takes open surfaces), or auto: the "
+        "second where the first fails (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--quality",
+        choices=("fast", "fine"),
+        default="fast",
+        help="how fine the tetrahedra are (default: %(default)s)",
+    )
+
+
+def _add_common(sub: argparse.ArgumentParser) -> None:
+    group = sub.add_argument_group("files and messages")
+    group.add_argument("--overwrite", action="store_true", help="replace files that exist (default: refuse)")
+    group.add_argument(
+        "--cache-dir",
+        metavar="DIR",
+        help="where tetrahedra and modes are kept (default: TORCH_MODAL_CACHE, or the user's cache folder)",
+    )
+    group.add_argument("--no-cache", action="store_true", help="compute everything anew and keep nothing")
+    group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
+    group.add_argument("--debug", action="store_true", help="show the traceback of an error")

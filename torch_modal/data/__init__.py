@@ -1,0 +1,1 @@
+"""Stored key-frame sets, random transforms and datasets of shapes."""

@@ -1,0 +1,253 @@
+"""Random shapes from a folder of stored key-frame sets, for PyTorch's data loaders."""
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch
+from torch_modal.data.random_in_between import RandomInBetween
+from torch_modal.data.sequential import AugmentationSequential
+from torch_modal.data.space import Recent, ShapeSpace
+from torch_modal.data.stored import StoredSet, find_sets, open_set
+from torch_modal.geometry.normals import vertex_normals
+
+LABELS_FILE = "labels.safetensors"
+
+Labels = Mapping[str, Tensor]
+Sample = dict[str, Any]
+
+
+def stored_labels(stored: StoredSet) -> Labels:
+    """What stands in the file ``labels.safetensors`` of a set's folder, if there is one."""
+    path = stored.folder / LABELS_FILE
+    return load_file(path) if path.is_file() else {}
+
+
+class _Opened(NamedTuple):
+    """A set in use."""
+
+    space: ShapeSpace
+    pool: ShapeBatch
+    """The key-frames, with labels."""
+
+
+class ShapeDataset(Dataset[Sample]):
+    """Random shapes of all key-frame sets of a folder (``torch-modal precompute``, :func:`torch_modal.write_set`).
+
+    A sample starts from a key-frame of its set, each in turn, and is transformed; partners are other key-frames of the
+    set. It depends on the seed, the epoch and its index alone, not on workers or their number. (Samples that a loader
+    asks for together are computed together: with another batch size they agree up to rounding.) Sets are opened when
+    they are needed, in the process that needs them, and only the most recent are kept open, so that memory does not
+    grow with their number.
+
+    A sample is a dict: ``vertices`` (V, 3); ``set``, the number of its set in :attr:`sets`; ``keyframe``, where it
+    started; and where asked for or there, ``faces`` (F, 3), ``normals`` (V, 3), ``vertex_labels`` and ``shape_labels``.
+
+    Args:
+        root: Folder of stored sets, at any depth.
+        transform: What is done to key-frames; in-betweens by default. Its ``same_on_batch`` has no effect here.
+        samples_per_set: Samples of each set in an epoch.
+        labels: Tells the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
+            each if there are any. A function of a module, if workers are spawned. By default those in the file
+            ``labels.safetensors`` of the set's folder.
+        seed: Of all that is random.
+        dtype: Of the vertices.
+        faces: Whether samples have their faces. A loader stacks them with the rest; :meth:`faces` gives them once.
+        normals: Whether samples have normals.
+        open_sets: How many sets are kept open, in each process.
+        options: Of the spaces (:class:`ShapeSpace`), such as ``coarse_faces`` or ``times``.
+
+    Raises:
+        FileNotFoundError: There is no such folder, or no set in it.
+        ValueError: ``samples_per_set`` or ``open_sets`` is below 1.
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        transform: AugmentationSequential | ShapeAugmentation | None = None,
+        *,
+        samples_per_set: int = 16,
+        labels: Callable[[StoredSet], Labels] = stored_labels,
+        seed: int = 0,
+        dtype: torch.dtype = torch.float32,
+        faces: bool = False,
+        normals: bool = False,
+        open_sets: int = 8,
+        **options: Any,
+    ) -> None:
+        if samples_per_set < 1 or open_sets < 1:
+            raise ValueError(f"samples_per_set and open_sets are 1 or more, got {samples_per_set} and {open_sets}")
+        self.sets = [str(path) for path in find_sets(root)]
+        if not self.sets:
+            raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
+        transform = RandomInBetween(p=1.0) if transform is None else transform
+        if not isinstance(transform, AugmentationSequential):
+            transform = AugmentationSequential(transform)
+        self.transform = transform
+        self.samples_per_set = samples_per_set
+        self.labels = labels
+        self.seed = seed
+        self.dtype = dtype
+        self.with_faces = faces
+        self.with_normals = normals
+        self.open_sets = open_sets
+        self.options = options
+        # In shared memory: workers that outlive an epoch see the next one.
+        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._opened = Recent(open_sets)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": Recent(self.open_sets)}
+
+    def __len__(self) -> int:
+        """Samples in an epoch."""
+        return len(self.sets) * self.samples_per_set
+
+    @property
+    def epoch(self) -> int:
+        """Which epoch samples are drawn for."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, before a loader is iterated; its workers see it too, persistent ones included."""
+        self._epoch.fill_(epoch)
+
+    def space(self, number: int) -> ShapeSpace:
+        """Key-frames and modes of a set."""
+        return self._open(number).space
+
+    def faces(self, number: int) -> Tensor:
+        """Faces of a set. *Shape:* ``(F, 3)``."""
+        return self._open(number).space.faces
+
+    def __getitem__(self, index: int) -> Sample:
+        """One sample."""
+        return self.__getitems__([index])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
+        """Several samples, those of the same set computed together; loaders call this for each batch."""
+        samples: dict[int, Sample] = {}
+        by_set: dict[int, list[int]] = {}
+        for place, index in enumerate(indices):
+            if not -len(self) <= index < len(self):
+                raise IndexError(f"index {index} of {len(self)} samples")
+            by_set.setdefault(index % len(self) // self.samples_per_set, []).append(place)
+        with torch.no_grad(), _one_thread():
+            for number, places in by_set.items():
+                made = self._make(number, [indices[place] % len(self) for place in places])
+                samples.update(zip(places, made, strict=True))
+        return [samples[place] for place in range(len(indices))]
+
+    def _make(self, number: int, indices: Sequence[int]) -> list[Sample]:
+        space, pool = self._open(number)
+        turn = self.epoch * self.samples_per_set
+        start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
+        drawn = [self.transform.forward_parameters(1, space, self._generator(index)) for index in indices]
+        params = [_joined(each) for each in zip(*drawn, strict=True)]
+        batch = self.transform.transform(pool.rows(start), params, space, pool)
+        parts = {"vertices": batch.shapes}
+        if self.with_normals:
+            parts["normals"] = vertex_normals(batch.shapes, space.faces)
+        if batch.vertex_labels is not None:
+            parts["vertex_labels"] = batch.vertex_labels
+        if batch.shape_labels is not None:
+            parts["shape_labels"] = batch.shape_labels
+        samples: list[Sample] = []
+        for row in range(len(indices)):
+            # Copies: a view would carry the whole batch to another process.
+            sample: Sample = {name: part[row].clone() for name, part in parts.items()}
+            sample |= {"set": number, "keyframe": int(start[row])}
+            if self.with_faces:
+                sample["faces"] = space.faces
+            samples.append(sample)
+        return samples
+
+    def _generator(self, index: int) -> torch.Generator:
+        state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
+        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+
+    def _open(self, number: int) -> _Opened:
+        def make() -> _Opened:
+            stored = open_set(self.sets[number])
+            space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
+            labels = self.labels(stored)
+            vertex_labels, shape_labels = (labels.get(name) for name in ("vertex_labels", "shape_labels"))
+            k, v = len(space), space.n_vertices
+            if vertex_labels is not None and vertex_labels.shape[:2] != (k, v) and vertex_labels.shape[:1] == (v,):
+                vertex_labels = vertex_labels.expand(k, *vertex_labels.shape)
+            for name, value, wanted in (
+                ("vertex_labels", vertex_labels, (k, v)),
+                ("shape_labels", shape_labels, (k,)),
+            ):
+                if value is not None and value.shape[: len(wanted)] != wanted:
+                    raise ValueError(
+                        f"{stored.folder}: {name} of {k} key-frames and {v} vertices begin with the shape {wanted}; "
+                        f"got {tuple(value.shape)}"
+                    )
+            return _Opened(space, ShapeBatch.of_keyframes(space, None, vertex_labels, shape_labels))
+
+        return self._opened.get(number, make)
+
+
+class SetBatchSampler(Sampler[list[int]]):
+    """Batches of samples of one set each, so that they can be stacked where sets differ in their vertices.
+
+    Follows the epoch of the dataset.
+
+    Args:
+        dataset: The dataset.
+        batch_size: Samples in a batch; the last of a set may be smaller.
+        shuffle: Whether samples of a set, and batches, come in random order.
+        drop_last: Whether smaller batches are left out.
+    """
+
+    def __init__(self, dataset: ShapeDataset, batch_size: int, shuffle: bool = True, drop_last: bool = False) -> None:
+        if batch_size < 1:
+            raise ValueError(f"batch_size is 1 or more, got {batch_size}")
+        self.dataset = dataset
+        self.batch_size = batch_size
+        self.shuffle = shuffle
+        self.drop_last = drop_last
+
+    def __len__(self) -> int:
+        """Number of batches in an epoch."""
+        whole, rest = divmod(self.dataset.samples_per_set, self.batch_size)
+        return len(self.dataset.sets) * (whole + (rest > 0 and not self.drop_last))
+
+    def __iter__(self) -> Iterator[list[int]]:
+        size = self.dataset.samples_per_set
+        random = np.random.default_rng([self.dataset.seed, self.dataset.epoch])
+        batches = []
+        for number in range(len(self.dataset.sets)):
+            own = number * size + (random.permutation(size) if self.shuffle else np.arange(size))
+            parts = [own[start : start + self.batch_size].tolist() for start in range(0, size, self.batch_size)]
+            batches += [part for part in parts if len(part) == self.batch_size or not self.drop_last]
+        order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
+        for place in order:
+            yield batches[place]
+
+
+def _joined(rows: Sequence[Parameters]) -> Parameters:
+    return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """As in a worker: sums are then split the same way, and give the same bits."""
+    threads = torch.get_num_threads()
+    if threads == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,157 @@
+"""Random deformations along vibration modes, that bend where modes alone would shear."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
+from torch_modal.data.space import Reference, ShapeSpace
+from torch_modal.geometry.poisson import Reconstruction
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.triangle_frames import Bend, bend, bent_sides, frames, sides
+
+# A draw beyond the bound is scaled down to this part of it, as if its largest strain were linear, which it nearly is.
+_INSIDE = 0.98
+_STEEPEST = 0.05
+_ROUNDS = 8
+
+# The same draw with and without gradients differs by rounding, which must not carry it over the bound.
+_ROUNDING = 1e-4
+
+# So many numbers of all side vectors together are worked on at a time.
+_CHUNK_NUMBERS = 2**22
+
+
+class RandomModalDeformation(ShapeAugmentation):
+    r"""Deforms shapes along the vibration modes of the nearest key-frame, with thermal amplitudes.
+
+    Amplitudes are independent and normal, :math:`a_i \sim N(0, \sigma^2 / \lambda_i)`, so that each mode has the same
+    energy on average: limbs bend far, thickness hardly changes. The linear displacement gives each triangle a rotation
+    and a strain, the rotation is made finite, and vertices follow by a Poisson problem (rotation-strain coordinates,
+    Huang et al. 2011): large draws bend. A draw whose largest edge strain would exceed the bound is scaled down until
+    it does not. The result is aligned with the shape that came.
+
+    Args:
+        strain: Range of the expected root mean square edge strain (which is sigma, in other units), drawn uniformly; a
+            number is a range of one.
+        max_strain: Bound on the relative change of length of every edge.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``strain`` is no range of positive numbers, or ``max_strain`` is not between 0 and 1.
+    """
+
+    def __init__(
+        self,
+        strain: float | tuple[float, float] = (0.0, 0.02),
+        max_strain: float = 0.2,
+        p: float = 0.5,
+        **options: Any,
+    ) -> None:
+        super().__init__(p, **options)
+        strain = (strain, strain) if isinstance(strain, (int, float)) else strain
+        self.strain = check_range("strain", strain, 0, 1)
+        if not 0 < max_strain < 1:
+            raise ValueError(f"max_strain is above 0 and below 1, got {max_strain}")
+        self.max_strain = max_strain
+
+    def extra_repr(self) -> str:
+        """Settings."""
+        return f"strain={self.strain}, max_strain={self.max_strain}, {super().extra_repr()}"
+
+    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+        """``noise``, standard normal, one number for each mode; and the ``strain``."""
+        space = self._space(space)
+        strain = self.strain[0] + (self.strain[1] - self.strain[0]) * uniform(n, generator)
+        return {"strain": strain, "noise": normal(n, generator, space.n_modes)}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
+    ) -> ShapeBatch:
+        """Deform each shape."""
+        space = self._space(space)
+        assert batch.nearest is not None and batch.given is not None
+        amplitudes = params["strain"][:, None] * params["noise"]
+        chunk = max(1, _CHUNK_NUMBERS // (9 * len(space.faces)))
+        shapes, order = [], []
+        for index in batch.nearest.unique().tolist():
+            for rows in torch.nonzero(batch.nearest == index).flatten().split(chunk):
+                here = rows.to(amplitudes.device)
+                shapes.append(self._deformed(batch.shapes[here], amplitudes[here], space, index))
+                order.append(rows)
+        back = torch.argsort(torch.cat(order)).to(amplitudes.device)
+        return batch._replace(shapes=torch.cat(shapes)[back], given=torch.zeros_like(batch.given))
+
+    def _deformed(self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, index: int) -> Tensor:
+        """Shapes that are nearest to one key-frame. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
+        reference = space.reference(index, x)
+        reconstruction = space.reconstruction
+        with torch.no_grad():
+            scale, deformed = self._bounded(x.detach(), amplitudes.detach(), space, reference, reconstruction)
+        if not (torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)):
+            return deformed
+        deformed = deform(x, scale[:, None] * amplitudes, reference, reconstruction)
+        # Nothing is left to chance: what does not come within the bound stays as it was.
+        with torch.no_grad():
+            within = (space.strain(deformed, x).abs() <= self.max_strain).all(1) & (scale > 0)
+        return torch.where(within[:, None, None], deformed, x)
+
+    def _bounded(
+        self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, reference: Reference, reconstruction: Reconstruction
+    ) -> tuple[Tensor, Tensor]:
+        """How far each draw may go, ``(B,)``, and the shapes that this gives; where nothing helps, those that came."""
+        bound = (1 - _ROUNDING) * self.max_strain
+        expected = linear_strain(amplitudes, reference, space.edges.to(x.device))
+        scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
+        shapes = x.clone()
+        rows = torch.arange(len(x), device=x.device)
+        for _ in range(_ROUNDS):
+            tried = deform(x[rows], (scale[:, None] * amplitudes)[rows], reference, reconstruction)
+            largest = space.strain(tried, x[rows]).abs().amax(1).nan_to_num(torch.inf)
+            within = largest <= bound
+            shapes = shapes.index_copy(0, rows[within], tried[within])
+            rows, largest = rows[~within], largest[~within]
+            if not len(rows):
+                return scale, shapes
+            factor = (_INSIDE * bound / largest).clamp_min(_STEEPEST)
+            scale = scale.index_copy(0, rows, scale[rows] * factor)
+        return scale.index_fill(0, rows, 0), shapes
+
+
+def deform(x: Tensor, amplitudes: Tensor, reference: Reference, reconstruction: Reconstruction) -> Tensor:
+    """Shapes bent along a key-frame's modes.
+
+    Rotations and strains are those of the key-frame, where the modes belong; a shape that has another pose is turned by
+    the same rotations, and strained along its own triangles.
+
+    Args:
+        x: Shapes near the key-frame. *Shape:* ``(B, V, 3)``.
+        amplitudes: Of the scaled modes. *Shape:* ``(B, n)``, n at least their number.
+        reference: The key-frame.
+        reconstruction: Of its connectivity.
+
+    Returns:
+        Aligned with ``x``. *Shape:* ``(B, V, 3)``.
+    """
+    faces, weights = reconstruction.faces.to(x.device), reconstruction.areas.to(x)
+    modes = reference.modes
+    displacement = (modes.mT @ amplitudes[:, : len(modes)].mT).unflatten(0, (-1, 3))
+    turn, strain = bend(sides(displacement, faces), reference.frames)
+    pose = best_fit(reference.shape.expand_as(x), x, weights).rotation
+    turn = (pose @ turn.movedim(-1, 0).mT).mT.movedim(0, -1)
+    rest = x.permute(1, 2, 0).contiguous()
+    wanted = bent_sides(Bend(turn, strain), frames(sides(rest, faces)))
+    bent = reconstruction(wanted, rest).permute(2, 0, 1)
+    return best_fit(bent, x, weights).apply(bent)
+
+
+def linear_strain(amplitudes: Tensor, reference: Reference, edges: Tensor) -> Tensor:
+    """Largest edge strain of the linear displacement: that of the bent shape to first order. *Shape:* ``(B,)``."""
+    i, j = edges.unbind(1)
+    modes = reference.modes
+    displacement = (modes.mT @ amplitudes[:, : len(modes)].mT).unflatten(0, (-1, 3))
+    side = (reference.shape[j] - reference.shape[i])[..., None]
+    along = ((displacement[j] - displacement[i]) * side).sum(1)
+    return (along / side.square().sum(1).clamp_min(torch.finfo(side.dtype).tiny)).abs().amax(0)

@@ -1,0 +1,92 @@
+"""Random transforms for PyTorch Geometric. Needs ``torch_geometric`` (``pip install torch_modal[pyg]``)."""
+
+from typing import Any
+
+import torch
+
+from torch_modal.data.augmentation import ShapeAugmentation, ShapeBatch
+from torch_modal.data.sequential import AugmentationSequential
+from torch_modal.data.space import ShapeSpace
+
+try:
+    from torch_geometric.data import Data
+    from torch_geometric.transforms import BaseTransform
+except ImportError as error:  # pragma: no cover
+    raise ImportError(
+        "torch_modal.data.pyg needs PyTorch Geometric: pip install torch_geometric, or torch_modal[pyg]"
+    ) from error
+
+
+class RandomShape(BaseTransform):
+    """A random transform of ``Data(pos, face)``; compose it with others as usual.
+
+    Partners of in-betweens are the key-frames of the space. ``normal`` is computed anew where a graph has it; all else,
+    labels of nodes among it, stays as it is, since nodes keep their order. Only ``y`` changes, and only if the
+    key-frames' own ``y`` are given: then it is taken along as the transform's ``blend_labels`` says.
+
+    Args:
+        augmentation: What is done; with its space.
+        space: Key-frames and modes; by default the augmentation's.
+        y: Labels of the key-frames. *Shape:* ``(K, ...)``.
+
+    Raises:
+        ValueError: There is no space.
+    """
+
+    def __init__(
+        self,
+        augmentation: ShapeAugmentation | AugmentationSequential,
+        space: ShapeSpace | None = None,
+        y: torch.Tensor | None = None,
+    ) -> None:
+        if isinstance(augmentation, ShapeAugmentation):
+            augmentation = AugmentationSequential(
+                augmentation, generator=augmentation.generator, space=augmentation.space
+            )
+        found = augmentation.space if space is None else space
+        if found is None:
+            raise ValueError("RandomShape needs key-frames and modes: pass space=ShapeSpace(bases, faces)")
+        self.space = found
+        self.y = y
+        keys = ("shapes", "normals", "shape_labels")
+        self.augmentation = AugmentationSequential(
+            *augmentation.transforms, data_keys=keys, generator=augmentation.generator, space=found
+        )
+
+    def forward(self, data: Data) -> Data:
+        """Transform a graph, in place (``BaseTransform`` hands over a copy).
+
+        Raises:
+            ValueError: It has not as many nodes as the space has vertices.
+        """
+        pos: Any = data.pos
+        if pos is None or pos.shape != (self.space.n_vertices, 3):
+            got = None if pos is None else tuple(pos.shape)
+            raise ValueError(f"data.pos of this space has the shape ({self.space.n_vertices}, 3); got {got}")
+        label = data.y if self.y is not None else None
+        pool = ShapeBatch.of_keyframes(self.space, pos, shape_labels=None if self.y is None else self.y.to(pos.device))
+        # A graph's labels have one row, or none.
+        rows = None if label is None else label.reshape(1, *pool.shape_labels.shape[1:])  # type: ignore[union-attr]
+        shapes, normals, labels = self.augmentation(pos[None], None, rows, pool=pool)
+        data.pos = shapes[0]
+        if "normal" in data:
+            data.normal = normals[0]
+        if label is not None:
+            data.y = labels.reshape(label.shape)
+        return data
+
+    def __repr__(self) -> str:
+        inside = ", ".join(repr(each) for each in self.augmentation.transforms)
+        return f"{type(self).__name__}({inside})"
+
+
+def as_data(sample: dict[str, Any]) -> Data:
+    """A sample of :class:`torch_modal.ShapeDataset`, made with ``faces=True``, as a graph.
+
+    Its keys become ``pos``, ``face``, ``normal``, ``y`` (labels of the shape) and ``vertex_labels``.
+    """
+    names = {"vertices": "pos", "normals": "normal", "shape_labels": "y", "vertex_labels": "vertex_labels"}
+    parts = {new: sample[old] for old, new in names.items() if old in sample}
+    if "y" in parts:
+        parts["y"] = parts["y"][None]
+    return Data(face=sample["faces"].T.contiguous(), **parts)

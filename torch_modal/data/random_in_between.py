@@ -1,0 +1,196 @@
+"""Shapes between two others, and a little beyond one of them."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, uniform
+from torch_modal.data.space import ShapeSpace
+from torch_modal.geometry.poisson import Reconstruction
+from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.triangle_frames import frames, mirrored_sides, sides
+
+
+class _Pairwise(ShapeAugmentation):
+    """Draws a partner and a time for each shape, and takes labels along.
+
+    Args:
+        blend_labels: See :class:`RandomInBetween`.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+    """
+
+    def __init__(self, blend_labels: bool, p: float, **options: Any) -> None:
+        super().__init__(p, **options)
+        self.blend_labels = blend_labels
+
+    def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
+        """*Shape:* ``(n,)``."""
+        raise NotImplementedError
+
+    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+        """``partner``, in [0, 1): how far along the others of the pool the partner stands; and the times ``t``."""
+        return {"partner": uniform(n, generator), "t": self.draw_times(n, generator)}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
+    ) -> ShapeBatch:
+        """Move each shape towards its partner, or away from it."""
+        space = self._space(space)
+        size = len(pool.batch.shapes)
+        if size < 2:
+            return batch
+        assert pool.own is not None
+        offset = (params["partner"].cpu() * (size - 1)).long().clamp(0, size - 2) + 1
+        other = pool.batch.rows((pool.own + offset) % size)
+        t = params["t"]
+        assert batch.nearest is not None and batch.given is not None
+        assert other.nearest is not None and other.given is not None
+        tracked = batch.shapes.requires_grad or other.shapes.requires_grad
+        known = batch.given & other.given & (batch.nearest != other.nearest) & (not tracked)
+        # The same two key-frames in either order are solved together.
+        swap = batch.nearest > other.nearest
+        turn = swap.to(t.device)
+        x_a, x_b = (
+            torch.where(turn[:, None, None], *shapes)
+            for shapes in ((other.shapes, batch.shapes), (batch.shapes, other.shapes))
+        )
+        ends = torch.stack([batch.nearest, other.nearest], 1).sort(1).values
+        kinds, kind = torch.cat([ends, known[:, None].long()], 1).unique(dim=0, return_inverse=True)
+        times = torch.where(turn, 1 - t, t)
+        shapes, order = [], []
+        for number, (i, j, is_known) in enumerate(kinds.tolist()):
+            rows = torch.nonzero(kind == number).flatten()
+            here = rows.to(t.device)
+            pair = _Pair(space, x_a[here], x_b[here], i, j, bool(is_known))
+            shapes.append(self.moved(pair, times[here]))
+            order.append(rows)
+        back = torch.argsort(torch.cat(order)).to(t.device)
+        nearer = (t.detach() > 0.5).cpu()
+        return ShapeBatch(
+            torch.cat(shapes)[back],
+            torch.where(nearer, other.nearest, batch.nearest),
+            torch.zeros_like(batch.given),
+            self._labels("vertex_labels", batch.vertex_labels, other.vertex_labels, t),
+            self._labels("shape_labels", batch.shape_labels, other.shape_labels, t),
+        )
+
+    def moved(self, pair: "_Pair", t: Tensor) -> Tensor:
+        """The shapes at the times ``t``. *Shape:* ``(B,) -> (B, V, 3)``."""
+        raise NotImplementedError
+
+    def _labels(self, name: str, own: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
+        if own is None or others is None:
+            return own
+        t = t.detach().to(own.device).reshape(-1, *[1] * (own.dim() - 1))
+        if not self.blend_labels:
+            return torch.where(t > 0.5, others, own)
+        if not own.is_floating_point():
+            raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {own.dtype}")
+        return torch.lerp(own, others, t.clamp(0, 1).to(own.dtype))
+
+
+class _Pair:
+    """Shapes with their partners, all with the modes of the same two key-frames, ``i <= j``."""
+
+    def __init__(self, space: ShapeSpace, x_a: Tensor, x_b: Tensor, i: int, j: int, known: bool) -> None:
+        self.space, self.x_a, self.x_b, self.i, self.j, self.known = space, x_a, x_b, i, j, known
+
+    def at(self, t: Tensor) -> Tensor:
+        """In-betweens. *Shape:* ``(B,) -> (B, V, 3)``."""
+        if self.known:
+            return self.space.keyframe_in_between(self.i, self.j, t)
+        return self.space.in_between(self.x_a, self.x_b, t, self.i, self.j)
+
+
+class RandomInBetween(_Pairwise):
+    """Replaces a shape by one between it and a partner, of least elastic energy (:class:`torch_modal.InBetween`).
+
+    Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames, if a call names a pool.
+
+    Args:
+        t: Range of times, drawn uniformly: 0 is the shape itself, 1 its partner.
+        blend_labels: Whether labels become ``(1-t) y_a + t y_b``; they must be floating-point then (one-hot vectors,
+            for classes). Otherwise a shape has the labels of the end that it is nearer to in time.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``t`` is no range within [0, 1].
+    """
+
+    def __init__(
+        self, t: tuple[float, float] = (0.0, 1.0), blend_labels: bool = False, p: float = 0.5, **options: Any
+    ) -> None:
+        super().__init__(blend_labels, p, **options)
+        self.t = check_range("t", t, 0, 1)
+
+    def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
+        """Uniform in the range."""
+        return self.t[0] + (self.t[1] - self.t[0]) * uniform(n, generator)
+
+    def moved(self, pair: _Pair, t: Tensor) -> Tensor:
+        """The in-betweens."""
+        return pair.at(t)
+
+    def extra_repr(self) -> str:
+        """Settings."""
+        return f"t={self.t}, blend_labels={self.blend_labels}, {super().extra_repr()}"
+
+
+class RandomExtrapolation(_Pairwise):
+    r"""Replaces a shape by one that goes on where the motion between it and a partner ends.
+
+    The shape at :math:`1 + s` is the mirror image of the in-between at :math:`1 - s` in the partner, and the one at
+    :math:`-s` that of the in-between at :math:`s` in the shape itself: each triangle turns back by the rotation that it
+    came by and stretches by the inverse, and vertices follow by a Poisson problem. So the partner is the shape half-way
+    between the two, as the discrete geodesics of shells continue (Heeren et al. 2014), and position and velocity are
+    continuous at the ends. (With a negative weight, the energies of the in-between would have no minimum.)
+
+    Args:
+        beyond: Range of s, how far outside [0, 1] the times are, drawn uniformly; 1 at most. Which end it is beyond is
+            drawn too.
+        blend_labels: As for :class:`RandomInBetween`, with times of 0 and 1: labels are those of the nearer end.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``beyond`` is no range within [0, 1].
+    """
+
+    def __init__(
+        self, beyond: tuple[float, float] = (0.0, 0.2), blend_labels: bool = False, p: float = 0.5, **options: Any
+    ) -> None:
+        super().__init__(blend_labels, p, **options)
+        self.beyond = check_range("beyond", beyond, 0, 1)
+
+    def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
+        """Below 0 or above 1, with the same probability."""
+        draw = uniform(n, generator, 2)
+        beyond = self.beyond[0] + (self.beyond[1] - self.beyond[0]) * draw[:, 0]
+        return torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)
+
+    def moved(self, pair: _Pair, t: Tensor) -> Tensor:
+        """The mirror images."""
+        after = t > 0.5
+        before_end = pair.at(torch.where(after, 2 - t, -t))
+        ends = torch.where(after[:, None, None], pair.x_b, pair.x_a)
+        return mirror(ends, before_end, pair.space.reconstruction)
+
+    def extra_repr(self) -> str:
+        """Settings."""
+        return f"beyond={self.beyond}, blend_labels={self.blend_labels}, {super().extra_repr()}"
+
+
+def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:
+    """The shape as far beyond ``centre`` as ``other`` lies before it, its rigid motion included.
+
+    *Shape:* ``(B, V, 3), (B, V, 3) -> (B, V, 3)``.
+    """
+    weights, faces = reconstruction.areas.to(centre), reconstruction.faces.to(centre.device)
+    motion = best_fit(centre, other, weights)
+    last, aligned = (y.permute(1, 2, 0).contiguous() for y in (centre, motion.inverse().apply(other)))
+    wanted = mirrored_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))
+    beyond = reconstruction(wanted, last).permute(2, 0, 1)
+    return RigidMotion(motion.rotation.mT, motion.source, 2 * motion.source - motion.target).apply(beyond)

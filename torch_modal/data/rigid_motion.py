@@ -1,0 +1,84 @@
+"""Random rigid motions."""
+
+import math
+from typing import Any
+
+import torch
+from kornia.geometry.liegroup import So3
+
+from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
+from torch_modal.data.space import ShapeSpace
+from torch_modal.geometry.rigid import RigidMotion
+
+
+class RandomRigidMotion(ShapeAugmentation):
+    """Turns shapes about the mean of their vertices, and moves them.
+
+    Args:
+        degrees: Range of the angle, drawn uniformly; a number is the range from it to its negative. With None,
+            rotations are uniform over all there are (``axis`` has no effect).
+        axis: What is turned about, ``(0, 1, 0)`` for shapes that stand upright in y; by default any direction.
+        translation: Largest move along each axis, in diagonals of the shape's bounding box.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: The angle is beyond 180 degrees, the axis has no length, or the translation is negative.
+    """
+
+    uses_keyframes = False
+
+    def __init__(
+        self,
+        degrees: float | tuple[float, float] | None = None,
+        axis: tuple[float, float, float] | None = None,
+        translation: float = 0.0,
+        p: float = 0.5,
+        **options: Any,
+    ) -> None:
+        super().__init__(p, **options)
+        if isinstance(degrees, (int, float)):
+            degrees = (-degrees, degrees)
+        self.degrees = None if degrees is None else check_range("degrees", degrees, -180, 180)
+        if axis is not None and not math.hypot(*axis) > 0:
+            raise ValueError(f"an axis has a length, got {axis}")
+        self.axis = axis
+        if translation < 0:
+            raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
+        self.translation = translation
+
+    def extra_repr(self) -> str:
+        """Settings."""
+        return f"degrees={self.degrees}, axis={self.axis}, translation={self.translation}, {super().extra_repr()}"
+
+    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+        """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
+        direction, angle = normal(n, generator, 4), uniform(n, generator)
+        move = self.translation * (2 * uniform(n, generator, 3) - 1)
+        if self.degrees is None:
+            # A normal vector of four has a uniform direction: a uniform quaternion.
+            sine = direction[:, 1:].norm(dim=1)
+            angle = 2 * torch.atan2(sine, direction[:, 0])
+            angle = torch.where(angle > torch.pi, angle - 2 * torch.pi, angle)
+        else:
+            low, high = (math.radians(degree) for degree in self.degrees)
+            angle = low + (high - low) * angle
+        axis = direction[:, 1:]
+        if self.axis is not None and self.degrees is not None:
+            axis = torch.as_tensor(self.axis).to(axis).expand_as(axis)
+        return {"rotation": angle[:, None] * torch.nn.functional.normalize(axis, dim=1), "translation": move}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
+    ) -> ShapeBatch:
+        """Move each shape."""
+        x = batch.shapes
+        diagonal = (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
+        centre = x.mean(1)
+        turn = params["rotation"]
+        rotation = So3.exp(turn).matrix()
+        if not turn.requires_grad:
+            rotation = rotation.detach()  # kornia makes a parameter of what it is given
+        motion = RigidMotion(rotation, centre, centre + params["translation"] * diagonal)
+        given = None if batch.given is None else torch.zeros_like(batch.given)
+        return batch._replace(shapes=motion.apply(x), given=given)

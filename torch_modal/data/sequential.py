@@ -1,0 +1,156 @@
+"""Several random transforms as one, with labels and normals."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_shapes
+from torch_modal.data.space import ShapeSpace
+from torch_modal.geometry.normals import vertex_normals
+
+DATA_KEYS = ("shapes", "normals", "vertex_labels", "shape_labels")
+
+
+class AugmentationSequential(nn.Module):
+    """Random transforms one after the other, that take labels along; named after kornia's.
+
+    A call takes one argument for each data key and returns as many, in the same order:
+
+    - ``"shapes"``: vertex positions, ``(B, V, 3)`` or ``(V, 3)``;
+    - ``"normals"``: replaced by the vertex normals of the new shapes; the argument may be None;
+    - ``"vertex_labels"``: ``(B, V, ...)``, or ``(V, ...)`` for one shape;
+    - ``"shape_labels"``: ``(B, ...)``, or of one shape without the B.
+
+    Since vertices keep their order, labels, landmarks and correspondences stay right as they are; only transforms that
+    take in a second shape change labels, as their ``blend_labels`` says.
+
+    Args:
+        transforms: What is done, in order.
+        data_keys: What a call takes and returns; ``"shapes"`` must be among them.
+        same_on_batch: Overrides that of the transforms, unless None.
+        keepdim: Whether one shape comes back as such, and not as a batch of one.
+        generator: Where random numbers come from, for all transforms; by default each has its own.
+        space: Key-frames and modes, for all transforms; by default each has its own.
+
+    Raises:
+        ValueError: An unknown or doubled data key, or no shapes.
+    """
+
+    def __init__(
+        self,
+        *transforms: ShapeAugmentation,
+        data_keys: Sequence[str] = ("shapes",),
+        same_on_batch: bool | None = None,
+        keepdim: bool = False,
+        generator: torch.Generator | None = None,
+        space: ShapeSpace | None = None,
+    ) -> None:
+        super().__init__()
+        self.transforms = nn.ModuleList(transforms)
+        self.data_keys = tuple(data_keys)
+        if "shapes" not in self.data_keys or len(set(self.data_keys)) < len(self.data_keys):
+            raise ValueError(f"data_keys name each thing once, 'shapes' among them; got {self.data_keys}")
+        if set(self.data_keys) - set(DATA_KEYS):
+            raise ValueError(f"data_keys are of {DATA_KEYS}; got {self.data_keys}")
+        self.same_on_batch = same_on_batch
+        self.keepdim = keepdim
+        self.generator = generator
+        self.space = space
+        self._params: list[Parameters] = []
+
+    @property
+    def params(self) -> list[Parameters]:
+        """Parameters of the last call, of each transform."""
+        return self._params
+
+    def forward_parameters(
+        self, n: int, space: ShapeSpace | None = None, generator: torch.Generator | None = None
+    ) -> list[Parameters]:
+        """Draw parameters of all transforms for ``n`` shapes."""
+        space = self.space if space is None else space
+        generator = self.generator if generator is None else generator
+        return [each.forward_parameters(n, space, generator, self.same_on_batch) for each in self._each()]
+
+    def transform(
+        self,
+        batch: ShapeBatch,
+        params: Sequence[Parameters],
+        space: ShapeSpace | None = None,
+        pool: ShapeBatch | None = None,
+    ) -> ShapeBatch:
+        """Transform a batch with given parameters; arguments as for :meth:`ShapeAugmentation.transform`."""
+        space = self.space if space is None else space
+        if len(params) != len(self.transforms):
+            raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
+        for each, own in zip(self._each(), params, strict=True):
+            batch = each.transform(batch, own, space, pool)
+        return batch
+
+    def forward(
+        self,
+        *inputs: Tensor | None,
+        params: Sequence[Parameters] | None = None,
+        space: ShapeSpace | None = None,
+        pool: ShapeBatch | None = None,
+    ) -> Any:
+        """Transform shapes, and what goes along with them.
+
+        Args:
+            inputs: One for each data key.
+            params: Parameters of an earlier call, to repeat it.
+            space: Key-frames and modes; by default the module's.
+            pool: The key-frames of the space (:meth:`ShapeBatch.of_keyframes`), with labels if ``inputs`` have any, if
+                partners come from there; by default they come from the batch.
+
+        Returns:
+            A tensor, or a tuple of one for each data key.
+
+        Raises:
+            ValueError: The inputs do not fit the data keys, each other or the space.
+        """
+        space = self.space if space is None else space
+        if len(inputs) != len(self.data_keys):
+            raise ValueError(f"the data keys are {self.data_keys}; got {len(inputs)} arguments")
+        named = dict(zip(self.data_keys, inputs, strict=True))
+        shapes = named["shapes"]
+        if shapes is None:
+            raise ValueError("shapes are None")
+        check_shapes(shapes, space)
+        single = shapes.dim() == 2
+        batch = _as_batch(named, single)
+        self._params = self.forward_parameters(len(batch.shapes), space) if params is None else list(params)
+        out = self.transform(batch, self._params, space, pool)
+        found = {
+            "shapes": out.shapes,
+            "normals": self._normals(out.shapes, space) if "normals" in named else None,
+            "vertex_labels": out.vertex_labels,
+            "shape_labels": out.shape_labels,
+        }
+        if single and self.keepdim:
+            found = {name: None if value is None else value[0] for name, value in found.items()}
+        results = tuple(found[name] for name in self.data_keys)
+        return results[0] if len(results) == 1 else results
+
+    def _each(self) -> list[Any]:
+        return list(self.transforms)
+
+    def _normals(self, x: Tensor, space: ShapeSpace | None) -> Tensor:
+        spaces = [space, *(each.space for each in self._each())]
+        known = next((each for each in spaces if each is not None), None)
+        if known is None:
+            raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
+        return vertex_normals(x, known.faces)
+
+
+def _as_batch(named: dict[str, Tensor | None], single: bool) -> ShapeBatch:
+    parts = {name: value[None] if single and value is not None else value for name, value in named.items()}
+    parts.pop("normals", None)
+    shapes = parts["shapes"]
+    assert shapes is not None
+    for name, wanted in (("vertex_labels", shapes.shape[:2]), ("shape_labels", shapes.shape[:1])):
+        value = parts.get(name)
+        if value is not None and value.shape[: len(wanted)] != wanted:
+            raise ValueError(f"{name} begin with the shape {tuple(wanted)} of the shapes; got {tuple(value.shape)}")
+    return ShapeBatch(shapes, vertex_labels=parts.get("vertex_labels"), shape_labels=parts.get("shape_labels"))

@@ -1,0 +1,278 @@
+"""What augmentations know of a connectivity: its key-frames, their modes, and what is made from them when needed."""
+
+import hashlib
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.data.stored import StoredSet
+from torch_modal.data.table import interpolate, read_table, write_table
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.poisson import Reconstruction
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.triangle_frames import Frames, frames, sides
+from torch_modal.keyframes.check import check_keyframes
+from torch_modal.nn.in_between import InBetween
+from torch_modal.precompute.basis import ModalBasis
+
+# Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
+_NOT_ELASTIC = 1e-8
+
+# What one space keeps of each kind; the rest is made again when it is needed. Fewer than a batch needs would make all
+# of them again for each batch.
+_N_LAYERS, _N_TABLES, _N_REFERENCES = 32, 64, 16
+
+
+class Recent:
+    """The few most recently used of what is expensive to make."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """The thing of this key, made where it is not kept."""
+        if key not in self._kept:
+            while len(self._kept) >= self.limit:  # before making, so that there are never more
+                self._kept.popitem(last=False)
+            self._kept[key] = make()
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+
+class Reference(NamedTuple):
+    """One key-frame as modal deformation needs it."""
+
+    shape: Tensor
+    """*Shape:* ``(V, 3)``."""
+    modes: Tensor
+    """Modes over the roots of their eigenvalues, so scaled that independent standard normal amplitudes give an expected
+    root mean square edge strain of one. *Shape:* ``(k, 3V)``."""
+    frames: Frames
+    """Of its triangles, for a batch of one."""
+
+
+class ShapeSpace:
+    """Key-frames of one connectivity with their modes: what a random shape is drawn from.
+
+    Layers, factorisations and tables are made when they are first needed, in the process that needs them, and only the
+    most recent are kept. Pickling leaves them out, so that a space can be handed to worker processes.
+
+    Args:
+        bases: The basis of each key-frame (:func:`torch_modal.extract_bases`).
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        coarse_faces: Of the mesh that energies are evaluated on (:class:`torch_modal.InBetween`).
+        tolerance: Of the in-betweens.
+        times: In-betweens of two key-frames are solved at so many even times, once, and interpolated among them by
+            cubics; None solves each anew. At least 4.
+        dtype: What tables are kept in.
+        folder: Where tables are kept between runs; by default nowhere.
+
+    Raises:
+        ValueError: The bases do not fit each other or the faces, or ``times`` is below 4.
+    """
+
+    def __init__(
+        self,
+        bases: ModalBasis | Sequence[ModalBasis],
+        faces: Tensor,
+        *,
+        coarse_faces: int = 300,
+        tolerance: float = 1e-5,
+        times: int | None = 17,
+        dtype: torch.dtype = torch.float32,
+        folder: str | os.PathLike[str] | None = None,
+    ) -> None:
+        self.bases = [basis.to("cpu") for basis in ([bases] if isinstance(bases, ModalBasis) else bases)]
+        if not self.bases:
+            raise ValueError("a shape space needs one basis or more")
+        sizes = {basis.n_vertices for basis in self.bases}
+        if len(sizes) > 1:
+            raise ValueError(f"the bases belong to meshes of {sorted(sizes)} vertices; a space has one connectivity")
+        if times is not None and times < 4:
+            raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between anew")
+        # What is wrong with the faces is said here, and repaired as everywhere.
+        self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
+        self.coarse_faces = coarse_faces
+        self.tolerance = tolerance
+        self.times = times
+        self.dtype = dtype
+        self.folder = None if folder is None else Path(folder)
+        self._forget()
+
+    @classmethod
+    def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
+        """The space of a stored key-frame set; tables are kept in its folder. Options as for the constructor."""
+        return cls(stored.bases, stored.faces, **{"folder": stored.folder, **options})
+
+    def _forget(self) -> None:
+        self._layers, self._tables, self._references = Recent(_N_LAYERS), Recent(_N_TABLES), Recent(_N_REFERENCES)
+        self._edges: Tensor | None = None
+        self._reconstruction: Reconstruction | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        made = ("_layers", "_tables", "_references", "_reconstruction", "_edges")
+        return {name: value for name, value in self.__dict__.items() if name not in made}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._forget()
+
+    def __len__(self) -> int:
+        """Number of key-frames, K."""
+        return len(self.bases)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, V."""
+        return self.bases[0].n_vertices
+
+    @property
+    def n_modes(self) -> int:
+        """Most modes that a key-frame has, k."""
+        return max(basis.n_modes for basis in self.bases)
+
+    @property
+    def edges(self) -> Tensor:
+        """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
+        if self._edges is None:
+            self._edges = torch.from_numpy(connectivity.unique_edges(self.faces.numpy())[0])
+        return self._edges
+
+    def keyframes(self, like: Tensor | None = None) -> Tensor:
+        """The key-frames, in the dtype and on the device of another tensor. *Shape:* ``(K, V, 3)``."""
+        shapes = torch.stack([basis.reference for basis in self.bases])
+        return shapes.to(self.dtype) if like is None else shapes.to(like)
+
+    def nearest(self, x: Tensor) -> Tensor:
+        """Which key-frame each shape is closest to, apart from a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
+        if len(self) == 1:
+            return torch.zeros(len(x), dtype=torch.int64)
+        with torch.no_grad():
+            x = x.detach()
+            weights = self.reconstruction.areas.to(x)
+            distances = [
+                ((best_fit(key.expand_as(x), x, weights).apply(key) - x) ** 2).sum(-1) @ weights
+                for key in self.keyframes(x)
+            ]
+        return torch.stack(distances).argmin(0).cpu()
+
+    def strain(self, x: Tensor, rest: Tensor) -> Tensor:
+        """Relative change of length of each edge. *Shape:* ``(B, V, 3), (B, V, 3) -> (B, E)``."""
+        i, j = self.edges.to(x.device).unbind(1)
+        rows = [y.permute(1, 2, 0).contiguous() for y in (x, rest)]
+        after, before = ((y[j] - y[i]).square().sum(1).sqrt() for y in rows)
+        return (after / before.clamp_min(torch.finfo(x.dtype).tiny) - 1).mT
+
+    # ------------------------------------------------------------------------------------------- made when needed
+    @property
+    def reconstruction(self) -> Reconstruction:
+        """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
+        if self._reconstruction is None:
+            self._reconstruction = Reconstruction(self.bases[0].reference, self.faces)
+        return self._reconstruction
+
+    def reference(self, index: int, like: Tensor) -> Reference:
+        """A key-frame for modal deformation, in the dtype and on the device of another tensor."""
+
+        def make() -> Reference:
+            basis = self.bases[index]
+            x = basis.reference.double()
+            values = basis.eigenvalues.double()
+            elastic = values > _NOT_ELASTIC * values.amax()
+            scale = torch.where(elastic, values, torch.inf).rsqrt()
+            modes = basis.modes.double() * scale[:, None, None]
+            i, j = self.edges.unbind(1)
+            side = x[j] - x[i]
+            slopes = ((modes[:, j] - modes[:, i]) * side).sum(-1) / side.square().sum(-1).clamp_min(1e-300)
+            expected = slopes.square().mean(1).sum().sqrt()
+            modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
+            own = frames(sides(x[..., None], self.faces))
+            return Reference(x.to(like), modes.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
+
+        return self._references.get((index, like.dtype, like.device), make)
+
+    def layer(self, i: int, j: int, like: Tensor) -> InBetween:
+        """The in-between layer of two key-frames' modes; ``i`` and ``j`` may be the same."""
+
+        def make() -> InBetween:
+            bases = [self.bases[i], self.bases[j]]
+            layer = InBetween(bases, self.faces, coarse_faces=self.coarse_faces, tolerance=self.tolerance)
+            return layer.to(like)
+
+        return self._layers.get((i, j, like.dtype, like.device), make)
+
+    def table(self, i: int, j: int) -> Tensor:
+        """In-betweens of two key-frames at even times, from disk where they are. *Shape:* ``(T, V, 3)``."""
+        assert self.times is not None
+
+        def make() -> Tensor:
+            settings = {
+                "times": str(self.times),
+                "coarse_faces": str(self.coarse_faces),
+                "tolerance": str(self.tolerance),
+                "dtype": str(self.dtype),
+                "bases": self._content(i, j),
+            }
+            path = None if self.folder is None else self.folder / f"between-{i}-{j}.safetensors"
+            kept = None if path is None else read_table(path, settings)
+            if kept is not None:
+                return kept
+            x_i, x_j = (self.bases[key].reference.double() for key in (i, j))
+            with torch.no_grad():
+                layer = InBetween(
+                    [self.bases[i], self.bases[j]],
+                    self.faces,
+                    coarse_faces=self.coarse_faces,
+                    tolerance=self.tolerance,
+                )
+                result = layer.solve(x_i, x_j, torch.linspace(0, 1, self.times, dtype=torch.float64))
+            table = _usable(result.shapes, i, j).to(self.dtype)
+            if path is not None:
+                write_table(path, table, settings)
+            return table
+
+        return self._tables.get((i, j), make)
+
+    def _content(self, i: int, j: int) -> str:
+        """A hash of the key-frames and their eigenvalues, by which a table is known to be theirs."""
+        digest = hashlib.sha256()
+        for basis in (self.bases[i], self.bases[j]):
+            for part in (basis.reference, basis.eigenvalues):
+                digest.update(part.contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    # -------------------------------------------------------------------------------------------------- in-betweens
+    def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:
+        """Between two key-frames themselves, from the table. *Shape:* ``(B,) -> (B, V, 3)``, in the dtype of ``t``."""
+        if i > j:
+            return self.keyframe_in_between(j, i, 1 - t)  # one table serves both ways
+        if self.times is None:
+            x_i, x_j = self.keyframes(t)[[i, j]]
+            return _usable(self.layer(i, j, t).solve(x_i, x_j, t).shapes, i, j)
+        table = self._tables.get((i, j, t.device), lambda: self.table(i, j).to(t.device))
+        return interpolate(table, t.to(table.dtype)).to(t.dtype)
+
+    def in_between(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: int, j: int) -> Tensor:
+        """Between any shapes, with the modes of two key-frames. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``."""
+        if i > j:
+            return self.in_between(x_b, x_a, 1 - t, j, i)
+        return _usable(self.layer(i, j, x_a).solve(x_a, x_b, t[:, None]).shapes[:, 0], i, j)
+
+
+def _usable(x: Tensor, i: int, j: int) -> Tensor:
+    """What training must never see is said here."""
+    if not bool(x.isfinite().all()):
+        raise ValueError(
+            f"there is no in-between of some shapes near the key-frames {i} and {j}: one is not finite, has no size, "
+            "or is the mirror image of the other"
+        )
+    return x

@@ -1,0 +1,222 @@
+"""Key-frame sets with their bases on disk: one folder each, written whole, read by memory mapping.
+
+A folder holds ``keyframes.safetensors`` (``keyframes``, ``faces``; names of the source files in its metadata) and
+``bases.safetensors``, where the tensors of each :class:`~torch_modal.ModalBasis` have the number of the key-frame and a
+dot before their names.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from torch_modal.precompute.basis import FORMAT as BASIS_FORMAT
+from torch_modal.precompute.basis import VERSION as BASIS_VERSION
+from torch_modal.precompute.basis import ModalBasis
+
+FORMAT = "torch_modal.set"
+VERSION = "1"
+KEYFRAMES_FILE = "keyframes.safetensors"
+BASES_FILE = "bases.safetensors"
+#: Made from a set and kept beside it: replaced along with it.
+DERIVED_FILES = "between-*.safetensors"
+_PARTS = tuple(field.name for field in fields(ModalBasis))
+
+
+class StoredSet:
+    """A key-frame set on disk. Opening reads two headers; tensors are mapped into memory when they are asked for.
+
+    The mapping is private: pages that nobody touches are never read, those that are read can be dropped again by the
+    system, and writing into a tensor does not change the file. Pickling keeps the path alone, so that a set can be
+    handed to worker processes, forked or spawned.
+
+    Args:
+        folder: Where it stands.
+
+    Raises:
+        FileNotFoundError: The folder or one of its two files is not there.
+        ValueError: A file is damaged, holds something else, or has another format version.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        meta, shapes = _read_header(self.folder / KEYFRAMES_FILE, FORMAT, VERSION, ("keyframes", "faces"))
+        self._shape = shapes["keyframes"]
+        if len(self._shape) != 3 or self._shape[2] != 3 or len(shapes["faces"]) != 2 or shapes["faces"][1] != 3:
+            raise ValueError(f"{self.folder / KEYFRAMES_FILE} needs keyframes (K, V, 3) and faces (F, 3); has {shapes}")
+        #: Names of the source files, one for each key-frame.
+        self.names: tuple[str, ...] = tuple(json.loads(meta.get("names", "[]")))
+        wanted = [f"{i}.{part}" for i in range(len(self)) for part in _PARTS]
+        _read_header(self.folder / BASES_FILE, BASIS_FORMAT, BASIS_VERSION, wanted)
+
+    def __len__(self) -> int:
+        """Number of key-frames, K."""
+        return self._shape[0]
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, V."""
+        return self._shape[1]
+
+    @cached_property
+    def keyframes(self) -> Tensor:
+        """Vertex positions, float64. *Shape:* ``(K, V, 3)``."""
+        return _map(self.folder / KEYFRAMES_FILE, ["keyframes"])[0]
+
+    @cached_property
+    def faces(self) -> Tensor:
+        """Vertex indices, int64. *Shape:* ``(F, 3)``."""
+        return _map(self.folder / KEYFRAMES_FILE, ["faces"])[0]
+
+    @cached_property
+    def bases(self) -> list[ModalBasis]:
+        """The basis of each key-frame."""
+        tensors = iter(_map(self.folder / BASES_FILE, [f"{i}.{part}" for i in range(len(self)) for part in _PARTS]))
+        return [ModalBasis(**{part: next(tensors) for part in _PARTS}) for _ in range(len(self))]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in ("folder", "names", "_shape")}
+
+    def __repr__(self) -> str:
+        return f"StoredSet({str(self.folder)!r}, {len(self)} key-frames, {self.n_vertices} vertices)"
+
+
+def open_set(folder: str | os.PathLike[str]) -> StoredSet:
+    """The key-frame set in a folder; see :class:`StoredSet`."""
+    return StoredSet(folder)
+
+
+def write_set(
+    folder: str | os.PathLike[str],
+    keyframes: Tensor,
+    faces: Tensor,
+    bases: Sequence[ModalBasis],
+    names: Sequence[str],
+) -> None:
+    """Write a key-frame set; its folder is whole or absent.
+
+    The files are written to a temporary folder beside it, which is then renamed. A stored set that is there already is
+    replaced.
+
+    Args:
+        folder: Where to; the folders above it are made.
+        keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        bases: The basis of each key-frame.
+        names: Name of each key-frame, for example its file's.
+
+    Raises:
+        FileExistsError: Something else is there.
+        OSError: It cannot be written. Nothing is left behind.
+        ValueError: The parts do not fit each other.
+    """
+    folder = Path(folder)
+    _check_parts(keyframes, faces, bases, names)
+    if os.path.lexists(folder) and not _is_replaceable(folder):
+        raise FileExistsError(f"{folder} exists and is no stored key-frame set; remove it or write elsewhere")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    mark = f"{os.getpid()}-{uuid.uuid4().hex[:8]}"
+    fresh, old = (folder.with_name(f".{folder.name}.{mark}.{end}") for end in ("tmp", "old.tmp"))
+    try:
+        fresh.mkdir()
+        shapes = {"keyframes": _plain(keyframes, torch.float64), "faces": _plain(faces, torch.int64)}
+        names_json = json.dumps([str(name) for name in names])
+        metadata = {"format": FORMAT, "version": VERSION, "names": names_json}
+        # Not safetensors' own save_file: its files are for the owner's eyes alone, whatever the umask says.
+        (fresh / KEYFRAMES_FILE).write_bytes(save_tensors(shapes, metadata))
+        parts = {f"{i}.{part}": _plain(getattr(basis, part)) for i, basis in enumerate(bases) for part in _PARTS}
+        metadata = {"format": BASIS_FORMAT, "version": BASIS_VERSION}
+        (fresh / BASES_FILE).write_bytes(save_tensors(parts, metadata))
+        if folder.exists():
+            with contextlib.suppress(FileNotFoundError):  # another process may be replacing it too
+                folder.rename(old)
+        fresh.rename(folder)
+    finally:
+        for leftover in (fresh, old):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def find_sets(root: str | os.PathLike[str]) -> list[Path]:
+    """Folders of stored key-frame sets at and below a folder, sorted. Hidden folders are passed over.
+
+    Raises:
+        FileNotFoundError: There is no such folder.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise FileNotFoundError(f"there is no folder {root}")
+    found = []
+    for place, below, files in os.walk(root):
+        if {KEYFRAMES_FILE, BASES_FILE} <= set(files):
+            found.append(Path(place))
+        below[:] = [name for name in below if not name.startswith(".")]
+    return sorted(found)
+
+
+def _plain(x: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    return x.detach().to("cpu", dtype).contiguous()
+
+
+def _is_replaceable(folder: Path) -> bool:
+    """Whether a folder holds nothing but what belongs to a set."""
+    own = {KEYFRAMES_FILE, BASES_FILE}
+    return folder.is_dir() and all(path.name in own or path.match(DERIVED_FILES) for path in folder.iterdir())
+
+
+def _check_parts(keyframes: Tensor, faces: Tensor, bases: Sequence[ModalBasis], names: Sequence[str]) -> None:
+    shape = tuple(keyframes.shape)
+    if len(shape) != 3 or shape[2] != 3 or not shape[0]:
+        raise ValueError(f"keyframes have the shape {shape}; a set needs (K, V, 3)")
+    if faces.dim() != 2 or faces.shape[1] != 3:
+        raise ValueError(f"faces have the shape {tuple(faces.shape)}; a set needs (F, 3)")
+    sizes = [basis.n_vertices for basis in bases]
+    if sizes != [shape[1]] * shape[0] or len(names) != shape[0]:
+        raise ValueError(
+            f"{shape[0]} key-frames of {shape[1]} vertices need as many bases and names; got bases of {sizes} vertices "
+            f"and {len(names)} names"
+        )
+
+
+def _read_header(
+    path: Path, kind: str, version: str, wanted: Sequence[str]
+) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
+    """Metadata and the shapes of the tensors of a file that holds what it should."""
+    with _opened(path) as file:
+        meta = file.metadata() or {}
+        there = set(file.keys())
+        if meta.get("format") != kind:
+            raise ValueError(f"{path} is of the format {meta.get('format')!r}, not {kind!r}")
+        if meta.get("version") != version:
+            raise ValueError(f"{path} has version {meta.get('version')!r}, this is the reader of version {version!r}")
+        missing = [name for name in wanted if name not in there]
+        if missing:
+            raise ValueError(f"{path} lacks the tensors {', '.join(missing[:4])}; compute the set again")
+        return meta, {name: tuple(file.get_slice(name).get_shape()) for name in wanted}
+
+
+def _map(path: Path, names: Sequence[str]) -> list[Tensor]:
+    """Tensors of a file, mapped into memory; the mapping outlives the handle."""
+    with _opened(path) as file:
+        return [file.get_tensor(name) for name in names]
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Any:
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            yield file
+    except SafetensorError as error:
+        raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error

@@ -1,0 +1,57 @@
+"""Shapes between two key-frames at even times, and cubic interpolation among them."""
+
+import contextlib
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from torch_modal.io.files import write_atomically
+
+FORMAT = "torch_modal.between"
+VERSION = "1"
+
+
+def interpolate(table: Tensor, t: Tensor) -> Tensor:
+    """Cubic Lagrange interpolation among the four nearest of even times in [0, 1].
+
+    Only these four are read, so that a table mapped from disk is not loaded whole. Exact at the times of the table.
+
+    Args:
+        table: Four shapes or more. *Shape:* ``(T, V, 3)``.
+        t: Times in [0, 1]. *Shape:* ``(B,)``.
+
+    Returns:
+        *Shape:* ``(B, V, 3)``.
+    """
+    n = len(table)
+    place = t * (n - 1)
+    start = (place.detach().floor().long() - 1).clamp(0, n - 4)
+    x = place - start
+    # The basis polynomials of the nodes 0, 1, 2, 3.
+    weights = [
+        (1 - x) * (2 - x) * (3 - x) / 6,
+        x * (2 - x) * (3 - x) / 2,
+        x * (x - 1) * (3 - x) / 2,
+        x * (x - 1) * (x - 2) / 6,
+    ]
+    return sum(weight[:, None, None] * table[start + i] for i, weight in enumerate(weights))  # type: ignore[return-value]
+
+
+def read_table(path: Path, settings: dict[str, str]) -> Tensor | None:
+    """A table mapped from disk; None where there is none, or it was made with other settings."""
+    with contextlib.suppress(OSError, SafetensorError), safe_open(path, framework="pt", device="cpu") as file:
+        if file.metadata() == _metadata(settings):
+            return file.get_tensor("shapes")
+    return None
+
+
+def write_table(path: Path, table: Tensor, settings: dict[str, str]) -> None:
+    """Keep a table; a folder that cannot be written is passed over, as it can be computed again."""
+    with contextlib.suppress(OSError):
+        write_atomically(path, save({"shapes": table.contiguous()}, _metadata(settings)))
+
+
+def _metadata(settings: dict[str, str]) -> dict[str, str]:
+    return {"format": FORMAT, "version": VERSION, **settings}

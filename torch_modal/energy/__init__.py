@@ -1,0 +1,1 @@
+"""The shell energy (Eq. 5) and its derivatives."""

@@ -1,0 +1,1 @@
+"""Connectivity, rigid motions, rotations, triangle frames, normals and sparse systems."""

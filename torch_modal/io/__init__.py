@@ -1,0 +1,1 @@
+"""Files: meshes, animations, samples."""

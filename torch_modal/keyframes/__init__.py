@@ -1,0 +1,1 @@
+"""The border: key-frames from files and arrays, checked."""

@@ -1,0 +1,273 @@
+"""The border: key-frames are checked. Everything that is wrong with the input is said here.
+
+``docs/input.md`` has a row for each condition. Messages count key-frames, vertices and faces from 0.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torch_modal.errors import MeshError, MeshWarning
+from torch_modal.geometry import inspect
+from torch_modal.geometry.connectivity import unique_edges
+from torch_modal.keyframes.arrays import as_faces, as_positions
+
+__all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_solid"]
+
+# What a length must exceed, relative to the coordinates it is the difference of, to be more than rounding.
+_RESOLUTION = {torch.float32: 1e-6, torch.float64: 1e-12}
+# Outside of this the factor that scales a diagonal to 100 leaves the number range.
+_DIAGONAL_RANGE = {torch.float32: (1e-30, 1e30), torch.float64: (1e-250, 1e250)}
+_LARGEST_SIZE_RATIO = 100.0
+_FLATNESS = 1e-6
+# Rounding of the coordinates, relative to the diagonal, above which it shows in the shape.
+_COARSE_ROUNDING = 1e-4
+
+
+class Keyframes(NamedTuple):
+    """Shapes with one connectivity."""
+
+    keyframes: torch.Tensor
+    """Vertex positions. *Shape:* ``(K, V, 3)``."""
+    faces: torch.Tensor
+    """Vertex indices, int64. *Shape:* ``(F, 3)``."""
+
+
+def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn: bool = True) -> Keyframes:
+    """Check key-frames and repair their faces.
+
+    Args:
+        keyframes: Vertex positions in any units, float32 or float64, as a tensor, an array or a sequence of
+            ``(V, 3)``. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices, of any integer type. *Shape:* ``(F, 3)``.
+        min_keyframes: How many key-frames the caller needs.
+        warn: Whether to warn; refusals are raised in any case.
+
+    Returns:
+        The positions as they came, with their dtype, device and graph; the repaired faces, int64, on the same
+        device. Repairs drop faces or turn them over; vertices are never dropped, added or reordered.
+
+    Raises:
+        MeshError: The input cannot work; the message says what arrived and what to do.
+
+    Warns:
+        MeshWarning: At most once per kind of flaw, with the number of places and the first one.
+    """
+    positions = as_positions(keyframes)
+    indices = as_faces(faces)
+    found: list[str] = []
+    note = found.append
+    _check_shapes(positions, indices, min_keyframes)
+    shapes = positions.detach().cpu().double().resolve_neg().numpy()
+    _check_values(shapes, indices)
+    indices, orientable = _repair_faces(indices, note)
+    scaled = _check_sizes(shapes, indices, positions.dtype, note)
+    _check_surface(scaled, indices, orientable, _RESOLUTION[positions.dtype], note)
+    if warn:
+        for message in found:
+            warnings.warn(message, MeshWarning, stacklevel=2)
+    return Keyframes(positions, torch.from_numpy(indices).to(positions.device))
+
+
+def require_solid(vertices: Any, faces: Any) -> None:
+    """Refuse a surface that lies in a plane: there is nothing inside it to fill with tetrahedra.
+
+    Args:
+        vertices: Positions of one shape. *Shape:* ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+
+    Raises:
+        MeshError: The extent across the plane that fits best is below 1e-6 of the largest extent.
+    """
+    points = torch.as_tensor(vertices).detach().cpu().double().numpy()
+    points = points[np.unique(torch.as_tensor(faces).cpu().numpy())]
+    points = points - points.mean(axis=0)
+    scale = np.abs(points).max()
+    _, axes = np.linalg.eigh((points / scale).T @ (points / scale)) if scale > 0 else (None, np.eye(3))
+    extent = np.sort(np.ptp(points @ axes, axis=0))
+    if extent[0] <= _FLATNESS * extent[2]:
+        raise MeshError(
+            f"the surface is flat: its extents are {extent[2]:.3g}, {extent[1]:.3g} and {extent[0]:.3g}, so "
+            "it encloses nothing that could be filled with tetrahedra and has no vibration modes of a "
+            "solid; give it a thickness"
+        )
+
+
+def _check_shapes(positions: torch.Tensor, faces: NDArray[np.int64], min_keyframes: int) -> None:
+    shape = tuple(positions.shape)
+    if len(shape) == 2 and shape[1] == 3:
+        raise MeshError(f"keyframes have shape {shape}, which is one shape; pass keyframes[None] for (K, V, 3)")
+    if len(shape) != 3 or shape[2] != 3:
+        raise MeshError(f"keyframes have shape {shape}; (K, V, 3) is needed: key-frames, vertices, coordinates")
+    if shape[0] < max(min_keyframes, 1):
+        raise MeshError(f"{shape[0]} key-frame(s) arrived, at least {max(min_keyframes, 1)} are needed")
+    if shape[1] == 0:
+        raise MeshError(f"keyframes have shape {shape}: there are no vertices")
+    if faces.ndim == 2 and faces.shape[1] == 4:
+        raise MeshError(
+            f"faces have shape {faces.shape}, which is quads (or tetrahedra); triangles (F, 3) are needed: "
+            "cut each quad along one diagonal, the same for all key-frames"
+        )
+    if faces.size == 0:
+        raise MeshError(f"faces have shape {faces.shape}: there are no faces; key-frames are surfaces of triangles")
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"faces have shape {faces.shape}; (F, 3) is needed, one for all key-frames")
+
+
+def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+    bad = ~np.isfinite(shapes).all(axis=2)
+    if bad.any():
+        k, v = np.argwhere(bad)[0]
+        raise MeshError(
+            f"{bad.sum()} vertices have NaN or infinite positions; the first is vertex {v} of key-frame {k}: "
+            f"{shapes[k, v].tolist()}"
+        )
+    wrong = ((faces < 0) | (faces >= shapes.shape[1])).any(axis=1)
+    if wrong.any():
+        face = int(np.flatnonzero(wrong)[0])
+        hint = "; indices count from 0, not from 1" if faces.min() == 1 and faces.max() == shapes.shape[1] else ""
+        raise MeshError(
+            f"{wrong.sum()} faces use vertices that do not exist; the first is face {face}, vertices "
+            f"{faces[face].tolist()}, with {shapes.shape[1]} vertices{hint}"
+        )
+
+
+def _repair_faces(faces: NDArray[np.int64], note: Callable[[str], None]) -> tuple[NDArray[np.int64], bool]:
+    """Drop faces that are none or are there twice, wind the rest consistently; say whether that went."""
+    kept = np.arange(len(faces))
+    for flaw, what in (
+        (inspect.degenerate_faces, "use a vertex twice"),
+        (inspect.repeated_faces, "have the same vertices as an earlier face"),
+    ):
+        bad = flaw(faces[kept])
+        if bad.any():
+            first = kept[bad][0]
+            note(f"{bad.sum()} faces {what} and were dropped; the first is face {first}, {faces[first].tolist()}")
+            kept = kept[~bad]
+        if len(kept) == 0:
+            raise MeshError("all faces use a vertex twice, so none is a triangle")
+    winding = inspect.consistent_winding(faces[kept])
+    if len(winding.flipped):
+        first = kept[winding.flipped[0]]
+        note(
+            f"{len(winding.flipped)} faces wind against their neighbours and were turned over; the first is "
+            f"face {first}, {faces[first].tolist()}"
+        )
+    if len(winding.non_orientable):
+        first = kept[winding.non_orientable[0]]
+        note(
+            f"{len(winding.non_orientable)} faces belong to a surface that has no consistent winding (like a "
+            "Moebius strip) and were left as they are, so some dihedral angles have the wrong sign and the "
+            f"volume means nothing; the first is face {first}, {faces[first].tolist()}"
+        )
+    return np.ascontiguousarray(winding.faces), not len(winding.non_orientable)
+
+
+def _check_sizes(
+    shapes: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    dtype: torch.dtype,
+    note: Callable[[str], None],
+) -> NDArray[np.float64]:
+    """Refuse sizes that cannot work; return the shapes around the origin, each with a diagonal of 1."""
+    surface = shapes[:, np.unique(faces)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        diagonals = inspect.diagonals(surface)
+    low, high = _DIAGONAL_RANGE[dtype]
+    far = []
+    for k, diagonal in enumerate(diagonals):
+        largest = np.abs(surface[k]).max()
+        if torch.finfo(dtype).eps * largest > _COARSE_ROUNDING * diagonal:
+            far.append((k, largest, diagonal))
+        if diagonal <= _RESOLUTION[dtype] * largest:
+            raise MeshError(
+                f"key-frame {k} has zero size: its bounding-box diagonal is {diagonal:.3g} at coordinates up "
+                f"to {largest:.3g}, which {dtype} cannot resolve; move it to the origin or check its export"
+            )
+        if not low < diagonal < high:
+            raise MeshError(
+                f"key-frame {k} has a bounding-box diagonal of {diagonal:.3g}, which {dtype} cannot compute "
+                "with; choose another unit"
+            )
+    if far:
+        k, largest, diagonal = far[0]
+        note(
+            f"{len(far)} key-frames lie so far from the origin that {dtype} rounds their shape visibly; the "
+            f"first is key-frame {k} with coordinates up to {largest:.3g} and a diagonal of {diagonal:.3g}: "
+            "use float64, or move it to the origin"
+        )
+    small, large = int(diagonals.argmin()), int(diagonals.argmax())
+    if diagonals[large] > _LARGEST_SIZE_RATIO * diagonals[small]:
+        raise MeshError(
+            f"key-frame {large} has a bounding-box diagonal of {diagonals[large]:.3g}, key-frame {small} one "
+            f"of {diagonals[small]:.3g}: more than {_LARGEST_SIZE_RATIO:.0f} times as large; they are "
+            "probably in different units, so scale one of them"
+        )
+    with np.errstate(over="ignore"):  # by a stray vertex of no face, which nothing below looks at
+        return (shapes - surface.mean(axis=1, keepdims=True)) / diagonals[:, None, None]
+
+
+def _check_surface(
+    scaled: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    orientable: bool,
+    resolution: float,
+    note: Callable[[str], None],
+) -> None:
+    """Note what the solver survives; refuse closed meshes that were turned inside out."""
+    n_vertices = scaled.shape[1]
+    edges, counts = unique_edges(faces)
+    vanishing = np.linalg.norm(scaled[:, edges[:, 0]] - scaled[:, edges[:, 1]], axis=2) <= resolution
+    if vanishing.any():
+        k, e = np.argwhere(vanishing)[0]
+        note(
+            f"{vanishing.sum()} edges have no length, their two vertices coincide; the first is edge "
+            f"{edges[e].tolist()} in key-frame {k}"
+        )
+    flat = np.stack([inspect.flat_faces(shape, faces, resolution) for shape in scaled])
+    if flat.any():
+        k, f = np.argwhere(flat)[0]
+        note(
+            f"{flat.sum()} faces have no area in some key-frame, so their dihedral angles are noise; the "
+            f"first is face {faces[f].tolist()} in key-frame {k}"
+        )
+    overfull = edges[counts > 2]
+    if len(overfull):
+        note(
+            f"{len(overfull)} edges join three or more faces (non-manifold): they resist stretching but not "
+            f"bending; the first is edge {overfull[0].tolist()}"
+        )
+    loose = inspect.unreferenced_vertices(faces, n_vertices)
+    if len(loose):
+        note(
+            f"{len(loose)} vertices belong to no face: they follow the interpolation of the key-frames; the "
+            f"first is vertex {loose[0]}"
+        )
+    boundary = edges[counts == 1]
+    if len(boundary):
+        note(
+            f"the surface is open: {len(boundary)} edges belong to one face only, the first is edge "
+            f"{boundary[0].tolist()}; its volume is measured from the centroid, and the tetrahedra close the "
+            "holes" + _seam_hint(scaled[0], boundary)
+        )
+    elif orientable and not (counts % 2).any():
+        volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
+        positive, negative = int(volumes.argmax()), int(volumes.argmin())
+        if volumes[positive] > _FLATNESS and volumes[negative] < -_FLATNESS:
+            raise MeshError(
+                f"key-frame {max(positive, negative)} is mirrored: its faces wind the other way round than "
+                f"those of key-frame {min(positive, negative)}, seen from outside, and no motion without "
+                "passing through itself leads from one to the other; mirror it back (negate one coordinate)"
+            )
+
+
+def _seam_hint(vertices: NDArray[np.float64], boundary: NDArray[np.int64]) -> str:
+    """Files for rendering split vertices at texture seams; such cuts look closed and are open."""
+    ends = np.unique(boundary)
+    _, copies = np.unique(vertices[ends], axis=0, return_counts=True)
+    split = int(copies[copies > 1].sum())
+    return f"; {split} of its vertices lie exactly on each other, perhaps a seam: weld them" if split else ""

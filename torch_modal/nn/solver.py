@@ -1,0 +1,340 @@
+"""The damped Gauss-Newton step on modal amplitudes, and the loop that repeats it."""
+
+from enum import IntEnum
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.nn.modal_energy import Derivatives
+
+# Fractions of a step that are tried, side by side, where the whole step disappoints.
+STEP_LENGTHS = (0.5, 0.25, 0.1, 0.03, 0.003)
+
+# A whole step is good if the energy falls by this part of what its quadratic model says.
+GOOD_AGREEMENT = 0.5
+
+# A Gauss-Newton step that takes the energy below this fraction needs no help from the second-order term.
+GOOD_DECREASE = 0.8
+
+# Of saddle-free Newton steps, relative to Gauss-Newton's Hessian.
+LEAST_CURVATURE = 0.1
+
+# Where the gradient has grown by this factor after what should have been the last Newton step, it was not the last.
+GROWN = 10.0
+
+# Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
+ROUNDING_MARGIN = 4.0
+ENERGY_ROUNDING = 64.0
+
+
+class AmplitudeEnergy(Protocol):
+    """What can be minimised here: an energy of amplitudes, with its derivatives."""
+
+    def value(self, a: Tensor, placement: Any) -> Tensor:
+        """Energy. *Shape:* ``(..., B, n) -> (..., B)``."""
+
+    def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
+        """Derivatives. *Shape:* ``(B, n)``."""
+
+    def second_order(self, a: Tensor, placement: Any) -> Tensor:
+        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+
+    def pull_back(self, a: Tensor, direction: Tensor, placement: Any) -> Any:
+        """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
+
+
+class Step(NamedTuple):
+    """One step of every sample of a batch."""
+
+    amplitudes: Tensor
+    """*Shape:* ``(B, n)``."""
+    energy: Tensor
+    """*Shape:* ``(B,)``."""
+    gradient_norm: Tensor
+    """Before the step. *Shape:* ``(B,)``."""
+    promised: Tensor
+    """Decrease of the energy that the quadratic model expects of the whole step. *Shape:* ``(B,)``."""
+    moved: Tensor
+    """False where no step was found that does not go uphill. *Shape:* ``(B,)``, bool."""
+    newton: Tensor
+    """Where a whole Newton step leads; NaN where none was asked for or the Hessian is indefinite.
+
+    *Shape:* ``(B, n)``.
+    """
+
+
+class Status(IntEnum):
+    """How the minimisation of a sample ended."""
+
+    CONVERGED = 0
+    """The gradient is within the tolerance, or as small as rounding lets it be, or ``least_gain`` ended it."""
+    OUT_OF_STEPS = 1
+    """There was more to gain."""
+    STALLED = 2
+    """No step went downhill any more."""
+    INVALID = 3
+    """No in-between exists: NaN or infinite entries, no size, or one key-frame of a closed mesh is a mirror image."""
+
+
+class Solution(NamedTuple):
+    """Result of :func:`minimise`, one value per sample."""
+
+    amplitudes: Tensor
+    """*Shape:* ``(B, n)``."""
+    energy: Tensor
+    """*Shape:* ``(B,)``."""
+    gradient_norm: Tensor
+    """Relative to the gradient norm at the start. *Shape:* ``(B,)``."""
+    n_steps: Tensor
+    """Steps taken. *Shape:* ``(B,)``, int64."""
+    status: Tensor
+    """A :class:`Status` for each. *Shape:* ``(B,)``, int64."""
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether the gradient is within the tolerance. *Shape:* ``(B,)``, bool."""
+        return self.status == Status.CONVERGED
+
+
+class GaussNewtonStep(nn.Module):
+    """One damped step of every sample of a batch, never uphill.
+
+    The residual at the optimum is large: Gauss-Newton alone gains a digit every six steps there, and the full Hessian
+    alone is often indefinite far from it. Both directions are tried, at several step lengths, in one batched evaluation
+    of the energy; the lowest wins. A sample where none is lower stays where it is.
+
+    Args:
+        energy: What is minimised.
+        damping: Ridge on the Hessian, relative to its mean diagonal. The line search does the globalisation; the
+            ridge only keeps directions that do nothing (coincident key-frames) from breaking the factorisation.
+            Default: 1e-12 in float64, 1e-6 in float32.
+    """
+
+    def __init__(self, energy: AmplitudeEnergy, damping: float | None = None) -> None:
+        super().__init__()
+        self.energy = energy
+        self.damping = damping
+
+    def ridged(self, hessian: Tensor) -> Tensor:
+        """A Hessian with the ridge. *Shape:* ``(..., n, n)``."""
+        damping = self.damping
+        if damping is None:
+            damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6
+        size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
+        ridge = damping * size.abs() + torch.finfo(size.dtype).tiny
+        return hessian + ridge[..., None, None] * torch.eye(hessian.shape[-1], dtype=size.dtype, device=size.device)
+
+    def directions(self, derivatives: Derivatives) -> Tensor:
+        """Directions ``-H^-1 g`` of Gauss-Newton and, where given, of the full Hessian.
+
+        Returns:
+            NaN for a sample whose Hessian is not positive definite. *Shape:* ``(D, B, n)``.
+        """
+        hessians = derivatives.gauss_newton[None]
+        if derivatives.second_order is not None:
+            hessians = torch.cat([hessians, hessians + derivatives.second_order])
+        hessians = self.ridged(hessians)
+        factor, info = torch.linalg.cholesky_ex(hessians)
+        definite = info == 0
+        if torch.is_grad_enabled():
+            # A failed factorisation that is not used would still give NaN gradients.
+            eye = torch.eye(hessians.shape[-1], dtype=hessians.dtype, device=hessians.device)
+            factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], hessians, eye))
+        gradient = derivatives.gradient.expand(len(hessians), -1, -1)[..., None]
+        direction = -torch.cholesky_solve(gradient, factor).squeeze(-1)
+        return torch.where(definite[..., None], direction, torch.nan)
+
+    @staticmethod
+    def floor(derivatives: Derivatives) -> Tensor:
+        """Gradient norm below which there is only rounding. *Shape:* ``(B,)``."""
+        return ROUNDING_MARGIN * derivatives.resolution
+
+    def take(self, a: Tensor, energy: Tensor, derivatives: Derivatives, placement: Any) -> Step:
+        """The best of the candidate steps from a point whose derivatives are known."""
+        plain = self.directions(derivatives)
+        directions = self._past_saddles(plain, derivatives)
+        best, lowest = self.lowest(a, directions, placement)
+        promised = self._promised(directions, derivatives)
+        poor = energy - lowest < GOOD_AGREEMENT * promised
+        if bool(poor.any()):
+            shorter, energies = self.lowest(a, self._shortened(directions), placement)
+            improves = poor & (energies < lowest)
+            best = torch.where(improves[:, None], shorter, best)
+            lowest = torch.where(improves, energies, lowest)
+        newton = torch.full_like(a, torch.nan) if derivatives.second_order is None else a + plain[1]
+        return self._unless_uphill(a, energy, best, lowest, promised, newton, derivatives)
+
+    def forward(self, a: Tensor, placement: Any) -> Step:
+        """Take one step, trying both directions at all lengths, without a branch that depends on data.
+
+        Args:
+            a: Amplitudes. *Shape:* ``(B, n)``.
+            placement: What the energy knows of each sample.
+        """
+        derivatives = self.energy.derivatives(a, placement)
+        directions = self.directions(derivatives)
+        best, lowest = self.lowest(a, torch.cat([directions, self._shortened(directions)]), placement)
+        promised = self._promised(directions, derivatives)
+        value = self.energy.value(a, placement)
+        return self._unless_uphill(a, value, best, lowest, promised, a + directions[-1], derivatives)
+
+    def _past_saddles(self, directions: Tensor, derivatives: Derivatives) -> Tensor:
+        """The directions, with saddle-free Newton (Dauphin et al. 2014) where the full Hessian is indefinite.
+
+        Negative eigenvalues are turned positive, so that what Newton's method would climb is run down. They are taken
+        relative to Gauss-Newton's Hessian, which is the scale of this problem. Near triangles that are about to
+        collapse, Gauss-Newton's direction alone crawls along such a ridge for dozens of steps.
+        """
+        if derivatives.second_order is None:
+            return directions
+        indefinite = ~directions[1].isfinite().all(-1) & derivatives.second_order.isfinite().all(-1).all(-1)
+        chosen = torch.nonzero(indefinite).flatten()
+        if not len(chosen):
+            return directions
+        factor, _ = torch.linalg.cholesky_ex(self.ridged(derivatives.gauss_newton[chosen]))
+
+        def whitened(columns: Tensor) -> Tensor:
+            return torch.linalg.solve_triangular(factor, columns, upper=False)
+
+        relative = whitened(whitened(derivatives.second_order[chosen]).mT)
+        finite = relative.isfinite().all(-1).all(-1)[:, None, None]
+        eigenvalues, vectors = torch.linalg.eigh(torch.where(finite, 0.5 * (relative + relative.mT), 0))
+        curvatures = (1 + eigenvalues).abs().clamp_min(LEAST_CURVATURE)
+        slope = vectors.mT @ whitened(derivatives.gradient[chosen, :, None])
+        step = torch.linalg.solve_triangular(factor.mT, -vectors @ (slope / curvatures[..., None]), upper=True)
+        return directions.index_put((torch.ones_like(chosen), chosen), step.squeeze(-1))
+
+    @staticmethod
+    def _shortened(directions: Tensor) -> Tensor:
+        """Shorter steps along each direction. *Shape:* ``(D, B, n) -> (D * L, B, n)``."""
+        return torch.cat([length * directions for length in STEP_LENGTHS])
+
+    @staticmethod
+    def _promised(directions: Tensor, derivatives: Derivatives) -> Tensor:
+        """The quadratic model of a Newton step falls by half the slope along it. *Shape:* ``(D, B, n) -> (B,)``."""
+        promised = -0.5 * (directions * derivatives.gradient).sum(-1)
+        return torch.where(promised.isfinite(), promised, 0).amax(0)
+
+    @staticmethod
+    def _unless_uphill(
+        a: Tensor,
+        energy: Tensor,
+        best: Tensor,
+        lowest: Tensor,
+        promised: Tensor,
+        newton: Tensor,
+        derivatives: Derivatives,
+    ) -> Step:
+        # At the optimum the energy is flat to rounding while the gradient still has digits to gain.
+        moved = lowest <= energy + 4 * torch.finfo(energy.dtype).eps * energy.abs()
+        norm = derivatives.gradient.norm(dim=-1)
+        reached = torch.where(moved[:, None], best, a)
+        return Step(reached, torch.where(moved, lowest, energy), norm, promised, moved, newton)
+
+    def lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+        """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low; ``a`` if nowhere finite."""
+        usable = steps.isfinite().all(-1)
+        candidates = a + torch.where(usable[..., None], steps, 0)
+        energies = self.energy.value(candidates, placement)
+        lowest, index = torch.where(usable & energies.isfinite(), energies, torch.inf).min(0)
+        return candidates.gather(0, index[None, :, None].expand(1, *a.shape)).squeeze(0), lowest
+
+
+def minimise(
+    step: GaussNewtonStep,
+    a: Tensor,
+    placement: Any,
+    max_steps: int = 40,
+    tolerance: float = 1e-8,
+    least_gain: float = 0.0,
+) -> Solution:
+    """Repeat the step until every sample has converged, or cannot go on.
+
+    Each sample takes its own path: those that are done leave the batch, and what is tried for one that needs the full
+    Hessian is not tried for the others. A sample's result does not depend on its batch.
+
+    Args:
+        step: The step to repeat.
+        a: Where to start. *Shape:* ``(B, n)``.
+        placement: What the energy knows of each sample.
+        max_steps: Give up after that many.
+        tolerance: Bound on the gradient norm, relative to its value at the start.
+        least_gain: Where a step promises less than this part of the energy, it is the last one. The gradient norm of
+            the solution is then the one before that step.
+    """
+    result = _blank_solution(a)
+    rows = torch.arange(len(a), device=a.device)
+    energy = step.energy.value(a, placement)
+    start = torch.full_like(energy, torch.inf)
+    slow = torch.zeros_like(energy, dtype=torch.bool)
+    last, before = torch.zeros_like(slow), start
+    for k in range(max_steps + 1):
+        derivatives = step.energy.derivatives(a, placement, second_order=False)
+        norm = derivatives.gradient.norm(dim=-1)
+        if k == 0:
+            start = norm
+        status = torch.full_like(rows, Status.OUT_OF_STEPS)
+        found = norm <= torch.maximum(tolerance * start, step.floor(derivatives))
+        status[found | (last & (norm <= GROWN * before))] = Status.CONVERGED
+        status[~(norm.isfinite() & energy.isfinite())] = Status.INVALID
+        leaving = (status != Status.OUT_OF_STEPS) | (k == max_steps)
+        if not bool(leaving.all()):
+            needing = slow & ~leaving
+            if bool(needing.any()):
+                derivatives = derivatives._replace(second_order=_second_order(step.energy, a, placement, needing))
+            taken = step.take(a, energy, derivatives, placement)
+            # Where all that is left to gain drowns in the rounding of the energy, nothing compares steps any more: a
+            # whole Newton step is taken, and is the last.
+            drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
+            last = slow & drowned & taken.newton.isfinite().all(-1)
+            stuck = ~leaving & slow & ~taken.moved & ~last
+            status[stuck] = torch.where(drowned, Status.CONVERGED, Status.STALLED)[stuck]
+            leaving = leaving | stuck
+            enough = ~leaving & taken.moved & (taken.promised < least_gain * energy.abs())
+            status[enough] = Status.CONVERGED
+            result.n_steps[rows[enough]] += 1
+            a, energy = torch.where(enough[:, None], taken.amplitudes, a), torch.where(enough, taken.energy, energy)
+            leaving = leaving | enough
+        relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
+        left = Solution(a, energy, relative, result.n_steps[rows], status)
+        for whole, part in zip(result, left, strict=True):
+            whole[rows[leaving]] = part[leaving]
+        if bool(leaving.all()):
+            break
+        slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)
+        result.n_steps[rows[~leaving & (taken.moved | last)]] += 1
+        a, energy = torch.where(last[:, None], taken.newton, taken.amplitudes), taken.energy
+        before = norm
+        if bool(leaving.any()):
+            stay = torch.nonzero(~leaving).flatten()
+            kept = (rows, a, energy, start, slow, last, before)
+            rows, a, energy, start, slow, last, before = (values[stay] for values in kept)
+            placement = _pick(placement, stay)
+    return result
+
+
+def _blank_solution(a: Tensor) -> Solution:
+    number = a.new_zeros(len(a))
+    whole = torch.zeros_like(number, dtype=torch.int64)
+    return Solution(torch.zeros_like(a), number, number.clone(), whole, whole.clone())
+
+
+def _second_order(energy: AmplitudeEnergy, a: Tensor, placement: Any, where: Tensor) -> Tensor:
+    """The second-order term of some samples; NaN, which rules its direction out, for the others."""
+    chosen = torch.nonzero(where).flatten()
+    if len(chosen) == len(a):
+        return energy.second_order(a, placement)
+    whole = a.new_full((len(a), a.shape[-1], a.shape[-1]), torch.nan)
+    whole[chosen] = energy.second_order(a[chosen], _pick(placement, chosen))
+    return whole
+
+
+def _pick(placement: Any, samples: Tensor) -> Any:
+    """The same for some of the samples: nested tuples and lists of tensors ``(B, ...)``."""
+    if isinstance(placement, Tensor):
+        return placement[samples]
+    if isinstance(placement, (tuple, list)):
+        parts = [_pick(part, samples) for part in placement]
+        return type(placement)(*parts) if hasattr(placement, "_fields") else type(placement)(parts)
+    return placement

@@ -1,0 +1,160 @@
+"""The vibration modes of one key-frame, as tensors."""
+
+import json
+import os
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from torch_modal.io.files import write_atomically
+
+FORMAT = "torch_modal.precompute.basis"
+VERSION = "1"
+
+
+@dataclass(frozen=True, eq=False)
+class ModalBasis:
+    """Lowest vibration modes of one shape, restricted to its surface.
+
+    The modes are constants of the autograd graph: they are precomputed outside of it, all tensors here are
+    detached, and no gradient flows to the key-frame through them.
+
+    Modes have unit mass (density 1) in the solid, not on the surface: ``phi`` scales as ``length^-3/2`` and
+    eigenvalues as ``length^-2`` with the units of the shape. Signs are arbitrary but fixed.
+
+    Attributes:
+        reference: The shape that the modes belong to, in the caller's coordinates. *Shape:* ``(V, 3)``.
+        eigenvalues: Ascending, of the elastic modes. *Shape:* ``(k,)``.
+        modes: Elastic displacements; the rigid motions are kept apart. Zero at vertices that no face uses.
+            *Shape:* ``(k, V, 3)``.
+        rigid_eigenvalues: The six zero eigenvalues as they were computed, for checks. *Shape:* ``(6,)``.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not fit each other.
+    """
+
+    reference: torch.Tensor
+    eigenvalues: torch.Tensor
+    modes: torch.Tensor
+    rigid_eigenvalues: torch.Tensor
+
+    def __post_init__(self) -> None:
+        shapes = {name: tuple(tensor.shape) for name, tensor in self._tensors().items()}
+        v, k = shapes["reference"][:1], shapes["eigenvalues"][:1]
+        expected = {
+            "reference": (*v, 3),
+            "eigenvalues": k,
+            "modes": (*k, *v, 3),
+            "rigid_eigenvalues": (6,),
+        }
+        if shapes != expected:
+            raise ValueError(
+                "a basis needs reference (V, 3), eigenvalues (k,), modes (k, V, 3), rigid_eigenvalues (6,); "
+                f"got {shapes}"
+            )
+        kinds = {(tensor.dtype, tensor.device) for tensor in self._tensors().values()}
+        if len(kinds) > 1 or not self.reference.is_floating_point():
+            raise ValueError(f"the tensors of a basis share one floating-point dtype and one device; got {kinds}")
+        for name, tensor in self._tensors().items():
+            object.__setattr__(self, name, tensor.detach())
+
+    def _tensors(self) -> dict[str, torch.Tensor]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
+    def n_modes(self) -> int:
+        """Number of elastic modes, k."""
+        return self.modes.shape[0]
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, V."""
+        return self.modes.shape[1]
+
+    @property
+    def rigid_modes(self) -> torch.Tensor:
+        """Orthonormal translations and infinitesimal rotations of the reference. *Shape:* ``(6, V, 3)``.
+
+        Orthonormal in the Euclidean product over all vertices: the translations along x, y and z, then
+        rotations about the mean of the vertices that span ``axis × (x - mean)``.
+        """
+        v = self.n_vertices
+        axes = torch.eye(3, dtype=self.reference.dtype, device=self.reference.device)
+        arms = self.reference - self.reference.mean(dim=0)
+        arms = arms / arms.abs().max()  # rotations are normalised anyway; this keeps any unit of length in range
+        translations = axes[:, None].expand(3, v, 3) / v**0.5
+        turned = torch.linalg.cross(axes[:, None].expand(3, v, 3), arms.expand(3, v, 3))
+        rotations = torch.linalg.qr(turned.reshape(3, 3 * v).T).Q.T.reshape(3, v, 3)
+        return torch.cat([translations, rotations])
+
+    def truncate(self, k: int) -> "ModalBasis":
+        """The basis of the lowest ``k`` modes.
+
+        Raises:
+            ValueError: ``k`` is below 0 or above the number of modes.
+        """
+        if not 0 <= k <= self.n_modes:
+            raise ValueError(f"{k} modes asked of a basis of {self.n_modes}; extract more modes")
+        return replace(self, eigenvalues=self.eigenvalues[:k], modes=self.modes[:k])
+
+    def to(self, *args: Any, **kwargs: Any) -> "ModalBasis":
+        """The basis on another device or in another dtype; arguments as for `torch.Tensor.to`."""
+        return ModalBasis(**{name: tensor.to(*args, **kwargs) for name, tensor in self._tensors().items()})
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a safetensors file; it is whole or absent.
+
+        Args:
+            path: The file; its folder must exist.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        tensors = {name: tensor.cpu().contiguous() for name, tensor in self._tensors().items()}
+        write_atomically(Path(path), save_tensors(tensors, {"format": FORMAT, "version": VERSION}))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "ModalBasis":
+        """Read a file written by `save`.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The basis on the CPU, in the dtype it was saved in.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged, holds something else, or has another format version.
+        """
+        data = Path(path).read_bytes()
+        try:
+            tensors = load_tensors(data)
+        except SafetensorError as error:
+            raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
+        metadata = _metadata(data)
+        if metadata.get("format") != FORMAT:
+            raise ValueError(f"{path} holds no modal basis: its format is {metadata.get('format')!r}, not {FORMAT!r}")
+        if metadata.get("version") != VERSION:
+            raise ValueError(
+                f"{path} is a modal basis of version {metadata.get('version')!r}, this is the reader of "
+                f"version {VERSION!r}; extract the modes again"
+            )
+        names = {field.name for field in fields(cls)}
+        if names - tensors.keys():
+            raise ValueError(f"{path} lacks the tensors {', '.join(sorted(names - tensors.keys()))}")
+        try:
+            return cls(**{name: tensors[name] for name in names})
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+
+def _metadata(data: bytes) -> dict[str, str]:
+    """Metadata of a valid safetensors file: the header is JSON after eight bytes that hold its length."""
+    length = int.from_bytes(data[:8], "little")
+    return json.loads(data[8 : 8 + length]).get("__metadata__", {})

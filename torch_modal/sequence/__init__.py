@@ -1,0 +1,1 @@
+"""From key-frames to a dense sequence."""

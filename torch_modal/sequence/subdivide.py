@@ -1,0 +1,190 @@
+"""From key-frames to a dense sequence: recursive subdivision (section 3.3 of the paper) and linear fill."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.rigid import blend
+from torch_modal.keyframes.check import check_keyframes
+from torch_modal.nn.mid_shape import MidShape
+from torch_modal.precompute.basis import ModalBasis
+from torch_modal.precompute.modes import extract_bases
+
+MAX_LEVELS = 12
+
+# No gradient is wanted, and further steps change nothing that one could see (docs/quality.md). The joint space's alone:
+# the paper's starts too far away.
+LEAST_GAIN = 0.03
+
+
+def subdivide(
+    keyframes: Any,
+    faces: Any,
+    levels: int = 3,
+    *,
+    bases: Sequence[ModalBasis] | None = None,
+    n_modes: int = 30,
+    cyclic: bool = False,
+    n_frames: int | None = None,
+    local: bool = True,
+    progress: bool | None = None,
+    **mid_shape: Any,
+) -> Tensor:
+    """Fill a sequence of key-frames with physically plausible shapes.
+
+    Each level inserts a mid-shape between all neighbours. A mid-shape then serves as a key-frame of the next level,
+    with the modes of the key-frames around it: of both in the joint space, of the nearest in the paired space.
+
+    Args:
+        keyframes: Vertex positions, two key-frames or more, in any units. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        levels: How often the number of intervals doubles.
+        bases: The basis of each key-frame. Default: :func:`torch_modal.extract_bases`, cached on disk.
+        n_modes: Modes of each key-frame where the bases are not given.
+        cyclic: Whether the last key-frame leads on to the first. The sequence then ends one frame before it would
+            repeat the first key-frame.
+        n_frames: Number of frames of the result, by linear fill (along the geodesic of the rigid motion) between the
+            subdivided shapes. The key-frames keep their place in it: intervals differ by one frame where the number
+            does not divide. Default: the subdivided shapes as they are.
+        local: Whether each mid-shape takes a few steps on the fine mesh, for what the modes cannot reach.
+        progress: Whether to show progress bars. Default: on a terminal only.
+        **mid_shape: Further options of :class:`torch_modal.MidShape`: ``space``, ``coarse_faces``, ``polish``, ...;
+            In the joint space ``rotations`` is true here, and ``least_gain`` 0.03.
+
+    Returns:
+        The sequence in the caller's coordinates, dtype and device, the key-frames bit for bit at their places. *Shape:*
+        ``((K-1) * 2**levels + 1, V, 3)``, ``(K * 2**levels, V, 3)`` if cyclic, or ``(n_frames, V, 3)``.
+
+    Raises:
+        ValueError: Input that cannot be used; the message says what arrived and what to do.
+    """
+    keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2, warn=bases is not None)
+    n_keys = len(keyframes)
+    places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames)
+    if bases is None:
+        bases = extract_bases(keyframes, faces, n_modes, progress=progress)
+    if len(bases) != n_keys:
+        raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
+
+    areas = connectivity.vertex_areas(keyframes[0].cpu().double().numpy(), working_faces.cpu().numpy())
+    weights = torch.from_numpy(areas).to(keyframes)
+    intervals = len(places) - 1
+    bar = tqdm(
+        total=intervals * levels,
+        desc="in-between shapes",
+        unit="level",
+        leave=False,
+        disable=None if progress is None else not progress,
+    )
+    paired = mid_shape.get("space") == "paired"
+    joint = {} if paired else {"rotations": True, "least_gain": LEAST_GAIN}
+    options = {"local": local, **joint, **mid_shape}
+    sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
+    with bar, torch.no_grad():
+        for i in range(intervals):
+            j = (i + 1) % n_keys
+            segment = _Segment((bases[i], bases[j]), working_faces, options, keyframes.device)
+            shapes = torch.stack([keyframes[i], keyframes[j]])
+            for _ in range(levels):
+                shapes = _interleave(shapes, segment.mid_shapes(shapes))
+                bar.update()
+            if n_frames is not None:
+                shapes = _resample(shapes, places[i + 1] - places[i], weights)
+            sequence[places[i] : places[i + 1] + 1] = shapes
+            sequence[places[i]], sequence[places[i + 1]] = keyframes[i], keyframes[j]
+    return sequence[:-1] if cyclic else sequence
+
+
+def keyframe_places(
+    n_keyframes: int, levels: int = 3, *, cyclic: bool = False, n_frames: int | None = None
+) -> list[int]:
+    """Where :func:`subdivide` puts the key-frames.
+
+    Returns:
+        The frame number of each key-frame; if cyclic, a further one where the first key-frame would come again.
+
+    Raises:
+        ValueError: ``levels`` or ``n_frames`` is out of range.
+    """
+    if not isinstance(levels, int) or not 0 <= levels <= MAX_LEVELS:
+        raise ValueError(f"levels is a whole number from 0 to {MAX_LEVELS} (each doubles the frames), got {levels!r}")
+    intervals = n_keyframes if cyclic else n_keyframes - 1
+    if n_frames is None:
+        return [i * 2**levels for i in range(intervals + 1)]
+    if n_frames < n_keyframes:
+        raise ValueError(
+            f"n_frames={n_frames} leaves no room for {n_keyframes} key-frames; ask for {n_keyframes} or more"
+        )
+    total = n_frames if cyclic else n_frames - 1
+    return [(2 * total * i + intervals) // (2 * intervals) for i in range(intervals + 1)]
+
+
+def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
+    """Straight lines of all vertices between key-frames: what :func:`subdivide` is compared with.
+
+    Args:
+        keyframes: *Shape:* ``(K, V, 3)``.
+        places: From :func:`keyframe_places`; one more than key-frames closes the cycle.
+    """
+    cyclic = len(places) > len(keyframes)
+    parts = []
+    for i, n in enumerate(b - a for a, b in pairwise(places)):
+        t = torch.arange(n, dtype=keyframes.dtype, device=keyframes.device) / n
+        parts.append(torch.lerp(keyframes[i], keyframes[(i + 1) % len(keyframes)], t[:, None, None]))
+    return torch.cat(parts if cyclic else [*parts, keyframes[-1:]])
+
+
+class _Segment:
+    """Mid-shapes between neighbours of one interval of key-frames."""
+
+    def __init__(
+        self,
+        bases: tuple[ModalBasis, ModalBasis],
+        faces: Tensor,
+        options: dict[str, Any],
+        device: torch.device,
+    ) -> None:
+        self.bases, self.faces, self.options, self.device = bases, faces.cpu(), options, device
+        self.layers: dict[tuple[int, int], MidShape] = {}
+
+    def mid_shapes(self, shapes: Tensor) -> Tensor:
+        """Between each shape and the next. *Shape:* ``(n + 1, V, 3) -> (n, V, 3)``."""
+        if self.options.get("space", "joint") == "joint":
+            return self._layer(0, 1)(shapes[:-1], shapes[1:])
+        nearest = self._nearest(shapes)
+        mids = [
+            self._layer(a, b)(x, y)
+            for a, b, x, y in zip(nearest[:-1], nearest[1:], shapes[:-1], shapes[1:], strict=True)
+        ]
+        return torch.stack(mids)
+
+    def _layer(self, a: int, b: int) -> MidShape:
+        if (a, b) not in self.layers:
+            layer = MidShape((self.bases[a], self.bases[b]), self.faces, **self.options)
+            self.layers[a, b] = layer.to(self.device)
+        return self.layers[a, b]
+
+    def _nearest(self, shapes: Tensor) -> list[int]:
+        """Which key-frame, 0 or 1, each shape is nearer to in its edge lengths, which no rigid motion changes."""
+        edges = torch.from_numpy(connectivity.unique_edges(self.faces.numpy())[0]).to(shapes.device)
+        lengths = torch.linalg.norm(shapes[:, edges[:, 0]] - shapes[:, edges[:, 1]], dim=-1)
+        to_first, to_last = ((lengths - lengths[end]).norm(dim=-1) for end in (0, -1))
+        return (to_last < to_first).long().tolist()
+
+
+def _interleave(shapes: Tensor, between: Tensor) -> Tensor:
+    """*Shape:* ``(n + 1, V, 3), (n, V, 3) -> (2 n + 1, V, 3)``."""
+    pairs = torch.stack([shapes[:-1], between], 1).flatten(0, 1)
+    return torch.cat([pairs, shapes[-1:]])
+
+
+def _resample(shapes: Tensor, intervals: int, weights: Tensor) -> Tensor:
+    """Even times over one interval of key-frames. *Shape:* ``(n + 1, V, 3) -> (intervals + 1, V, 3)``."""
+    position = torch.linspace(0, len(shapes) - 1, intervals + 1, dtype=shapes.dtype, device=shapes.device)
+    left = position.floor().long().clamp_max(len(shapes) - 2)
+    return blend(shapes[left], shapes[left + 1], position - left, weights)

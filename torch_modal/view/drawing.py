@@ -1,0 +1,196 @@
+"""Shapes drawn into images, by pyvista or by matplotlib.
+
+pyvista renders in a child process, because it takes its process down (a segmentation fault, nothing to catch) where
+neither EGL nor OSMesa exists; then matplotlib draws.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_modal.io.write import FloatArray, IntArray, vertex_normals
+
+ByteArray = NDArray[np.uint8]
+
+CHILD_SECONDS = 300.0
+SMOOTH_FACES = 30_000  # matplotlib draws at least so many
+LIGHTS = (
+    ((-2, 3, 4), 0.82),
+    ((4, 1, 3), 0.30),
+    ((0, -3, 2), 0.14),
+)  # from where, as the viewer sees it; how bright
+
+
+class Scene(NamedTuple):
+    """What a renderer gets: all shapes in view coordinates, the cell centred at the origin."""
+
+    points: FloatArray  # (S, V, 3)
+    colors: ByteArray  # (S, V, 3) RGB
+    faces: IntArray  # (F, 3)
+    half_size: FloatArray  # (2,) half width and half height of the cell
+    pixels: IntArray  # (2,) width and height of the image
+
+
+def _draw_pyvista(scene: Scene) -> ByteArray:
+    """Images ``(S, height, width, 3)``. Runs in the child only."""
+    import pyvista as pv
+
+    scale = 1.0 / float(scene.half_size[1])  # to half height 1: radii below are absolute
+    corners = np.insert(scene.faces, 0, 3, axis=1)
+    plotter: Any = pv.Plotter(off_screen=True, window_size=scene.pixels.tolist(), lighting="none")
+    plotter.set_background("white")
+    for position, intensity in LIGHTS:
+        plotter.add_light(pv.Light(position=position, intensity=intensity, light_type="camera light"))
+    plotter.enable_anti_aliasing("ssaa")
+    plotter.enable_ssao(radius=0.25, bias=0.01, kernel_size=128, blur=True)
+    plotter.enable_parallel_projection()
+    depth = float(np.abs(scene.points[..., 2]).max()) * scale + 1.0
+    plotter.camera.position, plotter.camera.focal_point, plotter.camera.up = (
+        (0, 0, 2 * depth),
+        (0, 0, 0),
+        (0, 1, 0),
+    )
+    plotter.camera.parallel_scale = 1.0
+    plotter.camera.clipping_range = (0.5 * depth, 3.5 * depth)
+    images: list[ByteArray] = []
+    for points, colors in zip(scene.points, scene.colors, strict=True):
+        mesh = pv.PolyData(points * scale, corners.reshape(-1))
+        mesh["rgb"] = colors
+        mesh.point_data.active_normals = vertex_normals(points, scene.faces)
+        actor = plotter.add_mesh(
+            mesh,
+            scalars="rgb",
+            rgb=True,
+            smooth_shading=True,
+            ambient=0.25,
+            diffuse=0.85,
+            specular=0.08,
+            specular_power=12,
+            reset_camera=False,
+        )
+        plotter.camera.clipping_range = (0.5 * depth, 3.5 * depth)
+        images.append(plotter.screenshot(None, return_img=True))
+        plotter.remove_actor(actor, reset_camera=False)
+    plotter.close()
+    return np.stack(images)[..., :3]
+
+
+def _quartered(corners: FloatArray) -> FloatArray:
+    """Each face ``(F, 3, D)`` as four, cut at the middles of its sides. *Shape:* ``(4F, 3, D)``."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])
+
+
+def _draw_matplotlib(scene: Scene) -> ByteArray:
+    """Images ``(S, height, width, 3)``: faces from back to front, each in one shade."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import PolyCollection
+    from matplotlib.figure import Figure
+
+    over = 2  # drawn larger without antialiasing (which would show every seam), then averaged
+    width, height = scene.pixels.tolist()
+    lights = np.array([brightness / np.linalg.norm(place) * np.array(place) for place, brightness in LIGHTS])
+    images = []
+    for points, colors in zip(scene.points, scene.colors, strict=True):
+        # Position, normal and colour of each corner of each face, in small enough faces to look smooth.
+        corners = np.concatenate([points, vertex_normals(points, scene.faces), colors / 255], axis=1)[scene.faces]
+        while len(corners) < SMOOTH_FACES:
+            corners = _quartered(corners)
+        middle = corners.mean(axis=1)
+        normals = middle[:, 3:6] / np.maximum(np.linalg.norm(middle[:, 3:6], axis=1, keepdims=True), 1e-12)
+        normals *= np.where(normals[:, 2:] < 0, -1.0, 1.0)  # open meshes show their inside too
+        shade = 0.25 + 0.85 * np.clip(normals @ lights.T, 0, None).sum(axis=1)
+        rim = 0.75 + 0.25 * np.clip(normals[:, 2], 0, 1) ** 0.5  # darker outlines part what overlaps
+        face_colors = middle[:, 6:] * (shade * rim)[:, None]
+        order = np.argsort(middle[:, 2], kind="stable")
+        figure = Figure(figsize=(width * over / 100, height * over / 100), dpi=100)
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        axes.set_xlim(-scene.half_size[0], scene.half_size[0])
+        axes.set_ylim(-scene.half_size[1], scene.half_size[1])
+        axes.add_collection(
+            PolyCollection(
+                list(corners[order, :, :2]),
+                facecolors=np.clip(face_colors[order], 0, 1),
+                linewidths=0,
+                antialiaseds=False,
+            )
+        )
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3].astype(np.float64)
+        images.append(pixels.reshape(height, over, width, over, 3).mean(axis=(1, 3)).round().astype(np.uint8))
+    return np.stack(images)
+
+
+_CHILD = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from torch_modal.view.drawing import _child_main
+_child_main(sys.argv[2])
+"""
+
+
+def _child_command(folder: str) -> list[str]:
+    return [sys.executable, "-c", _CHILD, str(Path(__file__).parents[2]), folder]
+
+
+def _child_main(folder: str) -> None:
+    with np.load(Path(folder, "scene.npz")) as stored:
+        scene = Scene(**{name: stored[name] for name in Scene._fields})
+    np.save(Path(folder, "images.npy"), _draw_pyvista(scene))
+
+
+def _draw_in_child(scene: Scene) -> ByteArray:
+    """Images from pyvista in a process of its own; RuntimeError with the reason if that fails."""
+    with tempfile.TemporaryDirectory(prefix="torch_modal-") as folder:
+        np.savez(Path(folder, "scene.npz"), **scene._asdict())
+        try:
+            # The folder is the working directory so that a core file goes with it.
+            done = subprocess.run(
+                _child_command(folder), cwd=folder, capture_output=True, timeout=CHILD_SECONDS, check=False
+            )
+        except subprocess.TimeoutExpired:
+            raise RuntimeError(f"it did not finish within {CHILD_SECONDS:g} s") from None
+        if done.returncode != 0:
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            ending = f"signal {-done.returncode}" if done.returncode < 0 else f"status {done.returncode}"
+            raise RuntimeError(f"its process ended with {ending}" + (f": {said[-1]}" if said else ""))
+        stored = Path(folder, "images.npy")
+        if not stored.is_file():
+            raise RuntimeError("it left no images")
+        images: ByteArray = np.load(stored)
+    if images.shape != (len(scene.points), scene.pixels[1], scene.pixels[0], 3) or (images == 255).all():
+        raise RuntimeError(f"its images are empty, shape {images.shape}")
+    return images
+
+
+def draw(scene: Scene, renderer: str) -> ByteArray:
+    """Images of all shapes. *Shape:* ``(S, height, width, 3)``.
+
+    Args:
+        scene: What to draw.
+        renderer: ``"pyvista"``, ``"matplotlib"``, or ``"auto"``: the first, and the second where the first fails.
+
+    Raises:
+        RuntimeError: ``renderer="pyvista"`` and pyvista cannot render here.
+    """
+    if renderer == "matplotlib":
+        return _draw_matplotlib(scene)
+    try:
+        return _draw_in_child(scene)
+    except RuntimeError as error:
+        if renderer == "pyvista":
+            raise RuntimeError(f"pyvista could not render: {error}. renderer='matplotlib' needs no GL.") from None
+        warnings.warn(f"pyvista could not render ({error}); matplotlib draws the picture.", stacklevel=3)
+        return _draw_matplotlib(scene)

@@ -1,0 +1,259 @@
+"""A picture that compares rows of shapes: one row a method, one column a time.
+
+All shapes are turned into view coordinates (x right, y up, z to the viewer), a renderer (drawing.py) draws each into an
+image of its own, and the sheet is set from those.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from torch_modal.io.write import FloatArray, check_frames, check_indices, refuse_existing, to_numpy, write_file
+from torch_modal.view.drawing import ByteArray, Scene, draw
+
+if TYPE_CHECKING:
+    from torch_modal.io.write import Array
+
+__all__ = ["render_sequence"]
+
+KEYFRAME_COLOR = (0.91, 0.60, 0.36)  # warm: given
+BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
+ERROR_COLORS = ["#e4e4e2", "#f6c9a0", "#e8804f", "#b2182b", "#5c0a20"]
+CELL_PIXELS = 420  # the longer side of a cell
+MARGIN = 1.06  # of a cell against the largest shape in it
+
+
+def _view_rotation(shape: FloatArray, view: tuple[float, float] | None, up: Literal["y", "z"] | None) -> FloatArray:
+    """Rows are the directions right, up and to the viewer. *Shape:* ``(3, 3)``.
+
+    Y is up unless the shape is flat in Y (less than half of both other extents): then Z. Without a ``view``
+    the viewer stands where the least principal direction points, and so sees the widest side, a little from
+    the side and from above so that depth shows.
+    """
+    extent = np.ptp(shape, axis=0)
+    if up is None:
+        up = "z" if extent[1] < 0.5 * min(extent[0], extent[2]) else "y"
+    # Columns: the directions of azimuth 0 and 90 degrees, and up. Front is +Z where Y is up, -Y where Z is.
+    world = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]] if up == "y" else [[0, -1, 0], [1, 0, 0], [0, 0, 1]]).T
+    if view is None:
+        least = np.linalg.eigh(np.cov(shape.T, bias=True))[1][:, 0] @ world
+        least *= 1.0 if least[0] >= 0 else -1.0
+        azimuth = np.degrees(np.arctan2(least[1], least[0])) + 20.0
+        elevation = np.clip(np.degrees(np.arcsin(np.clip(least[2], -1, 1))), -35.0, 35.0) + 10.0
+    else:
+        azimuth, elevation = view
+    a, e = np.radians([azimuth, elevation])
+    front = world @ [np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)]
+    right = world @ [-np.sin(a), np.cos(a), 0.0]
+    return np.stack([right, np.cross(front, right), front])
+
+
+def _centred(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Move shapes ``(R, C, V, 3)`` into their cells; also the half width and height that hold them all.
+
+    One centre serves all cells, so that what rests stays at its place and rows can be compared. Where the
+    shapes lie further apart than their own size, each column gets a centre, and if need be each shape.
+    """
+    own = np.ptp(points, axis=2).max(axis=(0, 1))
+    for together in ((0, 1, 2), (0, 2), (2,)):
+        low, high = points.min(axis=together, keepdims=True), points.max(axis=together, keepdims=True)
+        size = (high - low).max(axis=(0, 1, 2))
+        if (size[:2] <= 1.4 * own[:2]).all():
+            break
+    half = 0.5 * size[:2] * MARGIN
+    # Neither needles nor points: labels need some width.
+    half = np.maximum(half, max(0.4 * float(half.max()), np.finfo(np.float64).tiny))
+    return points - 0.5 * (low + high), half
+
+
+def _sheet(
+    images: ByteArray,  # (R, C, height, width, 3)
+    rows: list[str],
+    column_labels: list[tuple[str, str]],  # text and colour
+    color_bar: tuple[Any, str] | None,  # ScalarMappable and label
+    fmt: str,
+) -> bytes:
+    """The images on white paper with their labels. Measures are in pixels of the result."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    n_rows, n_columns, height, width = images.shape[:4]
+    dpi, gap = 200, 12
+    text = min(11.0, 0.13 * width * 72 / dpi)  # points; the longest column label has about twelve letters
+    line = text * dpi / 72
+    font = FontProperties(size=text + 1)
+    parts = [part for row in rows for part in row.split("\n") if part.strip()]  # TextPath fails on blanks
+    widest = max((TextPath((0, 0), part, prop=font).get_extents().width for part in parts), default=0.0)
+    left = widest * dpi / 72 + 2 * line
+    right = 7 * line if color_bar else line
+    top, bottom = 2.6 * line, line
+    total = np.array([left + n_columns * (width + gap) + right, top + n_rows * (height + gap) + bottom])
+    figure = Figure(figsize=tuple(total / dpi), dpi=dpi, facecolor="white")
+    FigureCanvasAgg(figure)
+
+    def cell(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
+        """From pixels, y down, to the fractions of the figure."""
+        return x / total[0], 1 - (y + h) / total[1], w / total[0], h / total[1]
+
+    for r, row in enumerate(rows):
+        y = top + r * (height + gap)
+        figure.text(*cell(line, y + height / 2, 0, 0)[:2], row, fontproperties=font, va="center", ha="left")
+        for c in range(n_columns):
+            axes = figure.add_axes(cell(left + c * (width + gap), y, width, height))
+            axes.imshow(images[r, c], aspect="auto", interpolation="none")
+            axes.set_axis_off()
+    for c, (label, color) in enumerate(column_labels):
+        x, y = cell(left + c * (width + gap) + width / 2, 1.6 * line, 0, 0)[:2]
+        figure.text(x, y, label, fontsize=text, color=color, ha="center", va="center")
+    if color_bar:
+        mappable, label = color_bar
+        tall = min(n_rows * (height + gap) - gap, 2 * height)
+        x, y = left + n_columns * (width + gap) + line, top + (n_rows * (height + gap) - gap - tall) / 2
+        beyond = "max" if mappable.get_array().max() > mappable.norm.vmax else "neither"
+        cax = figure.add_axes(cell(x, y, 0.8 * line, tall))
+        bar = figure.colorbar(mappable, cax=cax, extend=beyond, extendfrac=0.03)
+        bar.ax.tick_params(labelsize=0.8 * text)
+        bar.set_label(label, fontsize=0.9 * text)
+        bar.outline.set_visible(False)
+    stream = io.BytesIO()
+    figure.savefig(stream, format=fmt, dpi=dpi)
+    return stream.getvalue()
+
+
+def render_sequence(
+    frames_by_row: Mapping[str, Array],
+    faces: Array,
+    out: str | Path,
+    columns: int | Sequence[int] | None = None,
+    keyframe_indices: Sequence[int] | None = None,
+    view: tuple[float, float] | None = None,
+    up: Literal["y", "z"] | None = None,
+    colors: Mapping[str, Array] | None = None,
+    color_label: str = "",
+    renderer: Literal["auto", "pyvista", "matplotlib"] = "auto",
+    overwrite: bool = False,
+) -> Path:
+    """Draw rows of shapes side by side, all seen by the same camera at the same scale.
+
+    Args:
+        frames_by_row: For each row its label and its shapes, for example ``{"torch_modal": x, "linear": y}``.
+            *Shape of each:* ``(N, V, 3)``, the same for all.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        out: File to write, ``*.png`` or ``*.pdf``.
+        columns: How many frames to show, evenly chosen with the first and the last, or their numbers. By
+            default all up to seven, and of more a number from four to seven that gives equal steps.
+        keyframe_indices: Frames that are key-frames, drawn in the other colour. The first and the last by
+            default.
+        view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is
+            up, -Y where Z is), a positive azimuth moves the camera to the right. By default chosen from the
+            shape.
+        up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
+        colors: A number for each vertex, for any of the rows, shown as colour with a bar. The bar ends at the
+            99.5th percentile of what is shown, with an arrow if there is more.
+            *Shape of each:* ``(N, V)``.
+        color_label: What those numbers are, with their unit.
+        renderer: ``"auto"`` is pyvista, and matplotlib (with a warning) where pyvista cannot render.
+        overwrite: Replace the file if it exists.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: An argument cannot be used; the message says why.
+        FileExistsError: The file exists and ``overwrite`` is off.
+        RuntimeError: ``renderer="pyvista"`` and pyvista cannot render here.
+    """
+    if not frames_by_row:
+        raise ValueError("frames_by_row is empty; it needs at least one row of shapes.")
+    path = Path(out)
+    fmt = path.suffix.lower().lstrip(".")
+    if fmt not in ("png", "pdf"):
+        raise ValueError(f"out must end in .png or .pdf, got {path.name!r}.")
+    if renderer not in ("auto", "pyvista", "matplotlib"):
+        raise ValueError(f"renderer must be auto, pyvista or matplotlib, got {renderer!r}.")
+    if view is not None and not (len(view) == 2 and np.isfinite(view).all()):
+        raise ValueError(f"view must be two numbers of degrees, azimuth and elevation, got {view}.")
+    if up not in (None, "y", "z"):
+        raise ValueError(f"up must be 'y' or 'z', got {up!r}.")
+    refuse_existing(path, overwrite)
+
+    rows = list(frames_by_row)
+    checked = [check_frames(frames_by_row[row], faces, f"frames_by_row[{row!r}]") for row in rows]
+    shapes = [frames for frames, _ in checked]
+    if len({frames.shape for frames in shapes}) > 1:
+        sizes = ", ".join(f"{row!r} {frames.shape}" for row, frames in zip(rows, shapes, strict=True))
+        raise ValueError(f"all rows must have the same shape (N, V, 3), got {sizes}.")
+    n_frames = len(shapes[0])
+    if columns is None:
+        # Equal steps if at all possible: 5 of 9 or 17 frames, 7 of 25.
+        columns = next((c for c in (7, 6, 5, 4) if n_frames > c and (n_frames - 1) % (c - 1) == 0), 7)
+    if isinstance(columns, (int, np.integer)):
+        count = min(columns, n_frames)
+        if count < 1:
+            raise ValueError(f"columns must be at least 1, got {columns}.")
+        chosen = np.unique(np.linspace(0, n_frames - 1, count).round().astype(int)).tolist()
+    else:
+        chosen = check_indices(columns, n_frames, "columns")
+    given = [0, n_frames - 1] if keyframe_indices is None else keyframe_indices
+    keyframes = check_indices(given, n_frames, "keyframe_indices")
+
+    shown = np.stack([frames[chosen] for frames in shapes])  # (R, C, V, 3)
+    rotation = _view_rotation(shapes[0][0], view, up)
+    points, half = _centred(shown @ rotation.T)
+    paint = np.empty(shown.shape)
+    paint[:] = np.array([KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR for n in chosen])[:, None]
+    color_bar = None
+    if colors:
+        mappable, painted = _colored(colors, rows, shapes[0].shape[:2], chosen)
+        for r, rgb in painted.items():
+            paint[r] = rgb
+        color_bar = (mappable, color_label)
+    scene = Scene(
+        points.reshape(-1, *shown.shape[2:]),
+        (paint * 255).round().astype(np.uint8).reshape(-1, *shown.shape[2:]),
+        checked[0][1],
+        half,
+        np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64),
+    )
+    images = draw(scene, renderer)
+    last = max(n_frames - 1, 1)
+    labels = [(f"t = {n / last:.3g}", "#b4581a" if n in keyframes else "#333333") for n in chosen]
+    write_file(path, _sheet(images.reshape(*shown.shape[:2], *images.shape[1:]), rows, labels, color_bar, fmt))
+    return path
+
+
+def _colored(
+    colors: Mapping[str, Array], rows: list[str], size: tuple[int, ...], chosen: list[int]
+) -> tuple[Any, dict[int, FloatArray]]:
+    """The colour scale, shared by all rows, and for each coloured row its RGB ``(C, V, 3)`` in [0, 1]."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    values = {}
+    for row, numbers in colors.items():
+        array = to_numpy(numbers)
+        if row not in rows:
+            raise ValueError(f"colors has a row {row!r} that frames_by_row does not have ({', '.join(rows)}).")
+        if array.shape != size or not np.isfinite(array).all():
+            raise ValueError(
+                f"colors[{row!r}] must hold finite numbers, one a vertex, shape {size}, got shape {array.shape}."
+            )
+        values[rows.index(row)] = array[chosen].astype(np.float64)
+    everything = np.concatenate([v.reshape(-1) for v in values.values()])
+    low, high = (
+        everything.min(),
+        np.percentile(everything, 99.5),
+    )  # a few extreme vertices must not hide the rest
+    mappable = ScalarMappable(
+        Normalize(low, high if high > low else low + 1.0),
+        LinearSegmentedColormap.from_list("error", ERROR_COLORS),
+    )
+    mappable.set_array(everything)
+    return mappable, {r: mappable.to_rgba(v)[..., :3] for r, v in values.items()}
