@@ -32,7 +32,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 import torch_modal as tm
-from torch_modal.io.samples import load_sample
+from torch_modal.data.samples import load_sample
 
 TRAINED_ON = {"hand": (0, 1), "creature": (0, 2, 4)}
 ARMS = ("none", "linear", "torch_modal", "+ modes")
