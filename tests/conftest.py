@@ -15,6 +15,7 @@ from solids import box, surface
 
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.keyframes.load import load_keyframes
+from torch_modal.nn.between import Samples
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
@@ -135,8 +136,9 @@ def generator() -> torch.Generator:
 
 def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
     """What the layer's energy knows of the in-betweens of placed key-frames."""
-    member: Any = layer.in_between.members[0]
-    return member.space.placement(*member.problem(pair, t).inputs)
+    whole = layer.in_between
+    samples = Samples(pair.first, pair.second, None, t, whole._mu(t, t.shape), whole._stiffness(t, t.shape))
+    return whole.members[0].problem(pair, samples).placement
 
 
 def listen_to_ctrl_c() -> None:

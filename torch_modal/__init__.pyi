@@ -1,5 +1,6 @@
 """The public names, and the modules that they are loaded from when they are first used."""
 
+from . import nn as nn
 from .data.augmentation import ShapeAugmentation as ShapeAugmentation
 from .data.augmentation import ShapeBatch as ShapeBatch
 from .data.dataset import SetBatchSampler as SetBatchSampler
@@ -17,6 +18,7 @@ from .data.stored import find_sets as find_sets
 from .data.stored import open_set as open_set
 from .data.stored import write_set as write_set
 from .energy.shell import ShellEnergy as ShellEnergy
+from .energy.terms import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals
@@ -24,14 +26,24 @@ from .io.write import save_animation as save_animation
 from .io.write import save_frames as save_frames
 from .keyframes.check import check_keyframes as check_keyframes
 from .keyframes.load import load_keyframes as load_keyframes
+from .nn.adjoint import ConvergenceWarning as ConvergenceWarning
 from .nn.between import ConvergenceError as ConvergenceError
-from .nn.between import ConvergenceWarning as ConvergenceWarning
+from .nn.between import InBetweenResult as InBetweenResult
 from .nn.in_between import InBetween as InBetween
 from .nn.mid_shape import MidShape as MidShape
+from .nn.modal_energy import ModalEnergy as ModalEnergy
+from .nn.settings import PRESETS as PRESETS
+from .nn.settings import Objective as Objective
+from .nn.settings import Solver as Solver
 from .nn.solver import GaussNewtonStep as GaussNewtonStep
+from .nn.solver import Solution as Solution
+from .nn.solver import Status as Status
 from .precompute.basis import ModalBasis as ModalBasis
+from .precompute.eigen import ModalAnalysisError as ModalAnalysisError
 from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
+from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
+from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
 from .sequence.subdivide import keyframe_places as keyframe_places
 from .sequence.subdivide import linear_sequence as linear_sequence
 from .sequence.subdivide import subdivide as subdivide

@@ -3,6 +3,7 @@
 No modes, no coarse mesh: sparse Newton steps on 3V unknowns (the discrete-shell mean of Heeren et al. 2012, at any t).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,12 +12,13 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from torch_modal.energy.linearised import Linearised, Reference, energy_of, gradient, linearise
-from torch_modal.energy.shell import Measures, Rest, ShellEnergy, dihedral_hessian, length_hessian, wrap_angle
+from torch_modal.energy.assembly import PairBlocks
+from torch_modal.energy.energy import Energy, Linearised, Reference, Rest
+from torch_modal.energy.shell import DIAGONAL
+from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.vectors import cross, pick
-from torch_modal.nn.frame import DIAGONAL
 
 STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
 
@@ -91,8 +93,8 @@ def full_space(
     if not bool(torch.isfinite(size + second.sum())) or size == 0:
         raise ValueError("x_a and x_b must be finite and x_a must have a size; check them for NaN and infinity")
     scale = DIAGONAL / size
-    shell = ShellEnergy(faces, alpha, beta, gamma)
-    weights = torch.from_numpy(connectivity.vertex_areas(first.numpy(), shell.faces.numpy()))
+    faces = torch.as_tensor(faces).cpu().long()
+    weights = torch.from_numpy(connectivity.vertex_areas(first.numpy(), faces.numpy()))
     first, second = first * scale, second * scale
     back = best_fit(second, first, weights)
     aligned = back.apply(second)
@@ -101,103 +103,99 @@ def full_space(
     if start is not None:
         x = motion.inverse().apply(start.detach().cpu().double() * scale)
 
-    pulls = torch.tensor([1 - t]).double(), torch.tensor([t]).double()
-    rests = [shell.rest(y[None]) for y in (first, aligned)]
-    references = [Reference(rest, pull) for rest, pull in zip(rests, pulls, strict=True)]
+    energy = Energy(Mesh.of(faces, len(first)), [Stretch(), Bend(), Volume()])
+    at_t = torch.tensor([t], dtype=torch.float64)
+    rests = [energy.rest(energy.extend(y.T[:, None].contiguous())) for y in (first, aligned)]
+    stiffness = [alpha, beta, gamma]
+    reference = energy.between(rests[0], rests[1], at_t, stiffness)
     if example_based:
-        references = [Reference(_interpolated(rests[0], rests[1], t), torch.ones(1, dtype=torch.float64))]
-    rows, energies, stagnated, n_held = _minimise(shell, x.T[:, None].contiguous(), references, max_steps, tolerance)
+        reference = Energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
+    rows, energies, stagnated, n_held = _minimise(
+        energy, faces, x.T[:, None].contiguous(), reference, max_steps, tolerance
+    )
     shape = motion.apply(rows[:, 0].T) / scale
     return FullSpaceResult(shape.to(x_a), energies, stagnated, n_held)
 
 
-def _interpolated(first: Rest, second: Rest, t: float) -> Rest:
+def _interpolated(energy: Energy, first: Rest, second: Rest, t: float) -> Rest:
     """Measures and weights between those of two rest shapes; angles the short way round."""
-    lengths, angles, volumes = (torch.lerp(a, b, t) for a, b in zip(first.measures, second.measures, strict=True))
-    turn = wrap_angle(second.measures.angle - first.measures.angle)
-    angles = first.measures.angle + t * turn
-    weights = Measures(*(torch.lerp(a, b, t) for a, b in zip(first.weights, second.weights, strict=True)))
-    return Rest(Measures(lengths, angles, volumes), weights)
+    measures = tuple(
+        a + t * part.term.difference(b, a)
+        for part, a, b in zip(energy.parts, first.measures, second.measures, strict=True)
+    )
+    return Rest(measures, tuple(torch.lerp(a, b, t) for a, b in zip(first.weights, second.weights, strict=True)))
 
 
 def _minimise(
-    shell: ShellEnergy, rows: Tensor, references: list[Reference], max_steps: int, tolerance: float
+    energy: Energy, faces: Tensor, rows: Tensor, reference: Reference, max_steps: int, tolerance: float
 ) -> tuple[Tensor, list[float], bool, int]:
-    assembly = _Assembly(shell, rows.shape[-1])
-    energies = [float(energy_of(shell, shell.measure_rows(rows), references))]
+    assembly = _Assembly(energy)
+    energies = [float(energy.value(energy.extend(rows), reference))]
     held = torch.zeros(rows.shape[-1], dtype=torch.bool)
     for _ in range(max_steps):
-        at = linearise(shell, rows, references)
-        held = _held(shell, rows)
-        direction = assembly.direction(rows, at, held)
+        held = _held(faces, rows)
+        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held)
         for length in STEP_LENGTHS:
             moved = rows + length * direction
-            energy = float(energy_of(shell, shell.measure_rows(moved), references))
-            if energy < energies[-1]:
+            found = float(energy.value(energy.extend(moved), reference))
+            if found < energies[-1]:
                 break
         else:
             return rows, energies, True, int(held.sum())
         rows = moved
-        energies.append(energy)
-        if len(energies) > STAGNATION_STEPS and energies[-1 - STAGNATION_STEPS] - energy < tolerance * energy:
+        energies.append(found)
+        if len(energies) > STAGNATION_STEPS and energies[-1 - STAGNATION_STEPS] - found < tolerance * found:
             return rows, energies, True, int(held.sum())
     return rows, energies, False, int(held.sum())
 
 
-def _held(shell: ShellEnergy, rows: Tensor) -> Tensor:
+def _held(faces: Tensor, rows: Tensor) -> Tensor:
     """Vertices of collapsed triangles. *Shape:* ``(V,)``, bool."""
-    p, q, r = (pick(rows[:, 0], corner) for corner in shell.faces.unbind(1))
+    p, q, r = (pick(rows[:, 0], corner) for corner in faces.unbind(1))
     longest = torch.stack([q - p, r - q, p - r]).square().sum(1).amax(0)
     altitude = cross(q - p, r - p).norm(dim=0) / longest.clamp_min(torch.finfo(rows.dtype).tiny)
     held = torch.zeros(rows.shape[-1], dtype=torch.bool)
-    held[shell.faces[altitude < HELD_ALTITUDE].flatten()] = True
+    held[faces[altitude < HELD_ALTITUDE].flatten()] = True
     return held
 
 
 class _Assembly:
-    """The sparse Hessian: one 3 x 3 block for each pair of vertices that an edge, a hinge or a face couples.
+    """The sparse Hessian, of one 3 x 3 block for each pair of vertices that an element couples.
 
-    The blocks of a vertex with itself follow, because translations change nothing. The volume couples all vertices, by
-    a matrix of rank one that is treated apart. On an open surface the second derivative of the volume leaves out that
-    the centroid moves along; its gradient does not.
+    The volume couples all vertices, by a matrix of rank one that is treated apart. On an open surface the second
+    derivative of the volume leaves out that the centroid moves along; its gradient does not.
     """
 
-    def __init__(self, shell: ShellEnergy, n_vertices: int) -> None:
-        self.shell, self.n = shell, n_vertices
-        faces, edges, hinges = (x.numpy() for x in (shell.faces, shell.edges, shell.hinges))
-        i, j, k, m = hinges.T
-        blocks = [(i, j), (k, i), (k, j), (m, i), (m, j), (k, m)]
-        sides = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
-        first = np.concatenate([edges[:, 0], *(a for a, _ in blocks), sides[0]])
-        second = np.concatenate([edges[:, 1], *(b for _, b in blocks), sides[1]])
-        keys, places = np.unique(
-            np.minimum(first, second) * n_vertices + np.maximum(first, second), return_inverse=True
-        )
-        self.first, self.second = (torch.from_numpy(part) for part in np.divmod(keys, n_vertices))
-        # Blocks that come in descending order are kept beside the others, and transposed at the end.
-        self.places = torch.from_numpy(places.reshape(-1) + len(keys) * (first > second))
-        self.opposite = torch.from_numpy(faces[:, [2, 0, 1]].T.ravel())
+    def __init__(self, energy: Energy) -> None:
+        self.energy, self.n = energy, energy.n_vertices
+        local = [part.corners for part in energy.parts if not part.term.total]
+        coupled = [torch.stack([c[s], c[t]], 1) for c in local for s in range(len(c)) for t in range(s + 1, len(c))]
+        self.blocks = PairBlocks(torch.cat([*coupled, *(part.pairs for part in energy.parts)]), energy.n_extended)
+        self.inner = (self.blocks.pairs < self.n).all(1)
 
-    def direction(self, rows: Tensor, at: Linearised, held: Tensor) -> Tensor:
+    def direction(self, at: Sequence[Linearised], held: Tensor) -> Tensor:
         """Newton's direction, or a convex one where the Hessian is not positive definite. *Shape:* ``(3, 1, V)``."""
-        volume = torch.where(held, 0, at.to_volume[:, 0])
-        right = torch.stack([torch.where(held, 0, gradient(self.shell, at)[:, 0]), volume], -1)
+        energy = self.energy
+        volume = torch.where(held, 0, energy.fold(at[2].gradients)[:, 0])
+        gradient = torch.where(held, 0, energy.fold(energy.gradient(at))[:, 0])
+        right = torch.stack([gradient, volume], -1)
         for convex in (False, True):
-            solved = self._solve(self._matrix(rows, at, held, convex), right)
+            solved = self._solve(self._matrix(at, held, convex), right)
             if solved is not None:
                 break
         else:
             raise RuntimeError("the convex Hessian is not positive definite: the shape has numbers out of range")
         by_gradient, by_volume = solved.unbind(-1)
         # Sherman and Morrison.
-        weight = at.curvature.volume
+        weight = at[2].curvature
         part = weight * (volume * by_gradient).sum() / (1 + weight * (volume * by_volume).sum())
         return (part * by_volume - by_gradient)[:, None]
 
-    def _matrix(self, rows: Tensor, at: Linearised, held: Tensor, convex: bool) -> sparse.csc_matrix:
-        pairs = self._blocks(rows, at, convex)
+    def _matrix(self, at: Sequence[Linearised], held: Tensor, convex: bool) -> sparse.csc_matrix:
+        pairs = self._pairs(at, convex)[:, :, 0, self.inner]
+        first, second = self.blocks.pairs[self.inner].unbind(1)
         both = torch.cat([pairs, pairs.transpose(0, 1)], -1)
-        start, end = torch.cat([self.first, self.second]), torch.cat([self.second, self.first])
+        start, end = torch.cat([first, second]), torch.cat([second, first])
         diagonal = pairs.new_zeros(3, 3, self.n).index_add(-1, start, -both)
         diagonal = 0.5 * (diagonal + diagonal.transpose(0, 1))
         size = diagonal.diagonal().sum(-1).mean().abs() / 3
@@ -210,28 +208,17 @@ class _Assembly:
         entries = values.flatten().numpy(), (row.flatten().numpy(), column.flatten().numpy())
         return sparse.csc_matrix(entries, (3 * self.n, 3 * self.n))
 
-    def _blocks(self, rows: Tensor, at: Linearised, convex: bool) -> Tensor:
-        """The block of each pair, of the first with the second vertex. *Shape:* ``(3, 3, P)``."""
-        slope, curvature = at.slope, at.curvature
-        pull = slope.length.clamp_min(0) if convex else slope.length
-        on_edges = -(pull * length_hessian(at.edges) + curvature.length * at.to_edges[:, None] * at.to_edges)
-        to_e, to_a, to_b = at.to_hinges
-        to_i = -(to_e + to_a + to_b)
-        products = [(to_i, to_e), (to_a, to_i), (to_a, to_e), (to_b, to_i), (to_b, to_e), (to_a, to_b)]
-        on_hinges = [curvature.angle * p[:, None] * q for p, q in products]
-        # p.(q x r) has the block -[r] between p and q.
-        x, y, z = pick(rows - pick(rows, self.shell.used).mean(-1, keepdim=True), self.opposite)
-        zero = torch.zeros_like(x)
-        on_sides = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3)) * (slope.volume / 6)
-        if convex:
-            on_sides = torch.zeros_like(on_sides)
-        else:
-            bent = slope.angle * dihedral_hessian(at.spokes)
-            on_hinges[:5] = [a + b for a, b in zip(on_hinges, bent, strict=False)]
-        parts = torch.cat([on_edges, *on_hinges, on_sides], -1)[:, :, 0]
-        n_pairs = len(self.first)
-        ascending, descending = parts.new_zeros(3, 3, 2 * n_pairs).index_add(-1, self.places, parts).split(n_pairs, -1)
-        return ascending + descending.transpose(0, 1)
+    def _pairs(self, at: Sequence[Linearised], convex: bool) -> Tensor:
+        """The block of each pair, of the first with the second vertex. *Shape:* ``(3, 3, 1, P)``."""
+        parts, curved = [], []
+        for part, one in zip(self.energy.parts, at, strict=True):
+            if not part.term.total:
+                ends = part.to_corners(one.gradients).unflatten(-1, (len(part.corners), -1)).movedim(-2, 0)
+                n = len(ends)
+                parts += [one.curvature * ends[s][:, None] * ends[t] for s in range(n) for t in range(s + 1, n)]
+            own = part.term.blocks(one.spokes, one.slope.clamp_min(0) if convex else one.slope)
+            curved.append(own if not convex or isinstance(part.term, Stretch) else torch.zeros_like(own))
+        return self.blocks(torch.cat([*parts, *curved], -1))
 
     @staticmethod
     def _solve(matrix: sparse.csc_matrix, right: Tensor) -> Tensor | None:

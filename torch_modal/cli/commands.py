@@ -7,6 +7,7 @@ import argparse
 import os
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,8 +19,8 @@ def subdivide(args: argparse.Namespace) -> None:
     """Run ``torch-modal subdivide``."""
     if len(args.meshes) < 2:
         args.fail("subdivide needs two key-frames or more")
-    if args.mu is not None and args.space != "paired":
-        args.fail("--mu is the similarity weight of --space paired; the joint space has none")
+    if args.mu is not None and args.preset != "paper":
+        args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
         args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
     single = _is_file(args, ".glb")
@@ -34,7 +35,8 @@ def subdivide(args: argparse.Namespace) -> None:
     keyframes, faces = tm.load_keyframes(args.meshes)
     progress = False if args.quiet else None
     bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
-    options = {} if args.mu is None else {"mu": args.mu}
+    objective, solver = tm.PRESETS[args.preset]
+    objective = objective if args.mu is None else replace(objective, mu=args.mu)
     frames = tm.subdivide(
         keyframes,
         faces,
@@ -43,11 +45,8 @@ def subdivide(args: argparse.Namespace) -> None:
         cyclic=args.cyclic,
         n_frames=args.frames,
         progress=progress,
-        space=args.space,
-        coarse_faces=args.coarse_faces,
-        local=args.local,
-        polish=args.polish,
-        **options,
+        objective=objective,
+        solver=replace(solver, polish=args.polish),
     )
     report = _reporter(args)
     report(f"{len(keyframes)} key-frames of {keyframes.shape[1]} vertices -> {len(frames)} frames")

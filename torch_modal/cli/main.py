@@ -216,29 +216,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--cyclic", action="store_true", help="the last key-frame leads on to the first")
     sub.add_argument(
-        "--coarse-faces",
-        type=_number(int, 4),
-        default=1000,
-        metavar="N",
-        help="faces of the coarse mesh on which the energy is measured; more is slower (default: %(default)s)",
-    )
-    sub.add_argument(
-        "--space",
-        choices=("joint", "paired"),
-        default="joint",
-        help="where in-betweens are sought: joint, or paired as in the paper (default: %(default)s)",
+        "--preset",
+        choices=("accurate", "fast", "paper"),
+        default="accurate",
+        help="accurate; fast, without steps on the fine mesh; paper, its Eq. 4 as it stands (default: %(default)s)",
     )
     sub.add_argument(
         "--mu",
         type=_number(float, 0, above=True),
         metavar="X",
-        help="how strongly --space paired pulls its two shapes together (default: 1)",
-    )
-    sub.add_argument(
-        "--no-local",
-        dest="local",
-        action="store_false",
-        help="leave out the steps on the fine mesh that mend what the modes cannot reach",
+        help="how strongly --preset paper pulls its two shapes together (default: 1)",
     )
     sub.add_argument(
         "--polish",

@@ -18,7 +18,9 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.in_between import InBetween
+from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.precompute.basis import ModalBasis
+from torch_modal.version import __version__
 
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8
@@ -69,8 +71,9 @@ class ShapeSpace:
     Args:
         bases: The basis of each key-frame (:func:`torch_modal.extract_bases`).
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        coarse_faces: Of the mesh that energies are evaluated on (:class:`torch_modal.InBetween`).
-        tolerance: Of the in-betweens.
+        preset: Of the in-betweens, as for :class:`torch_modal.InBetween`.
+        objective: What they minimise, in the place of the preset's.
+        solver: How they are solved, in the place of the preset's.
         times: In-betweens of two key-frames are solved at so many even times, once, and interpolated among them by
             cubics; None solves each anew. At least 4.
         dtype: What tables are kept in.
@@ -85,8 +88,9 @@ class ShapeSpace:
         bases: ModalBasis | Sequence[ModalBasis],
         faces: Tensor,
         *,
-        coarse_faces: int = 300,
-        tolerance: float = 1e-5,
+        preset: Preset = "fast",
+        objective: Objective | None = None,
+        solver: Solver | None = None,
         times: int | None = 17,
         dtype: torch.dtype = torch.float32,
         folder: str | os.PathLike[str] | None = None,
@@ -101,8 +105,7 @@ class ShapeSpace:
             raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between anew")
         # What is wrong with the faces is said here, and repaired as everywhere.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
-        self.coarse_faces = coarse_faces
-        self.tolerance = tolerance
+        self.settings = settings(preset, objective, solver)
         self.times = times
         self.dtype = dtype
         self.folder = None if folder is None else Path(folder)
@@ -204,50 +207,50 @@ class ShapeSpace:
         """The in-between layer of two key-frames' modes; ``i`` and ``j`` may be the same."""
 
         def make() -> InBetween:
-            bases = [self.bases[i], self.bases[j]]
-            layer = InBetween(bases, self.faces, coarse_faces=self.coarse_faces, tolerance=self.tolerance)
-            return layer.to(like)
+            return self._layer(i, j).to(like)
 
         return self._layers.get((i, j, like.dtype, like.device), make)
+
+    def _layer(self, i: int, j: int) -> InBetween:
+        objective, solver = self.settings
+        return InBetween([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver)
 
     def table(self, i: int, j: int) -> Tensor:
         """In-betweens of two key-frames at even times, from disk where they are. *Shape:* ``(T, V, 3)``."""
         assert self.times is not None
 
         def make() -> Tensor:
-            settings = {
-                "times": str(self.times),
-                "coarse_faces": str(self.coarse_faces),
-                "tolerance": str(self.tolerance),
-                "dtype": str(self.dtype),
-                "bases": self._content(i, j),
-            }
+            key = {"times": str(self.times), "dtype": str(self.dtype), "content": self._content(i, j)}
             path = None if self.folder is None else self.folder / f"between-{i}-{j}.safetensors"
-            kept = None if path is None else read_table(path, settings)
+            kept = None if path is None else read_table(path, key)
             if kept is not None:
                 return kept
             x_i, x_j = (self.bases[key].reference.double() for key in (i, j))
             with torch.no_grad():
-                layer = InBetween(
-                    [self.bases[i], self.bases[j]],
-                    self.faces,
-                    coarse_faces=self.coarse_faces,
-                    tolerance=self.tolerance,
-                )
-                result = layer.solve(x_i, x_j, torch.linspace(0, 1, self.times, dtype=torch.float64))
+                result = self._layer(i, j).solve(x_i, x_j, torch.linspace(0, 1, self.times, dtype=torch.float64))
             table = _usable(result.shapes, i, j).to(self.dtype)
             if path is not None:
-                write_table(path, table, settings)
+                write_table(path, table, key)
             return table
 
         return self._tables.get((i, j), make)
 
     def _content(self, i: int, j: int) -> str:
-        """A hash of the key-frames and their eigenvalues, by which a table is known to be theirs."""
-        digest = hashlib.sha256()
-        for basis in (self.bases[i], self.bases[j]):
-            for part in (basis.reference, basis.eigenvalues):
-                digest.update(part.contiguous().numpy().tobytes())
+        """A hash of all that a table follows from: bases, faces, settings, and what made it."""
+        digest = hashlib.sha256(f"{__version__} {torch.__version__}".encode())
+        bases = (self.bases[i], self.bases[j])
+        tensors = [part for basis in bases for part in (basis.reference, basis.eigenvalues, basis.modes)]
+        values = [self.faces, *tensors]
+        for name, value in sorted({**vars(self.settings.objective), **vars(self.settings.solver)}.items()):
+            if isinstance(value, tuple):
+                digest.update(repr([(type(term).__qualname__, term.stiffness) for term in value]).encode())
+                values += [tensor for term in value for tensor in term.state_dict().values()]
+            elif isinstance(value, Tensor):
+                values.append(value)
+            else:
+                digest.update(f"{name} {value}".encode())
+        for tensor in values:
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
     # -------------------------------------------------------------------------------------------------- in-betweens
@@ -265,7 +268,7 @@ class ShapeSpace:
         """Between any shapes, with the modes of two key-frames. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``."""
         if i > j:
             return self.in_between(x_b, x_a, 1 - t, j, i)
-        return _usable(self.layer(i, j, x_a).solve(x_a, x_b, t[:, None]).shapes[:, 0], i, j)
+        return _usable(self.layer(i, j, x_a).solve(x_a, x_b, t).shapes, i, j)
 
 
 def _usable(x: Tensor, i: int, j: int) -> Tensor:

@@ -39,19 +39,19 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
     return sum(weight[:, None, None] * table[start + i] for i, weight in enumerate(weights))  # type: ignore[return-value]
 
 
-def read_table(path: Path, settings: dict[str, str]) -> Tensor | None:
+def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
     """A table mapped from disk; None where there is none, or it was made with other settings."""
     with contextlib.suppress(OSError, SafetensorError), safe_open(path, framework="pt", device="cpu") as file:
-        if file.metadata() == _metadata(settings):
+        if file.metadata() == _metadata(key):
             return file.get_tensor("shapes")
     return None
 
 
-def write_table(path: Path, table: Tensor, settings: dict[str, str]) -> None:
+def write_table(path: Path, table: Tensor, key: dict[str, str]) -> None:
     """Keep a table; a folder that cannot be written is passed over, as it can be computed again."""
     with contextlib.suppress(OSError):
-        write_atomically(path, save({"shapes": table.contiguous()}, _metadata(settings)))
+        write_atomically(path, save({"shapes": table.contiguous()}, _metadata(key)))
 
 
-def _metadata(settings: dict[str, str]) -> dict[str, str]:
-    return {"format": FORMAT, "version": VERSION, **settings}
+def _metadata(key: dict[str, str]) -> dict[str, str]:
+    return {"format": FORMAT, "version": VERSION, **key}

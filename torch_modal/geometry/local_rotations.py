@@ -87,14 +87,14 @@ class LocalRotations(nn.Module):
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
-        self.register_buffer("faces", faces.clone())
-        self.register_buffer("sides", torch.from_numpy(sides))
-        self.register_buffer("side_signs", torch.where(start < end, 1.0, -1.0).to(references))
+        self.register_buffer("faces", faces.clone(), persistent=False)
+        self.register_buffer("sides", torch.from_numpy(sides), persistent=False)
+        self.register_buffer("side_signs", torch.where(start < end, 1.0, -1.0).to(references), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
-        self.register_buffer("ancestors", torch.stack(ancestors))
-        self.register_buffer("piece", piece)
+        self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
+        self.register_buffer("piece", piece, persistent=False)
         #: The weight of each edge where edge vectors are fitted. *Shape:* ``(E,)``.
-        self.register_buffer("per_length", 1 / lengths.clamp_min(SHORTEST * lengths.mean()))
+        self.register_buffer("per_length", 1 / lengths.clamp_min(SHORTEST * lengths.mean()), persistent=False)
 
     @staticmethod
     def _tree(a: _Triangles, b: _Triangles, faces: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,1 +1,5 @@
-"""Per-call work, torch only: the energy, the solver and the layers."""
+"""Layers: in-betweens in a modal space, and what they are made of (torch only)."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

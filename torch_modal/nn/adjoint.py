@@ -1,35 +1,35 @@
 """Gradients of a minimiser: by the implicit function theorem, or through a fixed number of steps."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.func import grad
 
+from torch_modal.nn import trees
 from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, minimise
+
+
+class ConvergenceWarning(UserWarning):
+    """A minimisation stopped before its gradient vanished, or has no gradient where it stopped."""
 
 
 class Minimisation(NamedTuple):
     """What is minimised, and how far."""
 
     step: GaussNewtonStep
-    placement: Callable[..., Any]
-    """From the inputs to what the energy knows of each sample."""
-    guess: Callable[..., Tensor | None]
-    """Amplitudes to start from, from the inputs; None for zeros."""
-    require: Callable[..., None]
-    """Raises where the inputs have no solution."""
-    n_unknowns: int
     max_steps: int
     tolerance: float
     least_gain: float
+    require: Callable[[Tensor], None]
+    """Raises where there is no minimum at some of the times."""
     report: Callable[[Solution], None] | None
     """Told how it went."""
 
 
 class _ArgMin(torch.autograd.Function):
-    r"""Amplitudes :math:`a^*(\theta)` at which :math:`\partial E / \partial a = 0`.
+    r"""Amplitudes :math:`a^*(\theta)` at which :math:`\partial E / \partial a = 0`, for placements :math:`\theta`.
 
     Backward solves with the full Hessian: :math:`\bar\theta = -(\partial_\theta \partial_a E)^T H^{-1} \bar a`. With
     ``2 J^T J`` in its place the gradient is wrong wherever a residual remains at the optimum, and here much of it does.
@@ -38,14 +38,14 @@ class _ArgMin(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(minimisation: Minimisation, usable: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        minimisation.require(*inputs)
-        placement = minimisation.placement(*inputs)
-        start = inputs[0].new_zeros(len(inputs[0]), minimisation.n_unknowns)
-        guess = minimisation.guess(*inputs)
-        if guess is not None:
-            # Never a start that is worse than linear interpolation: what comes out must not be, either.
-            start, _ = minimisation.step.lowest(start, torch.stack([torch.zeros_like(guess), guess]), placement)
+    def forward(
+        minimisation: Minimisation, tree: Any, usable: Tensor, times: Tensor, start: Tensor, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        minimisation.require(times)
+        placement = trees.filled(tree, tensors)
+        # Never a start that is worse than linear interpolation: what comes out must not be, either.
+        zeros = torch.zeros_like(start)
+        start, _ = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
         limits = minimisation.max_steps, minimisation.tolerance, minimisation.least_gain
         solution = minimise(minimisation.step, start, placement, *limits)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
@@ -55,102 +55,96 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        minimisation, _, *tensors = inputs
+        minimisation, tree, _, _, _, *tensors = inputs
         amplitudes, *diagnostics = output
         ctx.mark_non_differentiable(*diagnostics)
-        ctx.minimisation = minimisation
+        ctx.minimisation, ctx.tree = minimisation, tree
         ctx.save_for_backward(amplitudes, diagnostics[-1], *tensors)
 
     @staticmethod
-    def backward(ctx: Any, grad_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        minimisation = ctx.minimisation
-        amplitudes, status, *inputs = ctx.saved_tensors
-        energy = minimisation.step.energy
-        converged = status == Status.CONVERGED
-        placement = minimisation.placement(*inputs)
-        derivatives = energy.derivatives(amplitudes, placement, second_order=True)
-        hessian = minimisation.step.ridged(derivatives.gauss_newton + derivatives.second_order)
-        hessian = torch.where(converged[:, None, None], hessian, torch.eye(len(hessian[0])).to(hessian))
-        adjoint = torch.linalg.solve(hessian, grad_amplitudes)
-        adjoint = torch.where(converged[:, None], adjoint, 0)
-
-        wanted = [i for i, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
-
-        to_placement = _tensors(energy.pull_back(amplitudes, adjoint, placement))
-
-        def slope(*variables: Tensor) -> Tensor:
-            """The energy's slope along the adjoint, of all samples, up to what does not change with the inputs."""
-            changed = list(inputs)
-            for i, variable in zip(wanted, variables, strict=True):
-                changed[i] = variable
-            moved = _tensors(minimisation.placement(*changed))
-            return sum((g * value).sum() for g, value in zip(to_placement, moved, strict=True))  # type: ignore
-
-        grads: list[Tensor | None] = [None] * len(inputs)
-        if wanted:
-            found = grad(slope, argnums=tuple(range(len(wanted))))(*(inputs[i] for i in wanted))
-            for i, value in zip(wanted, found, strict=True):
-                grads[i] = -torch.where(converged.reshape(-1, *[1] * (value.dim() - 1)), value, 0)
-        return (None, None, *grads)
+    def backward(ctx: Any, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        step = ctx.minimisation.step
+        amplitudes, status, *tensors = ctx.saved_tensors
+        placement = trees.filled(ctx.tree, tensors)
+        converged = (status == Status.CONVERGED)[:, None]
+        derivatives = step.energy.derivatives(amplitudes, placement, second_order=True)
+        hessian = step.ridged(derivatives.gauss_newton + derivatives.second_order)
+        eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
+        adjoint, info = torch.linalg.solve_ex(torch.where(converged[..., None], hessian, eye), to_amplitudes)
+        singular = (info != 0)[:, None]
+        _warn_of_singular(singular)
+        adjoint = torch.where(converged & ~singular, adjoint, 0)
+        to_placement = step.energy.pull_back(amplitudes, adjoint, placement)
+        return (None,) * 5 + tuple(-gradient for gradient in trees.leaves(to_placement))
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], minimisation: Minimisation, *tensors: Tensor
+        info: Any, in_dims: tuple[Any, ...], minimisation: Minimisation, tree: Any, *tensors: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        n = info.batch_size
-        flat = []
-        for tensor, dim in zip(tensors, in_dims[1:], strict=True):
-            batched = tensor.expand(n, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
-            flat.append(batched.flatten(0, 1))
-        output = _ArgMin.apply(minimisation, *flat)  # usable is the first of them
-        return tuple(value.unflatten(0, (n, -1)) for value in output), (0,) * len(output)
+        flat = flattened(info.batch_size, in_dims[-len(tensors) :], tensors)
+        output = _ArgMin.apply(minimisation, tree, *flat)
+        return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
 
 
-def _tensors(tree: Any) -> list[Tensor]:
-    """The tensors in nested tuples and lists, in order."""
-    if isinstance(tree, Tensor):
-        return [tree]
-    return [tensor for part in tree or () for tensor in _tensors(part)]
+def flattened(n: int, in_dims: tuple[int | None, ...], tensors: tuple[Tensor, ...]) -> list[Tensor]:
+    """Tensors under ``vmap`` as those of one larger batch: the mapped dimension joins the first."""
+    flat = []
+    for tensor, dim in zip(tensors, in_dims, strict=True):
+        batched = tensor.expand(n, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+        flat.append(batched.flatten(0, 1))
+    return flat
 
 
-def solve_implicit(minimisation: Minimisation, usable: Tensor, inputs: tuple[Tensor, ...]) -> Solution:
+def _warn_of_singular(singular: Tensor) -> None:
+    try:
+        number = int(singular.sum())
+    except RuntimeError:  # under vmap there is no number to see
+        return
+    if number:
+        warnings.warn(
+            f"the Hessian of {number} in-betweens is singular: no gradient flows through their amplitudes",
+            ConvergenceWarning,
+            stacklevel=2,
+        )
+
+
+def solve_implicit(
+    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor
+) -> Solution:
     """Minimise; gradients of the amplitudes by the implicit function theorem.
 
     Args:
         minimisation: What is minimised.
+        placement: What the energy depends on: nested tuples of tensors. *Shape of each:* ``(B, ...)``.
+        start: Where to start, unless zeros have a lower energy. *Shape:* ``(B, n)``.
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
-        inputs: What the energy depends on. *Shape of each:* ``(B, ...)``.
+        times: Checked before all else. *Shape:* ``(B,)``.
     """
-    return Solution(*_ArgMin.apply(minimisation, usable, *inputs))
+    batched = (usable, times, start.detach(), *trees.leaves(placement))
+    return Solution(*_ArgMin.apply(minimisation, trees.skeleton(placement), *batched))
 
 
-def solve_unrolled(minimisation: Minimisation, usable: Tensor, inputs: tuple[Tensor, ...]) -> Solution:
-    """Take exactly ``max_steps`` steps; gradients flow back through all of them.
+def solve_unrolled(
+    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor
+) -> Solution:
+    """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
 
     Nothing here depends on data but what is computed: no early end, no report, no choice of where to start.
-
-    Args:
-        minimisation: What is minimised.
-        usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
-        inputs: What the energy depends on. *Shape of each:* ``(B, ...)``.
+    Arguments as for :func:`solve_implicit`.
     """
     step = minimisation.step
-    placement = minimisation.placement(*inputs)
-    a = inputs[0].new_zeros(len(inputs[0]), minimisation.n_unknowns)
-    start = None
+    a = torch.zeros_like(start)
+    first = None
     for _ in range(minimisation.max_steps):
         taken = step(a, placement)
-        start = taken.gradient_norm if start is None else start
+        first = taken.gradient_norm if first is None else first
         a = taken.amplitudes
     derivatives = step.energy.derivatives(a, placement, second_order=False)
     norm = derivatives.gradient.norm(dim=-1)
-    start = norm if start is None else start
-    status = torch.where(
-        norm <= torch.maximum(minimisation.tolerance * start, step.floor(derivatives)),
-        Status.CONVERGED,
-        Status.OUT_OF_STEPS,
-    )
+    first = norm if first is None else first
+    found = norm <= torch.maximum(minimisation.tolerance * first, step.floor(derivatives))
+    status = torch.where(found, Status.CONVERGED, Status.OUT_OF_STEPS)
     status = torch.where(usable & norm.isfinite(), status, Status.INVALID)
-    relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
+    relative = norm / first.clamp_min(torch.finfo(first.dtype).tiny)
     steps = torch.full_like(status, minimisation.max_steps)
     return Solution(a, step.energy.value(a, placement), relative.detach(), steps, status)

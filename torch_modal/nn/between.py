@@ -1,4 +1,4 @@
-"""In-betweens of a batch between two bases: what all layers share."""
+"""In-betweens of one pair of bases, for flat batches: what all layers share."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -7,20 +7,22 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.linearised import references_between
-from torch_modal.energy.shell import ShellEnergy, enclosed_volume, per_sample
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.shell import DIAGONAL
+from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry import connectivity
-from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
-from torch_modal.nn.frame import DIAGONAL, Frame, Pair
+from torch_modal.nn import trees
+from torch_modal.nn.adjoint import ConvergenceWarning, Minimisation, solve_implicit, solve_unrolled
+from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.joint import JointSpace
+from torch_modal.nn.levels import Levels, Stiffness, coarse_values
 from torch_modal.nn.paired import PairedSpace
 from torch_modal.nn.relax import relax
+from torch_modal.nn.settings import Objective, Solver
 from torch_modal.nn.solver import GaussNewtonStep, Solution, Status
-from torch_modal.precompute.basis import ModalBasis
 
-# Newton steps of the local interpolation, and products with the Hessian in each: what closes 97 % of the gap in energy
-# between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
-LOCAL_STEPS = 2
+# Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
+# of the gap in energy between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
 LOCAL_PRODUCTS = 4
 POLISH_PRODUCTS = 20
 
@@ -29,10 +31,6 @@ FINE_CHUNK = 20_000
 
 # A key-frame smaller than this part of the basis' reference is a point.
 SMALLEST_SIZE = 1e-6
-
-
-class ConvergenceWarning(UserWarning):
-    """A minimisation stopped before its gradient vanished."""
 
 
 class ConvergenceError(RuntimeError):
@@ -48,112 +46,143 @@ class InBetweenResult(NamedTuple):
     """One value per shape: energy, relative gradient norm, number of steps, status."""
 
 
+class Samples(NamedTuple):
+    """A flat batch of in-betweens."""
+
+    x_a: Tensor
+    """Key-frames at 0. *Shape:* ``(P, V, 3)``."""
+    x_b: Tensor
+    """Key-frames at 1. *Shape:* ``(P, V, 3)``."""
+    which: Tensor | None
+    """Which of the P pairs each sample lies between; each its own where None. *Shape:* ``(B,)``."""
+    t: Tensor
+    """*Shape:* ``(B,)``."""
+    mu: Tensor
+    """*Shape:* ``(B,)``."""
+    stiffness: list[Tensor]
+    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+
+
 class Between(nn.Module):
-    """In-betweens of one pair of bases, for flat batches. Arguments as for :class:`torch_modal.InBetween`."""
+    """In-betweens of one pair of bases.
+
+    Args:
+        shapes: The references of both bases, float64 on the CPU. *Shape:* ``(2, V, 3)``.
+        modes: Their modes, likewise. *Shape of each:* ``(k, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        objective: What is minimised.
+        solver: How.
+        terms: The terms of the energy, which the layer owns.
+    """
 
     def __init__(
         self,
-        bases: Sequence[ModalBasis],
+        shapes: Tensor,
+        modes: Sequence[Tensor],
         faces: Tensor,
-        space: str,
-        mu: float | Tensor,
-        stiffness: Sequence[float | Tensor],
-        coarse_faces: int,
-        rotations: bool,
-        local: bool,
-        polish: int,
+        objective: Objective,
+        solver: Solver,
+        terms: Sequence[Term],
     ) -> None:
         super().__init__()
-        frame = Frame(bases, faces, coarse_faces)
-        shell = ShellEnergy(frame.coarse_faces)
-        if space == "joint":
-            ends = frame.place(*(basis.reference[None].to(frame.scale) for basis in bases))
+        self.solver = solver
+        self.frame = Frame(shapes, faces, objective.coarse_faces)
+        mesh = Mesh.of(faces, len(shapes[0]))
+        levels = Levels(self.frame, mesh, terms)
+        turned = self.frame.modes(*modes)
+        if objective.space == "joint":
+            ends = self.frame.place(*shapes[:, None])
             references = torch.cat([ends.first, ends.second])
-            self.space: Any = JointSpace(frame, shell, frame.modes(bases), references, rotations)
-        elif space == "paired":
-            self.space = PairedSpace(frame, shell, frame.modes(bases))
+            fine = mesh if objective.base == "rotations" else None
+            self.space: Any = JointSpace(self.frame, levels, turned, references, fine)
         else:
-            raise ValueError(f"space is 'joint' or 'paired', got {space!r}")
-        self.closed = len(connectivity.boundary_edges(frame.faces.numpy())) == 0
-        # Registered here alone: a module that hangs at two places confuses torch.func.functional_call.
-        self.alpha, self.beta, self.gamma = stiffness
-        self.mu = mu
-        self.local, self.polish = local, polish
-        #: The energy on the fine mesh, for what is done there.
-        self.fine_shell = ShellEnergy(frame.faces) if local or polish else None
+            self.space = PairedSpace(self.frame, levels, turned)
+        self.closed = len(connectivity.boundary_edges(faces.numpy())) == 0
+        #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
+        self.fine = Energy(mesh, terms)
 
-    def forward(
-        self,
-        x_a: Tensor,
-        x_b: Tensor,
-        t: Tensor,
-        gradient: str,
-        max_steps: int,
-        tolerance: float,
-        least_gain: float,
-        report: Callable[[Solution], None] | None,
-    ) -> InBetweenResult:
-        """Solve. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``."""
-        frame = self.space.frame
+    def forward(self, samples: Samples, exact: bool, report: Callable[[Solution], None] | None) -> InBetweenResult:
+        """Solve.
+
+        Args:
+            samples: The batch.
+            exact: Whether the minimisation goes on to the tolerance, whatever ``least_gain`` says.
+            report: Told how it went.
+        """
+        frame, space, solver = self.frame, self.space, self.solver
+        index, t = samples.which, samples.t
         # A sample that is not finite must not reach the factorisations of the others: the reference stands in for it.
-        usable = x_a.isfinite().flatten(1).all(1) & x_b.isfinite().flatten(1).all(1) & (t >= 0) & (t <= 1)
+        finite = samples.x_a.isfinite().flatten(1).all(1) & samples.x_b.isfinite().flatten(1).all(1)
         stand_in = frame.reference / frame.scale
-        clean_a, clean_b = (torch.where(usable[:, None, None], x, stand_in) for x in (x_a, x_b))
-        pair = frame.place(clean_a, clean_b)
-        usable = usable & self._solvable(pair)
-        problem = self.problem(pair, t)
-        space = self.space
-        minimisation = Minimisation(
-            self.step,
-            space.placement,
-            space.guess,
-            space.require,
-            space.n_unknowns,
-            max_steps,
-            tolerance,
-            least_gain,
-            report,
-        )
-        solve = solve_implicit if gradient == "implicit" else solve_unrolled
-        solution = solve(minimisation, usable, problem.inputs)
-        shapes = frame.restore(self._refine(self.space.lift(solution.amplitudes, problem), pair, t), pair, t)
+        pair = frame.place(*(torch.where(finite[:, None, None], x, stand_in) for x in (samples.x_a, samples.x_b)))
+        usable = finite & self._solvable(pair)
+        placed = pair
+        if index is not None:
+            usable, placed = trees.rows((usable, pair), index)
+        usable = usable & (t >= 0) & (t <= 1)
+        anchors = self._anchors(placed, t)
+        problem = self.problem(pair, samples, anchors)
+        least_gain = 0.0 if exact or isinstance(space, PairedSpace) else solver.least_gain
+        minimisation = Minimisation(self.step, solver.max_steps, solver.tolerance, least_gain, space.require, report)
+        solve = solve_implicit if solver.gradient == "implicit" else solve_unrolled
+        solution = solve(minimisation, problem.placement, problem.start, usable, t)
+        x = space.lift(solution.amplitudes, problem)
+        if solver.local_steps or solver.polish:
+            chunk = max(1, FINE_CHUNK // x.shape[-2])
+            per_item = (x, placed.first, placed.second, t, samples.stiffness, anchors)
+            parts = (trees.rows(per_item, slice(i, i + chunk)) for i in range(0, len(x), chunk))
+            x = torch.cat([self._relax(*part) for part in parts])
+        shapes = frame.restore(x, placed, t)
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
+
+    def problem(self, pair: Pair, samples: Samples, anchors: Tensor | None = None) -> Any:
+        """The minimisation of each sample, of key-frames that are placed."""
+        stiffness = self._levelled(samples.stiffness)
+        return self.space.problem(pair, samples.which, samples.t, stiffness, samples.mu, anchors)
 
     @property
     def step(self) -> GaussNewtonStep:
         """What is repeated. It has no state: registered, it would name all buffers of the energy twice."""
         return GaussNewtonStep(self.space.energy)
 
-    def problem(self, pair: Pair, t: Tensor) -> Any:
-        """The minimisation of each sample, at the times ``t``, *shape* ``(B,)``."""
-        return self.space.problem(pair, t, *per_sample((self.mu, self.alpha, self.beta, self.gamma), t))
-
-    def _refine(self, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
+    def _relax(
+        self, x: Tensor, first: Tensor, second: Tensor, t: Tensor, stiffness: list[Tensor], anchors: Tensor | None
+    ) -> Tensor:
         """Local interpolation and polish: what the modes cannot do. *Shape:* ``(B, V, 3)``."""
-        if self.fine_shell is None:
-            return x
-        chunk = max(1, FINE_CHUNK // x.shape[-2])
-        per_item = (x, pair.first, pair.second, t, *per_sample((self.alpha, self.beta, self.gamma), t))
-        parts = zip(*(value.split(chunk) for value in per_item), strict=True)
-        return torch.cat([self._relax(*part) for part in parts])
+        energy, solver = self.fine, self.solver
+        fixed = None if anchors is None else anchors.movedim(-1, 0)
+        a, b = (energy.rest(energy.extend(end.movedim(-1, 0).contiguous(), fixed)) for end in (first, second))
+        reference = energy.between(a, b, t, stiffness)
+        x = relax(energy, x, reference, solver.local_steps, LOCAL_PRODUCTS, anchors)
+        return relax(energy, x, reference, solver.polish, POLISH_PRODUCTS, anchors)
 
-    def _relax(self, x: Tensor, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> Tensor:
-        shell: Any = self.fine_shell
-        references = references_between(shell, first, second, t, *stiffness)
-        if self.local:
-            x = relax(shell, x, references, LOCAL_STEPS, LOCAL_PRODUCTS)
-        return relax(shell, x, references, self.polish, POLISH_PRODUCTS)
+    def _levelled(self, stiffness: list[Tensor]) -> Stiffness:
+        """Stiffnesses of the elements of the fine mesh, on those of each level."""
+        levels = self.space.levels
+        coarse, *sampled = levels.energies
+        parts = zip(levels.members[0], coarse.parts, strict=True)
+        found = [[coarse_values(stiffness[i], self.fine.parts[i], part, self.frame.clusters) for i, part in parts]]
+        if sampled:
+            found.append([stiffness[i] for i in levels.members[1]])
+        return Stiffness(stiffness, found)
+
+    def _anchors(self, placed: Pair, t: Tensor) -> Tensor | None:
+        """Those of all terms, in the frame. *Shape:* ``(B, P, 3)``."""
+        points = [part.term.anchors for part in self.fine.parts if part.term.anchors is not None]
+        if not points:
+            return None
+        return self.frame.bring(torch.cat(points).to(t).expand(len(t), -1, -1), placed, t)
 
     def _solvable(self, pair: Pair) -> Tensor:
         """Whether both ends have a size, and, where closed, the same side out: else the volume would vanish on the way.
 
-        *Shape:* ``(B,)``.
+        *Shape:* ``(P,)``.
         """
-        faces = self.space.frame.faces
-        ends = [x.detach().movedim(-1, 0) for x in (pair.first, pair.second)]
-        sizes = [(x.amax(-1) - x.amin(-1)).norm(dim=0) for x in ends]
-        first, second = (enclosed_volume(x, faces) for x in ends)
+        faces = self.frame.faces
+        ends = [x.detach() for x in (pair.first, pair.second)]
+        sizes = [(x.amax(-2) - x.amin(-2)).norm(dim=-1) for x in ends]
+        first, second = (torch.linalg.det(x[:, faces]).sum(-1) for x in ends)
         mirrored = (first * second < 0) & self.closed
         return (torch.minimum(*sizes) > SMALLEST_SIZE * DIAGONAL) & ~mirrored
 
@@ -169,10 +198,11 @@ def report(solution: Solution, max_steps: int, forbid: bool) -> None:
     Raises:
         ConvergenceError: Something did not converge, and that is an error.
     """
-    missed = ~solution.converged
+    missed = ~solution.usable
     if not bool(missed.any()):
         return
     counts = {status.name: int((solution.status == status).sum()) for status in Status if status}
+    counts.pop(Status.ENOUGH.name)
     message = (
         f"{int(missed.sum())} of {missed.numel()} in-betweens did not converge in {max_steps} steps "
         f"({', '.join(f'{n} {name}' for name, n in counts.items() if n)}): no gradient flows through their amplitudes; "

@@ -1,12 +1,9 @@
 """A shape between two key-frames by local rotations, with every vertex free: what the modes then improve."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
@@ -21,7 +18,8 @@ class RotationBlend(nn.Module):
     linear interpolation; vertices that no face uses are pieces of their own.
 
     Args:
-        shell: The energy on the fine mesh.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        edges: Those of :func:`~torch_modal.geometry.connectivity.unique_edges`. *Shape:* ``(E, 2)``.
         references: Two shapes near the key-frames. *Shape:* ``(2, V, 3)``.
     """
 
@@ -30,32 +28,29 @@ class RotationBlend(nn.Module):
     shares: Tensor
     free: Tensor
 
-    def __init__(self, shell: ShellEnergy, references: Tensor) -> None:
+    def __init__(self, faces: Tensor, edges: Tensor, references: Tensor) -> None:
         super().__init__()
         n = references.shape[-2]
-        self.rotations = LocalRotations(shell.faces, shell.edges, references)
-        self.register_buffer("edges", shell.edges.clone())
-        piece = connectivity.vertex_pieces(shell.edges.cpu().numpy(), n)
-        self.register_buffer("vertex_piece", torch.from_numpy(piece))
-        self.register_buffer("shares", (1 / torch.bincount(self.vertex_piece).to(references))[piece])
+        self.rotations = LocalRotations(faces, edges, references)
+        self.register_buffer("edges", edges.clone(), persistent=False)
+        piece = connectivity.vertex_pieces(edges.cpu().numpy(), n)
+        self.register_buffer("vertex_piece", torch.from_numpy(piece), persistent=False)
+        self.register_buffer("shares", (1 / torch.bincount(self.vertex_piece).to(references))[piece], persistent=False)
         # One vertex of each piece is held, and the piece placed afterwards.
         free = torch.ones(n, dtype=torch.bool)
         free[np.unique(piece, return_index=True)[1]] = False
-        self.register_buffer("free", free)
-        self._solver: SparseSolver | None = None
-
-    def _load_from_state_dict(self, *args: Any) -> None:
-        super()._load_from_state_dict(*args)
-        self._solver = None
+        self.register_buffer("free", free, persistent=False)
+        self._made: tuple[Tensor, SparseSolver] | None = None
 
     @property
     def solver(self) -> SparseSolver:
-        """The Laplacian's inverse, of what the buffers say now."""
-        if self._solver is None:
-            edges, weights = self.edges.cpu().numpy(), self.rotations.per_length.double().cpu().numpy()
-            laplacian = graph_laplacian(edges, weights, len(self.free))
-            self._solver = SparseSolver(laplacian, torch.nonzero(self.free).flatten().cpu().numpy())
-        return self._solver
+        """The Laplacian's inverse, of what the buffers say now: others may stand in for them, as in functional_call."""
+        weights = self.rotations.per_length
+        if self._made is None or not (weights is self._made[0] or torch.equal(weights, self._made[0])):
+            edges, values = self.edges.cpu().numpy(), weights.double().cpu().numpy()
+            laplacian = graph_laplacian(edges, values, len(self.free))
+            self._made = weights, SparseSolver(laplacian, torch.nonzero(self.free).flatten().cpu().numpy())
+        return self._made[1]
 
     def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t``. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``."""

@@ -1,19 +1,14 @@
 """Between the caller's coordinates and the frame in which an in-between is sought."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import RigidMotion, best_fit
-from torch_modal.keyframes.check import check_keyframes
-from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.coarsening import coarsen
-
-# Eq. 5 is not scale-invariant: its stiffnesses are meant for shapes of this bounding-box diagonal.
-DIAGONAL = 100.0
 
 # Combinations of columns whose squared norm is below this part of the largest are rounding, not directions.
 DEPENDENT = 1e-9
@@ -45,8 +40,8 @@ class Columns(nn.Module):
 
     def __init__(self, fine: Tensor, coarse: Tensor) -> None:
         super().__init__()
-        self.register_buffer("fine", fine)
-        self.register_buffer("coarse", coarse)
+        self.register_buffer("fine", fine, persistent=False)
+        self.register_buffer("coarse", coarse, persistent=False)
 
     def combine(self, a: Tensor) -> Tensor:
         """Fine displacement of given amplitudes. *Shape:* ``(..., n) -> (..., V, 3)``."""
@@ -57,12 +52,9 @@ class Frame(nn.Module):
     """The scale of 100, the alignment of two bases, and the coarse mesh that the energy is evaluated on.
 
     Args:
-        bases: The basis at each end.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        shapes: The reference of the basis at each end, float64 on the CPU, checked. *Shape:* ``(2, V, 3)``.
+        faces: Vertex indices, likewise. *Shape:* ``(F, 3)``.
         coarse_faces: Number of faces of the coarse mesh.
-
-    Raises:
-        ValueError: The bases do not fit each other or the faces.
     """
 
     scale: Tensor
@@ -75,15 +67,8 @@ class Frame(nn.Module):
     reference: Tensor
     turn: Tensor
 
-    def __init__(self, bases: Sequence[ModalBasis], faces: Tensor, coarse_faces: int) -> None:
+    def __init__(self, shapes: Tensor, faces: Tensor, coarse_faces: int) -> None:
         super().__init__()
-        if bases[0].n_vertices != bases[1].n_vertices:
-            raise ValueError(
-                f"the bases belong to meshes of {bases[0].n_vertices} and {bases[1].n_vertices} vertices; both ends "
-                "of an in-between need one connectivity"
-            )
-        ends = [basis.to("cpu", torch.float64) for basis in bases]
-        shapes, faces = check_keyframes([end.reference for end in ends], faces, warn=False)
         used = shapes[0][faces.unique()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
         # The areas of both ends, so that neither of them comes first.
@@ -97,21 +82,20 @@ class Frame(nn.Module):
         per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
 
         self.n_coarse = coarsening.n_vertices
-        self.register_buffer("scale", scale)
-        self.register_buffer("faces", faces)
-        self.register_buffer("coarse_faces", torch.from_numpy(coarsening.faces))
-        self.register_buffer("weights", weights)
-        self.register_buffer("coarse_weights", per_cluster.index_add(0, clusters, weights))
-        self.register_buffer("clusters", clusters)
-        self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters])
-        self.register_buffer("reference", references[0].clone())
+        self.register_buffer("scale", scale, persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
+        self.register_buffer("coarse_faces", torch.from_numpy(coarsening.faces), persistent=False)
+        self.register_buffer("weights", weights, persistent=False)
+        self.register_buffer("coarse_weights", per_cluster.index_add(0, clusters, weights), persistent=False)
+        self.register_buffer("clusters", clusters, persistent=False)
+        self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters], persistent=False)
+        self.register_buffer("reference", references[0].clone(), persistent=False)
         #: Rigid motions of the shape half-way between the references, to first order.
         self.rigid = self.orthonormal(_rigid_fields(references.mean(0)))
-        self.register_buffer("turn", turn.rotation)
+        self.register_buffer("turn", turn.rotation, persistent=False)
 
-    def modes(self, bases: Sequence[ModalBasis]) -> list[Tensor]:
+    def modes(self, first: Tensor, second: Tensor) -> list[Tensor]:
         """Modes of both ends, turned into this frame; their scale does not matter. *Shape of each:* ``(k, V, 3)``."""
-        first, second = (basis.modes.to(self.turn) for basis in bases)
         return [first, second @ self.turn.mT]
 
     def coarsen(self, x: Tensor) -> Tensor:
@@ -169,6 +153,10 @@ class Frame(nn.Module):
             t: *Shape:* ``(B,)``.
         """
         return pair.placed.inverse().apply(pair.between.fraction(t).apply(x) / self.scale)
+
+    def bring(self, points: Tensor, pair: Pair, t: Tensor) -> Tensor:
+        """The inverse of :meth:`restore`, of points of the caller's. *Shape:* ``(B, P, 3), (B,) -> (B, P, 3)``."""
+        return pair.between.fraction(t).inverse().apply(pair.placed.apply(points) * self.scale)
 
 
 def _rigid_fields(x: Tensor) -> Tensor:

@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.shell import ShellEnergy
+from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.vectors import pick
 
 # Directions that move no edge (coincident key-frames) get no amplitude.
 RIDGE = 1e-9
@@ -14,27 +15,28 @@ class Guess(nn.Module):
     r"""The amplitudes of :math:`\min_a \sum_e |e(a) - \bar e|^2 / l_e`, with edges from :class:`LocalRotations`.
 
     Args:
-        shell: The energy on the coarse mesh.
-        edge_columns: Edge vectors in each direction of the space. *Shape:* ``(E, 3, n)``.
+        mesh: The coarse mesh.
+        columns: Directions of the space. *Shape:* ``(n, V, 3)``.
         references: Two shapes near the key-frames. *Shape:* ``(2, V, 3)``.
     """
 
+    edges: Tensor
+    edge_columns: Tensor
     gram: Tensor
 
-    def __init__(self, shell: ShellEnergy, edge_columns: Tensor, references: Tensor) -> None:
+    def __init__(self, mesh: Mesh, columns: Tensor, references: Tensor) -> None:
         super().__init__()
-        self.rotations = LocalRotations(shell.faces, shell.edges, references)
-        columns = edge_columns.flatten(0, 1)
-        self.register_buffer("gram", columns.mT @ (columns * self.rotations.per_length.repeat_interleave(3)[:, None]))
+        self.rotations = LocalRotations(mesh.faces, mesh.edges, references)
+        self.register_buffer("edges", mesh.edges.clone(), persistent=False)
+        vectors = self._vectors(columns).permute(2, 0, 1).flatten(0, 1).contiguous()
+        self.register_buffer("edge_columns", vectors, persistent=False)
+        weights = self.rotations.per_length.repeat_interleave(3)[:, None]
+        self.register_buffer("gram", vectors.mT @ (vectors * weights), persistent=False)
 
-    def forward(
-        self, shell: ShellEnergy, edge_columns: Tensor, first: Tensor, second: Tensor, extra: Tensor, t: Tensor
-    ) -> Tensor:
+    def forward(self, first: Tensor, second: Tensor, extra: Tensor, t: Tensor) -> Tensor:
         """The amplitudes; linear interpolation has zeros.
 
         Args:
-            shell: The energy on the coarse mesh.
-            edge_columns: As above.
             first: Key-frames at 0. *Shape:* ``(B, V, 3)``.
             second: Key-frames at 1. *Shape:* ``(B, V, 3)``.
             extra: One more direction, of each sample's own. *Shape:* ``(B, V, 3)``.
@@ -43,11 +45,8 @@ class Guess(nn.Module):
         Returns:
             NaN where key-frames are not finite. *Shape:* ``(B, n + 1)``.
         """
-        straight, own = (
-            shell.edge_vectors(x.movedim(-1, 0).contiguous())
-            for x in (torch.lerp(first, second, t[:, None, None]), extra)
-        )
-        columns = edge_columns.flatten(0, 1)
+        straight, own = self._vectors(torch.lerp(first, second, t[:, None, None])), self._vectors(extra)
+        columns = self.edge_columns
         missing = self.rotations(first, second, t) - straight
         per_length = self.rotations.per_length
         missing, weighted, own = (x.permute(1, 2, 0).flatten(1) for x in (missing * per_length, own * per_length, own))
@@ -59,3 +58,9 @@ class Guess(nn.Module):
         ridge = RIDGE * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
         factor, _ = torch.linalg.cholesky_ex(gram + ridge * torch.eye(gram.shape[-1]).to(gram))
         return torch.cholesky_solve(right[..., None], factor).squeeze(-1)
+
+    def _vectors(self, x: Tensor) -> Tensor:
+        """Edge vectors, components first. *Shape:* ``(B, V, 3) -> (3, B, E)``."""
+        rows = x.movedim(-1, 0).contiguous()
+        start, end = self.edges.unbind(1)
+        return pick(rows, end) - pick(rows, start)

@@ -1,18 +1,18 @@
 """Shapes between two key-frames at any time, as a differentiable layer."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.nn.between import Between, InBetweenResult, report
+from torch_modal.keyframes.check import check_keyframes
+from torch_modal.nn.between import Between, InBetweenResult, Samples, report
+from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
-
-# The best of a grid over three spans of a hand (tests/benchmarks/quality.py); it depends on the mesh.
-DEFAULT_MU = 1.0
 
 
 class InBetween(nn.Module):
@@ -21,156 +21,176 @@ class InBetween(nn.Module):
     The key-frames may be any shapes of this connectivity near those that the bases were made from. They are given in
     the caller's coordinates and units, and so is the result. A rigid motion between them is taken out first and then
     followed along its geodesic; a rigid motion of both moves the result along. At half a turn, where both senses are
-    equally short, the one that kornia's quaternion gives is taken.
+    equally short, one is taken.
 
     Gradients reach the key-frames, the times, ``mu`` and the stiffnesses. The modes are constants.
+
+    It computes in its own dtype, float64 unless ``.to(torch.float32)`` says otherwise, and never below float32: under
+    ``autocast``, ``.half()`` and ``.bfloat16()`` it stays there. Results have the dtype of the key-frames.
 
     Args:
         bases: The bases (:func:`torch_modal.extract_bases`); one alone serves for both ends.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        space: ``"joint"`` (one shape in the sum of both spaces) or ``"paired"`` (Eq. 4 of the paper, t = 1/2 only).
-        mu: Weight of the similarity of Eq. 4; of no effect in the joint space.
+        preset: ``"accurate"``, ``"fast"`` or ``"paper"``: docs/layer.md says what each costs and gives.
+        objective: What is minimised, in the place of the preset's.
+        solver: How it is solved, in the place of the preset's.
         pairs: Which bases belong together, where there are more than two. Default: each with the next.
-        alpha: Stretching stiffness of Eq. 5: a number, or a tensor or parameter of one value or ``(B,)``.
-        beta: Bending stiffness of Eq. 5, likewise.
-        gamma: Volume stiffness of Eq. 5, likewise.
-        coarse_faces: Faces of the mesh that the energy is evaluated on.
-        max_steps: Gauss-Newton steps at most; exactly that many with ``gradient="unroll"``.
-        tolerance: Bound on the gradient norm, relative to the one at the start.
-        least_gain: A step that promises less than this part of the energy is the last one. At 0.01 the result is the
-            same to the eye at half the time; gradients are then only as exact. 0 goes on to the tolerance.
-        gradient: ``"implicit"`` (by the implicit function theorem with the full Hessian; memory does not grow with the
-            steps) or ``"unroll"`` (through all steps).
-        unconverged: What happens when samples did not converge: ``"warn"`` warns and lets no gradient flow through
-            their amplitudes, ``"raise"`` raises where gradients are recorded. With ``gradient="unroll"`` only
-            :meth:`solve` tells.
-        rotations: Whether the modes are added to a blend by local rotations of the triangles, in place of linear
-            interpolation: less is then left for them to do. Joint space only. It solves a sparse system on the CPU.
-        local: Whether all vertices take a few steps on the fine mesh at the end, for what the modes cannot reach:
-            fingertips, hooves, creases. Gradients go through these steps; they cost memory in proportion to V.
-        polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
 
     Raises:
         ValueError: An argument is not usable.
     """
 
+    terms: Any
+    bases: Any
+    members: Any
+
     def __init__(
         self,
         bases: ModalBasis | Sequence[ModalBasis],
         faces: Tensor,
-        space: str = "joint",
-        mu: float | Tensor = DEFAULT_MU,
+        preset: Preset = "accurate",
         *,
+        objective: Objective | None = None,
+        solver: Solver | None = None,
         pairs: Sequence[tuple[int, int]] | None = None,
-        alpha: float | Tensor = 500.0,
-        beta: float | Tensor = 10.0,
-        gamma: float | Tensor = 1000.0,
-        coarse_faces: int = 1000,
-        max_steps: int = 40,
-        tolerance: float = 1e-10,
-        least_gain: float = 0.0,
-        gradient: str = "implicit",
-        unconverged: str = "warn",
-        rotations: bool = False,
-        local: bool = False,
-        polish: int = 0,
     ) -> None:
         super().__init__()
         bases = [bases, bases] if isinstance(bases, ModalBasis) else list(bases)
         if len(bases) < 2:
             raise ValueError(f"an in-between needs two bases, got {len(bases)}; pass [basis_a, basis_b]")
-        if gradient not in ("implicit", "unroll"):
-            raise ValueError(f"gradient is 'implicit' or 'unroll', got {gradient!r}")
-        if unconverged not in ("warn", "raise"):
-            raise ValueError(f"unconverged is 'warn' or 'raise', got {unconverged!r}")
-        if rotations and space == "paired":
-            raise ValueError("rotations=True needs space='joint': Eq. 4 of the paired space starts from the key-frames")
-        if not 0 <= least_gain < 1:
-            raise ValueError(f"least_gain is a part of the energy, from 0 to less than 1; got {least_gain!r}")
-        if not isinstance(polish, int) or polish < 0:
-            raise ValueError(f"polish is a number of steps, 0 or more; got {polish!r}")
         self.pairs = list(pairs) if pairs is not None else [(i, i + 1) for i in range(len(bases) - 1)]
         if not self.pairs or any(not 0 <= i < len(bases) for pair in self.pairs for i in pair):
             raise ValueError(f"pairs hold indices of {len(bases)} bases, got {self.pairs}")
-        self.members = nn.ModuleList(
+        sizes = sorted({basis.n_vertices for basis in bases})
+        if len(sizes) > 1:
+            raise ValueError(f"the bases belong to meshes of {sizes} vertices; an in-between needs one connectivity")
+        self.objective, self.solver = settings(preset, objective, solver)
+        self.terms = nn.ModuleList(self.objective.all_terms())
+        mu = self.objective.mu
+        if isinstance(mu, Tensor) and not isinstance(mu, nn.Parameter):
+            self.register_buffer("mu", mu)
+        else:
+            self.mu = mu
+        self.bases = nn.ModuleList(_Basis(basis) for basis in bases)
+        _, self._faces = check_keyframes([basis.reference.double().cpu() for basis in bases], faces, warn=False)
+        self._build()
+        self.register_load_state_dict_post_hook(_rebuild)
+
+    def _build(self) -> None:
+        """What follows from the bases, on their device and in their dtype."""
+        like = self.bases[0].reference
+        ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
+        made = [
             Between(
-                [bases[i], bases[j]], faces, space, mu, (alpha, beta, gamma), coarse_faces, rotations, local, polish
+                torch.stack([ends[i][0], ends[j][0]]),
+                [ends[i][1], ends[j][1]],
+                self._faces.cpu(),
+                self.objective,
+                self.solver,
+                list(self.terms),
             )
             for i, j in self.pairs
-        )
-        self.max_steps = max_steps
-        self.tolerance = tolerance
-        self.least_gain = least_gain
-        self.gradient = gradient
-        self.unconverged = unconverged
+        ]
+        self.members = nn.ModuleList(made).to(like)
+        self._made_from = [basis.reference for basis in self.bases] + [basis.modes for basis in self.bases]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "InBetween":
+        """Never below float32."""
+
+        def kept(tensor: Tensor) -> Tensor:
+            out = fn(tensor)
+            low = out.is_floating_point() and torch.finfo(out.dtype).bits < 32
+            return tensor.to(out.device, torch.float32) if low else out
+
+        return super()._apply(kept, recurse)
 
     def solve(self, x_a: Tensor, x_b: Tensor, t: Tensor | float, pair: Tensor | int = 0) -> InBetweenResult:
         """The in-betweens, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         return self._batched(x_a, x_b, t, pair, None)
 
-    def _batched(
-        self, x_a: Tensor, x_b: Tensor, t: Tensor | float, pair: Tensor | int, report: Callable[[Solution], None] | None
-    ) -> InBetweenResult:
-        times = self._check(x_a, x_b, t)
-        lead = torch.broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], times.shape[:-1])
-        n_times, item = times.shape[-1], x_a.shape[-2:]
-        flat_t = times.expand(*lead, n_times).reshape(-1)
-        flat_a, flat_b = (
-            x.to(self.dtype).expand(*lead, *item)[..., None, :, :].expand(*lead, n_times, *item).reshape(-1, *item)
-            for x in (x_a, x_b)
-        )
-        result = self._solve(flat_a, flat_b, flat_t, self._chosen(pair, lead, n_times), report)
-        result_type = torch.promote_types(x_a.dtype, x_b.dtype)
-        shapes = result.shapes.to(result_type).reshape(*lead, n_times, *item)
-        # The ends are the key-frames to the last bit; their gradients are those of the in-between there.
-        for end, x in ((0, x_a), (1, x_b)):
-            exact = x[..., None, :, :].to(result_type).detach() + (shapes - shapes.detach())
-            shapes = torch.where((times == end)[..., None, None], exact, shapes)
-        return InBetweenResult(
-            shapes, Solution(*(value.reshape(*lead, n_times, *value.shape[1:]) for value in result.solution))
-        )
-
     def forward(self, x_a: Tensor, x_b: Tensor, t: Tensor | float, pair: Tensor | int = 0) -> Tensor:
         """The in-betweens.
+
+        All leading dimensions broadcast against each other, as in ``torch.lerp``: a number gives one shape for each
+        pair of key-frames, ``t`` of ``(B,)`` with ``(B, V, 3)`` each its own time, ``t`` of ``(T,)`` with ``(V, 3)`` T
+        times, and with ``x_a[:, None]`` all pairs, where what does not depend on the time is computed once.
 
         Args:
             x_a: Key-frames at 0. *Shape:* ``(..., V, 3)``.
             x_b: Key-frames at 1. *Shape:* ``(..., V, 3)``.
-            t: Times in [0, 1], the same for all samples or each its own. *Shape:* ``(T,)``, ``(..., T)``, or a number.
+            t: Times in [0, 1]. *Shape:* ``(...)``, or a number.
             pair: Which of the ``pairs`` each sample lies between. *Shape:* ``(...)``, or one number.
 
         Returns:
-            The key-frames exactly at 0 and 1. *Shape:* ``(..., T, V, 3)``.
+            The key-frames exactly at 0 and 1. *Shape:* ``(..., V, 3)``.
 
         Raises:
             ValueError: Shapes, dtypes, devices or times that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
         """
-        forbid = self.unconverged == "raise" and torch.is_grad_enabled()
-        return self._batched(x_a, x_b, t, pair, partial(report, max_steps=self.max_steps, forbid=forbid)).shapes
+        forbid = self.solver.unconverged == "raise" and torch.is_grad_enabled()
+        told = partial(report, max_steps=self.solver.max_steps, forbid=forbid)
+        return self._batched(x_a, x_b, t, pair, told).shapes
 
     @property
     def dtype(self) -> torch.dtype:
         """What is computed in."""
-        return self._reference.dtype
+        return self.members[0].frame.reference.dtype
 
-    @property
-    def _reference(self) -> Tensor:
-        space: Any = self.members[0].space
-        return space.frame.reference
-
-    def _solve(
-        self, x_a: Tensor, x_b: Tensor, t: Tensor, chosen: Tensor | int, report: Callable[[Solution], None] | None
+    def _batched(
+        self, x_a: Tensor, x_b: Tensor, t: Tensor | float, pair: Tensor | int, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
-        options = (self.gradient, self.max_steps, self.tolerance, self.least_gain, report)
-        if isinstance(chosen, int):
-            return self.members[chosen](x_a, x_b, t, *options)
+        times = self._check(x_a, x_b, t)
+        chosen = self._chosen(pair)
+        item = x_a.shape[-2:]
+        own = torch.broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], *([] if chosen is None else [chosen.shape]))
+        lead = torch.broadcast_shapes(own, times.shape)
+        flat_a, flat_b = (x.to(self.dtype).expand(*own, *item).reshape(-1, *item) for x in (x_a, x_b))
+        index = None
+        if own != lead:
+            index = torch.arange(len(flat_a), device=times.device).reshape(own).expand(lead).reshape(-1)
+        samples = Samples(
+            flat_a, flat_b, index, times.expand(lead).reshape(-1), self._mu(times, lead), self._stiffness(times, lead)
+        )
+        recorded = (x_a, x_b, times, samples.mu, *samples.stiffness)
+        exact = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in recorded)
+        with _full_precision(times.device.type):
+            if chosen is None:
+                result = self.members[0 if isinstance(pair, Tensor) else pair](samples, exact, report)
+            else:
+                result = self._of_several(samples, chosen.expand(own).reshape(-1), exact, report)
+        result_type = torch.promote_types(x_a.dtype, x_b.dtype)
+        shapes = result.shapes.to(result_type).reshape(*lead, *item)
+        # The ends are the key-frames to the last bit; their gradients are those of the in-between there.
+        for end, x in ((0, x_a), (1, x_b)):
+            exactly = x.to(result_type).detach() + (shapes - shapes.detach())
+            shapes = torch.where((times == end)[..., None, None], exactly, shapes)
+        return InBetweenResult(shapes, Solution(*(value.reshape(lead + value.shape[1:]) for value in result.solution)))
+
+    def _of_several(
+        self, samples: Samples, chosen: Tensor, exact: bool, report: Callable[[Solution], None] | None
+    ) -> InBetweenResult:
+        """Samples that lie between different pairs of bases."""
+        index = torch.arange(len(chosen), device=chosen.device) if samples.which is None else samples.which
         order, parts = [], []
         for i, member in enumerate(self.members):
-            mine = torch.nonzero(chosen == i).flatten()
-            if len(mine):
-                order.append(mine)
-                parts.append(member(x_a[mine], x_b[mine], t[mine], *options))
+            pairs = chosen == i
+            mine = torch.nonzero(pairs[index]).flatten()
+            if not len(mine):
+                continue
+            places = pairs.cumsum(0)[index[mine]] - 1
+            picked = Samples(
+                samples.x_a[pairs],
+                samples.x_b[pairs],
+                None if samples.which is None else places,
+                samples.t[mine],
+                samples.mu[mine],
+                [values[mine] for values in samples.stiffness],
+            )
+            order.append(mine)
+            parts.append(member(picked, exact, report))
+        if not parts:
+            return self.members[0](samples, exact, report)  # of nothing, nothing
         back = torch.argsort(torch.cat(order))
         widest = max(part.solution.amplitudes.shape[-1] for part in parts)
         amplitudes = torch.cat(
@@ -180,20 +200,24 @@ class InBetween(nn.Module):
         shapes = torch.cat([part.shapes for part in parts])
         return InBetweenResult(shapes[back], Solution(amplitudes[back], *others))
 
-    def _chosen(self, pair: Tensor | int, lead: torch.Size, n_times: int) -> Tensor | int:
-        if isinstance(pair, int) or pair.dim() == 0 or len(self.members) == 1:
-            pair = int(pair) if isinstance(pair, int) or pair.dim() == 0 else 0
-            if not 0 <= pair < len(self.members):
-                raise ValueError(f"pair is one of 0 to {len(self.members) - 1}, got {pair}")
-            return pair
-        if bool(((pair < 0) | (pair >= len(self.members))).any()):
-            raise ValueError(f"pair holds numbers from 0 to {len(self.members) - 1}, got up to {int(pair.max())}")
-        return pair.expand(lead)[..., None].expand(*lead, n_times).reshape(-1)
+    # ------------------------------------------------------------------------------------------------------ the border
+    def _chosen(self, pair: Tensor | int) -> Tensor | None:
+        """Which pair each sample lies between; None where all lie between the same."""
+        last = len(self.members) - 1
+        if not isinstance(pair, Tensor):
+            if not isinstance(pair, int) or not 0 <= pair <= last:
+                raise ValueError(f"pair is one of 0 to {last}, or a tensor of them; got {pair!r}")
+            return None
+        if pair.is_floating_point() or bool(((pair < 0) | (pair > last)).any()):
+            raise ValueError(f"pair holds whole numbers from 0 to {last}; got {pair.dtype} up to {pair.max()}")
+        return pair if last else None
 
     def _check(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
-        """Times as a tensor ``(..., T)``."""
-        reference = self._reference
+        """Times as a tensor."""
+        reference = self.members[0].frame.reference
         for name, x in (("x_a", x_a), ("x_b", x_b)):
+            if not isinstance(x, Tensor):
+                raise ValueError(f"{name} is a {type(x).__name__}; pass a tensor, for instance torch.as_tensor({name})")
             if x.shape[-2:] != reference.shape or not x.is_floating_point():
                 raise ValueError(
                     f"{name} must be floating-point of shape (..., {len(reference)}, 3) as the bases are; got "
@@ -202,4 +226,72 @@ class InBetween(nn.Module):
             if x.device != reference.device:
                 raise ValueError(f"{name} is on {x.device}, the layer on {reference.device}; move one with .to()")
         times = torch.as_tensor(t, dtype=reference.dtype, device=reference.device)
-        return times[None] if times.dim() == 0 else times
+        try:
+            torch.broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], times.shape)
+        except RuntimeError:
+            raise ValueError(
+                f"t of shape {tuple(times.shape)} does not broadcast against key-frames of {tuple(x_a.shape[:-2])} and "
+                f"{tuple(x_b.shape[:-2])}; for all times of all pairs pass x_a[:, None] and x_b[:, None]"
+            ) from None
+        return times
+
+    def _mu(self, times: Tensor, lead: torch.Size) -> Tensor:
+        """*Shape:* ``(B,)``."""
+        mu = torch.as_tensor(self.mu, dtype=times.dtype, device=times.device)
+        try:
+            return mu.expand(lead).reshape(-1)
+        except RuntimeError:
+            raise ValueError(
+                f"mu of shape {tuple(mu.shape)} does not broadcast against samples of {tuple(lead)}"
+            ) from None
+
+    def _stiffness(self, times: Tensor, lead: torch.Size) -> list[Tensor]:
+        """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+        found = []
+        for term, part in zip(self.terms, self.members[0].fine.parts, strict=True):
+            values = torch.as_tensor(term.stiffness, dtype=times.dtype, device=times.device)
+            values = values[None] if values.dim() == 0 else values
+            n = 1 if term.total else part.corners.shape[1]
+            try:
+                if values.shape[-1] not in (1, n):
+                    raise RuntimeError
+                found.append(values.expand(*lead, values.shape[-1]).reshape(-1, values.shape[-1]))
+            except RuntimeError:
+                raise ValueError(
+                    f"a stiffness of {type(term).__name__} has shape {tuple(values.shape)}; its last dimension counts "
+                    f"the {n} elements or is 1, its others broadcast against samples of {tuple(lead)}: one for each "
+                    "sample is values[:, None]"
+                ) from None
+        return found
+
+
+class _Basis(nn.Module):
+    """What a layer keeps of a basis: all else follows from it."""
+
+    reference: Tensor
+    modes: Tensor
+
+    def __init__(self, basis: ModalBasis) -> None:
+        super().__init__()
+        self.register_buffer("reference", basis.reference.double())
+        self.register_buffer("modes", basis.modes.double())
+
+
+def _rebuild(layer: InBetween, *_: Any) -> None:
+    """After other bases were loaded, what follows from them is made anew."""
+    layer._build()
+
+
+@contextmanager
+def _full_precision(device: str) -> Iterator[None]:
+    """No autocast, and no TF32 or bfloat16 inside products of float32: factorisations would fail."""
+    precision = torch.get_float32_matmul_precision()
+    with torch.autocast(device, enabled=False):
+        if precision == "highest":
+            yield
+            return
+        torch.set_float32_matmul_precision("highest")
+        try:
+            yield
+        finally:
+            torch.set_float32_matmul_precision(precision)

@@ -6,19 +6,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.linearised import energy_of, references_between
-from torch_modal.energy.shell import ShellEnergy
+from torch_modal.energy.terms import Mesh
+from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.guess import Guess
-from torch_modal.nn.modal_energy import ModalShell, Placement
+from torch_modal.nn.levels import Levels, Stiffness
+from torch_modal.nn.modal_energy import Placement
 
 
 class JointProblem(NamedTuple):
     """The in-between of each sample as a minimisation."""
 
-    inputs: tuple[Tensor, ...]
-    """What the minimiser depends on, for :meth:`JointSpace.placement`. *Shape of each:* ``(B, ...)``."""
+    placement: tuple[Placement, ...]
+    """What the minimiser depends on."""
+    start: Tensor
+    """Where the minimisation may start. *Shape:* ``(B, n)``."""
     base: Tensor
     """The fine shape that the modes are added to. *Shape:* ``(B, V, 3)``."""
     difference: Tensor
@@ -34,61 +37,74 @@ class JointSpace(nn.Module):
 
     Args:
         frame: Frame of the two bases.
-        shell: Energy on the frame's coarse mesh.
+        levels: The energies of the modal solve.
         modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
         references: Shapes that the modes belong to, in the frame. *Shape:* ``(2, V, 3)``.
-        rotations: Whether there is a blend by local rotations.
+        fine: The fine mesh, if there is a blend by local rotations.
     """
 
     def __init__(
-        self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor], references: Tensor, rotations: bool
+        self, frame: Frame, levels: Levels, modes: Sequence[Tensor], references: Tensor, fine: Mesh | None
     ) -> None:
         super().__init__()
-        self.frame = frame
+        self.frame, self.levels = frame, levels
         self.columns = frame.elastic_columns(torch.cat(list(modes)))
-        self.energy = ModalShell(shell, self.columns.coarse)
+        self.energy = levels.modal(self.columns)
         # With the blend as the base there is nothing left to guess.
-        self.blend = RotationBlend(ShellEnergy(frame.faces), references) if rotations else None
-        self.first_guess = None if rotations else Guess(shell, self.energy.edge_columns, frame.coarsen(references))
+        self.blend = None if fine is None else RotationBlend(fine.faces, fine.edges, references)
+        coarse = frame.coarsen(references)
+        self.guess = Guess(levels.mesh, self.columns.coarse, coarse) if fine is None else None
 
     @property
     def n_unknowns(self) -> int:
         """Number of amplitudes."""
         return len(self.columns.fine) + 1
 
-    def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> JointProblem:
-        """Set up the in-betweens of a batch at the times ``t``; ``mu`` plays no part. *Shape of each:* ``(B,)``."""
-        base, difference = torch.lerp(pair.first, pair.second, t[:, None, None]), self._difference(pair)
-        first, second, coarse_base, coarse_difference = (
-            self.frame.coarsen(x) for x in (pair.first, pair.second, base, difference)
+    def problem(
+        self, pair: Pair, index: Tensor | None, t: Tensor, stiffness: Stiffness, mu: Tensor, anchors: Tensor | None
+    ) -> JointProblem:
+        """Set up the in-betweens of a batch.
+
+        Args:
+            pair: P pairs of key-frames.
+            index: Which of them each sample lies between; each its own where None. *Shape:* ``(B,)``.
+            t: Times. *Shape:* ``(B,)``.
+            stiffness: Of each sample.
+            mu: Plays no part.
+            anchors: Of the terms, in the frame. *Shape:* ``(B, P, 3)``.
+        """
+        levels = self.levels
+        difference = self._difference(pair)
+        coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
+        ends = [levels.seen(pair.first, coarse_first), levels.seen(pair.second, coarse_second)]
+        extras = levels.seen(difference, self.frame.coarsen(difference))
+        rests_a, rests_b = (levels.rests(end) for end in ends)
+        references = levels.between(rests_a, rests_b, index, t, stiffness)
+        own = (pair.first, pair.second, difference, coarse_first, coarse_second, extras)
+        first, second, difference, coarse_first, coarse_second, extras = (
+            own if index is None else trees.rows(own, index)
         )
-        if self.blend is not None:
-            blend = self.blend(pair.first, pair.second, t)
-            coarse_blend = self.frame.coarsen(blend)
+        base = torch.lerp(first, second, t[:, None, None])
+        coarse_base = torch.lerp(coarse_first, coarse_second, t[:, None, None])
+        placement = levels.place(self.energy, levels.seen(base, coarse_base), references, extras, anchors)
+        start = t.new_zeros(len(t), self.n_unknowns)
+        if self.guess is not None:
             with torch.no_grad():
-                shell = self.energy.shell
-                references = references_between(shell, first, second, t, alpha, beta, gamma)
-                energies = [energy_of(shell, shell.measure(x), references) for x in (coarse_base, coarse_blend)]
-            better = (energies[1] < energies[0])[:, None, None]
-            base, coarse_base = torch.where(better, blend, base), torch.where(better, coarse_blend, coarse_base)
-        return JointProblem((first, second, coarse_difference, coarse_base, t, alpha, beta, gamma), base, difference)
-
-    def placement(
-        self, first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor
-    ) -> Placement:
-        """The minimisation on the coarse mesh, from the inputs of a problem."""
-        return Placement(base, difference, references_between(self.energy.shell, first, second, t, *stiffness))
-
-    def guess(
-        self, first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor
-    ) -> Tensor | None:
-        """Where the minimisation may start, from the inputs of a problem; None: at zeros. *Shape:* ``(B, n)``."""
-        if self.first_guess is None:
-            return None
-        return self.first_guess(self.energy.shell, self.energy.edge_columns, first, second, difference, t)
+                start = self.guess(coarse_first, coarse_second, extras[0], t)
+        if self.blend is not None:
+            blend = self.blend(first, second, t)
+            turned = levels.place(
+                self.energy, levels.seen(blend, self.frame.coarsen(blend)), references, extras, anchors
+            )
+            with torch.no_grad():
+                better = self.energy.value(start, turned) < self.energy.value(start, placement)
+            base = torch.where(better[:, None, None], blend, base)
+            chosen = zip(turned, placement, strict=True)
+            placement = tuple(b._replace(base=torch.where(better[:, None, None], a.base, b.base)) for a, b in chosen)
+        return JointProblem(placement, start, base, difference)
 
     @staticmethod
-    def require(first: Tensor, second: Tensor, difference: Tensor, base: Tensor, t: Tensor, *stiffness: Tensor) -> None:
+    def require(t: Tensor) -> None:
         """Times in [0, 1].
 
         Raises:

@@ -1,13 +1,13 @@
 """The shape half-way between two key-frames, as a layer."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor, nn
 
 from torch_modal.nn.between import InBetweenResult
-from torch_modal.nn.in_between import DEFAULT_MU, InBetween
-from torch_modal.nn.solver import Solution
+from torch_modal.nn.in_between import InBetween
+from torch_modal.nn.settings import Objective, Preset, Solver, settings, with_space
 from torch_modal.precompute.basis import ModalBasis
 
 
@@ -17,26 +17,33 @@ class MidShape(nn.Module):
     Args:
         bases: The basis at each end (:func:`torch_modal.extract_bases`), or one that serves for both.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        space: ``"joint"`` (one shape in the sum of both spaces) or ``"paired"`` (Eq. 4 of the paper).
-        mu: Weight of the similarity of Eq. 4; of no effect in the joint space.
-        **options: Further options of :class:`InBetween`.
+        space: ``"joint"`` (one shape in the sum of both spaces) or ``"paired"`` (Eq. 4 of the paper). Default: the
+            objective's.
+        mu: Weight of the similarity of Eq. 4, of no effect in the joint space. Default: the objective's.
+        preset: As for :class:`InBetween`.
+        objective: What is minimised, in the place of the preset's.
+        solver: How it is solved, in the place of the preset's.
 
     Raises:
-        ValueError: The bases, the faces or an option are not usable.
+        ValueError: An argument is not usable.
     """
 
     def __init__(
         self,
         bases: ModalBasis | Sequence[ModalBasis],
         faces: Tensor,
-        space: str = "joint",
-        mu: float | Tensor = DEFAULT_MU,
-        **options: Any,
+        space: Literal["joint", "paired"] | None = None,
+        mu: float | Tensor | None = None,
+        *,
+        preset: Preset = "accurate",
+        objective: Objective | None = None,
+        solver: Solver | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(bases, ModalBasis) and len(bases) != 2:
             raise ValueError(f"a mid-shape lies between two bases, got {len(bases)}; pass [basis_a, basis_b]")
-        self.in_between = InBetween(bases, faces, space, mu, **options)
+        objective, solver = with_space(settings(preset, objective, solver), space, mu)
+        self.in_between = InBetween(bases, faces, objective=objective, solver=solver)
 
     @property
     def space(self) -> Any:
@@ -50,9 +57,7 @@ class MidShape(nn.Module):
 
     def solve(self, x_a: Tensor, x_b: Tensor) -> InBetweenResult:
         """The mid-shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        shapes, solution = self.in_between.solve(x_a, x_b, 0.5)
-        last = shapes.dim() - 3
-        return InBetweenResult(shapes.squeeze(last), Solution(*(value.squeeze(last) for value in solution)))
+        return self.in_between.solve(x_a, x_b, 0.5)
 
     def forward(self, x_a: Tensor, x_b: Tensor) -> Tensor:
         """The mid-shapes. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
@@ -65,4 +70,4 @@ class MidShape(nn.Module):
             ValueError: Shapes, dtypes or devices that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
         """
-        return self.in_between(x_a, x_b, 0.5).squeeze(-3)
+        return self.in_between(x_a, x_b, 0.5)

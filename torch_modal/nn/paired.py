@@ -1,23 +1,23 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
-import copy
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.linearised import Reference
-from torch_modal.energy.shell import ShellEnergy, Stiffness
+from torch_modal.energy.energy import Energy
+from torch_modal.nn import trees
 from torch_modal.nn.frame import Columns, Frame, Pair
-from torch_modal.nn.modal_energy import Derivatives, ModalShell, Placement
+from torch_modal.nn.levels import Levels, Stiffness
+from torch_modal.nn.modal_energy import Derivatives, Placement, SumOfEnergies
 
 
 class PairedPlacement(NamedTuple):
     """The two shapes of each sample and their similarity, a quadratic in the amplitudes."""
 
-    first: Placement
-    second: Placement
+    first: tuple[Placement, ...]
+    second: tuple[Placement, ...]
     linear: Tensor
     """*Shape:* ``(B, n)``."""
     constant: Tensor
@@ -29,16 +29,21 @@ class PairedPlacement(NamedTuple):
 class PairedProblem(NamedTuple):
     """The mid-shape of each sample as a minimisation."""
 
-    inputs: tuple[Tensor, ...]
-    """What the minimiser depends on, for :meth:`PairedSpace.placement`. *Shape of each:* ``(B, ...)``."""
-    pair: Pair
+    placement: PairedPlacement
+    """What the minimiser depends on."""
+    start: Tensor
+    """Zeros, which are the key-frames, as in the paper. *Shape:* ``(B, n)``."""
+    first: Tensor
+    """*Shape:* ``(B, V, 3)``."""
+    second: Tensor
+    """*Shape:* ``(B, V, 3)``."""
 
 
-class PairedShell(nn.Module):
+class PairedEnergy(nn.Module):
     r"""Eq. 4: :math:`d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)` in the amplitudes of both shapes.
 
     Args:
-        shell: Energy on the coarse mesh.
+        energies: The energy of either shape in its own amplitudes.
         ends: Columns of both spaces.
         used: Which of the fine vertices the similarity is taken over. *Shape:* ``(V,)``, bool.
     """
@@ -46,19 +51,17 @@ class PairedShell(nn.Module):
     gap: Tensor
     gap_gram: Tensor
 
-    def __init__(self, shell: ShellEnergy, ends: tuple[Columns, Columns], used: Tensor) -> None:
+    def __init__(self, energies: Sequence[SumOfEnergies], ends: Sequence[Columns], used: Tensor) -> None:
         super().__init__()
-        # Each with a shell of its own: a module that hangs at two places is saved twice.
-        self.first = ModalShell(shell, ends[0].coarse)
-        self.second = ModalShell(copy.deepcopy(shell), ends[1].coarse)
+        self.first, self.second = energies
+        self.n_first = len(ends[0].fine)
         gap = (torch.cat([ends[0].fine, -ends[1].fine]) * used[:, None]).flatten(1)
-        self.register_buffer("gap", gap)
-        self.register_buffer("gap_gram", gap @ gap.mT)
+        self.register_buffer("gap", gap, persistent=False)
+        self.register_buffer("gap_gram", gap @ gap.mT, persistent=False)
 
     def split(self, a: Tensor) -> tuple[Tensor, Tensor]:
         """Amplitudes of the two shapes."""
-        n = self.first.columns.shape[-1]
-        return a[..., :n], a[..., n:]
+        return a[..., : self.n_first], a[..., self.n_first :]
 
     def value(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
@@ -69,7 +72,7 @@ class PairedShell(nn.Module):
 
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
-        first, second = (shell.derivatives(part, place, False) for shell, part, place in self._ends(a, placement))
+        first, second = (energy.derivatives(part, place, False) for energy, part, place in self._ends(a, placement))
         gradient = torch.cat([first.gradient, second.gradient], -1)
         gradient = gradient + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram
@@ -80,8 +83,8 @@ class PairedShell(nn.Module):
     def pull_back(self, a: Tensor, direction: Tensor, placement: PairedPlacement) -> PairedPlacement:
         """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
         first, second = (
-            shell.pull_back(part, along, place)
-            for (shell, part, place), along in zip(self._ends(a, placement), self.split(direction), strict=True)
+            tuple(energy.pull_back(part, along, place))
+            for (energy, part, place), along in zip(self._ends(a, placement), self.split(direction), strict=True)
         )
         to_mu = 2 * (direction * (a @ self.gap_gram + placement.linear)).sum(-1)
         to_linear = 2 * placement.mu[:, None] * direction
@@ -89,9 +92,11 @@ class PairedShell(nn.Module):
 
     def second_order(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
-        return _block_diagonal(*(shell.second_order(part, place) for shell, part, place in self._ends(a, placement)))
+        return _block_diagonal(*(energy.second_order(part, place) for energy, part, place in self._ends(a, placement)))
 
-    def _ends(self, a: Tensor, placement: PairedPlacement) -> Iterator[tuple[ModalShell, Tensor, Placement]]:
+    def _ends(
+        self, a: Tensor, placement: PairedPlacement
+    ) -> Iterator[tuple[SumOfEnergies, Tensor, tuple[Placement, ...]]]:
         return zip((self.first, self.second), self.split(a), (placement.first, placement.second), strict=True)
 
 
@@ -103,45 +108,42 @@ class PairedSpace(nn.Module):
 
     Args:
         frame: Frame of the two bases.
-        shell: Energy on the frame's coarse mesh.
+        levels: The energies of the modal solve.
         modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
     """
 
-    def __init__(self, frame: Frame, shell: ShellEnergy, modes: Sequence[Tensor]) -> None:
+    def __init__(self, frame: Frame, levels: Levels, modes: Sequence[Tensor]) -> None:
         super().__init__()
-        self.frame = frame
+        self.frame, self.levels = frame, levels
         self.first, self.second = (frame.elastic_columns(end) for end in modes)
-        self.energy = PairedShell(shell, (self.first, self.second), frame.weights > 0)
+        ends = (self.first, self.second)
+        self.energy = PairedEnergy([levels.modal(end) for end in ends], ends, frame.weights > 0)
 
     @property
     def n_unknowns(self) -> int:
         """Number of amplitudes."""
         return len(self.energy.gap)
 
-    def problem(self, pair: Pair, t: Tensor, mu: Tensor, alpha: Tensor, beta: Tensor, gamma: Tensor) -> PairedProblem:
-        """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. *Shape of each:* ``(B,)``."""
-        coarse = (self.frame.coarsen(x) for x in (pair.first, pair.second))
-        apart = ((pair.first - pair.second) * (self.frame.weights > 0)[:, None]).flatten(1)
-        return PairedProblem((*coarse, apart @ self.energy.gap.mT, (apart**2).sum(-1), t, mu, alpha, beta, gamma), pair)
+    def problem(
+        self, pair: Pair, index: Tensor | None, t: Tensor, stiffness: Stiffness, mu: Tensor, anchors: Tensor | None
+    ) -> PairedProblem:
+        """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. Arguments as for the joint space."""
+        ends = (pair.first, pair.second)
+        first, second = ends if index is None else trees.rows(ends, index)
 
-    def placement(
-        self, first: Tensor, second: Tensor, linear: Tensor, constant: Tensor, t: Tensor, mu: Tensor, *stiffness: Tensor
-    ) -> PairedPlacement:
-        """The minimisation on the coarse mesh, from the inputs of a problem."""
-        places = []
-        for shell, coarse in ((self.energy.first, first), (self.energy.second, second)):
-            rest = shell.shell.rest(coarse, Stiffness(*stiffness))
-            places.append(Placement(coarse, None, [Reference(rest, torch.ones_like(t))]))
-        return PairedPlacement(places[0], places[1], linear, constant, mu)
+        def place(x: Tensor, modal: SumOfEnergies) -> tuple[Placement, ...]:
+            seen = self.levels.seen(x, self.frame.coarsen(x))
+            rests = zip(self.levels.rests(seen), stiffness.levels, strict=True)
+            references = [Energy.against(rest, own) for rest, own in rests]
+            return self.levels.place(modal, seen, references, None, anchors)
 
-    @staticmethod
-    def guess(*inputs: Tensor) -> None:
-        """Where the minimisation may start: at zeros, which are the key-frames, as in the paper."""
+        places = place(first, self.energy.first), place(second, self.energy.second)
+        apart = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)
+        placement = PairedPlacement(places[0], places[1], apart @ self.energy.gap.mT, (apart**2).sum(-1), mu)
+        return PairedProblem(placement, t.new_zeros(len(t), self.n_unknowns), first, second)
 
     @staticmethod
-    def require(
-        first: Tensor, second: Tensor, linear: Tensor, constant: Tensor, t: Tensor, mu: Tensor, *stiffness: Tensor
-    ) -> None:
+    def require(t: Tensor) -> None:
         """The time 1/2.
 
         Raises:
@@ -153,9 +155,7 @@ class PairedSpace(nn.Module):
     def lift(self, a: Tensor, problem: PairedProblem) -> Tensor:
         """The fine mid-shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""
         a1, a2 = self.energy.split(a)
-        first = problem.pair.first + self.first.combine(a1)
-        second = problem.pair.second + self.second.combine(a2)
-        return 0.5 * (first + second)
+        return 0.5 * (problem.first + self.first.combine(a1) + problem.second + self.second.combine(a2))
 
 
 def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:

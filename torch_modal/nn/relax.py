@@ -1,58 +1,67 @@
-"""Eq. 5 with every vertex free: gradient, and a convex Hessian that is applied without being assembled."""
+"""An energy with every vertex free: a convex Hessian that is applied without being assembled, and steps with it."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_modal.energy.linearised import Linearised, Reference, energy_of, gather, gradient, linearise
-from torch_modal.energy.shell import ShellEnergy
-from torch_modal.geometry.vectors import norm
+from torch_modal.energy.energy import Energy, Linearised, Reference
+from torch_modal.nn import trees
+from torch_modal.nn.adjoint import flattened
 
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
 
-# What is tried where a whole step goes uphill.
-STEP_LENGTHS = (0.5, 0.25, 0.1, 0.03)
+# The whole step, and what is tried where it goes uphill.
+STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 
 
 class ConvexHessian:
     """Gauss-Newton's Hessian and the second-order term of stretched edges: never negative.
 
     Args:
-        shell: The energy.
+        energy: The energy.
         at: Where it is linearised.
     """
 
-    def __init__(self, shell: ShellEnergy, at: Linearised) -> None:
-        self.shell, self.at = shell, at
-        tiny = torch.finfo(at.edges.dtype).tiny
-        #: Stiffness across each edge; along it, there is the curvature. *Shape:* ``(B, E)``.
-        self.across = at.slope.length.clamp_min(0) / norm(at.edges).clamp_min(tiny**0.5)
-        self.along = at.curvature.length - self.across
+    def __init__(self, energy: Energy, at: Sequence[Linearised]) -> None:
+        self.energy, self.at = energy, at
+        #: Stiffness across each element of two vertices; along it, there is the curvature. *Shape:* ``(B, M)``.
+        self.tensions = [part.term.tension(one.spokes, one.slope) for part, one in zip(energy.parts, at, strict=True)]
 
-    def __call__(self, rows: Tensor) -> Tensor:
-        """The product with displacements. *Shape:* ``(3, B, V)``."""
-        shell, at = self.shell, self.at
-        edges, spokes = shell.edge_vectors(rows), shell.hinge_spokes(rows)
-        on_edges = self.across * edges + (self.along * (at.to_edges * edges).sum(0)) * at.to_edges
-        on_hinges = (at.curvature.angle * (at.to_hinges * spokes).sum((0, 1))) * at.to_hinges
-        swelling = at.curvature.volume * (at.to_volume * rows).sum((0, -1))
-        return gather(shell, on_edges, on_hinges, swelling, at.to_volume)
+    def __call__(self, field: Tensor) -> Tensor:
+        """The product with displacements. *Shape:* ``(3, B, V)``, extended."""
+        received = []
+        for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
+            if part.term.total:
+                received.append(one.curvature * (one.gradients * field).sum((0, -1))[:, None])
+                continue
+            spokes = part.spokes(field)
+            rate = (one.gradients * spokes).sum((0, 1))
+            if tension is None:
+                received.append(one.curvature * rate * one.gradients)
+            else:
+                received.append(tension * spokes + (one.curvature - tension) * rate * one.gradients)
+        return self.energy.scatter(self.at, received)
 
     def inverse_diagonal(self) -> Tensor:
-        """Inverses of the 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``."""
-        shell, at = self.shell, self.at
-        to_e, to_a, to_b = at.to_hinges
-        ends = torch.cat([-(to_e + to_a + to_b), to_e, to_a, to_b], -1)
-        on_edges = self.along * at.to_edges[:, None] * at.to_edges
-        axes = torch.arange(3, device=on_edges.device)
-        on_edges = on_edges.index_put((axes, axes), self.across.expand(3, *self.across.shape), accumulate=True)
-        on_ends = (at.curvature.angle.repeat(1, 4) * ends)[:, None] * ends
-        index = torch.cat([shell.edges.T.flatten(), shell.hinges.T.flatten()])
-        blocks = torch.zeros_like(at.to_volume).expand(3, *at.to_volume.shape)
-        blocks = blocks.index_add(-1, index, torch.cat([on_edges, on_edges, on_ends], -1))
-        return _inverse_of_symmetric(blocks)
+        """Inverses of the 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
+        on_corners = []
+        for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
+            if part.term.total:
+                continue  # of rank one: it couples all vertices, and adds little to each
+            ends = part.to_corners(one.gradients)
+            n = len(part.corners)
+            along = one.curvature if tension is None else one.curvature - tension
+            blocks = (along.repeat(1, n) * ends)[:, None] * ends
+            if tension is not None:
+                eye = torch.eye(3, dtype=ends.dtype, device=ends.device)[..., None, None]
+                blocks = blocks + eye * tension.repeat(1, n)
+            on_corners.append(blocks)
+        blocks = torch.cat(on_corners, -1)
+        summed = blocks.new_zeros(*blocks.shape[:-1], self.energy.n_extended)
+        return _inverse_of_symmetric(summed.index_add(-1, self.energy.corners, blocks))
 
 
 def _inverse_of_symmetric(blocks: Tensor) -> Tensor:
@@ -69,7 +78,9 @@ def _inverse_of_symmetric(blocks: Tensor) -> Tensor:
     return (cofactors / (determinant * trace)).unflatten(0, (3, 3))
 
 
-def relax(shell: ShellEnergy, x: Tensor, references: Sequence[Reference], n_steps: int, n_products: int) -> Tensor:
+def relax(
+    energy: Energy, x: Tensor, reference: Reference, n_steps: int, n_products: int, anchors: Tensor | None = None
+) -> Tensor:
     """Steps of a truncated Newton method on all vertices, never uphill.
 
     Each step solves with :class:`ConvexHessian` by conjugate gradients, preconditioned by its diagonal blocks and cut
@@ -77,25 +88,32 @@ def relax(shell: ShellEnergy, x: Tensor, references: Sequence[Reference], n_step
     same number of both, so that the result is differentiable like any other expression.
 
     Args:
-        shell: The energy.
+        energy: The energy.
         x: Where to start. *Shape:* ``(B, V, 3)``.
-        references: Rest shapes, and the factor of each one's energy.
+        reference: What is compared with.
         n_steps: Newton steps.
         n_products: Iterations of conjugate gradients in each.
+        anchors: Of the energy's terms, where there are some. *Shape:* ``(B, P, 3)``.
 
     Returns:
         *Shape:* ``(B, V, 3)``.
     """
+    fixed = None if anchors is None else anchors.movedim(-1, 0)
     rows = x.movedim(-1, 0).contiguous()
-    energy = energy_of(shell, shell.measure_rows(rows), references)
     for _ in range(n_steps):
-        at = linearise(shell, rows, references)
-        direction = _conjugate_gradients(ConvexHessian(shell, at), -gradient(shell, at), n_products)
-        rows, energy = _descend(shell, rows, direction, energy, references)
+        extended = energy.extend(rows, fixed)
+        at = energy.linearise(extended, reference)
+        right = -energy.fold(energy.gradient(at))
+        direction = _conjugate_gradients(energy, ConvexHessian(energy, at), right, n_products)
+        moves = energy.extend(direction)
+        before = energy.value_at(at, reference)
+        batched = (before, extended.transpose(0, 1), moves.transpose(0, 1), *trees.leaves(reference))
+        length = _Length.apply(energy, trees.skeleton(reference), *batched)
+        rows = rows + length[:, None] * direction
     return rows.movedim(0, -1)
 
 
-def _conjugate_gradients(hessian: ConvexHessian, right: Tensor, n_products: int) -> Tensor:
+def _conjugate_gradients(energy: Energy, hessian: ConvexHessian, right: Tensor, n_products: int) -> Tensor:
     """An approximate solution. *Shape:* ``(3, B, V)``."""
 
     def precondition(residual: Tensor) -> Tensor:
@@ -108,14 +126,14 @@ def _conjugate_gradients(hessian: ConvexHessian, right: Tensor, n_products: int)
         # A sample that is solved exactly has nothing left: 0 / 0.
         return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0)[:, None]
 
-    inverse = hessian.inverse_diagonal()
+    inverse = hessian.inverse_diagonal()[..., : right.shape[-1]]
     solution = torch.zeros_like(right)
     residual = right
     preconditioned = precondition(residual)
     direction = preconditioned
     size = dot(residual, preconditioned)
     for k in range(n_products):
-        product = hessian(direction)
+        product = energy.fold(hessian(energy.extend(direction)))
         length = quotient(size, dot(direction, product))
         solution = solution + length * direction
         if k == n_products - 1:
@@ -127,19 +145,32 @@ def _conjugate_gradients(hessian: ConvexHessian, right: Tensor, n_products: int)
     return solution
 
 
-def _descend(
-    shell: ShellEnergy, rows: Tensor, direction: Tensor, energy: Tensor, references: Sequence[Reference]
-) -> tuple[Tensor, Tensor]:
-    """The longest of the steps that goes downhill, of each sample, and its energy."""
-    best, lowest = rows, energy
-    moved = torch.zeros_like(energy, dtype=torch.bool)
-    for length in (1.0, *STEP_LENGTHS):
-        candidate = rows + length * direction
-        value = energy_of(shell, shell.measure_rows(candidate), references)
-        better = ~moved & (value < energy)
-        best = torch.where(better[:, None], candidate, best)
-        lowest = torch.where(better, value, lowest)
-        moved = moved | better
-        if bool(moved.all()):
-            break
-    return best, lowest
+class _Length(torch.autograd.Function):
+    """The longest of the steps that goes downhill, of each sample; 0 where none does. It has no gradient."""
+
+    @staticmethod
+    def forward(energy: Energy, tree: Any, before: Tensor, x: Tensor, moves: Tensor, *inputs: Tensor) -> Tensor:
+        rows, direction, reference = x.transpose(0, 1), moves.transpose(0, 1), trees.filled(tree, inputs)
+        chosen = torch.zeros_like(before)
+        searching = torch.ones_like(before, dtype=torch.bool)
+        for length in STEP_LENGTHS:
+            downhill = searching & (energy.value(rows + length * direction, reference) < before)
+            chosen = torch.where(downhill, length, chosen)
+            searching = searching & ~downhill
+            if not bool(searching.any()):
+                break
+        return chosen
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+        ctx.n_inputs = len(inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
+        return (None,) * ctx.n_inputs
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], energy: Energy, tree: Any, *tensors: Tensor) -> tuple[Tensor, int]:
+        flat = flattened(info.batch_size, in_dims[-len(tensors) :], tensors)
+        return _Length.apply(energy, tree, *flat).unflatten(0, (info.batch_size, -1)), 0

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from torch_modal.nn import trees
 from torch_modal.nn.modal_energy import Derivatives
 
 # Fractions of a step that are tried, side by side, where the whole step disappoints.
@@ -68,13 +69,15 @@ class Status(IntEnum):
     """How the minimisation of a sample ended."""
 
     CONVERGED = 0
-    """The gradient is within the tolerance, or as small as rounding lets it be, or ``least_gain`` ended it."""
+    """The gradient is within the tolerance, or as small as rounding lets it be."""
     OUT_OF_STEPS = 1
     """There was more to gain."""
     STALLED = 2
     """No step went downhill any more."""
     INVALID = 3
     """No in-between exists: NaN or infinite entries, no size, or one key-frame of a closed mesh is a mirror image."""
+    ENOUGH = 4
+    """The next step promised less than ``least_gain`` of the energy: a good shape, and no exact gradient."""
 
 
 class Solution(NamedTuple):
@@ -96,13 +99,27 @@ class Solution(NamedTuple):
         """Whether the gradient is within the tolerance. *Shape:* ``(B,)``, bool."""
         return self.status == Status.CONVERGED
 
+    @property
+    def usable(self) -> Tensor:
+        """Whether the shape is what was asked for: converged, or close enough by ``least_gain``. *Shape:* ``(B,)``."""
+        return self.converged | (self.status == Status.ENOUGH)
+
 
 class GaussNewtonStep(nn.Module):
     """One damped step of every sample of a batch, never uphill.
 
     The residual at the optimum is large: Gauss-Newton alone gains a digit every six steps there, and the full Hessian
     alone is often indefinite far from it. Both directions are tried, at several step lengths, in one batched evaluation
-    of the energy; the lowest wins. A sample where none is lower stays where it is.
+    of the energy; the lowest wins. A sample where none is lower stays where it is::
+
+        shell = tm.ShellEnergy(faces)
+        energy = tm.ModalEnergy(shell, basis.modes)
+        placement = energy.place(start, shell.against(rest))  # both (B, V, 3)
+        step = tm.GaussNewtonStep(energy)
+        a = torch.zeros(len(start), basis.n_modes, dtype=start.dtype)
+        for _ in range(10):
+            a = step(a, placement).amplitudes
+        x = start + torch.tensordot(a, basis.modes, 1)
 
     Args:
         energy: What is minimised.
@@ -292,7 +309,7 @@ def minimise(
             status[stuck] = torch.where(drowned, Status.CONVERGED, Status.STALLED)[stuck]
             leaving = leaving | stuck
             enough = ~leaving & taken.moved & (taken.promised < least_gain * energy.abs())
-            status[enough] = Status.CONVERGED
+            status[enough] = Status.ENOUGH
             result.n_steps[rows[enough]] += 1
             a, energy = torch.where(enough[:, None], taken.amplitudes, a), torch.where(enough, taken.energy, energy)
             leaving = leaving | enough
@@ -310,7 +327,7 @@ def minimise(
             stay = torch.nonzero(~leaving).flatten()
             kept = (rows, a, energy, start, slow, last, before)
             rows, a, energy, start, slow, last, before = (values[stay] for values in kept)
-            placement = _pick(placement, stay)
+            placement = trees.rows(placement, stay)
     return result
 
 
@@ -326,15 +343,5 @@ def _second_order(energy: AmplitudeEnergy, a: Tensor, placement: Any, where: Ten
     if len(chosen) == len(a):
         return energy.second_order(a, placement)
     whole = a.new_full((len(a), a.shape[-1], a.shape[-1]), torch.nan)
-    whole[chosen] = energy.second_order(a[chosen], _pick(placement, chosen))
+    whole[chosen] = energy.second_order(a[chosen], trees.rows(placement, chosen))
     return whole
-
-
-def _pick(placement: Any, samples: Tensor) -> Any:
-    """The same for some of the samples: nested tuples and lists of tensors ``(B, ...)``."""
-    if isinstance(placement, Tensor):
-        return placement[samples]
-    if isinstance(placement, (tuple, list)):
-        parts = [_pick(part, samples) for part in placement]
-        return type(placement)(*parts) if hasattr(placement, "_fields") else type(placement)(parts)
-    return placement

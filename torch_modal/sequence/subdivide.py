@@ -12,14 +12,11 @@ from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import extract_bases
 
 MAX_LEVELS = 12
-
-# No gradient is wanted, and further steps change nothing that one could see (docs/quality.md). The joint space's alone:
-# the paper's starts too far away.
-LEAST_GAIN = 0.03
 
 
 def subdivide(
@@ -31,9 +28,10 @@ def subdivide(
     n_modes: int = 30,
     cyclic: bool = False,
     n_frames: int | None = None,
-    local: bool = True,
+    preset: Preset = "accurate",
+    objective: Objective | None = None,
+    solver: Solver | None = None,
     progress: bool | None = None,
-    **mid_shape: Any,
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
 
@@ -51,10 +49,10 @@ def subdivide(
         n_frames: Number of frames of the result, by linear fill (along the geodesic of the rigid motion) between the
             subdivided shapes. The key-frames keep their place in it: intervals differ by one frame where the number
             does not divide. Default: the subdivided shapes as they are.
-        local: Whether each mid-shape takes a few steps on the fine mesh, for what the modes cannot reach.
+        preset: As for :class:`torch_modal.InBetween`.
+        objective: What is minimised, in the place of the preset's.
+        solver: How it is solved, in the place of the preset's.
         progress: Whether to show progress bars. Default: on a terminal only.
-        **mid_shape: Further options of :class:`torch_modal.MidShape`: ``space``, ``coarse_faces``, ``polish``, ...;
-            In the joint space ``rotations`` is true here, and ``least_gain`` 0.03.
 
     Returns:
         The sequence in the caller's coordinates, dtype and device, the key-frames bit for bit at their places. *Shape:*
@@ -81,14 +79,12 @@ def subdivide(
         leave=False,
         disable=None if progress is None else not progress,
     )
-    paired = mid_shape.get("space") == "paired"
-    joint = {} if paired else {"rotations": True, "least_gain": LEAST_GAIN}
-    options = {"local": local, **joint, **mid_shape}
+    chosen = settings(preset, objective, solver)
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     with bar, torch.no_grad():
         for i in range(intervals):
             j = (i + 1) % n_keys
-            segment = _Segment((bases[i], bases[j]), working_faces, options, keyframes.device)
+            segment = _Segment((bases[i], bases[j]), working_faces, chosen, keyframes.device)
             shapes = torch.stack([keyframes[i], keyframes[j]])
             for _ in range(levels):
                 shapes = _interleave(shapes, segment.mid_shapes(shapes))
@@ -146,15 +142,15 @@ class _Segment:
         self,
         bases: tuple[ModalBasis, ModalBasis],
         faces: Tensor,
-        options: dict[str, Any],
+        chosen: Settings,
         device: torch.device,
     ) -> None:
-        self.bases, self.faces, self.options, self.device = bases, faces.cpu(), options, device
+        self.bases, self.faces, self.chosen, self.device = bases, faces.cpu(), chosen, device
         self.layers: dict[tuple[int, int], MidShape] = {}
 
     def mid_shapes(self, shapes: Tensor) -> Tensor:
         """Between each shape and the next. *Shape:* ``(n + 1, V, 3) -> (n, V, 3)``."""
-        if self.options.get("space", "joint") == "joint":
+        if self.chosen.objective.space == "joint":
             return self._layer(0, 1)(shapes[:-1], shapes[1:])
         nearest = self._nearest(shapes)
         mids = [
@@ -165,7 +161,8 @@ class _Segment:
 
     def _layer(self, a: int, b: int) -> MidShape:
         if (a, b) not in self.layers:
-            layer = MidShape((self.bases[a], self.bases[b]), self.faces, **self.options)
+            objective, solver = self.chosen
+            layer = MidShape((self.bases[a], self.bases[b]), self.faces, objective=objective, solver=solver)
             self.layers[a, b] = layer.to(self.device)
         return self.layers[a, b]
 

@@ -1,0 +1,271 @@
+"""An energy of several terms on one mesh: values, gradients, and products with a convex Hessian.
+
+Components come first, ``(3, ..., V)``. Shapes are *extended* by the vertices that elements may have beside those of
+the mesh: its centre, and the anchors of the terms.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.energy.terms import Mesh, Term
+from torch_modal.geometry.vectors import inverse, pick
+
+
+class Rest(NamedTuple):
+    """A rest shape as an energy sees it: what costs nothing, and the weight of each measure, term by term."""
+
+    measures: tuple[Tensor, ...]
+    """*Shape of each:* ``(..., M)``."""
+    weights: tuple[Tensor, ...]
+    """Without the stiffness. *Shape of each:* ``(..., M)``."""
+
+
+class Reference(NamedTuple):
+    r"""What shapes are compared with: :math:`\sum_m W_m (q_m - Q_m)^2 + c`."""
+
+    measures: tuple[Tensor, ...]
+    """``Q``. *Shape of each:* ``(..., M)``."""
+    weights: tuple[Tensor, ...]
+    """``W``, the stiffness included. *Shape of each:* ``(..., M)``."""
+    constant: Tensor | float
+    """``c``. *Shape:* ``(...)``."""
+
+
+class Linearised(NamedTuple):
+    """One term at given shapes."""
+
+    spokes: Tensor
+    """*Shape:* ``(n-1, 3, B, M)``."""
+    gradients: Tensor
+    """Of the measures in the spokes, *shape* ``(n-1, 3, B, M)``; of a total in the vertices, *shape* ``(3, B, V)``."""
+    difference: Tensor
+    """From the reference. *Shape:* ``(B, M)``; ``(B, 1)`` of a total, as the next two."""
+    slope: Tensor
+    """First derivative of the energy in each measure. *Shape:* ``(B, M)``."""
+    curvature: Tensor
+    """Second derivative. *Shape:* ``(B, M)``."""
+
+
+class OnMesh(nn.Module):
+    """A term on a mesh.
+
+    Args:
+        term: The term. It is not registered here: terms serve several meshes, and belong to who made them.
+        mesh: The mesh.
+        numbers: New numbers of the vertices, where not all are there; -1 for those that are not. *Shape:* ``(V,)``.
+    """
+
+    corners: Tensor
+    pairs: Tensor
+
+    def __init__(self, term: Term, mesh: Mesh, numbers: Tensor | None = None) -> None:
+        super().__init__()
+        self._term = (term,)
+        elements, pairs = term.elements(mesh), term.pairs(mesh)
+        if elements.dim() != 2 or elements.shape[1] < 2 or elements.is_floating_point():
+            raise ValueError(
+                f"{type(term).__name__}.elements gave {tuple(elements.shape)} of {elements.dtype}; they are rows of "
+                "two vertex indices or more, (M, n)"
+            )
+        if numbers is not None:
+            elements, pairs = numbers[elements], numbers[pairs]
+        self.register_buffer("corners", elements.T.contiguous(), persistent=False)
+        self.register_buffer("pairs", pairs, persistent=False)
+
+    @property
+    def term(self) -> Term:
+        """The term."""
+        return self._term[0]
+
+    def spokes(self, rows: Tensor) -> Tensor:
+        """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
+        first, *others = (pick(rows, corner) for corner in self.corners)
+        return torch.stack([other - first for other in others])
+
+    def measures(self, spokes: Tensor) -> Tensor:
+        """What the energy sees of them: the measures, or their sum. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
+        measures = self.term.measures(spokes)
+        return measures.sum(-1, keepdim=True) if self.term.total else measures
+
+    def to_corners(self, on_spokes: Tensor) -> Tensor:
+        """From the spokes to the vertices of the elements. *Shape:* ``(n-1, 3, ..., M) -> (3, ..., n M)``."""
+        return torch.cat([-on_spokes.sum(0), *on_spokes], -1)
+
+
+class Energy(nn.Module):
+    """The sum of terms on one mesh.
+
+    Args:
+        mesh: The mesh.
+        terms: The terms.
+        sampled: Whether shapes consist of the :attr:`vertices` that elements have, and of no others. Terms then have
+            no centre.
+    """
+
+    parts: Any
+    used: Tensor
+    corners: Tensor
+    vertices: Tensor
+
+    def __init__(self, mesh: Mesh, terms: Sequence[Term], sampled: bool = False) -> None:
+        super().__init__()
+        n, n_anchors, meshes = mesh.n_vertices, 0, []
+        for term in terms:
+            meshes.append(mesh._replace(first_anchor=n + 1 + n_anchors))
+            n_anchors += 0 if term.anchors is None else len(term.anchors)
+        vertices, numbers = torch.arange(n), None
+        if sampled:
+            elements = [term.elements(own).flatten() for term, own in zip(terms, meshes, strict=True)]
+            vertices = torch.cat(elements).unique()
+            vertices = vertices[vertices < n]
+            numbers = torch.full((n + 1 + n_anchors,), -1).index_copy(0, vertices, torch.arange(len(vertices)))
+            numbers[n + 1 :] = len(vertices) + 1 + torch.arange(n_anchors)
+        parts = [OnMesh(term, own, numbers) for term, own in zip(terms, meshes, strict=True)]
+        self.parts = nn.ModuleList(parts)
+        self.n_vertices = len(vertices)
+        self.n_extended = len(vertices) + 1 + n_anchors
+        self.register_buffer("vertices", vertices, persistent=False)
+        self.register_buffer("used", torch.arange(len(vertices)) if sampled else mesh.faces.unique(), persistent=False)
+        local = [part.corners.flatten() for part in parts if not part.term.total]
+        corners = torch.cat(local) if local else torch.zeros(0, dtype=torch.int64)
+        #: The vertices of all elements of terms that are not totals.
+        self.register_buffer("corners", corners, persistent=False)
+
+    # ------------------------------------------------------------------------------------------------------- vertices
+    def extend(self, rows: Tensor, anchors: Tensor | None = None) -> Tensor:
+        """The vertices, their centre and the anchors.
+
+        Args:
+            rows: *Shape:* ``(3, ..., V)``.
+            anchors: Zeros where None, for displacements. *Shape:* ``(3, ..., P)``.
+        """
+        centre = pick(rows, self.used).mean(-1, keepdim=True)
+        n_anchors = self.n_extended - self.n_vertices - 1
+        if not n_anchors:
+            return torch.cat([rows, centre], -1)
+        fixed = rows.new_zeros(*rows.shape[:-1], n_anchors) if anchors is None else anchors
+        return torch.cat([rows, centre, fixed.expand(*rows.shape[:-1], n_anchors)], -1)
+
+    def fold(self, extended: Tensor) -> Tensor:
+        """The adjoint of :meth:`extend`: the vertices share what the centre received. *Shape:* ``(3, ..., V)``."""
+        share = extended[..., self.n_vertices, None] / len(self.used)
+        own = extended[..., : self.n_vertices].contiguous()
+        return own.index_add(-1, self.used, share.expand(*share.shape[:-1], len(self.used)).contiguous())
+
+    # ---------------------------------------------------------------------------------------------------- references
+    def rest(self, extended: Tensor) -> Rest:
+        """Measures and weights of rest shapes. *Shape:* ``(3, ..., V)``, extended."""
+        measures, weights = [], []
+        for part in self.parts:
+            spokes = part.spokes(extended)
+            found = part.measures(spokes)
+            measures.append(part.term.at_rest(found))
+            weights.append(part.term.weights(spokes, found))
+        return Rest(tuple(measures), tuple(weights))
+
+    def between(self, first: Rest, second: Rest, t: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
+        r"""Both as one reference: :math:`(1-t) \sum w_a (q - q_a)^2 + t \sum w_b (q - q_b)^2` up to squares.
+
+        Angles lie between those of the two the short way.
+
+        Args:
+            first: Rest shapes of the weight ``1 - t``.
+            second: Rest shapes of the weight ``t``.
+            t: Times. *Shape:* ``(...)``.
+            stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
+        """
+        t = t[..., None]
+        measures, weights, constant = [], [], torch.zeros_like(t[..., 0])
+        for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
+            pull_a, pull_b = (1 - t) * first.weights[i], t * second.weights[i]
+            whole = pull_a + pull_b
+            share = pull_b * inverse(whole, whole <= 0)
+            apart = part.term.difference(second.measures[i], first.measures[i])
+            measures.append(first.measures[i] + share * apart)
+            weights.append(factor * whole)
+            constant = constant + (factor * pull_a * share * apart**2).sum(-1)
+        return Reference(tuple(measures), tuple(weights), constant)
+
+    @staticmethod
+    def against(rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
+        """One rest shape as the reference."""
+        weights = tuple(factor * weight for factor, weight in zip(stiffness, rest.weights, strict=True))
+        return Reference(rest.measures, weights, 0.0)
+
+    # --------------------------------------------------------------------------------------------------------- values
+    def value(self, extended: Tensor, reference: Reference) -> Tensor:
+        """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
+        total: Any = reference.constant
+        for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
+            difference = part.term.difference(part.measures(part.spokes(extended)), rest)
+            total = total + (weight * difference**2).sum(-1)
+        return total
+
+    # ---------------------------------------------------------------------------------------------------- derivatives
+    def linearise(self, extended: Tensor, reference: Reference) -> list[Linearised]:
+        """All terms at given shapes. *Shape:* ``(3, B, V)``, extended."""
+        found = []
+        for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
+            spokes = part.spokes(extended)
+            measures = part.measures(spokes)
+            gradients = part.term.gradients(spokes)
+            if part.term.total:
+                corners = part.to_corners(gradients)
+                gradients = torch.zeros_like(extended).index_add(-1, part.corners.flatten(), corners)
+            difference = part.term.difference(measures, rest)
+            curvature = (2 * weight).expand_as(difference)
+            found.append(Linearised(spokes, gradients, difference, curvature * difference, curvature))
+        return found
+
+    @staticmethod
+    def value_at(at: Sequence[Linearised], reference: Reference) -> Tensor:
+        """The energy of shapes that were linearised. *Shape:* ``(B,)``."""
+        found: Any = reference.constant
+        return found + sum((0.5 * one.slope * one.difference).sum(-1) for one in at)
+
+    def rates(self, at: Sequence[Linearised], field: Tensor) -> list[Tensor]:
+        """First change of the measures with a displacement. *Shape:* ``(3, B, V)``, extended; ``(B, M)`` of each."""
+        return [
+            (one.gradients * field).sum((0, -1))[:, None]
+            if part.term.total
+            else (one.gradients * part.spokes(field)).sum((0, 1))
+            for part, one in zip(self.parts, at, strict=True)
+        ]
+
+    def scatter(self, at: Sequence[Linearised], on_elements: Sequence[Tensor]) -> Tensor:
+        """From the elements to the vertices.
+
+        Args:
+            at: Gives the gradients of totals.
+            on_elements: Of each term what its spokes receive, *shape* ``(n-1, 3, B, M)``; of a total, the factor of its
+                gradient, *shape* ``(B, 1)``.
+
+        Returns:
+            *Shape:* ``(3, B, V)``, extended.
+        """
+        out: Any = None
+        corners = []
+        for part, one, received in zip(self.parts, at, on_elements, strict=True):
+            if part.term.total:
+                own = received * one.gradients
+                out = own if out is None else out + own
+            else:
+                corners.append(part.to_corners(received))
+        if out is None:
+            out = corners[0].new_zeros(*corners[0].shape[:-1], self.n_extended)
+        return out.index_add(-1, self.corners, torch.cat(corners, -1)) if corners else out
+
+    def gather(self, at: Sequence[Linearised], factors: Sequence[Tensor]) -> Tensor:
+        """Gradients of all measures times factors of them, summed. *Shape:* ``(B, M)`` each, ``(3, B, V)`` extended."""
+        scaled = [
+            factor if part.term.total else factor * one.gradients
+            for part, one, factor in zip(self.parts, at, factors, strict=True)
+        ]
+        return self.scatter(at, scaled)
+
+    def gradient(self, at: Sequence[Linearised]) -> Tensor:
+        """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
+        return self.gather(at, [one.slope for one in at])

@@ -1,0 +1,291 @@
+r"""Terms of an energy: what is measured on the elements of a mesh, and how much a difference from rest counts.
+
+A term has the energy :math:`\sum_m k_m w_m (q_m - \bar q_m)^2` over its elements ``m``, with a measure ``q`` of each,
+its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. All that a term must say is
+which elements it sees and what it measures on one of them: derivatives then come from ``torch.func``. The three terms
+of Eq. 5 write theirs out, because they are what all the time goes into.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.func import jacrev, vmap
+
+from torch_modal.energy.measures import (
+    collapsed,
+    dihedral_angle,
+    dihedral_gradient,
+    dihedral_hessian,
+    length_gradient,
+    length_hessian,
+    wrap_angle,
+)
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.vectors import cross, inverse, norm
+
+# Eq. 5 divides by rest lengths, rest areas and the rest volume. Edges and hinges without a size have no say, needles
+# and flat bodies a bounded one; everywhere else the weights are the paper's.
+MIN_RELATIVE_LENGTH = 1e-6  # of the mean edge length
+MAX_BENDING_RATIO = 1e3  # of l^2 / A; an equilateral hinge has 1.15
+MIN_RELATIVE_VOLUME = 1e-6  # of (surface area)^(3/2); a sphere has 0.094
+
+
+class Mesh(NamedTuple):
+    """The vertices that elements may be made of."""
+
+    faces: Tensor
+    """*Shape:* ``(F, 3)``."""
+    edges: Tensor
+    """*Shape:* ``(E, 2)``."""
+    hinges: Tensor
+    """Rows of :func:`torch_modal.geometry.connectivity.hinges`. *Shape:* ``(H, 4)``."""
+    n_vertices: int
+    first_anchor: int
+    """The number that the first of the term's own :attr:`Term.anchors` has as a vertex."""
+
+    @property
+    def centre(self) -> int:
+        """The number that the mean of all vertices of faces has as a vertex."""
+        return self.n_vertices
+
+    @classmethod
+    def of(cls, faces: Tensor, n_vertices: int) -> "Mesh":
+        """The mesh of these faces, on the CPU."""
+        array = faces.detach().cpu().long().numpy()
+        edges, _ = connectivity.unique_edges(array)
+        hinges = connectivity.hinges(array)
+        return cls(
+            torch.from_numpy(array.copy()),
+            torch.from_numpy(edges),
+            torch.from_numpy(hinges),
+            n_vertices,
+            n_vertices + 1,
+        )
+
+
+class Term(nn.Module):
+    """One kind of measure on a mesh, as a term of an energy.
+
+    A term of your own is a class with two methods::
+
+        class Area(tm.Term):
+            def elements(self, mesh):
+                return mesh.faces
+
+            def measure(self, spokes):
+                return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+
+    and goes where terms are asked for: ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a bounding-box
+    diagonal of 100, like those of Eq. 5.
+
+    Args:
+        stiffness: ``k``: a number, or a tensor or parameter whose last dimension counts the elements, or is 1, and
+            whose others broadcast against the samples. *Shape:* ``()``, ``(..., M)`` or ``(..., 1)``.
+    """
+
+    total = False
+    """Whether the measures of all elements add up to one, such as a volume."""
+    sampled = False
+    """Whether elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
+    stiffness: Any
+
+    def __init__(self, stiffness: float | Tensor = 1.0) -> None:
+        super().__init__()
+        if isinstance(stiffness, Tensor) and not isinstance(stiffness, nn.Parameter):
+            self.register_buffer("stiffness", stiffness)
+        else:
+            self.stiffness = stiffness
+
+    # ------------------------------------------------------------------------------------------- what a term must say
+    def elements(self, mesh: Mesh) -> Tensor:
+        """The vertices of each element. *Shape:* ``(M, n)``, with n of 2 or more."""
+        raise NotImplementedError
+
+    def measure(self, spokes: Tensor) -> Tensor:
+        """The measure of one element, of the vectors from its first vertex to the others. *Shape:* ``(n-1, 3) -> ()``.
+
+        Only operations that ``torch.func`` can differentiate twice.
+        """
+        raise NotImplementedError
+
+    # -------------------------------------------------------------------------------------------- what a term may say
+    @property
+    def anchors(self) -> Tensor | None:
+        """Points of the caller's coordinates that elements may have as vertices, and that do not move.
+
+        *Shape:* ``(P, 3)``.
+        """
+        return None
+
+    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+        """Weights ``w`` of elements at rest. *Shape:* ``(n-1, 3, ..., M), (..., M) -> (..., M)``; one if total."""
+        return torch.ones_like(measures)
+
+    def at_rest(self, measures: Tensor) -> Tensor:
+        """The measures that cost nothing, from those of a rest shape. *Shape:* ``(..., M) -> (..., M)``."""
+        return measures
+
+    def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
+        """How far measures are from others. *Shape:* ``(..., M), (..., M) -> (..., M)``."""
+        return measures - rest
+
+    # ---------------------------------------------- all elements at once; written out by the terms that have to be fast
+    def measures(self, spokes: Tensor) -> Tensor:
+        """The measure of each element. *Shape:* ``(n-1, 3, ..., M) -> (..., M)``."""
+        return self._each(self.measure, spokes)
+
+    def gradients(self, spokes: Tensor) -> Tensor:
+        """Gradients of the measures in the spokes. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
+        return self._each(jacrev(self.measure), spokes)
+
+    def pairs(self, mesh: Mesh) -> Tensor:
+        """Pairs of vertices that the second derivatives couple. *Shape:* ``(N, 2)``."""
+        corners = self.elements(mesh).unbind(1)
+        n = len(corners)
+        return torch.cat([torch.stack([corners[s], corners[t]], 1) for s in range(n) for t in range(s + 1, n)])
+
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+        r"""The blocks of :math:`\sum_m s_m \nabla^2 q_m` between the two vertices of each of :meth:`pairs`.
+
+        Args:
+            spokes: *Shape:* ``(n-1, 3, B, M)``.
+            slope: ``s``. *Shape:* ``(B, M)``, or ``(B, 1)``.
+
+        Returns:
+            By row and column. *Shape:* ``(3, 3, B, N)``.
+        """
+        hessian = slope * self._each(jacrev(jacrev(self.measure)), spokes)
+        # Translations change nothing: the first vertex has what is left.
+        first = -hessian.sum(0).movedim(1, 0)
+        n = len(spokes)
+        others = [hessian[s, :, t] for s in range(n) for t in range(s + 1, n)]
+        return torch.cat([*first, *others], -1)
+
+    def tension(self, spokes: Tensor, slope: Tensor) -> Tensor | None:
+        """Stiffness that stretched elements of two vertices have across; None for elements of more.
+
+        *Shape:* ``(1, 3, B, M), (B, M) -> (B, M)``.
+        """
+        return None
+
+    @staticmethod
+    def _each(function: Any, spokes: Tensor) -> Tensor:
+        """A function of one element on all, which stay the last dimensions."""
+        out = vmap(function, in_dims=2, out_dims=-1)(spokes.flatten(2))
+        return out.unflatten(-1, spokes.shape[2:])
+
+
+class Stretch(Term):
+    r"""Edge lengths: :math:`\alpha \sum_e (l_e - \bar l_e)^2 / \bar l_e`, the first term of Eq. 5."""
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        """All edges."""
+        return mesh.edges
+
+    def measure(self, spokes: Tensor) -> Tensor:
+        """The length."""
+        return norm(spokes[0])
+
+    measures = measure
+
+    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+        """One over the length."""
+        return inverse(measures, measures <= MIN_RELATIVE_LENGTH * measures.mean(-1, keepdim=True))
+
+    def gradients(self, spokes: Tensor) -> Tensor:
+        """Unit vectors."""
+        return length_gradient(spokes[0])[None]
+
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+        """The length's Hessian with the other sign, between both ends."""
+        return -slope * length_hessian(spokes[0])
+
+    def tension(self, spokes: Tensor, slope: Tensor) -> Tensor:
+        """What a stretched string has."""
+        return slope.clamp_min(0) / norm(spokes[0])
+
+
+class Bend(Term):
+    r"""Dihedral angles: :math:`\beta \sum_h (\theta_h - \bar\theta_h)^2 \bar l_h^2 / \bar A_h`, the second of Eq. 5."""
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        """All hinges."""
+        return mesh.hinges
+
+    def measure(self, spokes: Tensor) -> Tensor:
+        """The angle."""
+        return dihedral_angle(spokes)
+
+    measures = measure
+
+    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+        """Square of the edge over the area of both triangles."""
+        e, a, b = spokes
+        n1, n2 = cross(e, a), cross(b, e)
+        squared, area = (e * e).sum(0), 0.5 * (norm(n1) + norm(n2))
+        floored = torch.maximum(area, squared / MAX_BENDING_RATIO)
+        return squared * inverse(floored, collapsed(e, n1) | collapsed(e, n2))
+
+    def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
+        """The short way round."""
+        return wrap_angle(measures - rest)
+
+    def gradients(self, spokes: Tensor) -> Tensor:
+        """In closed form."""
+        return dihedral_gradient(spokes)
+
+    def pairs(self, mesh: Mesh) -> Tensor:
+        """Without that of the two tips, which have no mixed derivative."""
+        i, j, k, m = mesh.hinges.unbind(1)
+        return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
+
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+        """In closed form."""
+        return torch.cat((slope * dihedral_hessian(spokes)).unbind(), -1)
+
+
+class Volume(Term):
+    r"""Enclosed volume: :math:`\gamma\, (v - \bar v)^2 / \bar v^2`, the third term of Eq. 5.
+
+    It is the sum of the tetrahedra from the centroid to all faces, so that an open surface may be moved too.
+    """
+
+    total = True
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        """The centre and each face, of a surface that cones from its boundary to the centre have closed."""
+        chain = torch.from_numpy(connectivity.boundary_chain(mesh.faces.numpy()))
+        centre = torch.full_like(chain[:, :1], mesh.centre)
+        closed = torch.cat([mesh.faces, torch.cat([chain.flip(1), centre], 1)])
+        return torch.cat([torch.full_like(closed[:, :1], mesh.centre), closed], 1)
+
+    def measure(self, spokes: Tensor) -> Tensor:
+        """Signed volume of a tetrahedron."""
+        p, q, r = spokes
+        return (p * cross(q, r)).sum(0) / 6
+
+    measures = measure
+
+    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+        """One over the square of the volume."""
+        p, q, r = spokes
+        surface = 0.5 * norm(cross(q - p, r - p)).sum(-1, keepdim=True)
+        return torch.maximum(measures.abs(), MIN_RELATIVE_VOLUME * surface**1.5) ** -2
+
+    def gradients(self, spokes: Tensor) -> Tensor:
+        """Sixths of cross products."""
+        p, q, r = spokes
+        return torch.stack([cross(q, r), cross(r, p), cross(p, q)]) / 6
+
+    def pairs(self, mesh: Mesh) -> Tensor:
+        """The sides of all faces; on a closed surface, what the centre feels cancels."""
+        i, j, k = self.elements(mesh)[:, 1:].unbind(1)
+        return torch.cat([torch.stack(side, 1) for side in ((i, j), (j, k), (k, i))])
+
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+        """``p.(q x r)`` has the block ``-[r]`` between ``p`` and ``q``."""
+        p, q, r = spokes
+        x, y, z = torch.cat([r, p, q], -1) * (slope / 6)
+        zero = torch.zeros_like(x)
+        return torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3))

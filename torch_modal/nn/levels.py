@@ -1,0 +1,106 @@
+"""Where the terms of an in-between's energy are evaluated: on the coarse mesh, or at the vertices that they name."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.energy.energy import Energy, OnMesh, Reference, Rest
+from torch_modal.energy.terms import Mesh, Term
+from torch_modal.nn import trees
+from torch_modal.nn.frame import Columns, Frame
+from torch_modal.nn.modal_energy import ModalEnergy, Placement, SumOfEnergies
+
+
+class Stiffness(NamedTuple):
+    """Stiffnesses of each sample, with those of the elements of either mesh."""
+
+    fine: list[Tensor]
+    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    levels: list[list[Tensor]]
+    """Of the terms of each level, likewise."""
+
+
+class Levels(nn.Module):
+    """The energies of the modal solve: most terms on the coarse mesh, and those that name vertices at these.
+
+    Args:
+        frame: The frame of both bases.
+        fine: The caller's mesh.
+        terms: All terms.
+    """
+
+    def __init__(self, frame: Frame, fine: Mesh, terms: Sequence[Term]) -> None:
+        super().__init__()
+        self.mesh = Mesh.of(frame.coarse_faces, frame.n_coarse)
+        numbers = range(len(terms))
+        #: Which terms each level has.
+        self.members = [[i for i in numbers if not terms[i].sampled], [i for i in numbers if terms[i].sampled]]
+        coarse, sampled = ([terms[i] for i in members] for members in self.members)
+        self.energies: Any = nn.ModuleList([Energy(self.mesh, coarse)])
+        if sampled:
+            self.energies.append(Energy(fine, sampled, sampled=True))
+
+    def modal(self, columns: Columns) -> SumOfEnergies:
+        """All of them in the amplitudes of a space."""
+        coarse, *sampled = self.energies
+        parts = [ModalEnergy(coarse, columns.coarse)]
+        return SumOfEnergies(*parts, *(ModalEnergy(energy, columns.fine[:, energy.vertices]) for energy in sampled))
+
+    def seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
+        """A fine shape and its coarse one as each energy sees them. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
+        return [coarse, *(x[..., energy.vertices, :] for energy in list(self.energies)[1:])]
+
+    def rests(self, seen: Sequence[Tensor]) -> list[Rest]:
+        """Rest shapes of each energy. *Shape of each:* ``(B, V, 3)``."""
+        return [
+            energy.rest(energy.extend(x.movedim(-1, 0).contiguous()))
+            for energy, x in zip(self.energies, seen, strict=True)
+        ]
+
+    def between(
+        self, first: list[Rest], second: list[Rest], index: Tensor | None, t: Tensor, stiffness: Stiffness
+    ) -> list[Reference]:
+        """What in-betweens at the times ``t`` are compared with, of the pairs ``index`` (all in turn where None)."""
+        if index is not None:
+            first, second = trees.rows(first, index), trees.rows(second, index)
+        parts = zip(self.energies, first, second, stiffness.levels, strict=True)
+        return [energy.between(a, b, t, own) for energy, a, b, own in parts]
+
+    def place(
+        self,
+        modal: SumOfEnergies,
+        bases: Sequence[Tensor],
+        references: Sequence[Reference],
+        extras: Sequence[Tensor | None] | None,
+        anchors: Tensor | None,
+    ) -> tuple[Placement, ...]:
+        """The affine space of each sample, as each energy sees it. *Shape of bases and extras:* ``(B, V, 3)``."""
+        extras = [None] * len(bases) if extras is None else extras
+        fixed = [None, anchors][: len(bases)]
+        parts = zip(modal.parts, bases, references, extras, fixed, strict=True)
+        return tuple(energy.place(base, reference, extra, own) for energy, base, reference, extra, own in parts)
+
+
+def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor) -> Tensor:
+    """Values of the elements of the fine mesh on those of the coarse one: means over clusters, then over corners.
+
+    Args:
+        values: *Shape:* ``(B, M)``, or ``(B, 1)``, which stays.
+        fine: The term on the fine mesh.
+        coarse: The same term on the coarse mesh.
+        clusters: The coarse vertex of each fine one. *Shape:* ``(V,)``.
+
+    Returns:
+        *Shape:* ``(B, M_coarse)``.
+    """
+    if values.shape[-1] == 1:
+        return values
+    owners = clusters[fine.corners].flatten()
+    n = int(clusters.max()) + 1
+    sums = values.new_zeros(len(values), n).index_add(1, owners, values.repeat(1, len(fine.corners)))
+    counts = torch.bincount(owners, minlength=n)
+    # A cluster without elements of its own knows the mean only.
+    means = torch.where(counts > 0, sums / counts.clamp_min(1), values.mean(1, keepdim=True))
+    return means[:, coarse.corners].mean(1)

@@ -1,0 +1,140 @@
+"""What is minimised, how it is solved, and named pairs of both: the settings that all in-betweens share."""
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+from torch import Tensor
+
+from torch_modal.energy.shell import ALPHA, BETA, GAMMA
+from torch_modal.energy.terms import Bend, Stretch, Term, Volume
+
+
+def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} is one of {', '.join(map(repr, choices))}; got {value!r}")
+
+
+def _whole(name: str, value: int, lowest: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < lowest:
+        raise ValueError(f"{name} is a whole number, {lowest} or more; got {value!r}")
+
+
+@dataclass(frozen=True)
+class Objective:
+    r"""What is minimised: :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)` or Eq. 4, with the energy of Eq. 5 for ``d``.
+
+    Attributes:
+        space: ``"joint"`` (one shape in the sum of both modal spaces) or ``"paired"`` (Eq. 4 of the paper: one near
+            each key-frame, pulled together, and the mean of both; t = 1/2 only).
+        base: The shape that the modes are added to in the joint space: ``"rotations"`` (a blend by local rotations of
+            the triangles, which leaves less for the modes to do) or ``"linear"`` (linear interpolation).
+        alpha: Stretching stiffness of Eq. 5: a number, or a tensor or parameter whose last dimension counts the edges,
+            or is 1, and whose others broadcast against the samples. *Shape:* ``()``, ``(..., E)`` or ``(..., 1)``.
+        beta: Bending stiffness, likewise with the hinges. *Shape:* ``()``, ``(..., H)`` or ``(..., 1)``.
+        gamma: Volume stiffness. *Shape:* ``()`` or ``(..., 1)``.
+        mu: Weight of the similarity of Eq. 4, of no effect in the joint space: a number, or a tensor or parameter that
+            broadcasts against the samples. *Shape:* ``(...)``.
+        terms: Further terms of the energy.
+        coarse_faces: Faces of the mesh that the energy is evaluated on in the modal space.
+
+    Raises:
+        ValueError: A choice that does not exist, or a number out of range.
+    """
+
+    space: Literal["joint", "paired"] = "joint"
+    base: Literal["rotations", "linear"] = "rotations"
+    alpha: float | Tensor = ALPHA
+    beta: float | Tensor = BETA
+    gamma: float | Tensor = GAMMA
+    mu: float | Tensor = 1.0  # the best of a grid over three spans of a hand; it depends on the mesh
+    terms: tuple[Term, ...] = ()
+    coarse_faces: int = 1000
+
+    def __post_init__(self) -> None:
+        _choice("space", self.space, ("joint", "paired"))
+        _choice("base", self.base, ("rotations", "linear"))
+        _whole("coarse_faces", self.coarse_faces, 4)
+        wrong = [term for term in self.terms if not isinstance(term, Term)]
+        if wrong:
+            raise ValueError(f"terms holds a {type(wrong[0]).__name__}; each is an instance of torch_modal.Term")
+
+    def all_terms(self) -> list[Term]:
+        """Those of Eq. 5 and the further ones."""
+        return [Stretch(self.alpha), Bend(self.beta), Volume(self.gamma), *self.terms]
+
+
+@dataclass(frozen=True)
+class Solver:
+    """How it is solved.
+
+    Attributes:
+        max_steps: Newton steps at most in the modal space; exactly that many with ``gradient="unroll"``.
+        tolerance: Bound on the gradient norm there, relative to the one at the start.
+        least_gain: A step that promises less than this part of the energy is the last one, where no gradient is
+            recorded: further steps change nothing that one could see (docs/quality.md). Where one is, the solve always
+            goes on to the tolerance, on which exact gradients rest. 0 goes on to it everywhere. Of no effect in the
+            paired space, which starts too far away.
+        gradient: ``"implicit"`` (by the implicit function theorem with the full Hessian; memory does not grow with the
+            steps) or ``"unroll"`` (through all steps).
+        unconverged: What happens when samples did not converge: ``"warn"`` warns and lets no gradient flow through
+            their amplitudes, ``"raise"`` raises where gradients are recorded. With ``gradient="unroll"`` only ``solve``
+            tells.
+        local_steps: Newton steps of all vertices on the fine mesh after the modal solve, for what the modes cannot
+            reach: fingertips, hooves, creases. Gradients go through them; they cost memory in proportion to V.
+        polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
+
+    Raises:
+        ValueError: A choice that does not exist, or a number out of range.
+    """
+
+    max_steps: int = 40
+    tolerance: float = 1e-10
+    least_gain: float = 0.03
+    gradient: Literal["implicit", "unroll"] = "implicit"
+    unconverged: Literal["warn", "raise"] = "warn"
+    local_steps: int = 2
+    polish: int = 0
+
+    def __post_init__(self) -> None:
+        _choice("gradient", self.gradient, ("implicit", "unroll"))
+        _choice("unconverged", self.unconverged, ("warn", "raise"))
+        for name, lowest in (("max_steps", 0), ("local_steps", 0), ("polish", 0)):
+            _whole(name, getattr(self, name), lowest)
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance bounds a relative gradient norm and is above 0; got {self.tolerance!r}")
+        if not 0 <= self.least_gain < 1:
+            raise ValueError(f"least_gain is a part of the energy, from 0 to less than 1; got {self.least_gain!r}")
+
+
+class Settings(NamedTuple):
+    """Both."""
+
+    objective: Objective
+    solver: Solver
+
+
+Preset = Literal["accurate", "fast", "paper"]
+
+PRESETS = {
+    "accurate": Settings(Objective(), Solver()),
+    "fast": Settings(Objective(coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
+    "paper": Settings(Objective(space="paired"), Solver(local_steps=0)),
+}
+"""What the names stand for; docs/layer.md says what each costs and gives."""
+
+
+def settings(preset: str, objective: Objective | None = None, solver: Solver | None = None) -> Settings:
+    """The settings of a preset, with what is given in the place of its own.
+
+    Raises:
+        ValueError: There is no such preset.
+    """
+    _choice("preset", preset, tuple(PRESETS))
+    chosen = PRESETS[preset]
+    return Settings(objective or chosen.objective, solver or chosen.solver)
+
+
+def with_space(chosen: Settings, space: str | None, mu: float | Tensor | None) -> Settings:
+    """The same with another space or ``mu``, where they are given."""
+    changes = {name: value for name, value in (("space", space), ("mu", mu)) if value is not None}
+    return chosen._replace(objective=replace(chosen.objective, **changes))  # type: ignore[arg-type]

@@ -1,0 +1,40 @@
+"""Nested tuples and lists of tensors of one batch."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def leaves(tree: Any) -> list[Tensor]:
+    """The tensors, in order."""
+    if isinstance(tree, Tensor):
+        return [tree]
+    return [tensor for part in tree for tensor in leaves(part)] if isinstance(tree, (tuple, list)) else []
+
+
+def mapped(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    """The same tree with a function of each tensor in its place; what is no tensor stays."""
+    if isinstance(tree, Tensor):
+        return function(tree)
+    if isinstance(tree, (tuple, list)):
+        parts = [mapped(part, function) for part in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
+    return tree
+
+
+def skeleton(tree: Any) -> Any:
+    """The same tree with nothing in the places of its tensors."""
+    return mapped(tree, lambda _: torch.empty(0))
+
+
+def filled(tree: Any, tensors: Iterable[Tensor]) -> Any:
+    """The same tree with other tensors in the places of its own, in order."""
+    each = iter(tensors)
+    return mapped(tree, lambda _: next(each))
+
+
+def rows(tree: Any, samples: Tensor | slice) -> Any:
+    """The same for some of the samples."""
+    return mapped(tree, lambda tensor: tensor[samples])
