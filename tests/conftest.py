@@ -18,6 +18,7 @@ from torch_modal.keyframes.load import load_keyframes
 from torch_modal.nn.between import Samples
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.settings import Objective, Solver
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases
@@ -132,6 +133,15 @@ def women(data_dir: Path) -> Shapes:
 def generator() -> torch.Generator:
     """The one source of random numbers."""
     return torch.Generator().manual_seed(0)
+
+
+def modal(
+    rotations: bool = False, local: bool = False, space: str = "joint", **changes: Any
+) -> dict[str, Objective | Solver]:
+    """Settings of the bare modal solve, to the tolerance; what is named here changes them."""
+    of_solver = {name: changes.pop(name) for name in set(changes) & set(Solver.__dataclass_fields__)}
+    objective = Objective(base="rotations" if rotations else "linear", space=space, **changes)
+    return {"objective": objective, "solver": Solver(**{"least_gain": 0.0, "local_steps": 2 * local, **of_solver})}
 
 
 def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:

@@ -1,20 +1,19 @@
 """The working frame: scale, alignment, coarse mesh and independent columns."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
 
-from torch_modal.nn.frame import DIAGONAL, Frame, Pair
+from torch_modal.energy.shell import DIAGONAL
+from torch_modal.nn.frame import Frame, Pair
 from torch_modal.precompute.coarsening import coarsen
 
 
 @pytest.fixture(scope="module")
 def frame(bars: Shapes) -> Frame:
-    return Frame(bars.bases[:2], bars.faces, coarse_faces=200)
+    return Frame(bars.keyframes[:2], bars.faces, coarse_faces=200)
 
 
 @pytest.fixture
@@ -46,12 +45,12 @@ def test_collapses_are_chosen_on_aligned_keyframes(frame: Frame, bars: Shapes, g
     """A rigid motion of the second basis changes nothing: same clusters, same space."""
     turn = random_rotation(generator)
     basis = bars.bases[1]
-    turned = replace(basis, reference=basis.reference @ turn.mT + 9, modes=basis.modes @ turn.mT)
-    other = Frame([bars.bases[0], turned], bars.faces, coarse_faces=200)
+    shapes = torch.stack([bars.keyframes[0], basis.reference @ turn.mT + 9])
+    other = Frame(shapes, bars.faces, coarse_faces=200)
     assert torch.equal(other.clusters, frame.clusters)
-    torch.testing.assert_close(
-        other.modes([bars.bases[0], turned])[1], frame.modes(bars.bases[:2])[1], atol=1e-11, rtol=0
-    )
+    first = bars.bases[0].modes
+    turned, straight = other.modes(first, basis.modes @ turn.mT)[1], frame.modes(first, basis.modes)[1]
+    torch.testing.assert_close(turned, straight, atol=1e-11, rtol=0)
 
 
 def test_place_and_restore(frame: Frame, moved: Tensor) -> None:
@@ -93,7 +92,7 @@ def test_remove_leaves_nothing_of_the_columns(frame: Frame, bars: Shapes, genera
 
 
 def test_elastic_columns_have_no_rigid_motion(frame: Frame, bars: Shapes) -> None:
-    modes = torch.cat(frame.modes(bars.bases[:2]))
+    modes = torch.cat(frame.modes(*(basis.modes for basis in bars.bases[:2])))
     columns = frame.elastic_columns(modes)
     assert len(frame.rigid.fine) == 6
     both = torch.cat([frame.rigid.coarse, columns.coarse])
@@ -106,33 +105,24 @@ def test_elastic_columns_have_no_rigid_motion(frame: Frame, bars: Shapes) -> Non
 
 
 def test_one_basis_for_both_ends(bars: Shapes) -> None:
-    twice = [bars.bases[0]] * 2
-    frame = Frame(twice, bars.faces, 200)
-    first, second = frame.modes(twice)
+    frame = Frame(bars.keyframes[[0, 0]], bars.faces, 200)
+    first, second = frame.modes(bars.bases[0].modes, bars.bases[0].modes)
     torch.testing.assert_close(first, second)
     assert len(frame.elastic_columns(torch.cat([first, second])).fine) == 8, "the second eight are the first eight"
 
 
+def test_points_are_brought_where_shapes_are(frame: Frame, moved: Tensor) -> None:
+    pair, t = frame.place(*moved), torch.tensor([0.3], dtype=torch.float64)
+    x = pair.first + 1
+    torch.testing.assert_close(frame.bring(frame.restore(x, pair, t), pair, t), x, atol=1e-9, rtol=0)
+
+
 def test_module(frame: Frame, bars: Shapes, moved: Tensor) -> None:
-    other = Frame([bars.bases[2], bars.bases[1]], bars.faces.flip(0), coarse_faces=200)
-    if other.n_coarse != frame.n_coarse:
-        pytest.skip("the two coarse meshes differ in size")
-    other.load_state_dict(frame.state_dict())
-    for mine, theirs in zip(other.place(*moved)[:2], frame.place(*moved)[:2], strict=True):
-        torch.testing.assert_close(mine, theirs, atol=0, rtol=0)
-    single = Frame(bars.bases[:2], bars.faces, 200).float()
+    assert not frame.state_dict(), "all of it follows from the bases"
+    single = Frame(bars.keyframes[:2], bars.faces, 200).float()
     pair = single.place(*moved.float())
     assert isinstance(pair, Pair)
     assert pair.first.dtype == torch.float32
-
-
-def test_exception(bars: Shapes, small_bars: Shapes) -> None:
-    with pytest.raises(ValueError, match="meshes of 164 and 30 vertices"):
-        Frame([bars.bases[0], small_bars.bases[0]], bars.faces, 200)
-    with pytest.raises(ValueError, match="vertices that do not exist"):
-        Frame(small_bars.bases[:2], bars.faces, 200)
-    with pytest.raises(ValueError, match="at least 4 faces"):
-        Frame(bars.bases[:2], bars.faces, 3)
 
 
 def test_keeps_what_coarsen_chose(frame: Frame, bars: Shapes) -> None:

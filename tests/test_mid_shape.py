@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes, placement_of, random_rotation
+from conftest import Shapes, modal, placement_of, random_rotation
 from torch import Tensor
 from torch.func import functional_call
 
@@ -15,8 +15,8 @@ from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import best_fit, blend
 from torch_modal.nn.between import ConvergenceWarning
-from torch_modal.nn.in_between import DEFAULT_MU
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.settings import Objective
 from torch_modal.precompute.basis import ModalBasis
 
 SPACES = ["joint", "paired"]
@@ -58,7 +58,7 @@ def bent(bars: Shapes) -> Shapes:
 
 @pytest.fixture(scope="module")
 def layer(bent: Shapes, space: str) -> MidShape:
-    return MidShape(bent.bases, bent.faces, space, coarse_faces=200)
+    return MidShape(bent.bases, bent.faces, space, **modal(coarse_faces=200))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def middle(layer: MidShape, bent: Shapes) -> Tensor:
 
 def test_energy_is_below_linear_interpolation_and_at_a_minimum(bent: Shapes, generator: torch.Generator) -> None:
     """Told by Eq. 5 on the fine mesh, which is here the one that is solved on."""
-    layer = MidShape(bent.bases, bent.faces, coarse_faces=1000)
+    layer = MidShape(bent.bases, bent.faces, **modal(coarse_faces=1000))
     found = layer.solve(*bent.keyframes)
     shell, scale = ShellEnergy(bent.faces), layer.space.frame.scale
 
@@ -102,8 +102,8 @@ def test_moves_along_with_both_keyframes(
     # And with the bases too, which are then made elsewhere. A quarter turn, as the box around the first sets the scale.
     turn = torch.tensor([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=torch.float64)
     bases = [moved(basis, turn, move) for basis in bent.bases]
-    there = MidShape(bases, bent.faces, space, coarse_faces=1000)(*(bent.keyframes @ turn.mT + move))
-    here = MidShape(bent.bases, bent.faces, space, coarse_faces=1000)(*bent.keyframes)
+    there = MidShape(bases, bent.faces, space, **modal(coarse_faces=1000))(*(bent.keyframes @ turn.mT + move))
+    here = MidShape(bent.bases, bent.faces, space, **modal(coarse_faces=1000))(*bent.keyframes)
     assert largest(there - (here @ turn.mT + move)) < 1e-8 * diagonal(middle)
 
 
@@ -123,7 +123,7 @@ def test_rigid_motion_between_keyframes_is_followed_half_way(layer: MidShape, be
 def test_units(factor: float, space: str, middle: Tensor, bent: Shapes) -> None:
     eye, origin = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     bases = [moved(basis, eye, origin, factor) for basis in bent.bases]
-    scaled = MidShape(bases, bent.faces, space, coarse_faces=200)(*(factor * bent.keyframes))
+    scaled = MidShape(bases, bent.faces, space, **modal(coarse_faces=200))(*(factor * bent.keyframes))
     assert largest(scaled - factor * middle) < 1e-8 * factor * diagonal(middle)
 
 
@@ -142,8 +142,8 @@ def test_the_other_way_round(coarse_faces: int, space: str, bent: Shapes) -> Non
     Measured, of the diagonal: 0.5 % as they lie, 0.01 to 0.04 % when laid upon each other.
     """
     x_a, x_b = bent.keyframes
-    there = MidShape(bent.bases, bent.faces, space, coarse_faces=coarse_faces)(x_a, x_b)
-    back = MidShape(bent.bases[::-1], bent.faces, space, coarse_faces=coarse_faces)(x_b, x_a)
+    there = MidShape(bent.bases, bent.faces, space, **modal(coarse_faces=coarse_faces))(x_a, x_b)
+    back = MidShape(bent.bases[::-1], bent.faces, space, **modal(coarse_faces=coarse_faces))(x_b, x_a)
     laid = best_fit(back, there, torch.ones(len(x_a), dtype=torch.float64)).apply(back)
     assert largest(there - back) < 0.01 * diagonal(x_a)
     assert largest(there - laid) < 1e-3 * diagonal(x_a)
@@ -154,7 +154,7 @@ def test_a_vertex_of_no_face_has_no_say(middle: Tensor, bent: Shapes, space: str
         return torch.cat([torch.full_like(x[..., :1, :], at), x], -2)
 
     bases = [replace(b, reference=with_stray(b.reference, 900.0), modes=with_stray(b.modes, 0.0)) for b in bent.bases]
-    found = MidShape(bases, bent.faces + 1, space, coarse_faces=200)(*with_stray(bent.keyframes, -50.0))
+    found = MidShape(bases, bent.faces + 1, space, **modal(coarse_faces=200))(*with_stray(bent.keyframes, -50.0))
     assert found.isfinite().all()
     assert largest(found[1:] - middle) < 1e-8 * diagonal(middle)
 
@@ -182,7 +182,7 @@ def test_float32(layer: MidShape, middle: Tensor, bent: Shapes, space: str) -> N
     assert largest(given - middle) < 1e-5 * diagonal(middle)
     mixed = layer(bent.keyframes[0].float(), bent.keyframes[1])
     assert mixed.dtype == torch.float64
-    single = MidShape(bent.bases, bent.faces, space, coarse_faces=200).float()
+    single = MidShape(bent.bases, bent.faces, space, **modal(coarse_faces=200)).float()
     found = single.solve(*bent.keyframes.float())
     assert found.solution.energy.dtype == torch.float32
     assert found.solution.converged
@@ -196,13 +196,19 @@ def test_bases_are_constants(layer: MidShape) -> None:
 
 
 def test_state_dict_and_functional_call(layer: MidShape, middle: Tensor, bent: Shapes, space: str) -> None:
-    same = MidShape(bent.bases, bent.faces, space, coarse_faces=200)
-    zeros = {name: torch.zeros_like(tensor) for name, tensor in same.state_dict().items()}
-    same.load_state_dict(zeros)
-    same.load_state_dict(layer.state_dict())
-    assert torch.equal(same(*bent.keyframes), middle)
-    buffers = dict(layer.named_buffers())
-    assert torch.equal(functional_call(same, buffers, tuple(bent.keyframes)), middle)
+    """What is saved are the bases; what follows from them is made anew when others are loaded."""
+    before = [basis.reference.clone() for basis in bent.bases]
+    other = MidShape(bent.bases[::-1], bent.faces, space, **modal(coarse_faces=200))
+    buffers, own = dict(layer.named_buffers()), other(*bent.keyframes)
+    assert largest(own - middle) > 1e-6
+    torch.testing.assert_close(functional_call(other, buffers, tuple(bent.keyframes)), middle, rtol=0, atol=1e-9)
+    state = layer.state_dict()
+    assert sorted(state) == sorted(f"in_between.bases.{i}.{name}" for i in range(2) for name in ("reference", "modes"))
+    other.load_state_dict(state)
+    assert torch.equal(other(*bent.keyframes), middle)
+    assert all(torch.equal(a, b.reference) for a, b in zip(before, bent.bases, strict=True))
+    with pytest.raises(ValueError, match="zero size"):
+        other.load_state_dict({name: torch.zeros_like(tensor) for name, tensor in state.items()})
 
 
 def test_stiffnesses_count(bent: Shapes, middle: Tensor, space: str) -> None:
@@ -211,25 +217,25 @@ def test_stiffnesses_count(bent: Shapes, middle: Tensor, space: str) -> None:
     measure = ShellEnergy(bent.faces).measure
     if space == "joint":
         stiff, soft = (
-            MidShape(bent.bases, bent.faces, gamma=gamma, coarse_faces=1000)(x_a, x_b) for gamma in (1e9, 0.0)
+            MidShape(bent.bases, bent.faces, **modal(gamma=gamma, coarse_faces=1000))(x_a, x_b) for gamma in (1e9, 0.0)
         )
         wanted = 0.5 * float(measure(x_a).volume + measure(x_b).volume)
         errors = [abs(float(measure(x).volume) / wanted - 1) for x in (stiff, soft)]
         assert errors[0] < 0.1 * errors[1]
-    options: dict[str, Any] = {"alpha": 5e3, "beta": 1e2, "gamma": 1e4, "mu": 10 * DEFAULT_MU, "coarse_faces": 200}
-    factor = MidShape(bent.bases, bent.faces, space, **options)(x_a, x_b)
+    options: dict[str, Any] = {"alpha": 5e3, "beta": 1e2, "gamma": 1e4, "mu": 10 * Objective().mu, "coarse_faces": 200}
+    factor = MidShape(bent.bases, bent.faces, space, **modal(**options))(x_a, x_b)
     assert largest(factor - middle) < 1e-7 * diagonal(x_a)
 
 
 def test_warns_if_it_gives_up(bent: Shapes, space: str) -> None:
-    hasty = MidShape(bent.bases, bent.faces, space, coarse_faces=200, max_steps=1)
+    hasty = MidShape(bent.bases, bent.faces, space, **modal(coarse_faces=200, max_steps=1))
     found = hasty.solve(*bent.keyframes)
     assert not found.solution.converged
     with pytest.warns(ConvergenceWarning, match=r"1 of 1 in-betweens did not converge in 1 steps"):
         assert hasty(*bent.keyframes).isfinite().all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        MidShape(bent.bases, bent.faces, space, coarse_faces=200)(*bent.keyframes)
+        MidShape(bent.bases, bent.faces, space, **modal(coarse_faces=200))(*bent.keyframes)
 
 
 def test_one_bad_sample(layer: MidShape, middle: Tensor, bent: Shapes) -> None:
@@ -248,11 +254,11 @@ def test_exception(layer: MidShape, bent: Shapes) -> None:
         layer(x_a.long(), x_b)
     with pytest.raises(ValueError, match=r"got \(164, 2\)"):
         layer(x_a[:, :2], x_b)
-    with pytest.raises(ValueError, match="space is 'joint' or 'paired', got 'both'"):
-        MidShape(bent.bases, bent.faces, "both")
+    with pytest.raises(ValueError, match="space is one of 'joint', 'paired'; got 'both'"):
+        MidShape(bent.bases, bent.faces, "both", **modal())
     with pytest.raises(ValueError, match="between two bases, got 1"):
-        MidShape(bent.bases[:1], bent.faces)
-    with pytest.raises(RuntimeError):
+        MidShape(bent.bases[:1], bent.faces, **modal())
+    with pytest.raises(ValueError, match=r"does not broadcast against key-frames of \(2,\) and \(3,\)"):
         layer(x_a.expand(2, -1, -1), x_b.expand(3, -1, -1))
 
 
@@ -266,7 +272,7 @@ def test_coincident_vertices_are_survived(bars: Shapes) -> None:
         modes = basis.modes.clone()
         modes[:, i] = modes[:, j]
         bases.append(replace(basis, reference=x, modes=modes))
-    found = MidShape(bases[:2], bars.faces).solve(*keyframes[:2])
+    found = MidShape(bases[:2], bars.faces, **modal()).solve(*keyframes[:2])
     assert found.solution.converged
 
 
@@ -289,7 +295,7 @@ def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands
     They vary with the meshing, which is not deterministic.
     """
     pair = hands.pick(*ends)
-    found = MidShape(pair.bases, pair.faces).solve(*pair.keyframes)
+    found = MidShape(pair.bases, pair.faces, **modal()).solve(*pair.keyframes)
     wanted = hands.keyframes[truth]
     shell = ShellEnergy(hands.faces)
     if ends == (0, 2):  # on some meshings the wider spans end STALLED, at a collapsed triangle; their shape is as good
@@ -304,7 +310,7 @@ def test_hand_without_its_rigid_motion(hands: Shapes, generator: torch.Generator
     """On a real mesh, through coarsening, with the second key-frame turned away from the first."""
     pair = hands.pick(0, 2)
     turn, move = random_rotation(generator), torch.tensor([9.0, 8.0, 7.0], dtype=torch.float64)
-    layer = MidShape(pair.bases, pair.faces)
+    layer = MidShape(pair.bases, pair.faces, **modal())
     x_a, x_b = pair.keyframes
     here, away = layer.solve(x_a, x_b), layer.solve(x_a, x_b @ turn.mT + move)
     assert float(away.solution.energy) == pytest.approx(float(here.solution.energy), rel=1e-9)
@@ -316,7 +322,7 @@ def test_hand_without_its_rigid_motion(hands: Shapes, generator: torch.Generator
 @pytest.mark.parametrize("ends", [(0, 4), (0, 2), (2, 4)], ids=["0-8", "0-4", "4-8"])
 def test_hand_energy_falls_at_every_step(ends: tuple[int, int], space: str, hands: Shapes) -> None:
     pair = hands.pick(*ends)
-    layer = MidShape(pair.bases, pair.faces, space)
+    layer = MidShape(pair.bases, pair.faces, space, **modal())
     t = torch.tensor([0.5], dtype=torch.float64)
     placement = placement_of(layer, layer.space.frame.place(*pair.keyframes[:, None]), t)
     a = torch.zeros(1, layer.space.n_unknowns, dtype=torch.float64)
@@ -332,7 +338,7 @@ def test_hand_energy_falls_at_every_step(ends: tuple[int, int], space: str, hand
 @pytest.mark.parametrize("ends", [(1, 2), (0, 1)], ids=["2-3", "0-2"])
 def test_walking_figure(ends: tuple[int, int], women: Shapes) -> None:
     pair = women.pick(*ends)
-    solution = MidShape(pair.bases, pair.faces).solve(*pair.keyframes).solution
+    solution = MidShape(pair.bases, pair.faces, **modal()).solve(*pair.keyframes).solution
     assert solution.converged
     assert solution.gradient_norm <= 1e-8
     assert solution.n_steps <= 20

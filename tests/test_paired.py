@@ -2,15 +2,17 @@
 
 import pytest
 import torch
-from conftest import Shapes
+from conftest import Shapes, modal
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev
 
-from torch_modal.energy.shell import ShellEnergy, per_sample
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.in_between import InBetween
+from torch_modal.nn.levels import Levels, Stiffness
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.paired import PairedPlacement, PairedProblem, PairedSpace
 from torch_modal.nn.solver import GaussNewtonStep, minimise
@@ -23,14 +25,17 @@ class Setting:
 
     def __init__(self, bars: Shapes, coarse_faces: int, mu: float | Tensor = MU) -> None:
         self.bars = bars
-        self.frame = Frame(bars.bases[:2], bars.faces, coarse_faces)
+        self.frame = Frame(bars.keyframes[:2], bars.faces, coarse_faces)
         self.shell = ShellEnergy(self.frame.coarse_faces)
-        self.space = PairedSpace(self.frame, self.shell, self.frame.modes(bars.bases[:2]))
+        terms = [Stretch(500.0), Bend(10.0), Volume(1000.0)]
+        levels = Levels(self.frame, Mesh.of(bars.faces, bars.keyframes.shape[1]), terms)
+        self.space = PairedSpace(self.frame, levels, self.frame.modes(*(basis.modes for basis in bars.bases[:2])))
         self.pair: Pair = self.frame.place(bars.keyframes[:2], bars.keyframes[1:3])
         half = torch.full((2,), 0.5, dtype=torch.float64)
-        weights = per_sample((mu, *self.shell.stiffness), half)
-        self.problem: PairedProblem = self.space.problem(self.pair, half, *weights)
-        self.placement: PairedPlacement = self.space.placement(*self.problem.inputs)
+        each = [torch.full((2, 1), term.stiffness, dtype=torch.float64) for term in terms]
+        mus = torch.as_tensor(mu, dtype=torch.float64).expand(2)
+        self.problem: PairedProblem = self.space.problem(self.pair, None, half, Stiffness(each, [each]), mus, None)
+        self.placement: PairedPlacement = self.problem.placement
         generator = torch.Generator().manual_seed(3)
         self.a = torch.randn(2, self.space.n_unknowns, dtype=torch.float64, generator=generator)
 
@@ -104,7 +109,7 @@ def test_small_mu_is_linear_interpolation(bars: Shapes) -> None:
     mean = blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
     distances = []
     for mu in (1e-3, 1e-6, 1e-9):
-        found = MidShape(bars.bases[1:], bars.faces, "paired", mu, coarse_faces=200)(x_a, x_b)
+        found = MidShape(bars.bases[1:], bars.faces, "paired", mu, **modal(coarse_faces=200))(x_a, x_b)
         distances.append(float((found - mean).abs().max()))
     assert distances[0] > 100 * distances[1] > 1e4 * distances[2], distances
     assert distances[2] < 1e-7
@@ -138,7 +143,9 @@ def test_mu_may_be_a_tensor_of_a_gradient(bars: Shapes) -> None:
 def test_knows_the_middle_only(bars: Shapes) -> None:
     with pytest.raises(ValueError, match="t = 1/2 only; use space='joint'"):
         x_a, x_b = bars.keyframes[:2]
-        InBetween(bars.bases[:2], bars.faces, "paired", coarse_faces=200)(x_a, x_b, torch.tensor([0.5, 0.25]))
+        InBetween(bars.bases[:2], bars.faces, **modal(space="paired", coarse_faces=200))(
+            x_a, x_b, torch.tensor([0.5, 0.25])
+        )
 
 
 @pytest.mark.parametrize(("ends", "truth"), [((0, 4), 2), ((0, 2), 1), ((2, 4), 3)], ids=["0-8", "0-4", "4-8"])
@@ -150,7 +157,7 @@ def test_hand_lies_between_linear_and_joint(ends: tuple[int, int], truth: int, h
     shapes = {"linear": blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)}
     for space in ("paired", "joint"):
         # On some meshings the wider spans end STALLED, at a collapsed triangle; the shape is as good.
-        shapes[space] = MidShape(pair.bases, pair.faces, space).solve(x_a, x_b).shapes
+        shapes[space] = MidShape(pair.bases, pair.faces, space, **modal()).solve(x_a, x_b).shapes
     i, j = torch.from_numpy(connectivity.unique_edges(hands.faces.numpy())[0]).T
     lengths = {name: torch.linalg.norm(x[i] - x[j], dim=1) for name, x in shapes.items()}
     wanted = torch.linalg.norm(hands.keyframes[truth][i] - hands.keyframes[truth][j], dim=1)

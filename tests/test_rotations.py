@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from conftest import Shapes
+from conftest import Shapes, modal
 from torch import Tensor
 
 from torch_modal.energy.shell import ShellEnergy
@@ -117,7 +117,7 @@ def test_derivatives(degrees: float, generator: torch.Generator) -> None:
 def test_starts_near_the_end_on_a_hand(ends: tuple[int, int], bound: float, hands: Shapes) -> None:
     """Linear interpolation has 11.8, 3.7 and 6.6 times its energy; fingers turn by up to 300 degrees."""
     pair = hands.pick(*ends)
-    layer = MidShape(pair.bases, pair.faces)
+    layer = MidShape(pair.bases, pair.faces, **modal())
     member = layer.in_between.members[0]
     space, x = member.space, pair.keyframes[:, None]
     problem = member.problem(space.frame.place(x[0], x[1]), T[2:3])

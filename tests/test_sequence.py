@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes, random_rotation
+from conftest import Shapes, modal, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
@@ -110,7 +110,9 @@ def test_steps_on_the_fine_mesh_by_default(scattered: Shapes) -> None:
     pair = scattered.pick(0, 1)
     options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
     default, modal = (subdivide(pair.keyframes, pair.faces, 1, local=local, **options)[1] for local in (True, False))
-    layer = MidShape(pair.bases, pair.faces, local=True, rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE)
+    layer = MidShape(
+        pair.bases, pair.faces, **modal(local=True, rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE)
+    )
     torch.testing.assert_close(default, layer(*pair.keyframes), rtol=0, atol=1e-12)
     assert largest(default - modal) > 1e-5
 
@@ -128,7 +130,7 @@ def test_recursion_by_hand(scattered: Shapes) -> None:
     """Two levels of the joint space are three mid-shapes with the modes of both ends."""
     pair = scattered.pick(1, 2)
     frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, local=False, **COARSE)
-    layer = MidShape(pair.bases, pair.faces, rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE)
+    layer = MidShape(pair.bases, pair.faces, **modal(rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE))
     middle = layer(*pair.keyframes)
     by_hand = [pair.keyframes[0], layer(pair.keyframes[0], middle), middle, layer(middle, pair.keyframes[1])]
     for frame, truth in zip(frames, by_hand, strict=False):
@@ -210,7 +212,7 @@ def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: 
     nearest = int((lengths[2] - lengths[1]).norm() < (lengths[2] - lengths[0]).norm())
     assert used == [(0, 1), (0, nearest), (nearest, 1)]
     # The same from the layers themselves.
-    left = MidShape([pair.bases[0], pair.bases[nearest]], pair.faces, "paired", **COARSE)(x_a, frames[2])
+    left = MidShape([pair.bases[0], pair.bases[nearest]], pair.faces, "paired", **modal(**COARSE))(x_a, frames[2])
     assert largest(frames[1] - left) < 1e-9
 
 

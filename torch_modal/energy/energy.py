@@ -64,12 +64,13 @@ class OnMesh(nn.Module):
     def __init__(self, term: Term, mesh: Mesh, numbers: Tensor | None = None) -> None:
         super().__init__()
         self._term = (term,)
-        elements, pairs = term.elements(mesh), term.pairs(mesh)
+        elements = term.elements(mesh)
         if elements.dim() != 2 or elements.shape[1] < 2 or elements.is_floating_point():
             raise ValueError(
                 f"{type(term).__name__}.elements gave {tuple(elements.shape)} of {elements.dtype}; they are rows of "
                 "two vertex indices or more, (M, n)"
             )
+        pairs = term.pairs(mesh)
         if numbers is not None:
             elements, pairs = numbers[elements], numbers[pairs]
         self.register_buffer("corners", elements.T.contiguous(), persistent=False)

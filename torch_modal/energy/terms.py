@@ -30,6 +30,9 @@ MIN_RELATIVE_LENGTH = 1e-6  # of the mean edge length
 MAX_BENDING_RATIO = 1e3  # of l^2 / A; an equilateral hinge has 1.15
 MIN_RELATIVE_VOLUME = 1e-6  # of (surface area)^(3/2); a sphere has 0.094
 
+# Strain over which the tension of an edge sets in.
+SLACK = 1e-3
+
 
 class Mesh(NamedTuple):
     """The vertices that elements may be made of."""
@@ -162,10 +165,13 @@ class Term(nn.Module):
         others = [hessian[s, :, t] for s in range(n) for t in range(s + 1, n)]
         return torch.cat([*first, *others], -1)
 
-    def tension(self, spokes: Tensor, slope: Tensor) -> Tensor | None:
+    def tension(self, spokes: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
         """Stiffness that stretched elements of two vertices have across; None for elements of more.
 
-        *Shape:* ``(1, 3, B, M), (B, M) -> (B, M)``.
+        Args:
+            spokes: *Shape:* ``(1, 3, B, M)``.
+            slope: First derivative of the energy in each measure. *Shape:* ``(B, M)``.
+            curvature: Second derivative. *Shape:* ``(B, M)``.
         """
         return None
 
@@ -201,9 +207,11 @@ class Stretch(Term):
         """The length's Hessian with the other sign, between both ends."""
         return -slope * length_hessian(spokes[0])
 
-    def tension(self, spokes: Tensor, slope: Tensor) -> Tensor:
-        """What a stretched string has."""
-        return slope.clamp_min(0) / norm(spokes[0])
+    def tension(self, spokes: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
+        """What a stretched string has; nearly none where compressed, without a kink in between."""
+        length = norm(spokes[0])
+        width = SLACK * curvature * length
+        return 0.5 * (slope + (slope * slope + width * width + torch.finfo(slope.dtype).tiny).sqrt()) / length
 
 
 class Bend(Term):

@@ -139,7 +139,7 @@ class Frame(nn.Module):
 
     def place(self, x_a: Tensor, x_b: Tensor) -> Pair:
         """Bring key-frames into the frame. *Shape:* ``(B, V, 3)`` each."""
-        placed = best_fit(x_a, self.reference / self.scale, self.weights)
+        placed = best_fit(x_a, (self.reference / self.scale).expand_as(x_a), self.weights)
         first, second = (placed.apply(x) * self.scale for x in (x_a, x_b))
         back = best_fit(second, first, self.weights)
         return Pair(first, back.apply(second), placed, back.inverse())

@@ -72,19 +72,21 @@ class InBetween(nn.Module):
         else:
             self.mu = mu
         self.bases = nn.ModuleList(_Basis(basis) for basis in bases)
-        _, self._faces = check_keyframes([basis.reference.double().cpu() for basis in bases], faces, warn=False)
+        self._faces = torch.as_tensor(faces)
         self._build()
         self.register_load_state_dict_post_hook(_rebuild)
 
     def _build(self) -> None:
         """What follows from the bases, on their device and in their dtype."""
         like = self.bases[0].reference
+        shapes = [basis.reference.double().cpu() for basis in self.bases]
+        _, self._faces = check_keyframes(shapes, self._faces.cpu(), warn=False)
         ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
         made = [
             Between(
                 torch.stack([ends[i][0], ends[j][0]]),
                 [ends[i][1], ends[j][1]],
-                self._faces.cpu(),
+                self._faces,
                 self.objective,
                 self.solver,
                 list(self.terms),
@@ -92,7 +94,6 @@ class InBetween(nn.Module):
             for i, j in self.pairs
         ]
         self.members = nn.ModuleList(made).to(like)
-        self._made_from = [basis.reference for basis in self.bases] + [basis.modes for basis in self.bases]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "InBetween":
         """Never below float32."""
@@ -273,8 +274,9 @@ class _Basis(nn.Module):
 
     def __init__(self, basis: ModalBasis) -> None:
         super().__init__()
-        self.register_buffer("reference", basis.reference.double())
-        self.register_buffer("modes", basis.modes.double())
+        # Copies: what is loaded into a layer must not reach the basis that it was made from.
+        self.register_buffer("reference", basis.reference.to(torch.float64, copy=True))
+        self.register_buffer("modes", basis.modes.to(torch.float64, copy=True))
 
 
 def _rebuild(layer: InBetween, *_: Any) -> None:

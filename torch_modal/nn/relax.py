@@ -28,7 +28,9 @@ class ConvexHessian:
     def __init__(self, energy: Energy, at: Sequence[Linearised]) -> None:
         self.energy, self.at = energy, at
         #: Stiffness across each element of two vertices; along it, there is the curvature. *Shape:* ``(B, M)``.
-        self.tensions = [part.term.tension(one.spokes, one.slope) for part, one in zip(energy.parts, at, strict=True)]
+        self.tensions = [
+            part.term.tension(one.spokes, one.slope, one.curvature) for part, one in zip(energy.parts, at, strict=True)
+        ]
 
     def __call__(self, field: Tensor) -> Tensor:
         """The product with displacements. *Shape:* ``(3, B, V)``, extended."""
@@ -107,8 +109,7 @@ def relax(
         direction = _conjugate_gradients(energy, ConvexHessian(energy, at), right, n_products)
         moves = energy.extend(direction)
         before = energy.value_at(at, reference)
-        batched = (before, extended.transpose(0, 1), moves.transpose(0, 1), *trees.leaves(reference))
-        length = _Length.apply(energy, trees.skeleton(reference), *batched)
+        length = _downhill(energy, before, extended, moves, reference)
         rows = rows + length[:, None] * direction
     return rows.movedim(0, -1)
 
@@ -143,6 +144,13 @@ def _conjugate_gradients(energy: Energy, hessian: ConvexHessian, right: Tensor, 
         previous, size = size, dot(residual, preconditioned)
         direction = preconditioned + quotient(size, previous) * direction
     return solution
+
+
+@torch.compiler.disable  # it looks at numbers: a graph ends here, and another begins
+def _downhill(energy: Energy, before: Tensor, rows: Tensor, moves: Tensor, reference: Reference) -> Tensor:
+    """The longest of the steps that goes downhill. *Shape:* ``(B,), (3, B, V), (3, B, V) -> (B,)``."""
+    batched = (before, rows.transpose(0, 1), moves.transpose(0, 1), *trees.leaves(reference))
+    return _Length.apply(energy, trees.skeleton(reference), *batched)
 
 
 class _Length(torch.autograd.Function):

@@ -100,8 +100,8 @@ class Solver:
         _choice("unconverged", self.unconverged, ("warn", "raise"))
         for name, lowest in (("max_steps", 0), ("local_steps", 0), ("polish", 0)):
             _whole(name, getattr(self, name), lowest)
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance bounds a relative gradient norm and is above 0; got {self.tolerance!r}")
+        if not self.tolerance >= 0:
+            raise ValueError(f"tolerance bounds a relative gradient norm and is 0 or more; got {self.tolerance!r}")
         if not 0 <= self.least_gain < 1:
             raise ValueError(f"least_gain is a part of the energy, from 0 to less than 1; got {self.least_gain!r}")
 

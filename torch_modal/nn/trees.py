@@ -3,8 +3,10 @@
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import torch
 from torch import Tensor
+
+HERE = "here"
+"""Stands in a skeleton where a tensor was."""
 
 
 def leaves(tree: Any) -> list[Tensor]:
@@ -14,9 +16,9 @@ def leaves(tree: Any) -> list[Tensor]:
     return [tensor for part in tree for tensor in leaves(part)] if isinstance(tree, (tuple, list)) else []
 
 
-def mapped(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
+def mapped(tree: Any, function: Callable[[Any], Any]) -> Any:
     """The same tree with a function of each tensor in its place; what is no tensor stays."""
-    if isinstance(tree, Tensor):
+    if isinstance(tree, (Tensor, str)):
         return function(tree)
     if isinstance(tree, (tuple, list)):
         parts = [mapped(part, function) for part in tree]
@@ -25,12 +27,12 @@ def mapped(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 
 def skeleton(tree: Any) -> Any:
-    """The same tree with nothing in the places of its tensors."""
-    return mapped(tree, lambda _: torch.empty(0))
+    """The same tree with :data:`HERE` in the places of its tensors."""
+    return mapped(tree, lambda _: HERE)
 
 
 def filled(tree: Any, tensors: Iterable[Tensor]) -> Any:
-    """The same tree with other tensors in the places of its own, in order."""
+    """A tree or skeleton with other tensors in the places of its own, in order."""
     each = iter(tensors)
     return mapped(tree, lambda _: next(each))
 

@@ -1,15 +1,17 @@
 """Eq. 5 with all vertices free: derivatives against autograd, and what a few steps gain."""
 
+from collections.abc import Iterable
 from itertools import pairwise
 
 import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
-from torch.func import hessian, jacfwd
+from torch.func import hessian, jacfwd, vmap
 
-from torch_modal.energy.linearised import Reference, energy_of, gradient, linearise
+from torch_modal.energy.energy import Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.vectors import norm
 from torch_modal.nn.relax import RIDGE, ConvexHessian, relax
 
 BATCH = 2
@@ -26,8 +28,20 @@ class Case:
         self.x = x[1] + roughness * noise
         self.rests = [x[1].expand_as(self.x), x[2] * torch.tensor([1.2, 0.8, 1.0])]
         self.pulls = [torch.tensor([0.5, 0.9]).double(), torch.tensor([0.5, 0.2]).double()]
-        self.references = [Reference(self.shell.rest(r), p) for r, p in zip(self.rests, self.pulls, strict=True)]
-        self.rows = self.x.movedim(-1, 0).contiguous()
+        self.core = self.shell.energy
+        self.rows = self.core.extend(self.x.movedim(-1, 0).contiguous())
+        self.reference = self.reference_of(range(BATCH))
+
+    def reference_of(self, samples: Iterable[int]) -> Reference:
+        """Both rest shapes in one, for some of the samples."""
+        rows = list(samples)
+        pulls = [pull[rows] for pull in self.pulls]
+        rests = [self.shell.rest(rest.expand_as(self.x)[rows]) for rest in self.rests]
+        factors = [(pulls[0] + pulls[1])[:, None] * stiffness for stiffness in self.shell.stiffness]
+        return self.core.between(rests[0], rests[1], pulls[1] / (pulls[0] + pulls[1]), factors)
+
+    def at(self, x: Tensor) -> list[Linearised]:
+        return self.core.linearise(self.core.extend(x.movedim(-1, 0).contiguous()), self.reference)
 
     def energy(self, x: Tensor, sample: int) -> Tensor:
         parts = zip(self.rests, self.pulls, strict=True)
@@ -40,7 +54,7 @@ def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
 
 
 def test_gradient(case: Case) -> None:
-    got = gradient(case.shell, linearise(case.shell, case.rows, case.references))
+    got = case.core.fold(case.core.gradient(case.at(case.x)))
     for sample in range(BATCH):
         x = case.x[sample].clone().requires_grad_()
         (truth,) = torch.autograd.grad(case.energy(x, sample), x)
@@ -48,20 +62,14 @@ def test_gradient(case: Case) -> None:
 
 
 def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> None:
-    at = linearise(case.shell, case.rows, case.references)
-    convex = ConvexHessian(case.shell, at)
+    core, at = case.core, case.at(case.x)
+    convex = ConvexHessian(core, at)
     n = case.x[0].numel()
+    to_volume = core.fold(at[2].gradients)
     for sample in range(BATCH):
         unit = torch.eye(n, dtype=torch.float64).reshape(n, *case.x[0].shape).movedim(-1, 0)
-        only = linearise(
-            case.shell,
-            case.rows[:, [sample]].expand(-1, n, -1).contiguous(),
-            [
-                Reference(case.shell.rest(r.expand_as(case.x)[[sample]]), p[[sample]])
-                for r, p in zip(case.rests, case.pulls, strict=True)
-            ],
-        )
-        got = ConvexHessian(case.shell, only)(unit).movedim(0, -1).flatten(1)
+        only = core.linearise(case.rows[:, [sample]].expand(-1, n, -1).contiguous(), case.reference_of([sample]))
+        got = core.fold(ConvexHessian(core, only)(core.extend(unit))).movedim(0, -1).flatten(1)
 
         def residuals(x: Tensor, sample: int = sample) -> Tensor:
             parts = zip(case.rests, case.pulls, strict=True)
@@ -70,7 +78,7 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
             )
 
         jacobian = jacfwd(residuals)(case.x[sample]).flatten(1)
-        stretched = at.slope.length[sample].clamp_min(0)
+        stretched = core.parts[0].term.tension(*at[0][:1], *at[0][-2:])[sample] * norm(at[0].spokes[0])[sample]
 
         def lengths(x: Tensor, stretched: Tensor = stretched) -> Tensor:
             return (stretched * case.shell.measure(x).length).sum()
@@ -79,15 +87,14 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
         assert float((got - truth).norm() / truth.norm()) < 1e-11
         assert float(torch.linalg.eigvalsh(got).amin()) > -1e-9 * float(torch.linalg.eigvalsh(got).amax())
 
-        blocks = convex.inverse_diagonal()[:, :, sample].permute(2, 0, 1)
+        blocks = convex.inverse_diagonal()[:, :, sample, : n // 3].permute(2, 0, 1)
         own = truth.reshape(n // 3, 3, n // 3, 3)
         # The volume couples all vertices and is left out of the blocks.
-        at_volume = (
-            at.curvature.volume[sample] * at.to_volume[:, sample].T[:, :, None] * at.to_volume[:, sample].T[:, None]
-        )
+        own_volume = to_volume[:, sample].T
+        at_volume = at[2].curvature[sample] * own_volume[:, :, None] * own_volume[:, None]
         diagonal = torch.stack([own[v, :, v] for v in range(n // 3)]) - at_volume
         ridge = RIDGE * torch.eye(3) * diagonal.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
-        product = (blocks @ (diagonal + ridge))[case.shell.used]
+        product = (blocks @ (diagonal + ridge))[core.used]
         torch.testing.assert_close(product, torch.eye(3).double().expand_as(product), atol=1e-8, rtol=0)
 
 
@@ -95,20 +102,28 @@ def test_steps_go_downhill_and_many_end_at_a_minimum(small_bars: Shapes) -> None
     case = Case(small_bars, roughness=0.05)
 
     def energies(x: Tensor) -> Tensor:
-        return energy_of(case.shell, case.shell.measure(x), case.references)
+        return torch.stack([case.energy(x[sample], sample) for sample in range(BATCH)])
 
-    values = [energies(relax(case.shell, case.x, case.references, n, 5)) for n in (0, 1, 2, 4)]
+    values = [energies(relax(case.core, case.x, case.reference, n, 5)) for n in (0, 1, 2, 4)]
     assert all(bool((after < before).all()) for before, after in pairwise(values))
-    end = relax(case.shell, case.x, case.references, 60, 100)
-    start_norm, end_norm = (
-        gradient(case.shell, linearise(case.shell, x.movedim(-1, 0).contiguous(), case.references)).norm()
-        for x in (case.x, end)
-    )
+    end = relax(case.core, case.x, case.reference, 60, 100)
+    start_norm, end_norm = (case.core.fold(case.core.gradient(case.at(x))).norm() for x in (case.x, end))
     assert float(end_norm / start_norm) < 1e-5
 
 
 def test_a_minimum_stays(small_bars: Shapes) -> None:
     case = Case(small_bars)
     rest = case.rests[0]
-    references = [Reference(case.shell.rest(rest), torch.ones(BATCH, dtype=torch.float64))]
-    assert torch.equal(relax(case.shell, rest, references, 2, 5), rest)
+    assert torch.equal(relax(case.core, rest, case.shell.against(rest), 2, 5), rest)
+
+
+@pytest.mark.parametrize("polish", [0, 1])
+def test_under_vmap(small_bars: Shapes, polish: int) -> None:
+    """The line search looks at numbers, and vmap must not mind."""
+    case = Case(small_bars, roughness=0.05)
+
+    def relaxed(x: Tensor) -> Tensor:
+        return relax(case.core, x, case.reference, 2, 4 + 16 * polish)
+
+    shifted = torch.stack([case.x, case.x + 0.5])
+    torch.testing.assert_close(vmap(relaxed)(shifted), torch.stack([relaxed(x) for x in shifted]))
