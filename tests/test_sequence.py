@@ -5,17 +5,19 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes, modal, random_rotation
+from conftest import Shapes, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.settings import Objective, Solver
 from torch_modal.sequence import subdivide as sequence
 from torch_modal.sequence.subdivide import keyframe_places, linear_sequence, subdivide
 
-COARSE = {"coarse_faces": 150}
+COARSE: dict[str, Any] = {"objective": Objective(coarse_faces=200)}
+PAIRED: dict[str, Any] = {"objective": Objective(space="paired", coarse_faces=200), "solver": Solver(local_steps=0)}
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +81,7 @@ def test_places_are_even(cyclic: bool) -> None:
         ({"levels": 1, "n_frames": 12}, 12),
         ({"levels": 1, "n_frames": 12, "cyclic": True}, 12),
         ({"levels": 2, "n_frames": 4}, 4),
-        ({"levels": 1, "space": "paired"}, 5),
+        ({"levels": 1, **PAIRED}, 5),
     ],
 )
 def test_keyframes_bit_for_bit_at_their_places(
@@ -87,7 +89,7 @@ def test_keyframes_bit_for_bit_at_their_places(
 ) -> None:
     keyframes = scattered.keyframes.to(dtype)
     before = keyframes.clone()
-    frames = subdivide(keyframes, scattered.faces, bases=scattered.bases, progress=False, **COARSE, **options)
+    frames = subdivide(keyframes, scattered.faces, bases=scattered.bases, progress=False, **{**COARSE, **options})
     assert frames.shape == (count, *keyframes.shape[1:])
     assert frames.dtype == dtype
     assert frames.isfinite().all()
@@ -109,12 +111,18 @@ def test_takes_arrays_and_two_keyframes(scattered: Shapes) -> None:
 def test_steps_on_the_fine_mesh_by_default(scattered: Shapes) -> None:
     pair = scattered.pick(0, 1)
     options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
-    default, modal = (subdivide(pair.keyframes, pair.faces, 1, local=local, **options)[1] for local in (True, False))
-    layer = MidShape(
-        pair.bases, pair.faces, **modal(local=True, rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE)
-    )
-    torch.testing.assert_close(default, layer(*pair.keyframes), rtol=0, atol=1e-12)
-    assert largest(default - modal) > 1e-5
+    default = subdivide(pair.keyframes, pair.faces, 1, **options)[1]
+    without = subdivide(pair.keyframes, pair.faces, 1, solver=Solver(local_steps=0), **options)[1]
+    torch.testing.assert_close(default, MidShape(pair.bases, pair.faces, **COARSE)(*pair.keyframes), rtol=0, atol=1e-12)
+    assert largest(default - without) > 1e-5
+
+
+def test_presets_are_those_of_the_layers(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 1)
+    for preset in tm.PRESETS:
+        found = subdivide(pair.keyframes, pair.faces, 1, bases=pair.bases, preset=preset, progress=False)[1]
+        layer = MidShape(pair.bases, pair.faces, preset=preset)
+        torch.testing.assert_close(found, layer(*pair.keyframes), rtol=0, atol=1e-12)
 
 
 def test_is_public() -> None:
@@ -129,8 +137,8 @@ def test_is_public() -> None:
 def test_recursion_by_hand(scattered: Shapes) -> None:
     """Two levels of the joint space are three mid-shapes with the modes of both ends."""
     pair = scattered.pick(1, 2)
-    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, local=False, **COARSE)
-    layer = MidShape(pair.bases, pair.faces, **modal(rotations=True, least_gain=sequence.LEAST_GAIN, **COARSE))
+    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **COARSE)
+    layer = MidShape(pair.bases, pair.faces, **COARSE)
     middle = layer(*pair.keyframes)
     by_hand = [pair.keyframes[0], layer(pair.keyframes[0], middle), middle, layer(middle, pair.keyframes[1])]
     for frame, truth in zip(frames, by_hand, strict=False):
@@ -204,21 +212,19 @@ def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: 
     monkeypatch.setattr(sequence._Segment, "_layer", record)
     x_a, x_b = scattered.keyframes[:2]
     pair = scattered.pick(0, 1)
-    frames = subdivide(
-        pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, local=False, space="paired", **COARSE
-    )
+    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **PAIRED)
     i, j = torch.from_numpy(connectivity.unique_edges(pair.faces.numpy())[0]).T
     lengths = [torch.linalg.norm(x[i] - x[j], dim=1) for x in (x_a, x_b, frames[2])]
     nearest = int((lengths[2] - lengths[1]).norm() < (lengths[2] - lengths[0]).norm())
     assert used == [(0, 1), (0, nearest), (nearest, 1)]
     # The same from the layers themselves.
-    left = MidShape([pair.bases[0], pair.bases[nearest]], pair.faces, "paired", **modal(**COARSE))(x_a, frames[2])
+    left = MidShape([pair.bases[0], pair.bases[nearest]], pair.faces, "paired", **PAIRED)(x_a, frames[2])
     assert largest(frames[1] - left) < 1e-9
 
 
 def test_nearest_key_frame_by_edge_lengths(scattered: Shapes) -> None:
     pair = scattered.pick(0, 1)
-    segment = sequence._Segment((pair.bases[0], pair.bases[1]), pair.faces, {}, torch.device("cpu"))
+    segment = sequence._Segment((pair.bases[0], pair.bases[1]), pair.faces, tm.PRESETS["paper"], torch.device("cpu"))
     weights = torch.ones(pair.keyframes.shape[1], dtype=torch.float64)
     times = torch.tensor([0.0, 0.1, 0.3, 0.7, 0.9, 1.0], dtype=torch.float64)
     shapes = blend(pair.keyframes[:1].expand(6, -1, -1), pair.keyframes[1:].expand(6, -1, -1), times, weights)
@@ -265,7 +271,7 @@ def test_linear_sequence(scattered: Shapes) -> None:
         ({"levels": 1.5}, "got 1.5"),
         ({"n_frames": 2}, "n_frames=2 leaves no room for 3 key-frames"),
         ({"bases": []}, "got 0 bases for 3 key-frames"),
-        ({"space": "both"}, "space is 'joint' or 'paired', got 'both'"),
+        ({"preset": "both"}, "preset is one of 'accurate', 'fast', 'paper'; got 'both'"),
     ],
 )
 def test_exception(options: dict[str, Any], message: str, scattered: Shapes) -> None:
