@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
@@ -147,7 +147,7 @@ class ShapeSpace:
     def edges(self) -> Tensor:
         """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
         if self._edges is None:
-            self._edges = torch.from_numpy(connectivity.unique_edges(self.faces.numpy())[0])
+            self._edges = torch.tensor(Connectivity(self.faces.numpy()).edges)
         return self._edges
 
     def keyframes(self, like: Tensor | None = None) -> Tensor:

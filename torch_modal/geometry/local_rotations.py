@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.vectors import cross, norm, pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
@@ -65,8 +65,9 @@ class LocalRotations(nn.Module):
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        edges: Those of :func:`~torch_modal.geometry.connectivity.unique_edges`. *Shape:* ``(E, 2)``.
+        edges: Those of the faces. *Shape:* ``(E, 2)``.
         references: Two shapes near the key-frames, for the tree and the weights. *Shape:* ``(2, V, 3)``.
+        mesh: The connectivity of the faces, where it is known.
     """
 
     faces: Tensor
@@ -76,20 +77,19 @@ class LocalRotations(nn.Module):
     piece: Tensor
     per_length: Tensor
 
-    def __init__(self, faces: Tensor, edges: Tensor, references: Tensor) -> None:
+    def __init__(self, faces: Tensor, edges: Tensor, references: Tensor, mesh: Connectivity | None = None) -> None:
         super().__init__()
-        start, end = faces.T.flatten(), faces[:, [1, 2, 0]].T.flatten()
-        sides = connectivity.edge_index(*(x.cpu().numpy() for x in (edges, start, end)))
+        mesh = Connectivity(faces.cpu().numpy()) if mesh is None else mesh
         first, second = edges.unbind(1)
         lengths = (references[:, second] - references[:, first]).norm(dim=-1).mean(0)
         a, b = (_Triangles.of(x[None], faces) for x in references)
-        parents, piece = self._tree(a, b, faces)
+        parents, piece = self._tree(a, b, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
         self.register_buffer("faces", faces.clone(), persistent=False)
-        self.register_buffer("sides", torch.from_numpy(sides), persistent=False)
-        self.register_buffer("side_signs", torch.where(start < end, 1.0, -1.0).to(references), persistent=False)
+        self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
+        self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
@@ -97,14 +97,14 @@ class LocalRotations(nn.Module):
         self.register_buffer("per_length", 1 / lengths.clamp_min(SHORTEST * lengths.mean()), persistent=False)
 
     @staticmethod
-    def _tree(a: _Triangles, b: _Triangles, faces: Tensor) -> tuple[Tensor, Tensor]:
+    def _tree(a: _Triangles, b: _Triangles, mesh: Connectivity) -> tuple[Tensor, Tensor]:
         """The parent of each triangle, and its piece. *Shape:* ``(F,)`` each."""
-        pairs = torch.from_numpy(connectivity.face_neighbours(faces.cpu().numpy()))
+        pairs = torch.tensor(mesh.face_neighbours)
         turns = _turn_between(a, b).squeeze(1)
         slenderness = torch.cat([a.slenderness, b.slenderness]).amin(0)
         alike = (turns[:, pairs[:, 0]] * turns[:, pairs[:, 1]]).sum(0).abs().clamp_max(1)
         costs = 2 * torch.arccos(alike) + SLIVER / slenderness[pairs].amin(-1).clamp_min(SLIVER / 1e3)
-        parents, piece = connectivity.spanning_forest(len(faces), pairs.numpy(), costs.numpy())
+        parents, piece = spanning_forest(len(mesh.faces), mesh.face_neighbours, costs.numpy())
         return torch.from_numpy(parents), torch.from_numpy(piece)
 
     def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
