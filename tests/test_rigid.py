@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import needs_gradient_of_no_turn, random_rotation
+from conftest import random_rotation
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
@@ -169,7 +169,6 @@ def test_half_turn_is_a_choice_and_no_nan(axis: list[float], cloud: Tensor) -> N
     assert gradient.isfinite().all()
 
 
-@needs_gradient_of_no_turn
 def test_gradcheck_fraction() -> None:
     source, target = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in ([1.0, 2, 3], [4.0, 0, 1]))
     t = time(0.4).requires_grad_()

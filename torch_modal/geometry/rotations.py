@@ -11,12 +11,12 @@ from torch import Tensor
 
 from torch_modal.geometry.vectors import cross
 
-# Squared angle below which series are taken: beyond it, differentiating the closed forms twice costs four digits at
-# most, and before it so many terms are exact to rounding.
-SMALL = 1e-2
-_SINC = [(-1) ** k / factorial(2 * k + 1) for k in range(5)]
-_COS = [(-1) ** k / factorial(2 * k) for k in range(6)]
-_ARC = [(-1) ** k / (2 * k + 1) for k in range(8)]
+# Squared half angle below which series are taken: so many terms are exact to rounding there, and beyond it closed forms
+# lose six digits at most when they are differentiated twice.
+SMALL = 1e-3
+_COS = [(-1) ** k / factorial(2 * k) for k in range(4)]
+_SINC = [(-1) ** k / factorial(2 * k + 1) for k in range(4)]
+_ARC = [(-1) ** k / (2 * k + 1) for k in range(5)]
 
 # At half a turn, the axis is taken that lies on this side. Hardly any axis that has a name lies between both sides.
 HALF_TURN_SIDE = (1.0, 1 / pi, 1 / pi**2)
@@ -26,16 +26,13 @@ HALF_TURN = 64
 
 
 def exp(turn: Tensor) -> Tensor:
-    """The rotation about an axis by its length in radians (Rodrigues' formula). *Shape:* ``(..., 3) -> (..., 3, 3)``."""
+    """The rotation about an axis by its length in radians (Rodrigues). *Shape:* ``(..., 3) -> (..., 3, 3)``."""
     w = turn.movedim(-1, 0)
-    squared = (w * w).sum(0)
-    sine, half = _sinc(squared), _sinc(0.25 * squared)
-    versed = 0.5 * half * half
-    x, y, z = sine * w
-    cosine = 1 - versed * squared
-    zero = torch.zeros_like(x)
-    skew = torch.stack([cosine, -z, y, z, cosine, -x, -y, x, cosine], -1).unflatten(-1, (3, 3))
-    return skew + (versed * w)[:, None].mul(w).movedim((0, 1), (-2, -1)) + zero[..., None, None]
+    cosine, sinc = _cos_and_sinc(0.25 * (w * w).sum(0))
+    x, y, z = sinc * cosine * w
+    real = 2 * cosine * cosine - 1
+    skew = torch.stack([real, -z, y, z, real, -x, -y, x, real]).unflatten(0, (3, 3))
+    return (skew + (0.5 * sinc * sinc * w)[:, None] * w).movedim((0, 1), (-2, -1))
 
 
 def log(rotation: Tensor) -> Tensor:
@@ -69,8 +66,8 @@ def power(q: Tensor, t: Tensor) -> Tensor:
     *Shape:* ``(4, ...), (...) -> (4, ...)``.
     """
     half = t * _arc(q)
-    squared = (half * half).sum(0)
-    return torch.cat([_cos(squared)[None], _sinc(squared) * half])
+    cosine, sinc = _cos_and_sinc((half * half).sum(0))
+    return torch.cat([cosine[None], sinc * half])
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
@@ -81,8 +78,9 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 
 def turned(turn: Tensor, v: Tensor) -> Tensor:
     """Vectors turned about axes by their lengths. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
-    squared = 0.25 * (turn * turn).sum(0)
-    return rotate(torch.cat([_cos(squared)[None], 0.5 * _sinc(squared) * turn]), v)
+    half = 0.5 * turn
+    cosine, sinc = _cos_and_sinc((half * half).sum(0))
+    return rotate(torch.cat([cosine[None], sinc * half]), v)
 
 
 def _arc(q: Tensor) -> Tensor:
@@ -91,27 +89,22 @@ def _arc(q: Tensor) -> Tensor:
     squared = (imaginary * imaginary).sum(0)
     small = (squared < SMALL * real * real) & (real > 0)
     sine = torch.where(small, 1, squared.clamp_min(torch.finfo(q.dtype).tiny)).sqrt()
-    inverse = 1 / torch.where(small, real, 1)
-    near = inverse * _series(_ARC, torch.where(small, squared, 0) * inverse * inverse)
-    return torch.where(small, near, torch.atan2(sine, real) / sine) * imaginary
+    tangent = torch.where(small, imaginary, 0) / torch.where(small, real, 1)
+    near = _series(_ARC, (tangent * tangent).sum(0)) * tangent
+    return torch.where(small, near, torch.atan2(sine, real) / sine * imaginary)
 
 
-def _sinc(squared: Tensor) -> Tensor:
-    """``sin(a) / a``, of the square of the angle."""
+def _cos_and_sinc(squared: Tensor) -> tuple[Tensor, Tensor]:
+    """``cos(a)`` and ``sin(a) / a``, of the square of the angle."""
     small = squared < SMALL
-    angle = torch.where(small, 1, squared).sqrt()
-    return torch.where(small, _series(_SINC, torch.where(small, squared, 0)), angle.sin() / angle)
-
-
-def _cos(squared: Tensor) -> Tensor:
-    """``cos(a)``, of the square of the angle."""
-    small = squared < SMALL
-    return torch.where(small, _series(_COS, torch.where(small, squared, 0)), torch.where(small, 1, squared).sqrt().cos())
+    near, angle = torch.where(small, squared, 0), torch.where(small, 1, squared).sqrt()
+    cosine, sinc = angle.cos(), angle.sin() / angle
+    return torch.where(small, _series(_COS, near), cosine), torch.where(small, _series(_SINC, near), sinc)
 
 
 def _series(factors: list[float], x: Tensor) -> Tensor:
     """A polynomial, from its constant on."""
-    out = torch.full_like(x, factors[-1])
-    for factor in factors[-2::-1]:
+    out = factors[-2] + factors[-1] * x
+    for factor in factors[-3::-1]:
         out = factor + x * out
     return out
