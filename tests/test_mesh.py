@@ -147,9 +147,8 @@ def test_parts_are_those_of_the_class() -> None:
     mesh = Connectivity(faces)
     edges, counts = connectivity.unique_edges(faces)
     parts = [edges, counts, connectivity.hinges(faces), connectivity.boundary_edges(faces)]
-    parts += [connectivity.boundary_chain(faces), connectivity.edge_index(edges, mesh.start, mesh.end)]
-    parts += [connectivity.vertex_pieces(edges, 14)]
-    wanted = [mesh.edges, mesh.counts, mesh.hinges, mesh.boundary_edges, mesh.boundary_chain, mesh.sides]
+    parts += [connectivity.boundary_chain(faces), connectivity.vertex_pieces(edges, 14)]
+    wanted = [mesh.edges, mesh.counts, mesh.hinges, mesh.boundary_edges, mesh.boundary_chain]
     wanted += [Connectivity(faces, 14).vertex_pieces]
     for part, truth in zip(parts, wanted, strict=True):
         np.testing.assert_array_equal(part, truth)

@@ -1,16 +1,31 @@
 """Rotations and strains of triangles against truth by hand, and the Poisson problem against known shapes."""
 
+import copy as copy_module
+import pickle
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 from conftest import Shapes, random_rotation
+from scipy import sparse
 
 from torch_modal.data.random_in_between import mirror
-from torch_modal.geometry.poisson import Reconstruction
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.poisson import Poisson, Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import Bend, Sides, bend, bent_sides, frames, mirrored_sides, sides
+from torch_modal.geometry.sparse import factorize
+from torch_modal.geometry.triangle_frames import (
+    Bend,
+    Sides,
+    bend,
+    bent_sides,
+    edge_means,
+    frames,
+    mirrored_sides,
+    sides,
+)
 
 F64 = torch.float64
 
@@ -201,6 +216,95 @@ def test_a_loose_piece_goes_along_with_its_neighbourhood() -> None:
     assert float(offset[len(ball.vertices) :].abs().max()) < 1e-9
     # The piece follows a rigid fit of its surroundings: off by their bending, not by the half radian that they turn.
     assert float(offset[: len(ball.vertices)].norm(dim=1).max()) < 0.06
+
+
+# ------------------------------------------------------------------------------------------------- edges to vertices
+def edges_of(x: torch.Tensor, mesh: Connectivity) -> torch.Tensor:
+    """Edge vectors. *Shape:* ``(3, B, V) -> (3, B, E)``."""
+    start, end = torch.tensor(mesh.edges).T
+    return x[..., end] - x[..., start]
+
+
+@pytest.fixture
+def two_pieces(bars: Shapes) -> tuple[Connectivity, torch.Tensor]:
+    """Two bars and a vertex of no face, between them: the connectivity, and a batch of three shapes."""
+    x, n = bars.keyframes.movedim(-1, 0), bars.keyframes.shape[1]
+    faces = torch.cat([bars.faces, bars.faces + n + 1])
+    return Connectivity(faces.numpy(), 2 * n + 1), torch.cat([x, x[..., :1], x.roll(1, 1) + 9.0], -1)
+
+
+def test_mean_edges_of_a_shape_are_its_own(bars: Shapes) -> None:
+    mesh, x = Connectivity(bars.faces.numpy()), bars.keyframes.movedim(-1, 0)
+    sides_of, signs = torch.tensor(mesh.sides), torch.tensor(mesh.signs)
+    weights = torch.rand(3, 3 * len(bars.faces), generator=torch.Generator().manual_seed(0), dtype=F64)
+    for given in (weights, weights[0]):
+        found = edge_means(sides(x, bars.faces), given, sides_of, signs, len(mesh.edges))
+        torch.testing.assert_close(found, edges_of(x, mesh))
+    # Of two faces that disagree, the mean by weight.
+    mesh = Connectivity(np.array([[0, 1, 2], [1, 0, 3]]))
+    wanted = Sides(torch.tensor([[1.0, -5.0], [0, 0], [0, 0]]), torch.zeros(3, 2))
+    weights = torch.tensor([3.0, 1.0]).repeat(3)
+    found = edge_means(wanted, weights, torch.tensor(mesh.sides), torch.tensor(mesh.signs).float(), 5)
+    assert found[0, 0].item() == (3 * 1 + 1 * 5) / 4
+
+
+def test_poisson_gives_shapes_back(two_pieces: tuple[Connectivity, torch.Tensor]) -> None:
+    mesh, x = two_pieces
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(len(mesh.edges), generator=generator, dtype=F64) + 0.1
+    mass = torch.rand(mesh.n_vertices, generator=generator, dtype=F64)
+    near = torch.randn(x.shape, generator=generator, dtype=F64)
+    for solver, share in ((Poisson(mesh, weights), torch.ones_like(mass)), (Poisson(mesh, weights, mass), mass)):
+        torch.testing.assert_close(solver(edges_of(x, mesh), x), x)
+        found = solver(edges_of(x, mesh), near)
+        torch.testing.assert_close(edges_of(found, mesh), edges_of(x, mesh))
+        for piece in np.unique(mesh.vertex_pieces):
+            own = torch.tensor(mesh.vertex_pieces == piece)
+            torch.testing.assert_close(found[..., own] @ share[own], near[..., own] @ share[own])
+    lone = mesh.n_vertices // 2
+    assert torch.equal(found[..., lone], near[..., lone])  # bit for bit
+
+
+def test_poisson_keeps_to_the_weights_that_are_there(two_pieces: tuple[Connectivity, torch.Tensor]) -> None:
+    """Replaced, as by functional_call; copied; of another dtype; and none of them in the state."""
+    mesh, x = two_pieces
+    weights = torch.ones(len(mesh.edges), dtype=F64)
+    other = torch.linspace(1, 2, len(weights), dtype=F64)
+    solver, truth = Poisson(mesh, weights), Poisson(mesh, other)
+    wanted = torch.randn(3, 1, len(weights), dtype=F64, generator=torch.Generator().manual_seed(0))
+    first = solver(wanted, x[:, :1])
+    factor = solver.solver
+    assert solver.solver is factor
+    found = torch.func.functional_call(solver, {"weights": other}, (wanted, x[:, :1]))
+    torch.testing.assert_close(found, truth(wanted, x[:, :1]))
+    assert float((found - first).abs().max()) > 1e-3
+    torch.testing.assert_close(solver(wanted, x[:, :1]), first)
+    for copy in (copy_module.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
+        torch.testing.assert_close(copy(wanted, x[:, :1]), first)
+    single = solver.float()(wanted.float(), x[:, :1].float())
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), first, rtol=0, atol=1e-4)
+    assert not solver.state_dict()
+
+
+def test_poisson_derivatives(small_bars: Shapes) -> None:
+    mesh = Connectivity(small_bars.faces.numpy())
+    solver = Poisson(mesh, torch.ones(len(mesh.edges), dtype=F64))
+    x = small_bars.keyframes[:2].movedim(-1, 0)
+    inputs = [part.contiguous().requires_grad_() for part in (edges_of(x, mesh), x.roll(1, 1))]
+    assert torch.autograd.gradcheck(solver, inputs)
+    assert torch.autograd.gradgradcheck(solver, inputs, fast_mode=True)
+    both = torch.func.vmap(solver, in_dims=1, out_dims=1)(*(part.detach() for part in inputs))
+    torch.testing.assert_close(both, solver(*inputs).detach())
+
+
+def test_factors_of_a_definite_matrix() -> None:
+    rows = np.random.default_rng(0).standard_normal((30, 30))
+    dense = rows @ rows.T + np.eye(30)
+    for matrix in (sparse.csr_matrix(dense), sparse.coo_matrix(dense)):
+        for ordering in ("MMD_AT_PLUS_A", "NATURAL"):
+            solved = factorize(matrix, ordering).solve(np.arange(30.0))
+            np.testing.assert_allclose(dense @ solved, np.arange(30.0), atol=1e-9)
 
 
 # -------------------------------------------------------------------------------------------------------- mirror

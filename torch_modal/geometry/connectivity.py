@@ -234,13 +234,6 @@ def boundary_chain(faces: IntArray) -> IntArray:
     return Connectivity(faces).boundary_chain.copy()
 
 
-def edge_index(edges: IntArray, i: IntArray, j: IntArray) -> IntArray:
-    """Which of the sorted edges of `unique_edges` joins ``i`` and ``j``. *Shape:* ``(n,), (n,) -> (n,)``."""
-    n = int(edges.max()) + 1
-    keys = edges[:, 0] * n + edges[:, 1]
-    return np.searchsorted(keys, np.minimum(i, j) * n + np.maximum(i, j)).astype(np.int64)
-
-
 def vertex_pieces(edges: IntArray, n: int) -> IntArray:
     """:func:`connected_pieces`."""
     return connected_pieces(edges, n)

@@ -1,7 +1,5 @@
 """Vertices from the edges or the sides that are asked for: a Poisson problem, factorised once for a connectivity."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -47,28 +45,23 @@ class Poisson(nn.Module):
         mass = torch.ones(len(piece)) if vertex_weights is None else vertex_weights.cpu()
         mass = mass.double() + torch.finfo(torch.float64).tiny  # for pieces without area
         total = torch.zeros_like(mass).index_add(0, piece, mass)
-        self.register_buffer("edges", torch.tensor(mesh.edges))
-        self.register_buffer("weights", weights.clone())
-        self.register_buffer("piece", piece)
-        self.register_buffer("shares", (mass / total[piece]).to(weights))
+        self.register_buffer("edges", torch.tensor(mesh.edges), persistent=False)
+        self.register_buffer("weights", weights.clone(), persistent=False)
+        self.register_buffer("piece", piece, persistent=False)
+        self.register_buffer("shares", (mass / total[piece]).to(weights), persistent=False)
         # The equations fix each piece up to a translation: one vertex of each is held, and the piece placed afterwards.
         held = np.unique(mesh.vertex_pieces, return_index=True)[1]
-        self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), held)))
-        self._made: tuple[Tensor, int, SparseSolver] | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the factorisation, which cannot be copied or pickled."""
-        return {**self.__dict__, "_made": None}
+        self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), held)), persistent=False)
+        self._made: tuple[Tensor, SparseSolver] | None = None
 
     @property
     def solver(self) -> SparseSolver:
-        """The Laplacian's inverse, of what the weights are now."""
-        now, version = self.weights, self.weights._version
-        if self._made is None or self._made[0] is not now or self._made[1] != version:
-            arrays = (self.edges.cpu().numpy(), now.double().cpu().numpy())
-            laplacian = graph_laplacian(*arrays, len(self.piece))
-            self._made = now, version, SparseSolver(laplacian, self.free.cpu().numpy())
-        return self._made[2]
+        """The Laplacian's inverse, of what the weights are now: others may stand in for them, as in functional_call."""
+        now = self.weights
+        if self._made is None or not _equal(now, self._made[0]):
+            laplacian = graph_laplacian(self.edges.cpu().numpy(), now.double().cpu().numpy(), len(self.piece))
+            self._made = now, SparseSolver(laplacian, self.free.cpu().numpy())
+        return self._made[1]
 
     def forward(self, wanted: Tensor, near: Tensor) -> Tensor:
         """The shape whose edges come closest to those wanted.
@@ -147,6 +140,10 @@ class Reconstruction:
             moved = placed[..., piece] + (motion.apply(centre) - centre).movedim(-1, 0)
             out = out.index_copy(-1, piece, moved)
         return out
+
+
+def _equal(a: Tensor, b: Tensor) -> bool:
+    return a is b or (a.dtype == b.dtype and a.device == b.device and torch.equal(a, b))
 
 
 def _side_weights(shape: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
