@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid
+from torch_modal.geometry.rotations import exp
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -105,6 +106,40 @@ def test_gradcheck_best_rotation(name: str) -> None:
     covariance = covariances()[name].clone().requires_grad_()
     assert gradcheck(best_rotation, (covariance,), atol=1e-7)
     assert gradgradcheck(best_rotation, (covariance,), atol=1e-6)
+
+
+DEGENERATE = {
+    "plane": [2, 1, 0],
+    "nearly a plane": [2, 1, 1e-9],
+    "line": [2, 0, 0],
+    "nearly a line": [2, 1e-7, 1e-9],
+    "point": [0, 0, 0],
+    "mirrored": [3, 2, -0.5],
+    "mirrored, two alike": [3, 2, -2],
+    "mirrored, two nearly alike": [3, 2, -1.999999],
+    "turned inside out": [1, 1, -1],
+    "tiny": [3e-150, 2e-150, 1e-150],
+    "huge": [3e150, 2e150, 1e150],
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("tracked", [False, True])
+def test_best_rotation_of_degenerate_shapes(name: str, tracked: bool, generator: torch.Generator) -> None:
+    """One of the best, where there are many; a rotation always, with finite gradients."""
+    values = torch.tensor(DEGENERATE[name], dtype=torch.float64)
+    before, after = (exp(2 * torch.randn(100, 3, dtype=torch.float64, generator=generator)) for _ in range(2))
+    covariance = (before * values @ after.mT).requires_grad_(tracked)
+    with torch.set_grad_enabled(tracked):
+        rotation = best_rotation(covariance)
+    torch.testing.assert_close(rotation @ rotation.mT, EYE.expand(100, 3, 3), atol=1e-13, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(100, dtype=torch.float64))
+    size = float(values.abs().max()) or 1.0
+    reached = (rotation * (covariance / size)).sum((-2, -1))
+    torch.testing.assert_close(reached, (values.sum() / size).expand(100), atol=1e-13, rtol=0)
+    if tracked:
+        (gradient,) = torch.autograd.grad((rotation * before).sum(), covariance)
+        assert gradient.isfinite().all()
 
 
 def test_derivative_at_a_sphere_by_hand() -> None:
