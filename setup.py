@@ -26,9 +26,7 @@ setup(
         "networkx>=3.0",
         "pytetwild[all]>=0.4.2",
         "fast-simplification>=0.1.11",
-        # Before 0.9, its rotation matrices are right to 1e-6 only; 0.9 has no release for Python 3.10.
-        "kornia>=0.9; python_version >= '3.11'",
-        "kornia>=0.8.2; python_version < '3.11'",
+        "kornia>=0.8.2",
         "safetensors>=0.4.3",
         "pygltflib>=1.16",
         "matplotlib>=3.7",

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solids import box, surface
 
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import signed_volume
 
 FloatArray = NDArray[np.float64]
@@ -174,13 +174,14 @@ def irregular(vertices: FloatArray, faces: IntArray, jitter: float = 0.35) -> tu
         jitter: How far vertices move, as a part of the way to a random point of one of their faces.
     """
     random = np.random.default_rng(0)
-    hinges = connectivity.hinges(faces)
+    mesh = Connectivity(faces)
+    hinges = mesh.hinges
     i, j, k, left = (vertices[corner] for corner in hinges.T)
     first, second = np.cross(j - i, k - i), np.cross(left - i, j - i)
     first, second = (n / np.linalg.norm(n, axis=1, keepdims=True) for n in (first, second))
     smooth = np.einsum("hi,hi->h", first, second) > np.cos(SHARP)
     fixed = np.zeros(len(vertices), dtype=bool)
-    fixed[hinges[~smooth, :2]] = fixed[connectivity.boundary_edges(faces)] = True
+    fixed[hinges[~smooth, :2]] = fixed[mesh.boundary_edges] = True
 
     own = np.empty(len(vertices), dtype=np.int64)  # a random face of each vertex
     order = random.permutation(len(faces))
@@ -195,9 +196,9 @@ def _turned_edges(
     vertices: FloatArray, faces: IntArray, hinges: IntArray, random: np.random.Generator, share: float = 0.3
 ) -> IntArray:
     """Some edges replaced by the other diagonal of their two triangles, where those stay fat."""
+    edges = {tuple(edge) for edge in Connectivity(faces).edges}
     faces = faces.copy()
     face_of = {tuple(np.roll(face, -c)): f for f, face in enumerate(faces) for c in range(3)}
-    edges = {tuple(edge) for edge in connectivity.unique_edges(faces)[0]}
     touched: set[int] = set()
     for i, j, k, m in random.permutation(hinges)[: int(share * len(hinges))]:
         first, second = face_of[i, j, k], face_of[j, i, m]

@@ -2,7 +2,6 @@
 
 import signal
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,10 +23,6 @@ from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases
 from torch_modal.precompute.stiffness import arap_hessian, lumped_mass
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
-
-# The only releases for Python 3.10; their logarithm of a rotation has no gradient at no turn and at half a turn.
-OLD_KORNIA = version("kornia") < "0.9"
-needs_gradient_of_no_turn = pytest.mark.skipif(OLD_KORNIA, reason="kornia before 0.9: NaN gradient at no turn")
 
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
 

@@ -5,7 +5,7 @@ import pytest
 from bodies import BAR, BODIES, WALL, Body, bend, body, squeeze, twist
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import consistent_winding, degenerate_faces, repeated_faces, signed_volume
 
 HOLLOW = [name for name in BODIES if name.startswith(("tube", "vessel"))]
@@ -21,11 +21,12 @@ def lengths(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", BODIES)
 def test_one_manifold_surface_of_the_promised_size(name: str, jittered: bool) -> None:
     shape = body(name, jittered)
-    edges, counts = connectivity.unique_edges(shape.faces)
+    mesh = Connectivity(shape.faces)
+    edges, counts = mesh.edges, mesh.counts
     assert 2000 <= len(shape.rest) <= 4000
     assert np.array_equal(np.unique(shape.faces), np.arange(len(shape.rest)))
     assert not degenerate_faces(shape.faces).any() and not repeated_faces(shape.faces).any()
-    assert len(consistent_winding(shape.faces).flipped) == 0
+    assert len(consistent_winding(mesh).flipped) == 0
     euler = len(shape.rest) - len(edges) + len(shape.faces)
     if name.startswith(SHEETS):
         assert set(counts) == {1, 2} and euler == 1  # a disc
@@ -88,7 +89,7 @@ def test_bar_bent_by_hand() -> None:
 def test_edges_of_a_bent_body_have_the_lengths_of_chords(name: str, time: float) -> None:
     shape = body(name)
     angle = np.radians(float(name.split()[-1])) * time
-    edges, _ = connectivity.unique_edges(shape.faces)
+    edges = Connectivity(shape.faces).edges
     start, stop = shape.rest[edges[:, 0]], shape.rest[edges[:, 1]]
     level = np.abs(start[:, 1] - stop[:, 1]) < 1e-12  # both ends on one arc
     radius = BAR / angle - start[:, 1]
@@ -99,7 +100,7 @@ def test_edges_of_a_bent_body_have_the_lengths_of_chords(name: str, time: float)
 
 def test_sheet_is_rolled_without_stretch() -> None:
     shape = body("sheet rolled 270")
-    edges, _ = connectivity.unique_edges(shape.faces)
+    edges = Connectivity(shape.faces).edges
     assert np.abs(lengths(shape.pose(1.0), edges) / lengths(shape.rest, edges) - 1).max() < 3e-4
 
 
@@ -178,7 +179,7 @@ def test_limb_is_slender_and_moves_alone() -> None:
 def test_irregular_is_the_same_surface_otherwise_triangulated(name: str) -> None:
     regular, other = body(name), body(name, jittered=True)
     assert len(regular.rest) == len(other.rest) and len(regular.faces) == len(other.faces)
-    edges = [connectivity.unique_edges(shape.faces)[0] for shape in (regular, other)]
+    edges = [Connectivity(shape.faces).edges for shape in (regular, other)]
     assert len(set(map(tuple, edges[0])) ^ set(map(tuple, edges[1]))) > 0.1 * len(edges[0])  # edges were turned
     spread = [np.std(lengths(shape.rest, e)) for shape, e in zip((regular, other), edges, strict=True)]
     assert spread[1] > 1.5 * spread[0]
@@ -188,7 +189,7 @@ def test_irregular_is_the_same_surface_otherwise_triangulated(name: str) -> None
         assert signed_volume(other.rest, other.faces) == pytest.approx(BAR, rel=1e-12)  # flat sides stay flat
     if name.startswith("sheet"):
         assert (other.rest[:, 1] == 0).all()
-        assert np.array_equal(connectivity.boundary_edges(other.faces), connectivity.boundary_edges(regular.faces))
+        assert np.array_equal(*(Connectivity(shape.faces).boundary_edges for shape in (other, regular)))
     again = body(name, jittered=True)
     assert np.array_equal(again.rest, other.rest) and np.array_equal(again.faces, other.faces)
 

@@ -23,7 +23,7 @@ from torch_modal.precompute import modes as modes_module
 from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
 
-FAST = ["--modes", "6", "--levels", "1", "--coarse-faces", "200"]
+FAST = ["--modes", "6", "--levels", "1", "--preset", "fast"]
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_folder_gets_frames_and_animation(
     assert torch.equal(frames[[0, 2]], keys.keyframes)  # bit for bit, in the caller's coordinates
     # What the library gives with the same options; the cache makes the mesher's result the same.
     bases = tm.extract_bases(*keys, 6)
-    expected = tm.subdivide(*keys, 1, bases=bases, coarse_faces=200)
+    expected = tm.subdivide(*keys, 1, bases=bases, preset="fast")
     torch.testing.assert_close(frames, expected, rtol=0, atol=1e-9)
     assert picture.read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr()
@@ -126,8 +126,9 @@ def test_paired_space_and_mu_arrive(
 
     monkeypatch.setattr(tm, "subdivide", subdivide)
     argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
-    assert cli.main([*argv, "--space", "paired", "--mu", "0.5", "--quiet"]) == 0
-    assert (seen["space"], seen["mu"], seen["coarse_faces"]) == ("paired", 0.5, 1000)
+    assert cli.main([*argv, "--preset", "paper", "--mu", "0.5", "--quiet"]) == 0
+    objective: Any = seen["objective"]
+    assert (objective.space, objective.mu) == ("paired", 0.5)
     assert len(seen["bases"]) == 2 and seen["bases"][0].n_modes == 6  # type: ignore[arg-type, index]
     assert capsys.readouterr() == ("", "")
 
@@ -240,7 +241,7 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
     assert "two key-frames or more" in misused(capsys, "subdivide", meshes[0], *out)
     assert "required: --out" in misused(capsys, "subdivide", *meshes)
     assert "ending in .glb or a folder" in misused(capsys, "subdivide", *meshes, "--out", "a.obj")
-    assert "--space paired" in misused(capsys, "subdivide", *meshes, *out, "--mu", "1")
+    assert "--preset paper" in misused(capsys, "subdivide", *meshes, *out, "--mu", "1")
     assert "must end in .png or .pdf" in misused(capsys, "subdivide", *meshes, *out, "--picture", "a.jpg")
     assert "one file, but there are 2" in misused(capsys, "modes", *meshes, "--out", "a.safetensors")
     assert "the same file name" in misused(capsys, "modes", meshes[0], meshes[0], "--out", "a")
@@ -253,7 +254,7 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
         ("--fps", "nan"),
         ("--fps", "inf"),
         ("--modes", "0"),
-        ("--coarse-faces", "3"),
+        ("--polish", "-1"),
         ("--mu", "many"),
     ):
         assert f"argument {option}: {value!r} is not a" in misused(capsys, "subdivide", *meshes, *out, option, value)

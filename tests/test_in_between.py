@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes, bent_bar, modal, needs_gradient_of_no_turn, placement_of, random_rotation
+from conftest import Shapes, bent_bar, modal, placement_of, random_rotation
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
@@ -393,7 +393,6 @@ class TestSingleSamples:
         assert bool(x_a.grad[[0, 2]].isfinite().all())
         assert bool(t.grad.isfinite().all())
 
-    @needs_gradient_of_no_turn
     def test_coincident_key_frames_stay(self, layer: InBetween, bars: Shapes) -> None:
         x = bars.keyframes[0].clone().requires_grad_()
         between = layer(x, x, times(0.2, 0.5))
@@ -411,7 +410,6 @@ class TestSingleSamples:
         (gradient,) = torch.autograd.grad(x.sum(), x_a)
         assert bool(gradient.isfinite().all())
 
-    @needs_gradient_of_no_turn
     def test_half_a_turn_between_the_key_frames(self, layer: InBetween, bars: Shapes) -> None:
         x_a = bars.keyframes[0]
         x_b = (x_a * torch.tensor([-1.0, -1.0, 1.0], dtype=DOUBLE)).requires_grad_()
@@ -436,7 +434,6 @@ class TestSingleSamples:
         with pytest.raises(ValueError, match=r"t lies in \[0, 1\]"):
             layer(*bars.keyframes[:2], times(0.5, t))
 
-    @needs_gradient_of_no_turn
     def test_unconverged_samples_are_reported(self, bars: Shapes) -> None:
         x_a, x_b = bars.keyframes[1:]
         x_b = torch.stack([x_b, x_a]).clone().requires_grad_()

@@ -1,12 +1,14 @@
 """Connectivity against meshes small enough to read, and against trimesh on a larger one."""
 
 import itertools
+import pickle
 
 import numpy as np
 import pytest
 import trimesh
 
 from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])  # open, one interior edge
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # closed
@@ -14,21 +16,87 @@ FINS = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])  # three faces at the edge 01
 AGAINST = np.array([[0, 1, 2], [0, 3, 2]])  # the second face winds against the first
 
 
-def test_unique_edges() -> None:
-    edges, counts = connectivity.unique_edges(SQUARE)
-    assert edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
-    assert counts.tolist() == [1, 2, 1, 1, 1]
-    edges, counts = connectivity.unique_edges(TETRAHEDRON)
-    assert edges.tolist() == [list(pair) for pair in itertools.combinations(range(4), 2)]
-    assert counts.tolist() == [2] * 6
-    edges, counts = connectivity.unique_edges(FINS)
-    assert len(edges) == 7
-    assert counts.tolist() == [3, 1, 1, 1, 1, 1, 1]
+def random_faces(seed: int) -> np.ndarray:
+    """Few vertices, many faces: edges of three and more, windings of all kinds."""
+    faces = np.random.default_rng(seed).integers(0, 12, (30, 3))
+    return faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+
+
+def by_hand(faces: np.ndarray) -> dict[tuple[int, int], list[tuple[int, int]]]:
+    """The sides along each edge: their number, and their direction."""
+    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for side, (i, j) in enumerate((face[c], face[c - 2]) for c in range(3) for face in faces.tolist()):
+        found.setdefault((min(i, j), max(i, j)), []).append((side, 1 if i < j else -1))
+    return found
+
+
+def test_edges() -> None:
+    mesh = Connectivity(SQUARE)
+    assert mesh.edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
+    assert mesh.counts.tolist() == [1, 2, 1, 1, 1]
+    mesh = Connectivity(TETRAHEDRON)
+    assert mesh.edges.tolist() == [list(pair) for pair in itertools.combinations(range(4), 2)]
+    assert mesh.counts.tolist() == [2] * 6
+    mesh = Connectivity(FINS)
+    assert len(mesh.edges) == 7
+    assert mesh.counts.tolist() == [3, 1, 1, 1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("offset", [0, 2**30], ids=["packed", "too many vertices to pack"])
+@pytest.mark.parametrize("seed", range(5))
+def test_everything_by_hand(seed: int, offset: int) -> None:
+    faces = random_faces(seed)
+    mesh, truth = Connectivity(faces + offset), by_hand(faces + offset)
+    edges = sorted(truth)
+    assert mesh.edges.tolist() == [list(edge) for edge in edges]
+    assert mesh.counts.tolist() == [len(truth[edge]) for edge in edges]
+    for number, edge in enumerate(edges):
+        for side, sign in truth[edge]:
+            assert (mesh.sides[side], mesh.signs[side]) == (number, sign)
+            assert {mesh.start[side], mesh.end[side]} == set(edge)
+            assert {*edge, int(mesh.opposite[side])} == set(mesh.faces[side % len(faces)].tolist())
+    pairs = [[side for side, _ in truth[edge]] for edge in edges if len(truth[edge]) == 2]
+    assert mesh.hinge_sides.tolist() == pairs
+    assert mesh.boundary_edges.tolist() == [list(edge) for edge in edges if len(truth[edge]) == 1]
+    neighbours = [
+        sorted(side % len(faces) for side, _ in pair) for edge in edges for pair in itertools.pairwise(truth[edge])
+    ]
+    assert mesh.face_neighbours.tolist() == neighbours
+    left = {edge: sum(sign for _, sign in truth[edge]) for edge in edges}
+    chain = [[*(edge if net > 0 else edge[::-1])] for edge, net in left.items() for _ in range(abs(net))]
+    assert mesh.boundary_chain.tolist() == chain
+
+
+def test_cardinality_and_types() -> None:
+    mesh = Connectivity(FINS.astype(np.int32), n_vertices=9)
+    expected = {
+        **dict.fromkeys(("start", "end", "opposite", "sides", "signs"), (9,)),
+        **{"edges": (7, 2), "counts": (7,), "hinges": (0, 4), "hinge_sides": (0, 2), "face_neighbours": (2, 2)},
+        **{"boundary_edges": (6, 2), "boundary_chain": (7, 2), "vertex_pieces": (9,)},
+    }
+    for name, shape in expected.items():
+        assert getattr(mesh, name).shape == shape, name
+        assert getattr(mesh, name).dtype == (np.float64 if name == "signs" else np.int64), name
+    nothing = Connectivity(np.zeros((0, 3), dtype=np.int64))
+    assert nothing.edges.shape == nothing.boundary_edges.shape == (0, 2)
+    assert nothing.hinges.shape == (0, 4) and nothing.vertex_pieces.shape == (0,)
+
+
+def test_what_is_shared_cannot_be_written_to() -> None:
+    faces = TETRAHEDRON.copy()
+    mesh = Connectivity(faces)
+    with pytest.raises(ValueError, match="read-only"):
+        mesh.edges[0] = 7
+    faces[0] = 9
+    assert mesh.faces.tolist() == TETRAHEDRON.tolist()
+    copy = pickle.loads(pickle.dumps(mesh))
+    assert vars(copy).keys() == {"faces", "n_vertices"}  # what follows from the faces is not pickled
+    np.testing.assert_array_equal(copy.hinges, mesh.hinges)
 
 
 @pytest.mark.parametrize(("faces", "n_hinges"), [(SQUARE, 1), (TETRAHEDRON, 6), (FINS, 0)])
 def test_hinges_follow_the_winding(faces: np.ndarray, n_hinges: int) -> None:
-    rows = connectivity.hinges(faces)
+    rows = Connectivity(faces).hinges
     assert rows.shape == (n_hinges, 4)
     turned = {tuple(np.roll(face, shift).tolist()) for face in faces for shift in range(3)}
     for i, j, k, m in rows.tolist():
@@ -38,38 +106,53 @@ def test_hinges_follow_the_winding(faces: np.ndarray, n_hinges: int) -> None:
 
 
 def test_hinge_of_faces_that_wind_against_each_other() -> None:
-    ((i, j, k, m),) = connectivity.hinges(AGAINST).tolist()
+    ((i, j, k, m),) = Connectivity(AGAINST).hinges.tolist()
     assert {i, j} == {0, 2}
     assert {k, m} == {1, 3}
 
 
 def test_boundaries() -> None:
-    assert connectivity.boundary_edges(SQUARE).tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
-    assert {tuple(e) for e in connectivity.boundary_chain(SQUARE).tolist()} == {(0, 1), (1, 2), (2, 3), (3, 0)}
-    assert connectivity.boundary_edges(TETRAHEDRON).shape == (0, 2)
-    assert connectivity.boundary_chain(TETRAHEDRON).shape == (0, 2)
+    square = Connectivity(SQUARE)
+    assert square.boundary_edges.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
+    assert {tuple(e) for e in square.boundary_chain.tolist()} == {(0, 1), (1, 2), (2, 3), (3, 0)}
+    assert Connectivity(TETRAHEDRON).boundary_edges.shape == (0, 2)
+    assert Connectivity(TETRAHEDRON).boundary_chain.shape == (0, 2)
     around_fins = {(1, 2), (2, 0), (0, 3), (3, 1), (1, 4), (4, 0)}
     # Two of the three faces run along 01 in its direction, one against it: one is left over.
-    assert {tuple(e) for e in connectivity.boundary_chain(FINS).tolist()} == around_fins | {(0, 1)}
-    assert {tuple(sorted(e)) for e in around_fins} == {tuple(e) for e in connectivity.boundary_edges(FINS).tolist()}
+    fins = Connectivity(FINS)
+    assert {tuple(e) for e in fins.boundary_chain.tolist()} == around_fins | {(0, 1)}
+    assert {tuple(sorted(e)) for e in around_fins} == {tuple(e) for e in fins.boundary_edges.tolist()}
 
 
 def test_edge_index() -> None:
-    edges, _ = connectivity.unique_edges(TETRAHEDRON + 5)  # vertices 0 to 4 belong to no face
-    order = np.random.default_rng(0).permutation(len(edges))
-    i, j = edges[order].T
-    assert connectivity.edge_index(edges, i, j).tolist() == order.tolist()
-    assert connectivity.edge_index(edges, j, i).tolist() == order.tolist()
+    mesh = Connectivity(TETRAHEDRON + 5)  # vertices 0 to 4 belong to no face
+    order = np.random.default_rng(0).permutation(len(mesh.edges))
+    i, j = mesh.edges[order].T
+    assert mesh.edge_index(i, j).tolist() == order.tolist()
+    assert mesh.edge_index(j, i).tolist() == order.tolist()
+    for missing in ([5, 0], [7, 7], [8, 100]):
+        with pytest.raises(ValueError, match=f"between the vertices {missing[0]} and {missing[1]}"):
+            mesh.edge_index(np.array([5, missing[0]]), np.array([6, missing[1]]))
 
 
-def test_face_index_tells_face_and_order() -> None:
-    faces = np.concatenate([TETRAHEDRON, [[7, 3, 2]]])
-    even = [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
-    for orders, sign in ((even, 1.0), ([order[::-1] for order in even], -1.0)):
-        for order in orders:
-            index, signs = connectivity.face_index(faces, *faces[:, order].T)
-            assert index.tolist() == list(range(5))
-            assert signs.tolist() == [sign] * 5
+def test_pieces() -> None:
+    mesh = Connectivity(np.concatenate([TETRAHEDRON + 1, SQUARE + 6]), n_vertices=11)
+    assert mesh.vertex_pieces.tolist() == [0, 1, 1, 1, 1, 2, 3, 3, 3, 3, 4]
+    assert connected_pieces(np.zeros((0, 2), dtype=np.int64), 3).tolist() == [0, 1, 2]
+
+
+def test_parts_are_those_of_the_class() -> None:
+    """What callers may write to."""
+    faces = random_faces(9)
+    mesh = Connectivity(faces)
+    edges, counts = connectivity.unique_edges(faces)
+    parts = [edges, counts, connectivity.hinges(faces), connectivity.boundary_edges(faces)]
+    parts += [connectivity.boundary_chain(faces), connectivity.vertex_pieces(edges, 14)]
+    wanted = [mesh.edges, mesh.counts, mesh.hinges, mesh.boundary_edges, mesh.boundary_chain]
+    wanted += [Connectivity(faces, 14).vertex_pieces]
+    for part, truth in zip(parts, wanted, strict=True):
+        np.testing.assert_array_equal(part, truth)
+        assert part.flags.writeable
 
 
 def test_vertex_areas() -> None:
@@ -82,10 +165,10 @@ def test_vertex_areas() -> None:
 def test_agrees_with_trimesh(capsule: tuple[np.ndarray, np.ndarray]) -> None:
     vertices, faces = capsule
     closed = trimesh.Trimesh(vertices, faces, process=False)
-    edges, counts = connectivity.unique_edges(faces)
-    assert (counts == 2).all()
-    assert len(vertices) - len(edges) + len(faces) == 2  # Euler, genus 0
-    rows = connectivity.hinges(faces)
+    mesh = Connectivity(faces)
+    assert (mesh.counts == 2).all()
+    assert len(vertices) - len(mesh.edges) + len(faces) == 2  # Euler, genus 0
+    rows = mesh.hinges
     key = np.lexsort(np.sort(rows[:, :2], 1).T)
     theirs = np.lexsort(closed.face_adjacency_edges.T)
     np.testing.assert_array_equal(np.sort(rows[key, :2], 1), closed.face_adjacency_edges[theirs])
@@ -95,7 +178,7 @@ def test_agrees_with_trimesh(capsule: tuple[np.ndarray, np.ndarray]) -> None:
 
 def test_neighbours_share_an_edge() -> None:
     fan = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [1, 0, 7], [0, 1, 8]])
-    assert {tuple(pair) for pair in connectivity.face_neighbours(fan)} == {(0, 1), (0, 3), (3, 4)}
+    assert {tuple(pair) for pair in Connectivity(fan).face_neighbours.tolist()} == {(0, 1), (0, 3), (3, 4)}
 
 
 def test_spanning_forest_takes_what_is_cheap() -> None:

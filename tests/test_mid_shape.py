@@ -281,7 +281,7 @@ def test_coincident_vertices_are_survived(bars: Shapes) -> None:
 
 def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
     """Mean over edges of the relative error of their length."""
-    i, j = torch.from_numpy(connectivity.unique_edges(faces.numpy())[0]).T
+    i, j = torch.tensor(connectivity.Connectivity(faces.numpy()).edges).T
     lengths = torch.linalg.norm(truth[i] - truth[j], dim=1)
     return float(((torch.linalg.norm(x[i] - x[j], dim=1) - lengths).abs() / lengths).mean())
 

@@ -158,7 +158,7 @@ def test_hand_lies_between_linear_and_joint(ends: tuple[int, int], truth: int, h
     for space in ("paired", "joint"):
         # On some meshings the wider spans end STALLED, at a collapsed triangle; the shape is as good.
         shapes[space] = MidShape(pair.bases, pair.faces, space, **modal()).solve(x_a, x_b).shapes
-    i, j = torch.from_numpy(connectivity.unique_edges(hands.faces.numpy())[0]).T
+    i, j = torch.tensor(connectivity.Connectivity(hands.faces.numpy()).edges).T
     lengths = {name: torch.linalg.norm(x[i] - x[j], dim=1) for name, x in shapes.items()}
     wanted = torch.linalg.norm(hands.keyframes[truth][i] - hands.keyframes[truth][j], dim=1)
     errors = {name: float(((length - wanted).abs() / wanted).mean()) for name, length in lengths.items()}

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from conftest import needs_gradient_of_no_turn, random_rotation
+from conftest import random_rotation
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from torch_modal.geometry.rigid import RigidMotion, best_fit, best_rotation, blend, centroid
+from torch_modal.geometry.rotations import exp
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -107,6 +108,40 @@ def test_gradcheck_best_rotation(name: str) -> None:
     assert gradgradcheck(best_rotation, (covariance,), atol=1e-6)
 
 
+DEGENERATE = {
+    "plane": [2, 1, 0],
+    "nearly a plane": [2, 1, 1e-9],
+    "line": [2, 0, 0],
+    "nearly a line": [2, 1e-7, 1e-9],
+    "point": [0, 0, 0],
+    "mirrored": [3, 2, -0.5],
+    "mirrored, two alike": [3, 2, -2],
+    "mirrored, two nearly alike": [3, 2, -1.999999],
+    "turned inside out": [1, 1, -1],
+    "tiny": [3e-150, 2e-150, 1e-150],
+    "huge": [3e150, 2e150, 1e150],
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("tracked", [False, True])
+def test_best_rotation_of_degenerate_shapes(name: str, tracked: bool, generator: torch.Generator) -> None:
+    """One of the best, where there are many; a rotation always, with finite gradients."""
+    values = torch.tensor(DEGENERATE[name], dtype=torch.float64)
+    before, after = (exp(2 * torch.randn(100, 3, dtype=torch.float64, generator=generator)) for _ in range(2))
+    covariance = (before * values @ after.mT).requires_grad_(tracked)
+    with torch.set_grad_enabled(tracked):
+        rotation = best_rotation(covariance)
+    torch.testing.assert_close(rotation @ rotation.mT, EYE.expand(100, 3, 3), atol=1e-13, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(100, dtype=torch.float64))
+    size = float(values.abs().max()) or 1.0
+    reached = (rotation * (covariance / size)).sum((-2, -1))
+    torch.testing.assert_close(reached, (values.sum() / size).expand(100), atol=1e-13, rtol=0)
+    if tracked:
+        (gradient,) = torch.autograd.grad((rotation * before).sum(), covariance)
+        assert gradient.isfinite().all()
+
+
 def test_derivative_at_a_sphere_by_hand() -> None:
     # R^T A stays symmetric: at A = c I, R = I + W with 2 c W = dA - dA^T.
     change = torch.tensor([[0.3, -1.0, 2.0], [0.5, 0.1, -0.7], [0.0, 4.0, 1.0]], dtype=torch.float64)
@@ -169,7 +204,6 @@ def test_half_turn_is_a_choice_and_no_nan(axis: list[float], cloud: Tensor) -> N
     assert gradient.isfinite().all()
 
 
-@needs_gradient_of_no_turn
 def test_gradcheck_fraction() -> None:
     source, target = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in ([1.0, 2, 3], [4.0, 0, 1]))
     t = time(0.4).requires_grad_()

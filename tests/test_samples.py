@@ -10,7 +10,7 @@ import torch
 
 from torch_modal import keyframe_places, linear_sequence, load_keyframes
 from torch_modal.data.samples import FOLDER, SAMPLES, load_sample, sample_files
-from torch_modal.geometry.connectivity import unique_edges
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import consistent_winding, degenerate_faces, flat_faces, repeated_faces, signed_volume
 
 ROOT = Path(__file__).parents[1]
@@ -20,13 +20,14 @@ ROOT = Path(__file__).parents[1]
 def test_one_closed_manifold_surface_wound_outwards(name: str) -> None:
     sample = load_sample(name)
     faces = sample.faces.numpy()
-    edges, counts = unique_edges(faces)
+    mesh = Connectivity(faces)
+    edges, counts = mesh.edges, mesh.counts
     assert (counts == 2).all()  # closed, no edge of three faces
     n_vertices = sample.keyframes.shape[1]
     assert np.array_equal(np.unique(faces), np.arange(n_vertices))  # every vertex is used
     assert n_vertices - len(edges) + len(faces) == 2  # Euler: one sphere, so also one fan of faces a vertex
     assert not degenerate_faces(faces).any() and not repeated_faces(faces).any()
-    assert len(consistent_winding(faces).flipped) == 0
+    assert len(consistent_winding(mesh).flipped) == 0
     for shape in torch.cat([sample.keyframes, sample.truth]).numpy():
         assert signed_volume(shape, faces) > 0
         assert not flat_faces(shape, faces, 1e-6).any()

@@ -213,7 +213,7 @@ def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: 
     x_a, x_b = scattered.keyframes[:2]
     pair = scattered.pick(0, 1)
     frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **PAIRED)
-    i, j = torch.from_numpy(connectivity.unique_edges(pair.faces.numpy())[0]).T
+    i, j = torch.tensor(connectivity.Connectivity(pair.faces.numpy()).edges).T
     lengths = [torch.linalg.norm(x[i] - x[j], dim=1) for x in (x_a, x_b, frames[2])]
     nearest = int((lengths[2] - lengths[1]).norm() < (lengths[2] - lengths[0]).norm())
     assert used == [(0, 1), (0, nearest), (nearest, 1)]

@@ -1,28 +1,44 @@
 """Rotations and strains of triangles against truth by hand, and the Poisson problem against known shapes."""
 
+import copy as copy_module
+import pickle
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 from conftest import Shapes, random_rotation
+from scipy import sparse
 
 from torch_modal.data.random_in_between import mirror
-from torch_modal.geometry.poisson import Reconstruction
-from torch_modal.geometry.rigid import _exp, best_fit
-from torch_modal.geometry.triangle_frames import Bend, Sides, bend, bent_sides, frames, mirrored_sides, sides
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.poisson import Poisson, Reconstruction
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rotations import exp
+from torch_modal.geometry.sparse import factorize
+from torch_modal.geometry.triangle_frames import (
+    Bend,
+    Sides,
+    bend,
+    bent_sides,
+    edge_means,
+    frames,
+    mirrored_sides,
+    sides,
+)
 
 F64 = torch.float64
 
 
-def columns(x: torch.Tensor) -> torch.Tensor:
-    """*Shape:* ``(V, 3) -> (V, 3, 1)``."""
-    return x[..., None]
+def rows(x: torch.Tensor) -> torch.Tensor:
+    """Of a batch of one. *Shape:* ``(V, 3) -> (3, 1, V)``."""
+    return x.mT[:, None]
 
 
 def test_frames_are_orthonormal_and_give_the_sides_back(bars: Shapes) -> None:
-    given = sides(bars.keyframes.permute(1, 2, 0), bars.faces)
+    given = sides(bars.keyframes.movedim(-1, 0), bars.faces)
     own = frames(given)
-    axes = torch.stack([own.e1, own.e2, own.normal], 1).movedim(-1, 0)
+    axes = torch.stack([own.e1, own.e2, own.normal]).movedim((0, 1), (-2, -1))
     identity = torch.eye(3, dtype=F64).expand(3, len(bars.faces), 3, 3)
     torch.testing.assert_close(axes @ axes.mT, identity)
     torch.testing.assert_close(own.world(own.length, torch.zeros_like(own.length)), given.first)
@@ -30,21 +46,21 @@ def test_frames_are_orthonormal_and_give_the_sides_back(bars: Shapes) -> None:
 
 
 def test_a_rotation_field_is_a_turn_without_strain(bars: Shapes) -> None:
-    x, faces = columns(bars.keyframes[1]), bars.faces
+    x, faces = rows(bars.keyframes[1]), bars.faces
     omega = torch.tensor([0.3, -0.2, 0.5], dtype=F64)
-    field = torch.linalg.cross(omega.expand(len(x), 3), x[..., 0])[..., None] + 7.0
+    field = rows(torch.linalg.cross(omega.expand(len(bars.keyframes[1]), 3), bars.keyframes[1]) + 7.0)
     found = bend(sides(field, faces), frames(sides(x, faces)))
-    torch.testing.assert_close(found.turn, omega[None, :, None].expand_as(found.turn))
+    torch.testing.assert_close(found.turn, omega[:, None, None].expand_as(found.turn))
     for entry in found.strain:
         torch.testing.assert_close(entry, torch.zeros_like(entry), atol=1e-12, rtol=0)
 
 
 def test_a_linear_field_has_its_symmetric_part_as_strain() -> None:
     # A triangle in the plane z = 0 whose first side is along x, so that its frame is that of the world.
-    x = columns(torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1.5, 0]], dtype=F64))
+    x = rows(torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1.5, 0]], dtype=F64))
     faces = torch.tensor([[0, 1, 2]])
     gradient = torch.tensor([[0.1, 0.3, 0], [-0.2, 0.4, 0], [0.05, -0.07, 0]], dtype=F64)
-    found = bend(sides(columns(x[..., 0] @ gradient.T), faces), frames(sides(x, faces)))
+    found = bend(sides(rows(x[:, 0].mT @ gradient.T), faces), frames(sides(x, faces)))
     xx, xy, yy = (float(entry) for entry in found.strain)
     assert (xx, xy, yy) == pytest.approx((0.1, 0.05, 0.4))
     # The normal turns so that it stays normal: about x by dw/dy, about -y by dw/dx; about z by the spin.
@@ -52,38 +68,38 @@ def test_a_linear_field_has_its_symmetric_part_as_strain() -> None:
 
 
 def test_turns_become_finite_rotations(bars: Shapes) -> None:
-    x, faces = columns(bars.keyframes[0]), bars.faces
+    x, faces = rows(bars.keyframes[0]), bars.faces
     own = frames(sides(x, faces))
     zero = torch.zeros_like(own.length)
     for omega in ([0.0, 0.0, 0.0], [2.0, -1.0, 0.7], [1e-9, 0.0, 0.0]):
-        turn = torch.tensor(omega, dtype=F64)[None, :, None].expand_as(own.e1)
+        turn = torch.tensor(omega, dtype=F64)[:, None, None].expand_as(own.e1)
         found = bent_sides(Bend(turn, (zero, zero, zero)), own)
-        rotation = _exp(torch.tensor(omega, dtype=F64))
+        rotation = exp(torch.tensor(omega, dtype=F64))
         for mine, its in zip(found, sides(x, faces), strict=True):
-            torch.testing.assert_close(mine[..., 0], its[..., 0] @ rotation.T)
+            torch.testing.assert_close(mine[:, 0], rotation @ its[:, 0])
     stretched = bent_sides(Bend(torch.zeros_like(own.e1), (zero + 0.5, zero, zero + 0.5)), own)
     for mine, its in zip(stretched, sides(x, faces), strict=True):
         torch.testing.assert_close(mine, np.exp(0.5) * its)
 
 
 def test_the_stretch_is_the_exponential_of_the_strain() -> None:
-    x = columns(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=F64))
+    x = rows(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=F64))
     own = frames(sides(x, torch.tensor([[0, 1, 2]])))
     for strain in ([[0.3, 0.2], [0.2, -0.1]], [[0.0, 0.4], [0.4, 0.0]], [[-3.0, 0.0], [0.0, -3.0]]):
         given = torch.tensor(strain, dtype=F64)
         entries = (given[0, 0].reshape(1, 1), given[0, 1].reshape(1, 1), given[1, 1].reshape(1, 1))
-        found = bent_sides(Bend(torch.zeros(1, 3, 1, dtype=F64), entries), own)
+        found = bent_sides(Bend(torch.zeros(3, 1, 1, dtype=F64), entries), own)
         expected = torch.linalg.matrix_exp(given)
-        torch.testing.assert_close(found.first[0, :2, 0], expected[:, 0])
-        torch.testing.assert_close(found.second[0, :2, 0], expected[:, 1])
+        torch.testing.assert_close(found.first[:2, 0, 0], expected[:, 0])
+        torch.testing.assert_close(found.second[:2, 0, 0], expected[:, 1])
 
 
 def test_mirrored_sides_turn_back_and_stretch_the_other_way(bars: Shapes) -> None:
-    x, faces = columns(bars.keyframes[1]), bars.faces
-    rotation = _exp(torch.tensor([0.5, 1.0, -0.8], dtype=F64))
-    turned = columns(x[..., 0] @ rotation.T)
+    x, faces = rows(bars.keyframes[1]), bars.faces
+    rotation = exp(torch.tensor([0.5, 1.0, -0.8], dtype=F64))
+    turned = rows(bars.keyframes[1] @ rotation.T)
     found = mirrored_sides(frames(sides(x, faces)), frames(sides(turned, faces)))
-    for mine, its in zip(found, sides(columns(x[..., 0] @ rotation), faces), strict=True):
+    for mine, its in zip(found, sides(rows(bars.keyframes[1] @ rotation), faces), strict=True):
         torch.testing.assert_close(mine, its)
     found = mirrored_sides(frames(sides(x, faces)), frames(sides(3.0 * x, faces)))
     for mine, its in zip(found, sides(x, faces), strict=True):
@@ -91,25 +107,25 @@ def test_mirrored_sides_turn_back_and_stretch_the_other_way(bars: Shapes) -> Non
 
 
 def test_mirrored_sides_of_a_shear_follow_the_matrix_function() -> None:
-    x = columns(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=F64))
+    x = rows(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=F64))
     faces = torch.tensor([[0, 1, 2]])
     m = torch.tensor([[1.2, 0.4], [-0.3, 0.8]], dtype=F64)
-    other = torch.zeros(3, 3, 1, dtype=F64)
-    other[1:, :2, 0] = m.T
+    other = torch.zeros(3, 1, 3, dtype=F64)
+    other[:2, 0, 1:] = m
     found = mirrored_sides(frames(sides(x, faces)), frames(sides(other, faces)))
     u, s, vh = np.linalg.svd(m.numpy())
     stretch = vh.T @ np.diag(4 / (1 + s) ** 2) @ vh
     expected = (u @ vh).T @ stretch
-    np.testing.assert_allclose(found.first[0, :2, 0], expected[:, 0], atol=1e-12)
-    np.testing.assert_allclose(found.second[0, :2, 0], expected[:, 1], atol=1e-12)
-    np.testing.assert_allclose(found.second[0, 2, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(found.first[:2, 0, 0], expected[:, 0], atol=1e-12)
+    np.testing.assert_allclose(found.second[:2, 0, 0], expected[:, 1], atol=1e-12)
+    np.testing.assert_allclose(found.second[2, 0, 0], 0, atol=1e-12)
 
 
 def test_a_triangle_without_area_stays_finite() -> None:
     x = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 0, 0]], dtype=F64)
     faces = torch.tensor([[0, 1, 2], [0, 3, 1]])
-    own = frames(sides(columns(x), faces))
-    field = torch.randn(4, 3, 1, dtype=F64, generator=torch.Generator().manual_seed(0))
+    own = frames(sides(rows(x), faces))
+    field = torch.randn(3, 1, 4, dtype=F64, generator=torch.Generator().manual_seed(0))
     found = bend(sides(field, faces), own)
     for part in (*own, found.turn, *found.strain, *mirrored_sides(own, own)):
         assert bool(part.isfinite().all())
@@ -118,15 +134,15 @@ def test_a_triangle_without_area_stays_finite() -> None:
 # ------------------------------------------------------------------------------------------------ reconstruction
 def test_reconstruction_returns_a_shape_from_its_sides(bars: Shapes) -> None:
     solver = Reconstruction(bars.keyframes[0], bars.faces)
-    rest = bars.keyframes.permute(1, 2, 0)
+    rest = bars.keyframes.movedim(-1, 0)
     torch.testing.assert_close(solver(sides(rest, bars.faces), rest), rest)
     # Weighted by one key-frame, it returns any shape, its centroid where the rest has it.
-    other = rest.roll(1, -1)
+    other = rest.roll(1, 1)
     found = solver(sides(other, bars.faces), rest)
     shift = found - other
-    torch.testing.assert_close(shift, shift[:1].expand_as(shift))
+    torch.testing.assert_close(shift, shift[..., :1].expand_as(shift))
     weights = solver.areas / solver.areas.sum()
-    torch.testing.assert_close(torch.einsum("v,vcb->cb", weights, found), torch.einsum("v,vcb->cb", weights, rest))
+    torch.testing.assert_close(found @ weights, rest @ weights)
 
 
 def test_reconstruction_is_the_least_squares_solution(small_bars: Shapes) -> None:
@@ -134,19 +150,20 @@ def test_reconstruction_is_the_least_squares_solution(small_bars: Shapes) -> Non
     x, faces = small_bars.keyframes[0], small_bars.faces
     solver = Reconstruction(x, faces)
     generator = torch.Generator().manual_seed(0)
-    wanted = Sides(*(torch.randn(len(faces), 3, 1, dtype=F64, generator=generator) for _ in range(2)))
-    found = solver(wanted, columns(x))[..., 0]
-    rows, targets = [], []
+    wanted = Sides(*(torch.randn(3, 1, len(faces), dtype=F64, generator=generator) for _ in range(2)))
+    found = solver(wanted, rows(x))[:, 0].mT
+    equations, targets = [], []
     between = {(0, 1): wanted.first, (0, 2): wanted.second, (1, 2): wanted.second - wanted.first}
     for f, face in enumerate(faces.tolist()):
         for (a, b), target in between.items():
             row = torch.zeros(len(x), dtype=F64)
             row[face[b]] += 1
             row[face[a]] -= 1
-            weight = solver.weights[f, 3 - a - b].sqrt()
-            rows.append(weight * row)
-            targets.append(weight * target[f, :, 0])
-    expected = torch.linalg.lstsq(torch.stack(rows), torch.stack(targets), driver="gelsd").solution
+            side = {(0, 1): 0, (1, 2): 1, (0, 2): 2}[a, b]
+            weight = solver.weights[side * len(faces) + f].sqrt()
+            equations.append(weight * row)
+            targets.append(weight * target[:, 0, f])
+    expected = torch.linalg.lstsq(torch.stack(equations), torch.stack(targets), driver="gelsd").solution
     torch.testing.assert_close(found - found.mean(0), expected - expected.mean(0))
 
 
@@ -154,7 +171,8 @@ def test_weights_are_cotangents_within_bounds(small_bars: Shapes) -> None:
     x, faces = small_bars.keyframes[0], small_bars.faces
     solver = Reconstruction(x, faces)
     angles = trimesh.Trimesh(x.numpy(), faces.numpy(), process=False).face_angles
-    np.testing.assert_allclose(solver.weights, np.clip(0.5 / np.tan(angles), 0.02, 20), rtol=1e-9)
+    across = angles[:, [2, 0, 1]].T.reshape(-1)
+    np.testing.assert_allclose(solver.weights, np.clip(0.5 / np.tan(across), 0.02, 20), rtol=1e-9)
 
 
 def test_gradients_go_through_the_solve(small_bars: Shapes) -> None:
@@ -163,7 +181,7 @@ def test_gradients_go_through_the_solve(small_bars: Shapes) -> None:
     def shape(first: torch.Tensor, second: torch.Tensor, rest: torch.Tensor) -> torch.Tensor:
         return solver(Sides(first, second), rest)
 
-    rest = small_bars.keyframes[:2].permute(1, 2, 0).contiguous()
+    rest = small_bars.keyframes[:2].movedim(-1, 0).contiguous()
     first, second = sides(rest, small_bars.faces)
     inputs = [part.clone().requires_grad_() for part in (first, second, rest)]
     assert torch.autograd.gradcheck(shape, inputs)
@@ -187,10 +205,9 @@ def test_a_loose_piece_goes_along_with_its_neighbourhood() -> None:
         [(radius - up) * torch.sin(along / radius), radius - (radius - up) * torch.cos(along / radius), deep], 1
     )
     solver = Reconstruction(x, faces)
-    assert len(solver.pieces) == 2
-    assert len(solver.pieces[0]) == len(bar.vertices)
+    assert [len(piece) for piece, _ in solver.loose] == [len(ball.vertices)]
     target = torch.cat([bent, x[-1:]])
-    found = solver(sides(columns(target), faces), columns(x))[..., 0]
+    found = solver(sides(rows(target), faces), rows(x))[:, 0].mT
     assert torch.equal(found[-1], x[-1])
     motion = best_fit(
         found[len(ball.vertices) : -1], bent[len(ball.vertices) :], torch.ones(len(bar.vertices)).double()
@@ -199,6 +216,95 @@ def test_a_loose_piece_goes_along_with_its_neighbourhood() -> None:
     assert float(offset[len(ball.vertices) :].abs().max()) < 1e-9
     # The piece follows a rigid fit of its surroundings: off by their bending, not by the half radian that they turn.
     assert float(offset[: len(ball.vertices)].norm(dim=1).max()) < 0.06
+
+
+# ------------------------------------------------------------------------------------------------- edges to vertices
+def edges_of(x: torch.Tensor, mesh: Connectivity) -> torch.Tensor:
+    """Edge vectors. *Shape:* ``(3, B, V) -> (3, B, E)``."""
+    start, end = torch.tensor(mesh.edges).T
+    return x[..., end] - x[..., start]
+
+
+@pytest.fixture
+def two_pieces(bars: Shapes) -> tuple[Connectivity, torch.Tensor]:
+    """Two bars and a vertex of no face, between them: the connectivity, and a batch of three shapes."""
+    x, n = bars.keyframes.movedim(-1, 0), bars.keyframes.shape[1]
+    faces = torch.cat([bars.faces, bars.faces + n + 1])
+    return Connectivity(faces.numpy(), 2 * n + 1), torch.cat([x, x[..., :1], x.roll(1, 1) + 9.0], -1)
+
+
+def test_mean_edges_of_a_shape_are_its_own(bars: Shapes) -> None:
+    mesh, x = Connectivity(bars.faces.numpy()), bars.keyframes.movedim(-1, 0)
+    sides_of, signs = torch.tensor(mesh.sides), torch.tensor(mesh.signs)
+    weights = torch.rand(3, 3 * len(bars.faces), generator=torch.Generator().manual_seed(0), dtype=F64)
+    for given in (weights, weights[0]):
+        found = edge_means(sides(x, bars.faces), given, sides_of, signs, len(mesh.edges))
+        torch.testing.assert_close(found, edges_of(x, mesh))
+    # Of two faces that disagree, the mean by weight.
+    mesh = Connectivity(np.array([[0, 1, 2], [1, 0, 3]]))
+    wanted = Sides(torch.tensor([[1.0, -5.0], [0, 0], [0, 0]]), torch.zeros(3, 2))
+    weights = torch.tensor([3.0, 1.0]).repeat(3)
+    found = edge_means(wanted, weights, torch.tensor(mesh.sides), torch.tensor(mesh.signs).float(), 5)
+    assert found[0, 0].item() == (3 * 1 + 1 * 5) / 4
+
+
+def test_poisson_gives_shapes_back(two_pieces: tuple[Connectivity, torch.Tensor]) -> None:
+    mesh, x = two_pieces
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(len(mesh.edges), generator=generator, dtype=F64) + 0.1
+    mass = torch.rand(mesh.n_vertices, generator=generator, dtype=F64)
+    near = torch.randn(x.shape, generator=generator, dtype=F64)
+    for solver, share in ((Poisson(mesh, weights), torch.ones_like(mass)), (Poisson(mesh, weights, mass), mass)):
+        torch.testing.assert_close(solver(edges_of(x, mesh), x), x)
+        found = solver(edges_of(x, mesh), near)
+        torch.testing.assert_close(edges_of(found, mesh), edges_of(x, mesh))
+        for piece in np.unique(mesh.vertex_pieces):
+            own = torch.tensor(mesh.vertex_pieces == piece)
+            torch.testing.assert_close(found[..., own] @ share[own], near[..., own] @ share[own])
+    lone = mesh.n_vertices // 2
+    assert torch.equal(found[..., lone], near[..., lone])  # bit for bit
+
+
+def test_poisson_keeps_to_the_weights_that_are_there(two_pieces: tuple[Connectivity, torch.Tensor]) -> None:
+    """Replaced, as by functional_call; copied; of another dtype; and none of them in the state."""
+    mesh, x = two_pieces
+    weights = torch.ones(len(mesh.edges), dtype=F64)
+    other = torch.linspace(1, 2, len(weights), dtype=F64)
+    solver, truth = Poisson(mesh, weights), Poisson(mesh, other)
+    wanted = torch.randn(3, 1, len(weights), dtype=F64, generator=torch.Generator().manual_seed(0))
+    first = solver(wanted, x[:, :1])
+    factor = solver.solver
+    assert solver.solver is factor
+    found = torch.func.functional_call(solver, {"weights": other}, (wanted, x[:, :1]))
+    torch.testing.assert_close(found, truth(wanted, x[:, :1]))
+    assert float((found - first).abs().max()) > 1e-3
+    torch.testing.assert_close(solver(wanted, x[:, :1]), first)
+    for copy in (copy_module.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
+        torch.testing.assert_close(copy(wanted, x[:, :1]), first)
+    single = solver.float()(wanted.float(), x[:, :1].float())
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), first, rtol=0, atol=1e-4)
+    assert not solver.state_dict()
+
+
+def test_poisson_derivatives(small_bars: Shapes) -> None:
+    mesh = Connectivity(small_bars.faces.numpy())
+    solver = Poisson(mesh, torch.ones(len(mesh.edges), dtype=F64))
+    x = small_bars.keyframes[:2].movedim(-1, 0)
+    inputs = [part.contiguous().requires_grad_() for part in (edges_of(x, mesh), x.roll(1, 1))]
+    assert torch.autograd.gradcheck(solver, inputs)
+    assert torch.autograd.gradgradcheck(solver, inputs, fast_mode=True)
+    both = torch.func.vmap(solver, in_dims=1, out_dims=1)(*(part.detach() for part in inputs))
+    torch.testing.assert_close(both, solver(*inputs).detach())
+
+
+def test_factors_of_a_definite_matrix() -> None:
+    rows = np.random.default_rng(0).standard_normal((30, 30))
+    dense = rows @ rows.T + np.eye(30)
+    for matrix in (sparse.csr_matrix(dense), sparse.coo_matrix(dense)):
+        for ordering in ("MMD_AT_PLUS_A", "NATURAL"):
+            solved = factorize(matrix, ordering).solve(np.arange(30.0))
+            np.testing.assert_allclose(dense @ solved, np.arange(30.0), atol=1e-9)
 
 
 # -------------------------------------------------------------------------------------------------------- mirror
@@ -245,9 +351,9 @@ def test_mirror_is_the_linear_one_for_small_steps(bars: Shapes) -> None:
 
 
 def test_frames_have_gradients(small_bars: Shapes) -> None:
-    x = small_bars.keyframes[1][..., None].clone().requires_grad_()
+    x = rows(small_bars.keyframes[1]).clone().requires_grad_()
     faces = small_bars.faces[:6]
-    still = frames(sides(small_bars.keyframes[0][..., None], faces))
+    still = frames(sides(rows(small_bars.keyframes[0]), faces))
 
     def wanted(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         own = frames(sides(x, faces))

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from torch_modal.energy.assembly import PairBlocks
@@ -18,6 +17,7 @@ from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.sparse import factorize
 from torch_modal.geometry.vectors import cross, pick
 
 STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
@@ -223,7 +223,7 @@ class _Assembly:
     @staticmethod
     def _solve(matrix: sparse.csc_matrix, right: Tensor) -> Tensor | None:
         """None where the matrix is not positive definite. *Shape:* ``(3, V, m) -> (3, V, m)``."""
-        factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        factor = factorize(matrix)
         # Without row exchanges the signs of the pivots are those of the eigenvalues.
         if (factor.U.diagonal() <= 0).any():
             return None

@@ -13,7 +13,7 @@ from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to
 
 import torch_modal as tm
 from torch_modal.energy.shell import wrap_angle
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.nn.frame import DIAGONAL
 
@@ -79,7 +79,7 @@ class Yardstick:
 
     def __init__(self, case: Case) -> None:
         self.case = case
-        self.edges = torch.from_numpy(connectivity.unique_edges(case.faces.numpy())[0])
+        self.edges = torch.tensor(Connectivity(case.faces.numpy()).edges)
         used = case.x_a[case.faces.unique()]
         self.scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
         self.shell = tm.ShellEnergy(case.faces)
@@ -142,7 +142,7 @@ class Yardstick:
         """Whether all known shapes enclose something: a sheet does not."""
         shapes = [self.case.x_a, self.case.x_b, *([] if self.truth is None else [self.truth])]
         areas = [float(self.normals(x).norm(dim=1).sum() / 2) for x in shapes]
-        closed = len(connectivity.boundary_edges(self.case.faces.numpy())) == 0
+        closed = len(Connectivity(self.case.faces.numpy()).boundary_edges) == 0
         return closed or all(abs(self.volume(x)) > FLAT * a**1.5 for x, a in zip(shapes, areas, strict=True))
 
     def normals(self, x: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from solvers import solvers
 
 import torch_modal as tm
-from torch_modal.geometry.connectivity import unique_edges
+from torch_modal.geometry.connectivity import Connectivity
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -59,7 +59,7 @@ def measured(work: Callable[[], object]) -> Cost:
 def refined(keyframes: FloatArray, faces: IntArray, n_vertices: int) -> tuple[FloatArray, IntArray]:
     """The same surfaces with more vertices: the longest edges of the first are split at their middle, in all."""
     while keyframes.shape[1] < n_vertices:
-        edges, _ = unique_edges(faces)
+        edges = Connectivity(faces).edges
         length = np.linalg.norm(keyframes[0][edges[:, 0]] - keyframes[0][edges[:, 1]], axis=1)
         sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
         base = keyframes.shape[1]

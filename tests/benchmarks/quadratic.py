@@ -7,6 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
+from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.embedding import closest_tetrahedra
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
@@ -55,7 +56,7 @@ def quadratic_modes(solid: Tetrahedra, n_modes: int) -> QuadraticModes:
 
     shift = 1.0 / float((np.ptp(solid.vertices, axis=0) ** 2).sum())
     shifted = sp.csc_matrix(stiffness + shift * mass)
-    factors = spla.splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factors = factorize(shifted)
     inverse = spla.LinearOperator(shifted.shape, matvec=factors.solve)
     # More than are wanted, from a start that is the same every time: of equal eigenvalues, as the rigid ones and those
     # of symmetric shapes are, ARPACK may miss one and take the next for it.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.data.samples import Sample, load_sample
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.io.write import save_animation
 from torch_modal.precompute.modes import extract_bases
@@ -95,7 +95,7 @@ def run_demo(
 
 def compare(name: str, sample: Sample, linear: Tensor, ours: Tensor, levels: int) -> list[Comparison]:
     """Errors against the true frames. *Shape of the sequences:* ``(N, V, 3)``."""
-    edges = torch.from_numpy(connectivity.unique_edges(sample.faces.numpy())[0])
+    edges = torch.tensor(Connectivity(sample.faces.numpy()).edges)
 
     def error(shape: Tensor, true: Tensor) -> Error:
         lengths, wanted = (torch.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], dim=-1) for x in (shape, true))

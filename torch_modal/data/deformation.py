@@ -10,6 +10,7 @@ from torch_modal.data.space import Reference, ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Bend, bend, bent_sides, frames, sides
+from torch_modal.geometry.vectors import pick
 
 # A draw beyond the bound is scaled down to this part of it, as if its largest strain were linear, which it nearly is.
 _INSIDE = 0.98
@@ -136,22 +137,26 @@ def deform(x: Tensor, amplitudes: Tensor, reference: Reference, reconstruction: 
         Aligned with ``x``. *Shape:* ``(B, V, 3)``.
     """
     faces, weights = reconstruction.faces.to(x.device), reconstruction.areas.to(x)
-    modes = reference.modes
-    displacement = (modes.mT @ amplitudes[:, : len(modes)].mT).unflatten(0, (-1, 3))
+    displacement = _displacement(amplitudes, reference)
     turn, strain = bend(sides(displacement, faces), reference.frames)
     pose = best_fit(reference.shape.expand_as(x), x, weights).rotation
-    turn = (pose @ turn.movedim(-1, 0).mT).mT.movedim(0, -1)
-    rest = x.permute(1, 2, 0).contiguous()
+    turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
+    rest = x.movedim(-1, 0).contiguous()
     wanted = bent_sides(Bend(turn, strain), frames(sides(rest, faces)))
-    bent = reconstruction(wanted, rest).permute(2, 0, 1)
+    bent = reconstruction(wanted, rest).movedim(0, -1)
     return best_fit(bent, x, weights).apply(bent)
 
 
 def linear_strain(amplitudes: Tensor, reference: Reference, edges: Tensor) -> Tensor:
     """Largest edge strain of the linear displacement: that of the bent shape to first order. *Shape:* ``(B,)``."""
     i, j = edges.unbind(1)
+    displacement = _displacement(amplitudes, reference)
+    side = (reference.shape[j] - reference.shape[i]).mT[:, None]
+    along = ((pick(displacement, j) - pick(displacement, i)) * side).sum(0)
+    return (along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)).abs().amax(1)
+
+
+def _displacement(amplitudes: Tensor, reference: Reference) -> Tensor:
+    """Of the vertices, components first. *Shape:* ``(B, n) -> (3, B, V)``."""
     modes = reference.modes
-    displacement = (modes.mT @ amplitudes[:, : len(modes)].mT).unflatten(0, (-1, 3))
-    side = (reference.shape[j] - reference.shape[i])[..., None]
-    along = ((displacement[j] - displacement[i]) * side).sum(1)
-    return (along / side.square().sum(1).clamp_min(torch.finfo(side.dtype).tiny)).abs().amax(0)
+    return (amplitudes[:, : len(modes)] @ modes).unflatten(1, (3, -1)).movedim(1, 0)

@@ -190,7 +190,7 @@ def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Ten
     """
     weights, faces = reconstruction.areas.to(centre), reconstruction.faces.to(centre.device)
     motion = best_fit(centre, other, weights)
-    last, aligned = (y.permute(1, 2, 0).contiguous() for y in (centre, motion.inverse().apply(other)))
+    last, aligned = (y.movedim(-1, 0).contiguous() for y in (centre, motion.inverse().apply(other)))
     wanted = mirrored_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))
-    beyond = reconstruction(wanted, last).permute(2, 0, 1)
+    beyond = reconstruction(wanted, last).movedim(0, -1)
     return RigidMotion(motion.rotation.mT, motion.source, 2 * motion.source - motion.target).apply(beyond)

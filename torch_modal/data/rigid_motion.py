@@ -4,11 +4,13 @@ import math
 from typing import Any
 
 import torch
-from kornia.geometry.liegroup import So3
+from kornia.geometry.conversions import quaternion_to_axis_angle
+from torch.nn.functional import normalize
 
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.rigid import RigidMotion
+from torch_modal.geometry.rotations import exp
 
 
 class RandomRigidMotion(ShapeAugmentation):
@@ -57,16 +59,13 @@ class RandomRigidMotion(ShapeAugmentation):
         move = self.translation * (2 * uniform(n, generator, 3) - 1)
         if self.degrees is None:
             # A normal vector of four has a uniform direction: a uniform quaternion.
-            sine = direction[:, 1:].norm(dim=1)
-            angle = 2 * torch.atan2(sine, direction[:, 0])
-            angle = torch.where(angle > torch.pi, angle - 2 * torch.pi, angle)
-        else:
-            low, high = (math.radians(degree) for degree in self.degrees)
-            angle = low + (high - low) * angle
+            return {"rotation": quaternion_to_axis_angle(normalize(direction, dim=1)), "translation": move}
+        low, high = (math.radians(degree) for degree in self.degrees)
+        angle = low + (high - low) * angle
         axis = direction[:, 1:]
-        if self.axis is not None and self.degrees is not None:
+        if self.axis is not None:
             axis = torch.as_tensor(self.axis).to(axis).expand_as(axis)
-        return {"rotation": angle[:, None] * torch.nn.functional.normalize(axis, dim=1), "translation": move}
+        return {"rotation": angle[:, None] * normalize(axis, dim=1), "translation": move}
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
@@ -75,10 +74,6 @@ class RandomRigidMotion(ShapeAugmentation):
         x = batch.shapes
         diagonal = (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
         centre = x.mean(1)
-        turn = params["rotation"]
-        rotation = So3.exp(turn).matrix()
-        if not turn.requires_grad:
-            rotation = rotation.detach()  # kornia makes a parameter of what it is given
-        motion = RigidMotion(rotation, centre, centre + params["translation"] * diagonal)
+        motion = RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * diagonal)
         given = None if batch.given is None else torch.zeros_like(batch.given)
         return batch._replace(shapes=motion.apply(x), given=given)

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
+from torch_modal.geometry.vectors import norm, pick
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
@@ -57,7 +58,7 @@ class Reference(NamedTuple):
     """*Shape:* ``(V, 3)``."""
     modes: Tensor
     """Modes over the roots of their eigenvalues, so scaled that independent standard normal amplitudes give an expected
-    root mean square edge strain of one. *Shape:* ``(k, 3V)``."""
+    root mean square edge strain of one, components first. *Shape:* ``(k, 3V)``."""
     frames: Frames
     """Of its triangles, for a batch of one."""
 
@@ -147,7 +148,7 @@ class ShapeSpace:
     def edges(self) -> Tensor:
         """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
         if self._edges is None:
-            self._edges = torch.from_numpy(connectivity.unique_edges(self.faces.numpy())[0])
+            self._edges = torch.tensor(Connectivity(self.faces.numpy()).edges)
         return self._edges
 
     def keyframes(self, like: Tensor | None = None) -> Tensor:
@@ -171,9 +172,9 @@ class ShapeSpace:
     def strain(self, x: Tensor, rest: Tensor) -> Tensor:
         """Relative change of length of each edge. *Shape:* ``(B, V, 3), (B, V, 3) -> (B, E)``."""
         i, j = self.edges.to(x.device).unbind(1)
-        rows = [y.permute(1, 2, 0).contiguous() for y in (x, rest)]
-        after, before = ((y[j] - y[i]).square().sum(1).sqrt() for y in rows)
-        return (after / before.clamp_min(torch.finfo(x.dtype).tiny) - 1).mT
+        rows = (y.movedim(-1, 0).contiguous() for y in (x, rest))
+        after, before = (norm(pick(y, j) - pick(y, i)) for y in rows)
+        return after / before - 1
 
     # ------------------------------------------------------------------------------------------- made when needed
     @property
@@ -198,8 +199,8 @@ class ShapeSpace:
             slopes = ((modes[:, j] - modes[:, i]) * side).sum(-1) / side.square().sum(-1).clamp_min(1e-300)
             expected = slopes.square().mean(1).sum().sqrt()
             modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
-            own = frames(sides(x[..., None], self.faces))
-            return Reference(x.to(like), modes.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
+            own = frames(sides(x.mT[:, None], self.faces))
+            return Reference(x.to(like), modes.mT.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
 
         return self._references.get((index, like.dtype, like.device), make)
 

@@ -1,5 +1,8 @@
 """Connectivity of triangle meshes: edges, hinges, boundaries, neighbours. NumPy and SciPy only."""
 
+from functools import cached_property
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -8,85 +11,169 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 IntArray = NDArray[np.int64]
 
 
-def _half_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """All directed edges ``(3F, 2)`` of the faces and the vertex opposite to each ``(3F,)``."""
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
-    return directed, opposite
+class Connectivity:
+    """All that follows from the faces of a mesh, made when it is first asked for, from one sort of their sides.
 
+    Made once for a mesh and handed on to all who need it. The arrays are shared, so they cannot be written to:
+    ``torch.tensor(...)`` makes a copy that can be.
 
-def unique_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Undirected edges, each once, and how many faces share each.
+    A face has three sides. Side ``c F + f`` runs from corner ``c`` of face ``f`` to the next, so that an array of all
+    ``3F`` sides is three arrays of ``F``, one after the other.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-
-    Returns:
-        Edges with the smaller index first, sorted, *shape* ``(E, 2)``; number of faces, *shape* ``(E,)``.
+        n_vertices: Number of vertices, V; by default those up to the last one that a face uses.
     """
-    directed, _ = _half_edges(faces)
-    return np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
 
+    def __init__(self, faces: IntArray, n_vertices: int | None = None) -> None:
+        self.faces: IntArray = _shared(np.array(faces, dtype=np.int64).reshape(-1, 3))
+        self.n_vertices = int(self.faces.max(initial=-1)) + 1 if n_vertices is None else n_vertices
 
-def hinges(faces: IntArray) -> IntArray:
-    """Interior edges with the two vertices opposite to them.
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The faces alone are pickled: the rest is made faster than it is read."""
+        return Connectivity, (self.faces, self.n_vertices)
 
-    An edge of one face has no dihedral angle, an edge of three or more has no single one: neither gives a hinge.
+    @cached_property
+    def start(self) -> IntArray:
+        """The vertex at which each side starts. *Shape:* ``(3F,)``."""
+        return _shared(self.faces.T.reshape(-1))
 
-    Args:
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+    @cached_property
+    def end(self) -> IntArray:
+        """The vertex at which each side ends. *Shape:* ``(3F,)``."""
+        return _shared(self.faces[:, [1, 2, 0]].T.reshape(-1))
 
-    Returns:
-        Rows ``(i, j, k, l)``: the edge ``ij`` and the opposite vertices ``k`` and ``l`` of its two triangles. Where
+    @cached_property
+    def opposite(self) -> IntArray:
+        """The corner across each side. *Shape:* ``(3F,)``."""
+        return _shared(self.faces[:, [2, 0, 1]].T.reshape(-1))
+
+    @cached_property
+    def _runs(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Sides in the order of their edges, ``(3F,)``; where each edge starts there, and its packed ends, ``(E,)``."""
+        key = self._pack(self.start, self.end)
+        bits = len(key).bit_length()
+        if 2 * self._bits + bits < 64:  # ends and number in one integer: sorted three times as fast as by argsort
+            packed = np.sort(key << bits | np.arange(len(key)))
+            order, key = packed & (1 << bits) - 1, packed >> bits
+        else:
+            order = np.argsort(key, kind="stable")
+            key = key[order]
+        first = np.flatnonzero(np.diff(key, prepend=-1))
+        return order, first, key[first]
+
+    @property
+    def _bits(self) -> int:
+        return max(self.n_vertices - 1, 0).bit_length()
+
+    def _pack(self, i: IntArray, j: IntArray) -> IntArray:
+        """One integer for two vertices, whichever comes first; its order is that of the edges."""
+        return np.minimum(i, j) << self._bits | np.maximum(i, j)
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """Each edge once, the smaller vertex first, sorted. *Shape:* ``(E, 2)``."""
+        key = self._runs[2]
+        return _shared(np.stack([key >> self._bits, key & (1 << self._bits) - 1], axis=1))
+
+    @cached_property
+    def counts(self) -> IntArray:
+        """How many faces share each edge. *Shape:* ``(E,)``."""
+        order, first, _ = self._runs
+        return _shared(np.diff(first, append=len(order)))
+
+    @cached_property
+    def sides(self) -> IntArray:
+        """The edge that each side runs along. *Shape:* ``(3F,)``."""
+        sides = np.empty(3 * len(self.faces), dtype=np.int64)
+        sides[self._runs[0]] = np.repeat(np.arange(len(self.counts)), self.counts)
+        return _shared(sides)
+
+    @cached_property
+    def signs(self) -> NDArray[np.float64]:
+        """+1 for a side that runs along its edge from the smaller vertex to the larger, otherwise -1.
+
+        *Shape:* ``(3F,)``.
+        """
+        return _shared(np.where(self.start < self.end, 1.0, -1.0))
+
+    @cached_property
+    def hinge_sides(self) -> IntArray:
+        """The two sides at each edge of exactly two faces, in the order of the edges. *Shape:* ``(H, 2)``."""
+        order, first, _ = self._runs
+        one = first[self.counts == 2]
+        return _shared(np.stack([order[one], order[one + 1]], axis=1))
+
+    @cached_property
+    def hinges(self) -> IntArray:
+        """Interior edges with the two vertices opposite to them.
+
+        An edge of one face has no dihedral angle, an edge of three or more has no single one: neither gives a hinge.
+        Rows are ``(i, j, k, l)``: the edge ``ij`` and the opposite vertices ``k`` and ``l`` of its two triangles. Where
         the winding is consistent, the triangles are ``(i, j, k)`` and ``(j, i, l)``. *Shape:* ``(H, 4)``.
+        """
+        first, second = self.hinge_sides.T
+        ends = self.start[first], self.end[first]
+        return _shared(np.stack([*ends, self.opposite[first], self.opposite[second]], axis=1))
+
+    @cached_property
+    def face_neighbours(self) -> IntArray:
+        """Pairs of faces at one edge, the smaller first; where there are three or more, each with the next.
+
+        *Shape:* ``(n, 2)``.
+        """
+        order = self._runs[0]
+        same = np.diff(self.sides[order]) == 0
+        return _shared(np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(self.faces), axis=1))
+
+    @cached_property
+    def boundary_edges(self) -> IntArray:
+        """Edges of exactly one face. *Shape:* ``(·, 2)``."""
+        return _shared(self.edges[self.counts == 1])
+
+    @cached_property
+    def boundary_chain(self) -> IntArray:
+        """Directed edges that are left when opposite ones cancel: the boundary of an open surface.
+
+        Where the winding is consistent, these are the edges of one face, in its direction. An edge that two faces run
+        along in the same direction, or a third face shares, is left as often as it does not cancel.
+        *Shape:* ``(·, 2)``.
+        """
+        net = np.bincount(self.sides, self.signs, minlength=len(self.edges)).astype(np.int64)
+        oriented = np.where((net > 0)[:, None], self.edges, self.edges[:, ::-1])
+        return _shared(np.repeat(oriented, np.abs(net), axis=0))
+
+    @cached_property
+    def vertex_pieces(self) -> IntArray:
+        """Which connected piece each vertex belongs to; one of no face is a piece. *Shape:* ``(V,)``."""
+        return _shared(connected_pieces(self.edges, self.n_vertices))
+
+    def edge_index(self, i: IntArray, j: IntArray) -> IntArray:
+        """Which of the edges joins ``i`` and ``j``. *Shape:* ``(n,), (n,) -> (n,)``.
+
+        Raises:
+            ValueError: None does.
+        """
+        known, wanted = self._runs[2], self._pack(i, j)
+        found = np.searchsorted(known, wanted)
+        missing = np.append(known, -1)[found] != wanted
+        if missing.any():
+            first = int(np.flatnonzero(missing)[0])
+            raise ValueError(f"no face has an edge between the vertices {i[first]} and {j[first]}")
+        return found.astype(np.int64)
+
+
+def _shared(array: NDArray[Any]) -> NDArray[Any]:
+    array.flags.writeable = False
+    return array
+
+
+def connected_pieces(pairs: IntArray, n: int) -> IntArray:
+    """Which connected piece each of ``n`` nodes belongs to, numbered by their first nodes. *Shape:* ``(m, 2) -> (n,)``.
+
+    A node without a pair is a piece.
     """
-    directed, opposite = _half_edges(faces)
-    edge_ids, counts = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)[1:]
-    order = np.argsort(edge_ids.reshape(-1), kind="stable")
-    order = order[(counts == 2)[edge_ids.reshape(-1)[order]]].reshape(-1, 2)
-    first, second = order[:, 0], order[:, 1]
-    return np.concatenate([directed[first], opposite[first, None], opposite[second, None]], axis=1)
-
-
-def boundary_edges(faces: IntArray) -> IntArray:
-    """Edges of exactly one face. *Shape:* ``(·, 2)``."""
-    edges, counts = unique_edges(faces)
-    return edges[counts == 1]
-
-
-def boundary_chain(faces: IntArray) -> IntArray:
-    """Directed edges that are left when opposite ones cancel: the boundary of an open surface.
-
-    Where the winding is consistent, these are the edges of one face, in its direction. An edge that two faces run
-    along in the same direction, or a third face shares, is left as often as it does not cancel. *Shape:* ``(·, 2)``.
-    """
-    directed, _ = _half_edges(faces)
-    edges, ids = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
-    forward = directed[:, 0] < directed[:, 1]
-    net = np.bincount(ids.reshape(-1), np.where(forward, 1, -1), minlength=len(edges)).astype(np.int64)
-    oriented = np.where((net > 0)[:, None], edges, edges[:, ::-1])
-    return np.repeat(oriented, np.abs(net), axis=0)
-
-
-def edge_index(edges: IntArray, i: IntArray, j: IntArray) -> IntArray:
-    """Which of the sorted edges of `unique_edges` joins ``i`` and ``j``. *Shape:* ``(n,), (n,) -> (n,)``."""
-    n = int(edges.max()) + 1
-    keys = edges[:, 0] * n + edges[:, 1]
-    return np.searchsorted(keys, np.minimum(i, j) * n + np.maximum(i, j)).astype(np.int64)
-
-
-def face_neighbours(faces: IntArray) -> IntArray:
-    """Pairs of faces at one edge; where there are three or more, each with the next. *Shape:* ``(n, 2)``."""
-    directed, _ = _half_edges(faces)
-    edge = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-    order = np.argsort(edge, kind="stable")
-    same = np.diff(edge[order]) == 0
-    return np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(faces), axis=1)
-
-
-def vertex_pieces(edges: IntArray, n: int) -> IntArray:
-    """Which connected piece each of ``n`` vertices belongs to; one without an edge is a piece. *Shape:* ``(n,)``."""
-    graph = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    graph = sparse.coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
@@ -102,37 +189,51 @@ def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tupl
         The parent of each node, its own for a root; the connected piece of each. *Shape:* ``(n,)`` each.
     """
     # Two nodes may be connected twice: entries of a sparse matrix would add up.
-    order = np.lexsort((costs, pairs[:, 1], pairs[:, 0]))
-    first = np.unique(pairs[order], axis=0, return_index=True)[1]
-    rows, columns = pairs[order][first].T
-    tree = minimum_spanning_tree(sparse.coo_matrix((costs[order][first], (rows, columns)), shape=(n, n)).tocsr())
-    _, piece = connected_components(tree, directed=False)
+    key = pairs[:, 0] * n + pairs[:, 1]
+    order = np.lexsort((costs, key))
+    order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
+    tree = minimum_spanning_tree(sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr())
+    piece = connected_pieces(pairs, n)
     parents = np.arange(n)
     for root in np.unique(piece, return_index=True)[1]:
         found, before = breadth_first_order(tree, root, directed=False)
         parents[found[1:]] = before[found[1:]]
-    return parents.astype(np.int64), piece.astype(np.int64)
-
-
-def face_index(faces: IntArray, i: IntArray, j: IntArray, k: IntArray) -> tuple[IntArray, NDArray[np.float64]]:
-    """Which face has the corners ``i, j, k``, and +1 or -1 for their order in it. *Shape:* ``(n,)`` each."""
-    n = int(faces.max()) + 1
-    sorted_corners = np.sort(faces, axis=1)
-    keys = (sorted_corners[:, 0] * n + sorted_corners[:, 1]) * n + sorted_corners[:, 2]
-    order = np.argsort(keys)
-    a, b, c = np.sort(np.stack([i, j, k]), axis=0)
-    index = order[np.searchsorted(keys, (a * n + b) * n + c, sorter=order)]
-    corners = faces[index]
-    place = (corners == i[:, None]).argmax(1)
-    follows = np.take_along_axis(corners, ((place + 1) % 3)[:, None], axis=1)[:, 0] == j
-    return index, np.where(follows, 1.0, -1.0)
+    return parents.astype(np.int64), piece
 
 
 def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
     """A third of the area of the faces around each vertex. *Shape:* ``(V,)``."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(normals, axis=1)
-    areas = np.zeros(len(vertices))
-    np.add.at(areas, faces.reshape(-1), np.repeat(area / 3, 3))
-    return areas
+    area = np.linalg.norm(normals, axis=1)
+    summed = np.bincount(faces.reshape(-1), np.repeat(area / 6, 3), minlength=len(vertices))
+    return summed.astype(np.float64)  # of no face at all it is of integers
+
+
+# What follows gives single parts of a Connectivity, as copies of the caller's own.
+
+
+def unique_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """:attr:`Connectivity.edges` and :attr:`Connectivity.counts`."""
+    mesh = Connectivity(faces)
+    return mesh.edges.copy(), mesh.counts.copy()
+
+
+def hinges(faces: IntArray) -> IntArray:
+    """:attr:`Connectivity.hinges`."""
+    return Connectivity(faces).hinges.copy()
+
+
+def boundary_edges(faces: IntArray) -> IntArray:
+    """:attr:`Connectivity.boundary_edges`."""
+    return Connectivity(faces).boundary_edges.copy()
+
+
+def boundary_chain(faces: IntArray) -> IntArray:
+    """:attr:`Connectivity.boundary_chain`."""
+    return Connectivity(faces).boundary_chain.copy()
+
+
+def vertex_pieces(edges: IntArray, n: int) -> IntArray:
+    """:func:`connected_pieces`."""
+    return connected_pieces(edges, n)

@@ -1,14 +1,14 @@
 """What can be wrong with triangles or with the shapes on them: findings and repairs. NumPy and SciPy only.
 
-Nothing here raises or warns: `keyframes.py` decides what a finding means.
+Nothing here raises or warns: `keyframes/check.py` decides what a finding means.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -40,30 +40,19 @@ def repeated_faces(faces: IntArray) -> BoolArray:
     return repeated
 
 
-def consistent_winding(faces: IntArray) -> Winding:
+def consistent_winding(mesh: Connectivity) -> Winding:
     """Turn the fewest faces over, so that the two faces of each edge run through it in opposite directions.
 
     Every face stands in a graph twice, as it is and turned over. Neighbours that agree are joined like to
     like, neighbours that disagree crosswise. A piece that can be oriented falls apart into two mirror copies
     in this graph; one that cannot stays whole. Edges of three or more faces join nothing.
     """
-    n_faces = len(faces)
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    owner = np.tile(np.arange(n_faces), 3)
-    forward = directed[:, 0] < directed[:, 1]
-    low, high = np.sort(directed, axis=1).T
-    order = np.lexsort((high, low))
-    new_edge = np.ones(len(order), dtype=bool)
-    new_edge[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
-    start = np.flatnonzero(new_edge)
-    start = start[np.diff(np.append(start, len(order))) == 2]
-    one, two = order[start], order[start + 1]
-    crossed = (forward[one] == forward[two]) * n_faces
-
-    rows = np.concatenate([owner[one], owner[one] + n_faces])
-    columns = np.concatenate([owner[two] + crossed, owner[two] + n_faces - crossed])
-    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(2 * n_faces, 2 * n_faces))
-    _, label = connected_components(graph, directed=False)
+    faces, n_faces = mesh.faces, len(mesh.faces)
+    one, two = mesh.hinge_sides.T % n_faces
+    signs = mesh.signs[mesh.hinge_sides]
+    crossed = (signs[:, 0] == signs[:, 1]) * n_faces
+    pairs = np.stack([np.append(one, one + n_faces), np.append(two + crossed, two + n_faces - crossed)], axis=1)
+    label = connected_pieces(pairs, 2 * n_faces)
     as_is, turned = label[:n_faces], label[n_faces:]
     non_orientable = as_is == turned
 

@@ -1,23 +1,35 @@
 """Normals of shapes."""
 
+from typing import TypeVar
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_modal.geometry.vectors import cross, pick
 
-def vertex_normals(x: Tensor, faces: Tensor) -> Tensor:
+Array = TypeVar("Array", Tensor, NDArray[np.float64])
+
+
+def vertex_normals(x: Array, faces: Tensor | NDArray[np.int64]) -> Array:
     """Unit normals: means of those of the faces around each vertex, weighted by area.
 
     Args:
-        x: Vertex positions. *Shape:* ``(B, V, 3)``.
+        x: Vertex positions, a tensor or an array. *Shape:* ``(..., V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
 
     Returns:
-        Zero where a vertex has no face. *Shape:* ``(B, V, 3)``.
+        Zero where a vertex has no face, or its faces cancel; of the type of ``x``. *Shape:* ``(..., V, 3)``.
     """
-    faces = faces.to(x.device)
-    # Vertices first: whole rows are then gathered and summed.
-    rows = x.permute(1, 2, 0).contiguous()
-    a, b, c = (rows[corner] for corner in faces.unbind(1))
-    doubled = torch.linalg.cross(b - a, c - a, dim=1)
-    summed = torch.zeros_like(rows).index_add(0, faces.T.flatten(), doubled.repeat(3, 1, 1))
-    return torch.nn.functional.normalize(summed, dim=1, eps=torch.finfo(x.dtype).tiny ** 0.5).permute(2, 0, 1)
+    if not isinstance(x, Tensor):
+        return vertex_normals(torch.tensor(x), torch.tensor(faces)).numpy()
+    faces = torch.as_tensor(faces, dtype=torch.int64, device=x.device)
+    rows = x.movedim(-1, 0).contiguous()
+    a, b, c = (pick(rows, corner) for corner in faces.unbind(1))
+    doubled = cross(b - a, c - a)
+    # Scaled, so that the squares of small shapes' areas do not vanish.
+    largest = doubled.detach().abs().amax((0, -1), keepdim=True)
+    doubled = doubled / torch.where(largest > 0, largest, 1)
+    summed = torch.zeros_like(rows).index_add(-1, faces.T.flatten(), torch.cat([doubled] * 3, -1))
+    return torch.nn.functional.normalize(summed, dim=0, eps=torch.finfo(x.dtype).tiny ** 0.5).movedim(0, -1)

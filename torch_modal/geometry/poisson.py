@@ -1,16 +1,16 @@
-"""Vertices from the sides that triangles ask for: a Poisson problem, factorised once for a connectivity."""
+"""Vertices from the edges or the sides that are asked for: a Poisson problem, factorised once for a connectivity."""
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
-from torch import Tensor
+from torch import Tensor, nn
 
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity, IntArray, vertex_areas
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
-from torch_modal.geometry.triangle_frames import Sides
+from torch_modal.geometry.triangle_frames import Sides, edge_means
+from torch_modal.geometry.vectors import pick
 
 # Cotangents of slivers: a side counts neither for nothing nor for everything. Positive weights also make the matrix
 # definite whatever the triangles.
@@ -20,12 +20,79 @@ _WEIGHT_RANGE = (0.02, 20.0)
 _N_ANCHORS = 16
 
 
+class Poisson(nn.Module):
+    r"""Vertices of :math:`\min_x \sum_e w_e |x_j - x_i - \bar e|^2`, each piece of the surface where it is told.
+
+    The weights serve all shapes, so that one factorisation does
+    (:class:`~torch_modal.geometry.sparse.SparseSolver`, on the CPU). It is made at the first use, and again whenever
+    the weights are others than those that it was made of.
+
+    Args:
+        mesh: The connectivity, of all vertices.
+        weights: One for each edge, above 0. *Shape:* ``(E,)``.
+        vertex_weights: Whose mean is a piece's centre, none below 0; by default all the same. *Shape:* ``(V,)``.
+    """
+
+    edges: Tensor
+    weights: Tensor
+    piece: Tensor
+    shares: Tensor
+    free: Tensor
+
+    def __init__(self, mesh: Connectivity, weights: Tensor, vertex_weights: Tensor | None = None) -> None:
+        super().__init__()
+        piece = torch.tensor(mesh.vertex_pieces)
+        mass = torch.ones(len(piece)) if vertex_weights is None else vertex_weights.cpu()
+        mass = mass.double() + torch.finfo(torch.float64).tiny  # for pieces without area
+        total = torch.zeros_like(mass).index_add(0, piece, mass)
+        self.register_buffer("edges", torch.tensor(mesh.edges), persistent=False)
+        self.register_buffer("weights", weights.clone(), persistent=False)
+        self.register_buffer("piece", piece, persistent=False)
+        self.register_buffer("shares", (mass / total[piece]).to(weights), persistent=False)
+        # The equations fix each piece up to a translation: one vertex of each is held, and the piece placed afterwards.
+        held = np.unique(mesh.vertex_pieces, return_index=True)[1]
+        self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), held)), persistent=False)
+        self._made: tuple[Tensor, SparseSolver] | None = None
+
+    @property
+    def solver(self) -> SparseSolver:
+        """The Laplacian's inverse, of what the weights are now: others may stand in for them, as in functional_call."""
+        now = self.weights
+        if self._made is None or not _equal(now, self._made[0]):
+            laplacian = graph_laplacian(self.edges.cpu().numpy(), now.double().cpu().numpy(), len(self.piece))
+            self._made = now, SparseSolver(laplacian, self.free.cpu().numpy())
+        return self._made[1]
+
+    def forward(self, wanted: Tensor, near: Tensor) -> Tensor:
+        """The shape whose edges come closest to those wanted.
+
+        Args:
+            wanted: Edge vectors, components first. *Shape:* ``(3, ..., E)``.
+            near: A shape whose pieces have their centres where those of the result are wanted. *Shape:*
+                ``(3, ..., V)``.
+
+        Returns:
+            Vertices that no face uses are pieces of their own, and stay where ``near`` has them. *Shape:*
+            ``(3, ..., V)``.
+        """
+        pulls = wanted * self.weights.to(wanted)
+        both = torch.cat([-pulls, pulls], -1)
+        right = torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both)
+        x = self.solver(right.movedim(0, -1)).movedim(-1, 0)
+        return x + self.centres(near - x)
+
+    def centres(self, x: Tensor) -> Tensor:
+        """The centre of the piece of each vertex. *Shape:* ``(3, ..., V) -> (3, ..., V)``."""
+        piece, shares = self.piece.to(x.device), self.shares.to(x.device)
+        # Thousands of float32 added one after the other would lose three digits.
+        weighted = x.double() * shares.double()
+        return pick(torch.zeros_like(weighted).index_add(-1, piece, weighted), piece).to(x)
+
+
 class Reconstruction:
     r"""The shape whose sides come closest to those wanted, :math:`\min_x \sum w_{ij} |x_j - x_i - s_{ij}|^2`.
 
-    The weights are cotangents of a reference, so that one factorisation serves all shapes of the connectivity. It is
-    SciPy's sparse LU in float64 on the CPU: tensors on a GPU go there and back, which is said in the documents. The
-    operator is symmetric, and backward solves with it once more.
+    The weights are cotangents of a reference, so that one factorisation serves all shapes of the connectivity.
 
     Args:
         reference: A shape that gives the weights. *Shape:* ``(V, 3)``.
@@ -33,77 +100,66 @@ class Reconstruction:
     """
 
     def __init__(self, reference: Tensor, faces: Tensor) -> None:
-        shape, triangles = reference.detach().cpu().double().numpy(), faces.cpu().numpy()
+        shape = reference.detach().cpu().double().numpy()
+        self.mesh = mesh = Connectivity(faces.cpu().numpy(), len(shape))
         self.faces = faces.cpu()
-        self.n_vertices = len(shape)
-        weights = _side_weights(shape, triangles)
-        self.weights = torch.from_numpy(weights)
-        self.areas = torch.from_numpy(connectivity.vertex_areas(shape, triangles))
-        across = np.concatenate([triangles[:, [(corner + 1) % 3, (corner + 2) % 3]] for corner in range(3)])
-        laplacian = graph_laplacian(across, weights.T.reshape(-1), len(shape))
-        used = np.unique(triangles)
-        self.unused = torch.from_numpy(np.setdiff1d(np.arange(len(shape)), used))
-        labels = connected_components(laplacian, directed=False)[1]
+        self.sides, self.signs = torch.tensor(mesh.sides), torch.tensor(mesh.signs)
+        #: Of the sides. *Shape:* ``(3F,)``.
+        self.weights = torch.from_numpy(_side_weights(shape, mesh))
+        self.areas = torch.from_numpy(vertex_areas(shape, mesh.faces))
+        weights = torch.zeros(len(mesh.edges), dtype=torch.float64).index_add(0, self.sides, self.weights)
+        self.poisson = Poisson(mesh, weights, self.areas)
+        self.loose = [tuple(torch.from_numpy(part) for part in pair) for pair in self._loose(shape)]
+
+    def _loose(self, shape: NDArray[np.float64]) -> list[tuple[IntArray, IntArray]]:
+        """The vertices of all pieces but the largest, and those of the largest that they follow."""
+        labels, areas = self.mesh.vertex_pieces, self.areas.numpy()
+        used = np.unique(self.mesh.faces)
         pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[used])]
-        pieces.sort(key=lambda piece: -float(self.areas.numpy()[piece].sum()))
-        self.pieces = [torch.from_numpy(piece) for piece in pieces]
-        self.anchors = [torch.from_numpy(_nearest(shape[pieces[0]], shape[piece], pieces[0])) for piece in pieces[1:]]
-        # The equations fix each piece up to a translation: one vertex of each is held, and the piece placed afterwards.
-        free = np.setdiff1d(used, [piece[0] for piece in pieces])
-        self.solver = SparseSolver(laplacian, free)
+        pieces.sort(key=lambda piece: -float(areas[piece].sum()))
+        return [(piece, pieces[0][_nearest(shape[pieces[0]], shape[piece])]) for piece in pieces[1:]]
 
     def __call__(self, wanted: Sides, rest: Tensor) -> Tensor:
         """The shape, its centroid where that of ``rest`` is. Vertices that no face uses stay.
 
         Args:
             wanted: Sides of the triangles.
-            rest: The shape before, which loose pieces are placed by. *Shape:* ``(V, 3, B)``.
+            rest: The shape before, which loose pieces are placed by. *Shape:* ``(3, B, V)``.
 
         Returns:
-            *Shape:* ``(V, 3, B)``.
+            *Shape:* ``(3, B, V)``.
         """
-        faces, (opposite_0, opposite_1, opposite_2) = self.faces.to(rest.device), self.weights.to(rest).unbind(1)
-        first, second = wanted
-        third = opposite_0[:, None, None] * (second - first)
-        at_1, at_2 = opposite_2[:, None, None] * first - third, opposite_1[:, None, None] * second + third
-        right = torch.zeros_like(rest).index_add(0, faces.T.flatten(), torch.cat([-at_1 - at_2, at_1, at_2]))
-        solved = self.solver(right.flatten(1)).unflatten(1, (3, -1))
-        return self._placed(solved, rest)
-
-    def _placed(self, x: Tensor, rest: Tensor) -> Tensor:
-        out = rest
-        for number, piece in enumerate(self.pieces):
-            piece = piece.to(rest.device)
-            weights = self.areas.to(rest)[piece]
-            weights = weights + torch.finfo(weights.dtype).tiny
-            weights = (weights / weights.sum())[:, None, None]
-            place = (weights * rest[piece]).sum(0, keepdim=True)
-            if number:
-                anchors = self.anchors[number - 1].to(rest.device)
-                before, after = (y[anchors].permute(2, 0, 1) for y in (rest, out))
-                motion = best_fit(before, after, torch.ones_like(before[0, :, 0]))
-                place = motion.apply(place.permute(2, 0, 1)).permute(1, 2, 0)
-            moved = x[piece] - (weights * x[piece]).sum(0, keepdim=True) + place
-            out = out.index_copy(0, piece, moved)
+        sides, signs, weights = self.sides.to(rest.device), self.signs.to(rest), self.weights.to(rest)
+        edges = edge_means(wanted, weights, sides, signs, len(self.mesh.edges))
+        out = placed = self.poisson(edges, rest)
+        for piece, anchors in self.loose:
+            piece, anchors = piece.to(rest.device), anchors.to(rest.device)
+            before, after = (x[..., anchors].movedim(0, -1) for x in (rest, placed))
+            motion = best_fit(before, after, torch.ones_like(before[0, :, 0]))
+            centre = (rest[..., piece] * self.poisson.shares.to(rest)[piece]).sum(-1).T[:, None]
+            moved = placed[..., piece] + (motion.apply(centre) - centre).movedim(-1, 0)
+            out = out.index_copy(-1, piece, moved)
         return out
 
 
-def _side_weights(shape: NDArray[np.float64], faces: connectivity.IntArray) -> NDArray[np.float64]:
-    """Half the cotangent at each corner: the weight of the side across it. *Shape:* ``(F, 3)``."""
-    corners = shape[faces]
-    u, v = np.roll(corners, -1, axis=1) - corners, np.roll(corners, -2, axis=1) - corners
+def _equal(a: Tensor, b: Tensor) -> bool:
+    return a is b or (a.dtype == b.dtype and a.device == b.device and torch.equal(a, b))
+
+
+def _side_weights(shape: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
+    """Half the cotangent of the angle across each side. *Shape:* ``(3F,)``."""
+    tip = shape[mesh.opposite]
+    u, v = shape[mesh.start] - tip, shape[mesh.end] - tip
     twice_area = np.linalg.norm(np.cross(u, v), axis=-1)
     tiny = np.finfo(np.float64).tiny
     return np.clip(0.5 * (u * v).sum(-1) / np.maximum(twice_area, tiny), *_WEIGHT_RANGE)
 
 
-def _nearest(
-    points: NDArray[np.float64], piece: NDArray[np.float64], indices: connectivity.IntArray
-) -> connectivity.IntArray:
-    """The vertices of the largest piece that are nearest to another piece."""
+def _nearest(points: NDArray[np.float64], piece: NDArray[np.float64]) -> IntArray:
+    """Which points are nearest to a piece, a few of them."""
     count = min(_N_ANCHORS, len(points))
     distances, found = KDTree(points).query(piece, k=min(count, 4))
     found, distances = np.asarray(found).reshape(-1), np.asarray(distances).reshape(-1)
     order = found[np.argsort(distances, kind="stable")]
     _, first = np.unique(order, return_index=True)
-    return indices[order[np.sort(first)][:count]]
+    return order[np.sort(first)][:count]

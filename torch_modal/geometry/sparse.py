@@ -1,4 +1,4 @@
-"""Sparse symmetric systems for tensors: factorised once by SciPy, differentiable, the same for every sample."""
+"""Sparse symmetric systems: factorised by SciPy, and for tensors differentiable, the same for every sample."""
 
 from typing import Any
 
@@ -8,6 +8,17 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
+
+
+def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> SuperLU:
+    """Sparse LU of a symmetric positive definite matrix: no pivoting, which would spoil the ordering.
+
+    Args:
+        matrix: *Shape:* ``(n, n)``.
+        ordering: SuperLU's name; ``"NATURAL"`` if the unknowns are in a good order already.
+    """
+    options = {"SymmetricMode": True}
+    return splu(sparse.csc_matrix(matrix), permc_spec=ordering, diag_pivot_thresh=0.0, options=options)
 
 
 class SparseSolver:
@@ -24,7 +35,7 @@ class SparseSolver:
     def __init__(self, matrix: sparse.spmatrix, free: NDArray[np.int64] | None = None) -> None:
         self.n = matrix.shape[0]
         self.free = np.arange(self.n) if free is None else free
-        self._inner = sparse.csc_matrix(matrix if free is None else matrix.tocsr()[free][:, free])
+        self._inner = matrix if free is None else matrix.tocsr()[free][:, free]
         self._factor: SuperLU | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -38,8 +49,7 @@ class SparseSolver:
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same for arrays. *Shape:* ``(V, m) -> (V, m)``."""
         if self._factor is None:
-            options = {"SymmetricMode": True}
-            self._factor = splu(self._inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            self._factor = factorize(self._inner)
         out = np.zeros_like(right)
         out[self.free] = self._factor.solve(right[self.free])
         return out

@@ -1,6 +1,6 @@
 """Rotations and stretches of triangles, and the sides that they ask for.
 
-Batches stand last here, ``(V, 3, B)``: vertices are gathered and summed as whole rows, and all else is elementwise.
+Components come first, ``(3, B, F)``, as in :mod:`~torch_modal.geometry.vectors`. ``B`` may be any leading dimensions.
 """
 
 from typing import NamedTuple
@@ -8,65 +8,99 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.rotations import turned
+from torch_modal.geometry.vectors import cross, norm, pick, tiny
+
+# Below this part of the sides a height is rounding, and dividing by it would make noise into a gradient.
+_FLAT = 1e-6
+
 
 class Sides(NamedTuple):
     """Two sides of each triangle, from its first corner to the others; the third is their difference."""
 
     first: Tensor
-    """*Shape:* ``(F, 3, B)``."""
+    """*Shape:* ``(3, B, F)``."""
     second: Tensor
-    """*Shape:* ``(F, 3, B)``."""
+    """*Shape:* ``(3, B, F)``."""
 
 
 class Frames(NamedTuple):
     """A frame on each triangle, and its sides in it: ``first = length e1``, ``second = along e1 + height e2``."""
 
     e1: Tensor
-    """Unit vector along the first side. *Shape:* ``(F, 3, B)``."""
+    """Unit vector along the first side. *Shape:* ``(3, B, F)``."""
     e2: Tensor
-    """Unit vector in the plane, across it. *Shape:* ``(F, 3, B)``."""
+    """Unit vector in the plane, across it. *Shape:* ``(3, B, F)``."""
     normal: Tensor
-    """Unit normal. *Shape:* ``(F, 3, B)``."""
+    """Unit normal. *Shape:* ``(3, B, F)``."""
     length: Tensor
-    """*Shape:* ``(F, B)``."""
+    """*Shape:* ``(B, F)``."""
     along: Tensor
-    """*Shape:* ``(F, B)``."""
+    """*Shape:* ``(B, F)``."""
     height: Tensor
-    """*Shape:* ``(F, B)``, above 0."""
+    """*Shape:* ``(B, F)``, above 0."""
 
     def world(self, x: Tensor, y: Tensor) -> Tensor:
-        """The vector of given coordinates in the plane. *Shape:* ``(F, B), (F, B) -> (F, 3, B)``."""
-        return x[:, None] * self.e1 + y[:, None] * self.e2
+        """The vector of given coordinates in the plane. *Shape:* ``(B, F), (B, F) -> (3, B, F)``."""
+        return x * self.e1 + y * self.e2
+
+    @property
+    def doubled_areas(self) -> Tensor:
+        """*Shape:* ``(B, F)``."""
+        return self.length * self.height
+
+    @property
+    def slenderness(self) -> Tensor:
+        """Altitude over longest side. *Shape:* ``(B, F)``."""
+        ends = (self.length, 0), (self.along, self.height), (self.along - self.length, self.height)
+        return self.doubled_areas / torch.stack([x * x + y * y for x, y in ends]).amax(0)
 
 
 class Bend(NamedTuple):
     """What a displacement does to each triangle, to first order."""
 
     turn: Tensor
-    """Axis times angle, in the coordinates of the shape. *Shape:* ``(F, 3, B)``."""
+    """Axis times angle, in the coordinates of the shape. *Shape:* ``(3, B, F)``."""
     strain: tuple[Tensor, Tensor, Tensor]
-    """Entries ``xx, xy, yy`` of the symmetric gradient in the triangle's frame. *Shape of each:* ``(F, B)``."""
+    """Entries ``xx, xy, yy`` of the symmetric gradient in the triangle's frame. *Shape of each:* ``(B, F)``."""
 
 
 def sides(x: Tensor, faces: Tensor) -> Sides:
-    """Sides of all triangles. *Shape:* ``(V, 3, B), (F, 3)``."""
-    origin = x[faces[:, 0]]
-    return Sides(x[faces[:, 1]] - origin, x[faces[:, 2]] - origin)
+    """Sides of all triangles. *Shape:* ``(3, B, V), (F, 3)``."""
+    origin, first, second = (pick(x, corner) for corner in faces.unbind(1))
+    return Sides(first - origin, second - origin)
 
 
 def frames(given: Sides) -> Frames:
     """The frame of each triangle; of one without area it is finite, and means nothing."""
     first, second = given
-    tiny = torch.finfo(first.dtype).tiny ** 0.5
-    length = _norm(first).clamp_min(tiny)
-    e1 = first / length[:, None]
+    length = norm(first)
+    e1 = first / length
     along = _dot(second, e1)
-    across = second - along[:, None] * e1
-    # Below this part of the sides a height is rounding, and dividing by it would make noise into a gradient.
-    floor = 1e-6 * (length + along.abs()) + tiny
-    height = torch.maximum(_norm(across), floor)
-    e2 = across / height[:, None]
-    return Frames(e1, e2, torch.linalg.cross(e1, e2, dim=1), length, along, height)
+    across = second - along * e1
+    height = torch.maximum(norm(across), _FLAT * (length + along.abs()))
+    e2 = across / height
+    return Frames(e1, e2, cross(e1, e2), length, along, height)
+
+
+def edge_means(wanted: Sides, weights: Tensor, edges: Tensor, signs: Tensor, n_edges: int) -> Tensor:
+    """Edge vectors from the sides that run along them, their weighted means.
+
+    Args:
+        wanted: Of all triangles.
+        weights: Of the sides, none below 0. *Shape:* ``(3F,)`` or ``(B, 3F)``.
+        edges: The ``sides`` of a :class:`~torch_modal.geometry.connectivity.Connectivity`. *Shape:* ``(3F,)``.
+        signs: Its ``signs``. *Shape:* ``(3F,)``.
+        n_edges: E.
+
+    Returns:
+        *Shape:* ``(3, B, E)``.
+    """
+    first, second = wanted
+    around = torch.cat([first, second - first, -second], -1) * (weights * signs)
+    summed = around.new_zeros(*around.shape[:-1], n_edges).index_add(-1, edges, around)
+    total = weights.new_zeros(*weights.shape[:-1], n_edges).index_add(-1, edges, weights)
+    return summed / total.clamp_min(torch.finfo(total.dtype).tiny)
 
 
 def bend(displaced: Sides, reference: Frames) -> Bend:
@@ -83,8 +117,7 @@ def bend(displaced: Sides, reference: Frames) -> Bend:
         (d - along * reference.along) / reference.height for d, along in zip(d_y, (x_x, y_x, n_x), strict=True)
     )
     spin = 0.5 * (y_x - x_y)
-    turn = n_y[:, None] * axes[0] - n_x[:, None] * axes[1] + spin[:, None] * axes[2]
-    return Bend(turn, (x_x, 0.5 * (x_y + y_x), y_y))
+    return Bend(n_y * axes[0] - n_x * axes[1] + spin * axes[2], (x_x, 0.5 * (x_y + y_x), y_y))
 
 
 def bent_sides(bending: Bend, own: Frames) -> Sides:
@@ -99,7 +132,7 @@ def bent_sides(bending: Bend, own: Frames) -> Sides:
     xx, xy, yy = _exponential(*bending.strain)
     first = own.world(xx * own.length, xy * own.length)
     second = own.world(xx * own.along + xy * own.height, xy * own.along + yy * own.height)
-    return Sides(_rotate(bending.turn, first), _rotate(bending.turn, second))
+    return Sides(turned(bending.turn, first), turned(bending.turn, second))
 
 
 def mirrored_sides(centre: Frames, other: Frames) -> Sides:
@@ -119,13 +152,13 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
     i_xx, i_xy, i_yy = (2 * v / determinant for v in (1 + u_yy, -u_xy, 1 + u_xx))
     g_xx, g_xy, g_yy = i_xx**2 + i_xy**2, i_xy * (i_xx + i_yy), i_xy**2 + i_yy**2
 
-    def turned(x: Tensor, y: Tensor) -> Tensor:
+    def turned_back(x: Tensor, y: Tensor) -> Tensor:
         v = centre.world(x, y)
         p, q, r = (_dot(v, axis) for axis in (other.e1, other.e2, other.normal))
-        return centre.world(cos * p + sin * q, cos * q - sin * p) + r[:, None] * centre.normal
+        return centre.world(cos * p + sin * q, cos * q - sin * p) + r * centre.normal
 
-    first = turned(g_xx * centre.length, g_xy * centre.length)
-    second = turned(
+    first = turned_back(g_xx * centre.length, g_xy * centre.length)
+    second = turned_back(
         g_xx * centre.along + g_xy * centre.height,
         g_xy * centre.along + g_yy * centre.height,
     )
@@ -133,27 +166,14 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """*Shape:* ``(F, 3, B), (F, 3, B) -> (F, B)``."""
-    return (a * b).sum(1)
+    """*Shape:* ``(3, B, F), (3, B, F) -> (B, F)``."""
+    return (a * b).sum(0)
 
 
 def _exponential(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of symmetric 2 x 2 matrices, entry by entry."""
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-    radius = (half**2 + xy**2).clamp_min(torch.finfo(xx.dtype).tiny).sqrt()
+    radius = (half**2 + xy**2).clamp_min(tiny(xx)).sqrt()
     scale = mean.exp()
     even, odd = scale * radius.cosh(), scale * radius.sinh() / radius
     return even + odd * half, odd * xy, even - odd * half
-
-
-def _norm(a: Tensor) -> Tensor:
-    """With gradient zero where it is zero; much faster than the norm along an inner dimension. *Shape:* ``(F, B)``."""
-    return _dot(a, a).clamp_min(torch.finfo(a.dtype).tiny).sqrt()
-
-
-def _rotate(turn: Tensor, v: Tensor) -> Tensor:
-    """Rodrigues' formula, smooth at no turn. *Shape:* ``(F, 3, B), (F, 3, B) -> (F, 3, B)``."""
-    angle = _norm(turn)[:, None]
-    across = torch.linalg.cross(turn.expand_as(v), v, dim=1)
-    twice = torch.linalg.cross(turn.expand_as(v), across, dim=1)
-    return v + torch.sinc(angle / torch.pi) * across + 0.5 * torch.sinc(angle / (2 * torch.pi)) ** 2 * twice

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_modal.geometry import normals
 from torch_modal.io.files import write_atomically
 
 if TYPE_CHECKING:  # at run time these stay out: a reader of PLY files needs neither
@@ -102,25 +103,9 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals, the mean over the faces around each vertex weighted by area.
-
-    A vertex with no face, or whose faces cancel, gets ``(0, 0, 1)``: GLB demands unit length everywhere.
-
-    Args:
-        vertices: Vertex positions. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-
-    Returns:
-        Normals. *Shape:* ``(V, 3)``.
-    """
-    corners = vertices[faces]
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # Scaled first, so that the squares of tiny shapes' areas do not underflow.
-    face_normals /= max(float(np.abs(face_normals).max()), np.finfo(np.float64).tiny)
-    corner_ids, repeated = faces.reshape(-1), np.repeat(face_normals, 3, axis=0)
-    normals = np.stack([np.bincount(corner_ids, repeated[:, c], len(vertices)) for c in range(3)], axis=1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 1e-12, normals / np.maximum(length, 1e-12), np.array([0.0, 0.0, 1.0]))
+    """As GLB demands them, of unit length everywhere: ``(0, 0, 1)`` where a vertex has none. *Shape:* ``(V, 3)``."""
+    found = normals.vertex_normals(vertices, faces)
+    return np.where(found.any(axis=1, keepdims=True), found, np.array([0.0, 0.0, 1.0]))
 
 
 def _ply_bytes(vertices: FloatArray, faces: IntArray) -> bytes:
@@ -310,10 +295,10 @@ def save_animation(
     gltf = gl.GLTF2(asset=gl.Asset(version="2.0", generator="torch_modal"))
     buffer = _Buffer(gltf)
     base = shapes[0].astype(np.float32)
-    normals = vertex_normals(shapes[0], triangles).astype(np.float32)
+    base_normals = vertex_normals(shapes[0], triangles).astype(np.float32)
     attributes = gl.Attributes(
         POSITION=buffer.add(base, gl.VEC3, gl.ARRAY_BUFFER, bounds=True),
-        NORMAL=buffer.add(normals, gl.VEC3, gl.ARRAY_BUFFER),
+        NORMAL=buffer.add(base_normals, gl.VEC3, gl.ARRAY_BUFFER),
     )
     index_type = np.uint16 if shapes.shape[1] <= 65535 else np.uint32  # 65535 itself is not a valid uint16 index
     indices = buffer.add(triangles.astype(index_type).reshape(-1), gl.SCALAR, gl.ELEMENT_ARRAY_BUFFER)
@@ -324,7 +309,7 @@ def save_animation(
         moved = (shapes[number] - base).astype(np.float32)
         target = {"POSITION": buffer.add(moved, gl.VEC3, gl.ARRAY_BUFFER, bounds=True)}
         if move_normals:
-            turned = (vertex_normals(shapes[number], triangles) - normals).astype(np.float32)
+            turned = (vertex_normals(shapes[number], triangles) - base_normals).astype(np.float32)
             target["NORMAL"] = buffer.add(turned, gl.VEC3, gl.ARRAY_BUFFER)
         targets.append(target)
 

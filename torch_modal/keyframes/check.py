@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry import inspect
-from torch_modal.geometry.connectivity import unique_edges
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 __all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_solid"]
@@ -64,9 +64,9 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
     _check_shapes(positions, indices, min_keyframes)
     shapes = positions.detach().cpu().double().resolve_neg().numpy()
     _check_values(shapes, indices)
-    indices, orientable = _repair_faces(indices, note)
+    mesh, indices, orientable = _repair_faces(indices, note)
     scaled = _check_sizes(shapes, indices, positions.dtype, note)
-    _check_surface(scaled, indices, orientable, _RESOLUTION[positions.dtype], note)
+    _check_surface(scaled, mesh, indices, orientable, _RESOLUTION[positions.dtype], note)
     if warn:
         for message in found:
             warnings.warn(message, MeshWarning, stacklevel=2)
@@ -136,8 +136,13 @@ def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None
         )
 
 
-def _repair_faces(faces: NDArray[np.int64], note: Callable[[str], None]) -> tuple[NDArray[np.int64], bool]:
-    """Drop faces that are none or are there twice, wind the rest consistently; say whether that went."""
+def _repair_faces(
+    faces: NDArray[np.int64], note: Callable[[str], None]
+) -> tuple[Connectivity, NDArray[np.int64], bool]:
+    """Drop faces that are none or are there twice, wind the rest consistently; say whether that went.
+
+    The connectivity is that before the winding was changed, which its edges do not see.
+    """
     kept = np.arange(len(faces))
     for flaw, what in (
         (inspect.degenerate_faces, "use a vertex twice"),
@@ -150,7 +155,8 @@ def _repair_faces(faces: NDArray[np.int64], note: Callable[[str], None]) -> tupl
             kept = kept[~bad]
         if len(kept) == 0:
             raise MeshError("all faces use a vertex twice, so none is a triangle")
-    winding = inspect.consistent_winding(faces[kept])
+    mesh = Connectivity(faces[kept])
+    winding = inspect.consistent_winding(mesh)
     if len(winding.flipped):
         first = kept[winding.flipped[0]]
         note(
@@ -164,7 +170,7 @@ def _repair_faces(faces: NDArray[np.int64], note: Callable[[str], None]) -> tupl
             "Moebius strip) and were left as they are, so some dihedral angles have the wrong sign and the "
             f"volume means nothing; the first is face {first}, {faces[first].tolist()}"
         )
-    return np.ascontiguousarray(winding.faces), not len(winding.non_orientable)
+    return mesh, np.ascontiguousarray(winding.faces), not len(winding.non_orientable)
 
 
 def _check_sizes(
@@ -213,6 +219,7 @@ def _check_sizes(
 
 def _check_surface(
     scaled: NDArray[np.float64],
+    mesh: Connectivity,
     faces: NDArray[np.int64],
     orientable: bool,
     resolution: float,
@@ -220,7 +227,7 @@ def _check_surface(
 ) -> None:
     """Note what the solver survives; refuse closed meshes that were turned inside out."""
     n_vertices = scaled.shape[1]
-    edges, counts = unique_edges(faces)
+    edges, counts = mesh.edges, mesh.counts
     vanishing = np.linalg.norm(scaled[:, edges[:, 0]] - scaled[:, edges[:, 1]], axis=2) <= resolution
     if vanishing.any():
         k, e = np.argwhere(vanishing)[0]
@@ -247,7 +254,7 @@ def _check_surface(
             f"{len(loose)} vertices belong to no face: they follow the interpolation of the key-frames; the "
             f"first is vertex {loose[0]}"
         )
-    boundary = edges[counts == 1]
+    boundary = mesh.boundary_edges
     if len(boundary):
         note(
             f"the surface is open: {len(boundary)} edges belong to one face only, the first is edge "

@@ -4,11 +4,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.surface import DIAGONAL, Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes, tet_volumes
@@ -81,10 +81,7 @@ class Carrier:
         columns = np.tile(tetrahedra.tets, 4).reshape(-1)
         n = len(tetrahedra.vertices)
         laplacian = sp.coo_matrix((stiffness.reshape(-1), (rows, columns)), shape=(n, n))
-        system = sp.csc_matrix(laplacian.tocsc() + weights.T @ self._pull)
-        self._factors = spla.splu(
-            system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        self._factors = factorize(laplacian.tocsc() + weights.T @ self._pull)
 
     def carry(self, points: FloatArray) -> Carried:
         """The tetrahedra in the pose of another key-frame.

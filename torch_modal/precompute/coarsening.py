@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from torch_modal.geometry.connectivity import IntArray
+from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
 
 FloatArray = NDArray[np.float64]
 
@@ -75,10 +76,8 @@ def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsen
     while not np.array_equal(root[root], root):
         root = root[root]
     coarse_faces = root[faces]
-    a, b, c = coarse_faces.T
-    coarse_faces = coarse_faces[(a != b) & (b != c) & (c != a)]
-    _, first = np.unique(np.sort(coarse_faces, axis=1), axis=0, return_index=True)
-    coarse_faces = coarse_faces[np.sort(first)]
+    coarse_faces = coarse_faces[~degenerate_faces(coarse_faces)]
+    coarse_faces = coarse_faces[~repeated_faces(coarse_faces)]
     # Roots that lost all their faces carry no energy: they are left out, as are vertices that never had one.
     used = np.unique(coarse_faces)
     index = np.full(len(points), -1)

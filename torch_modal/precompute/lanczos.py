@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.mass import Mass
 
 FloatArray = NDArray[np.float64]
@@ -95,8 +95,8 @@ def factored(
     """
     vertices = _elimination_order(graph)
     order = _of_coordinates(vertices)
-    shifted = sp.csc_matrix(k[order][:, order] + shift * mass.of_vertices(vertices).for_coordinates())
-    factors = spla.splu(shifted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    shifted = k[order][:, order] + shift * mass.of_vertices(vertices).for_coordinates()
+    factors = factorize(shifted, "NATURAL")
     return vertices, factors.solve
 
 
@@ -158,6 +158,5 @@ def _elimination_order(graph: sp.csc_matrix) -> IntArray:
     """A minimum-degree ordering, which SciPy only gives along with a factorisation: of a small, tame matrix."""
     n = graph.shape[0]
     pattern = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
-    dominant = sp.csc_matrix(pattern + sp.identity(n) * (1.0 + np.diff(graph.indptr).max()))
-    factors = spla.splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factors = factorize(pattern + sp.identity(n) * (1.0 + np.diff(graph.indptr).max()))
     return np.argsort(factors.perm_c)

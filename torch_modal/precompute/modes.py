@@ -4,11 +4,10 @@ import warnings
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 import torch
-from scipy.sparse.csgraph import connected_components
 from tqdm import tqdm
 
+from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.cache import Cache
@@ -200,6 +199,5 @@ def _warn(name: str, solved: Solved) -> None:
 
 
 def _n_pieces(tetrahedra: Tetrahedra) -> int:
-    n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
-    pairs = (np.ones(3 * t), (np.repeat(tetrahedra.tets[:, 0], 3), tetrahedra.tets[:, 1:].reshape(-1)))
-    return connected_components(sp.coo_matrix(pairs, shape=(n, n)), directed=False)[0]
+    pairs = np.stack([np.repeat(tetrahedra.tets[:, 0], 3), tetrahedra.tets[:, 1:].reshape(-1)], axis=1)
+    return int(connected_pieces(pairs, len(tetrahedra.vertices)).max()) + 1

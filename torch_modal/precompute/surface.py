@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
 from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.normals import vertex_normals
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -59,13 +60,7 @@ class Surface:
     @cached_property
     def normals(self) -> FloatArray:
         """Outward unit normals of the points, zero where the faces have no area. *Shape:* ``(U, 3)``."""
-        corners = self.points[self.faces]
-        weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        summed = np.stack(
-            [np.bincount(self.faces.reshape(-1), np.repeat(c, 3), minlength=len(self.points)) for c in weighted.T],
-            axis=1,
-        )
-        return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
+        return vertex_normals(self.points, self.faces)
 
 
 def outward(vertices: FloatArray, faces: IntArray) -> IntArray:

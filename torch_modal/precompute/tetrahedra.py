@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.geometry.connectivity import connected_pieces, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.io.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.parallel import StoppedError
@@ -193,13 +191,12 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     owner = np.tile(np.arange(len(tets)), 4)
     order = np.lexsort(sides.T)
     shared = (np.diff(sides[order], axis=0) == 0).all(axis=1)
-    pairs = (owner[order][:-1][shared], owner[order][1:][shared])
-    graph = sp.coo_matrix((np.ones(len(pairs[0])), pairs), shape=(len(tets), len(tets)))
-    n_pieces, piece = connected_components(graph, directed=False)
+    pairs = np.stack([owner[order][:-1][shared], owner[order][1:][shared]], axis=1)
+    piece = connected_pieces(pairs, len(tets))
     volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
     users = np.unique(np.stack([tets.reshape(-1), np.repeat(piece, 4)], axis=1), axis=0)
     hinge = np.bincount(users[:, 0])[users[:, 0]] > 1  # a vertex of two pieces or more
-    hangs = np.bincount(users[:, 1], hinge, n_pieces) > 0
+    hangs = np.bincount(users[:, 1], hinge, len(volumes)) > 0
     debris = hangs & (volumes < DEBRIS * volumes.sum())
     return _kept(tetrahedra, ~debris[piece])
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import blend
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.mid_shape import MidShape
@@ -69,7 +69,7 @@ def subdivide(
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
 
-    areas = connectivity.vertex_areas(keyframes[0].cpu().double().numpy(), working_faces.cpu().numpy())
+    areas = vertex_areas(keyframes[0].cpu().double().numpy(), working_faces.cpu().numpy())
     weights = torch.from_numpy(areas).to(keyframes)
     intervals = len(places) - 1
     bar = tqdm(
@@ -168,7 +168,7 @@ class _Segment:
 
     def _nearest(self, shapes: Tensor) -> list[int]:
         """Which key-frame, 0 or 1, each shape is nearer to in its edge lengths, which no rigid motion changes."""
-        edges = torch.from_numpy(connectivity.unique_edges(self.faces.numpy())[0]).to(shapes.device)
+        edges = torch.tensor(Connectivity(self.faces.numpy()).edges, device=shapes.device)
         lengths = torch.linalg.norm(shapes[:, edges[:, 0]] - shapes[:, edges[:, 1]], dim=-1)
         to_first, to_last = ((lengths - lengths[end]).norm(dim=-1) for end in (0, -1))
         return (to_last < to_first).long().tolist()

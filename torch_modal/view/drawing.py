@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.io.write import FloatArray, IntArray, vertex_normals
+from torch_modal.geometry.normals import vertex_normals
+from torch_modal.io.write import FloatArray, IntArray
 
 ByteArray = NDArray[np.uint8]
 
