@@ -139,11 +139,16 @@ def modal(
     return {"objective": objective, "solver": Solver(**{"least_gain": 0.0, "local_steps": 2 * local, **of_solver})}
 
 
-def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
-    """What the layer's energy knows of the in-betweens of placed key-frames."""
+def problem_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
+    """The in-betweens of placed key-frames as the layer's minimisation."""
     whole = layer.in_between
     samples = Samples(pair.first, pair.second, None, t, whole._mu(t, t.shape), whole._stiffness(t, t.shape))
-    return whole.members[0].problem(pair, samples).placement
+    return whole.members[0].problem(pair, samples)
+
+
+def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
+    """What the layer's energy knows of them."""
+    return problem_of(layer, pair, t).placement
 
 
 def listen_to_ctrl_c() -> None:

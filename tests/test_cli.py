@@ -127,8 +127,8 @@ def test_paired_space_and_mu_arrive(
     monkeypatch.setattr(tm, "subdivide", subdivide)
     argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
     assert cli.main([*argv, "--preset", "paper", "--mu", "0.5", "--quiet"]) == 0
-    objective: Any = seen["objective"]
-    assert (objective.space, objective.mu) == ("paired", 0.5)
+    objective = seen["objective"]
+    assert (objective.space, objective.mu) == ("paired", 0.5)  # type: ignore[attr-defined]
     assert len(seen["bases"]) == 2 and seen["bases"][0].n_modes == 6  # type: ignore[arg-type, index]
     assert capsys.readouterr() == ("", "")
 

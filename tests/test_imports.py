@@ -78,7 +78,7 @@ def test_precompute_does_not_know_the_layers(module: str) -> None:
 def test_layers_are_torch_only(module: str) -> None:
     packages = {name.split(".")[0] for name in imported(module)}
     assert not packages & FOREIGN_TO_LAYERS
-    if module not in ("nn.frame", "nn.blend"):
+    if module not in ("nn.frame", "nn.congruence"):
         assert "numpy" not in packages
     # Bases are what comes in; only the frame, made once, looks further into the other room.
     allowed = {"precompute.basis", "precompute.coarsening"} if module == "nn.frame" else {"precompute.basis"}

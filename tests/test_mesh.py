@@ -141,20 +141,6 @@ def test_pieces() -> None:
     assert connected_pieces(np.zeros((0, 2), dtype=np.int64), 3).tolist() == [0, 1, 2]
 
 
-def test_parts_are_those_of_the_class() -> None:
-    """What callers may write to."""
-    faces = random_faces(9)
-    mesh = Connectivity(faces)
-    edges, counts = connectivity.unique_edges(faces)
-    parts = [edges, counts, connectivity.hinges(faces), connectivity.boundary_edges(faces)]
-    parts += [connectivity.boundary_chain(faces), connectivity.vertex_pieces(edges, 14)]
-    wanted = [mesh.edges, mesh.counts, mesh.hinges, mesh.boundary_edges, mesh.boundary_chain]
-    wanted += [Connectivity(faces, 14).vertex_pieces]
-    for part, truth in zip(parts, wanted, strict=True):
-        np.testing.assert_array_equal(part, truth)
-        assert part.flags.writeable
-
-
 def test_vertex_areas() -> None:
     corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [9, 9, 9]])
     # Three right triangles of 1/2 at the origin and one of sqrt(3)/2 opposite; vertex 4 belongs to no face.

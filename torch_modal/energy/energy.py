@@ -5,6 +5,7 @@ the mesh: its centre, and the anchors of the terms.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -115,7 +116,7 @@ class Energy(nn.Module):
         super().__init__()
         n, n_anchors, meshes = mesh.n_vertices, 0, []
         for term in terms:
-            meshes.append(mesh._replace(first_anchor=n + 1 + n_anchors))
+            meshes.append(replace(mesh, n_anchors=n_anchors))
             n_anchors += 0 if term.anchors is None else len(term.anchors)
         vertices, numbers = torch.arange(n), None
         if sampled:

@@ -6,7 +6,8 @@ which elements it sees and what it measures on one of them: derivatives then com
 of Eq. 5 write theirs out, because they are what all the time goes into.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +22,7 @@ from torch_modal.energy.measures import (
     length_hessian,
     wrap_angle,
 )
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, inverse, norm
 
 # Eq. 5 divides by rest lengths, rest areas and the rest volume. Edges and hinges without a size have no say, needles
@@ -34,37 +35,52 @@ MIN_RELATIVE_VOLUME = 1e-6  # of (surface area)^(3/2); a sphere has 0.094
 SLACK = 1e-3
 
 
-class Mesh(NamedTuple):
-    """The vertices that elements may be made of."""
+@dataclass(frozen=True)
+class Mesh:
+    """The vertices that elements may be made of.
 
-    faces: Tensor
-    """*Shape:* ``(F, 3)``."""
-    edges: Tensor
-    """*Shape:* ``(E, 2)``."""
-    hinges: Tensor
-    """Rows of :func:`torch_modal.geometry.connectivity.hinges`. *Shape:* ``(H, 4)``."""
-    n_vertices: int
-    first_anchor: int
-    """The number that the first of the term's own :attr:`Term.anchors` has as a vertex."""
+    Attributes:
+        connectivity: Of the faces.
+        n_anchors: How many :attr:`Term.anchors` other terms have before those of this one.
+    """
+
+    connectivity: Connectivity
+    n_anchors: int = 0
+
+    @property
+    def faces(self) -> Tensor:
+        """*Shape:* ``(F, 3)``."""
+        return torch.tensor(self.connectivity.faces)
+
+    @property
+    def edges(self) -> Tensor:
+        """*Shape:* ``(E, 2)``."""
+        return torch.tensor(self.connectivity.edges)
+
+    @property
+    def hinges(self) -> Tensor:
+        """Rows of :attr:`torch_modal.geometry.connectivity.Connectivity.hinges`. *Shape:* ``(H, 4)``."""
+        return torch.tensor(self.connectivity.hinges)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, V."""
+        return self.connectivity.n_vertices
 
     @property
     def centre(self) -> int:
         """The number that the mean of all vertices of faces has as a vertex."""
         return self.n_vertices
 
+    @property
+    def first_anchor(self) -> int:
+        """The number that the first of the term's own :attr:`Term.anchors` has as a vertex."""
+        return self.n_vertices + 1 + self.n_anchors
+
     @classmethod
     def of(cls, faces: Tensor, n_vertices: int) -> "Mesh":
-        """The mesh of these faces, on the CPU."""
-        array = faces.detach().cpu().long().numpy()
-        edges, _ = connectivity.unique_edges(array)
-        hinges = connectivity.hinges(array)
-        return cls(
-            torch.from_numpy(array.copy()),
-            torch.from_numpy(edges),
-            torch.from_numpy(hinges),
-            n_vertices,
-            n_vertices + 1,
-        )
+        """The mesh of these faces."""
+        return cls(Connectivity(faces.detach().cpu().long().numpy().copy(), n_vertices))
 
 
 class Term(nn.Module):
@@ -263,7 +279,7 @@ class Volume(Term):
 
     def elements(self, mesh: Mesh) -> Tensor:
         """The centre and each face, of a surface that cones from its boundary to the centre have closed."""
-        chain = torch.from_numpy(connectivity.boundary_chain(mesh.faces.numpy()))
+        chain = torch.tensor(mesh.connectivity.boundary_chain)
         centre = torch.full_like(chain[:, :1], mesh.centre)
         closed = torch.cat([mesh.faces, torch.cat([chain.flip(1), centre], 1)])
         return torch.cat([torch.full_like(closed[:, :1], mesh.centre), closed], 1)

@@ -208,32 +208,3 @@ def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.f
     area = np.linalg.norm(normals, axis=1)
     summed = np.bincount(faces.reshape(-1), np.repeat(area / 6, 3), minlength=len(vertices))
     return summed.astype(np.float64)  # of no face at all it is of integers
-
-
-# What follows gives single parts of a Connectivity, as copies of the caller's own.
-
-
-def unique_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """:attr:`Connectivity.edges` and :attr:`Connectivity.counts`."""
-    mesh = Connectivity(faces)
-    return mesh.edges.copy(), mesh.counts.copy()
-
-
-def hinges(faces: IntArray) -> IntArray:
-    """:attr:`Connectivity.hinges`."""
-    return Connectivity(faces).hinges.copy()
-
-
-def boundary_edges(faces: IntArray) -> IntArray:
-    """:attr:`Connectivity.boundary_edges`."""
-    return Connectivity(faces).boundary_edges.copy()
-
-
-def boundary_chain(faces: IntArray) -> IntArray:
-    """:attr:`Connectivity.boundary_chain`."""
-    return Connectivity(faces).boundary_chain.copy()
-
-
-def vertex_pieces(edges: IntArray, n: int) -> IntArray:
-    """:func:`connected_pieces`."""
-    return connected_pieces(edges, n)

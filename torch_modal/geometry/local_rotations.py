@@ -25,10 +25,8 @@ class LocalRotations(nn.Module):
     turn alike: the signs of quaternions are passed on along a spanning tree, which tells up to a full turn.
 
     Args:
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        edges: Those of the faces. *Shape:* ``(E, 2)``.
+        mesh: The connectivity.
         references: Two shapes near the key-frames, for the tree and the weights. *Shape:* ``(2, V, 3)``.
-        mesh: The connectivity of the faces, where it is known.
     """
 
     faces: Tensor
@@ -38,17 +36,16 @@ class LocalRotations(nn.Module):
     piece: Tensor
     per_length: Tensor
 
-    def __init__(self, faces: Tensor, edges: Tensor, references: Tensor, mesh: Connectivity | None = None) -> None:
+    def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__()
-        mesh = Connectivity(faces.cpu().numpy()) if mesh is None else mesh
-        first, second = edges.unbind(1)
+        faces, (first, second) = torch.tensor(mesh.faces), torch.tensor(mesh.edges).unbind(1)
         lengths = (references[:, second] - references[:, first]).norm(dim=-1).mean(0)
         a, b = (_frames(x[None], faces) for x in references)
         parents, piece = self._tree(a, b, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
-        self.register_buffer("faces", faces.clone(), persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Mesh, Term
-from torch_modal.geometry import connectivity
 from torch_modal.nn import trees
 from torch_modal.nn.adjoint import ConvergenceWarning, Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.frame import Frame, Pair
@@ -69,7 +68,7 @@ class Between(nn.Module):
     Args:
         shapes: The references of both bases, float64 on the CPU. *Shape:* ``(2, V, 3)``.
         modes: Their modes, likewise. *Shape of each:* ``(k, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        mesh: The caller's mesh.
         objective: What is minimised.
         solver: How.
         terms: The terms of the energy, which the layer owns.
@@ -79,15 +78,14 @@ class Between(nn.Module):
         self,
         shapes: Tensor,
         modes: Sequence[Tensor],
-        faces: Tensor,
+        mesh: Mesh,
         objective: Objective,
         solver: Solver,
         terms: Sequence[Term],
     ) -> None:
         super().__init__()
         self.solver = solver
-        self.frame = Frame(shapes, faces, objective.coarse_faces)
-        mesh = Mesh.of(faces, len(shapes[0]))
+        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces)
         levels = Levels(self.frame, mesh, terms)
         turned = self.frame.modes(*modes)
         if objective.space == "joint":
@@ -97,7 +95,7 @@ class Between(nn.Module):
             self.space: Any = JointSpace(self.frame, levels, turned, references, fine)
         else:
             self.space = PairedSpace(self.frame, levels, turned)
-        self.closed = len(connectivity.boundary_edges(faces.numpy())) == 0
+        self.closed = len(mesh.connectivity.boundary_edges) == 0
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
         self.fine = Energy(mesh, terms)
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.precompute.coarsening import coarsen
 
@@ -72,7 +72,7 @@ class Frame(nn.Module):
         used = shapes[0][faces.unique()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
         # The areas of both ends, so that neither of them comes first.
-        areas = torch.stack([torch.from_numpy(connectivity.vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
+        areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
         weights = (areas / areas.sum(1, keepdim=True)).mean(0)
         turn = best_fit(shapes[1], shapes[0], weights)
         references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale

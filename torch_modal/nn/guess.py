@@ -26,8 +26,8 @@ class Guess(nn.Module):
 
     def __init__(self, mesh: Mesh, columns: Tensor, references: Tensor) -> None:
         super().__init__()
-        self.rotations = LocalRotations(mesh.faces, mesh.edges, references)
-        self.register_buffer("edges", mesh.edges.clone(), persistent=False)
+        self.rotations = LocalRotations(mesh.connectivity, references)
+        self.register_buffer("edges", mesh.edges, persistent=False)
         vectors = self._vectors(columns).permute(2, 0, 1).flatten(0, 1).contiguous()
         self.register_buffer("edge_columns", vectors, persistent=False)
         weights = self.rotations.per_length.repeat_interleave(3)[:, None]

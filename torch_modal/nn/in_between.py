@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torch_modal.energy.terms import Mesh
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.between import Between, InBetweenResult, Samples, report
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
@@ -82,11 +83,12 @@ class InBetween(nn.Module):
         shapes = [basis.reference.double().cpu() for basis in self.bases]
         _, self._faces = check_keyframes(shapes, self._faces.cpu(), warn=False)
         ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
+        mesh = Mesh.of(self._faces, len(shapes[0]))
         made = [
             Between(
                 torch.stack([ends[i][0], ends[j][0]]),
                 [ends[i][1], ends[j][1]],
-                self._faces,
+                mesh,
                 self.objective,
                 self.solver,
                 list(self.terms),

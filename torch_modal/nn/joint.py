@@ -51,7 +51,7 @@ class JointSpace(nn.Module):
         self.columns = frame.elastic_columns(torch.cat(list(modes)))
         self.energy = levels.modal(self.columns)
         # With the blend as the base there is nothing left to guess.
-        self.blend = None if fine is None else RotationBlend(fine.faces, fine.edges, references)
+        self.blend = None if fine is None else RotationBlend(fine.connectivity, references)
         coarse = frame.coarsen(references)
         self.guess = Guess(levels.mesh, self.columns.coarse, coarse) if fine is None else None
 
