@@ -12,6 +12,7 @@ import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, surface
+from threads import limit_threads
 
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.keyframes.load import load_keyframes
@@ -28,6 +29,8 @@ OLD_KORNIA = version("kornia") < "0.9"
 needs_gradient_of_no_turn = pytest.mark.skipif(OLD_KORNIA, reason="kornia before 0.9: NaN gradient at no turn")
 
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
+
+limit_threads()  # small problems, and often several processes at once: threads would wait for each other
 
 
 @pytest.fixture(scope="session", autouse=True)
