@@ -64,10 +64,10 @@ def main(job_path: str, result_path: str) -> None:
             stop_energy=stop_energy,
             num_threads=1,  # more make it no faster
         )
-    except (RuntimeError, ValueError):
-        # Told apart from a missing library or too little memory: the parent remembers it.
+    except (RuntimeError, ValueError) as error:
+        # Told apart from a missing library, too little memory or too many threads: the parent remembers it.
         traceback.print_exc()
-        sys.exit(MESHER_RAISED)
+        sys.exit(1 if any(word in str(error) for word in ("alloc", "memory", "Resource")) else MESHER_RAISED)
     np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))
 
 
