@@ -30,6 +30,7 @@ setup(
         "safetensors>=0.4.3",
         "pygltflib>=1.16",
         "matplotlib>=3.7",
+        "threadpoolctl>=3.1",
         "tqdm>=4.65",
         "lazy_loader>=0.4",
     ],

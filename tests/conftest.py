@@ -11,6 +11,7 @@ import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, surface
+from threads import limit_threads
 
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.keyframes.load import load_keyframes
@@ -25,6 +26,8 @@ from torch_modal.precompute.stiffness import arap_hessian, lumped_mass
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
 
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
+
+limit_threads()  # small problems, and often several processes at once: threads would wait for each other
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,9 +7,6 @@ root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 . "$root/tests/environment.sh"
 cd "$root"
 
-# Small problems in many processes (the mesher is one more): threads of OpenMP and BLAS then wait for each other.
-export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}" OPENBLAS_NUM_THREADS="${OPENBLAS_NUM_THREADS:-1}"
-
 "$python" -m ruff check .
 "$python" -m ruff format --check .
 "$python" -m mypy

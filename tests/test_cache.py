@@ -1,6 +1,8 @@
 """The cache returns what was computed, or computes it."""
 
 import os
+import subprocess
+import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,6 +20,9 @@ from torch_modal.precompute.cache import (
     clear_cache,
     content_key,
     default_cache_dir,
+    parse_size,
+    shrink_cache,
+    size_limit,
 )
 
 POINTS = np.arange(6.0).reshape(2, 3)
@@ -175,3 +180,109 @@ def test_content_and_clearing(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.safetensors", "notes.txt"]
     assert_right(get(tmp_path, compute, k=1))
     assert compute.calls == 3
+
+
+# ------------------------------------------------------------------------------------------- the limit of its size
+ENTRY = np.zeros(2**14)  # 128 KiB
+
+
+def keep(cache: Cache, number: int) -> None:
+    cache.keep("thing", {}, {"number": number}, {"x": ENTRY + number})
+
+
+def kept(cache: Cache, n: int) -> list[int]:
+    """Which are there, without using them."""
+    assert cache.folder is not None
+    return [i for i in range(n) if cache._path(cache.folder, "thing", {}, {"number": i}).exists()]
+
+
+def test_the_least_recently_used_make_room(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, limit=10 * 2**17 + 10 * 2**10)  # ten of them, with their heads
+    for i in range(10):
+        keep(cache, i)
+    assert kept(cache, 10) == list(range(10))
+    found = cache.find("thing", {}, {"number": 0})
+    assert found is not None
+    np.testing.assert_array_equal(found["x"], ENTRY)
+    keep(cache, 10)
+    assert kept(cache, 11) == [0, *range(3, 11)], "nine tenths of the limit, and the first was used last"
+    assert cache_content(tmp_path).n_bytes <= cache.limit
+
+
+def test_an_entry_above_the_limit_is_kept_alone(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, limit=1000)
+    for i in range(3):
+        keep(cache, i)
+        assert kept(cache, 3) == [i]
+
+
+def test_files_of_others_and_half_written_ones_stay(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, limit=1000)
+    keep(cache, 0)
+    (entry,) = tmp_path.iterdir()
+    written, abandoned = (tmp_path / f".{entry.name}.{name}.tmp" for name in ("1-a", "2-b"))
+    for path in (written, abandoned, tmp_path / "mine.safetensors"):
+        path.write_bytes(bytes(2000))
+    os.utime(abandoned, (1.0, 1.0))
+    keep(cache, 1)
+    assert written.exists()
+    assert not abandoned.exists()
+    assert (tmp_path / "mine.safetensors").exists()
+    assert kept(cache, 2) == [1]
+
+
+WRITER = """
+import sys, warnings
+import numpy as np
+from pathlib import Path
+from torch_modal.precompute.cache import Cache
+warnings.simplefilter("error")
+cache = Cache(Path(sys.argv[1]), limit=5 * 2**17)
+for i in range(60):
+    number = (i * int(sys.argv[2])) % 23
+    arrays = cache.get("thing", {}, {"number": number}, lambda: {"x": np.zeros(2**14) + number})
+    assert (arrays["x"] == number).all()
+"""
+
+
+def test_several_processes_share_the_limit(tmp_path: Path) -> None:
+    root = str(Path(cache_module.__file__).parents[2])
+    command = [sys.executable, "-c", WRITER, str(tmp_path)]
+    writers = [
+        subprocess.Popen([*command, str(step)], env={**os.environ, "PYTHONPATH": root}, stderr=subprocess.PIPE)
+        for step in (3, 5, 7)
+    ]
+    for writer in writers:
+        assert writer.wait(timeout=120) == 0, writer.communicate()[1].decode()
+    assert 0 < cache_content(tmp_path).n_bytes <= 5 * 2**17
+
+
+def test_shrinking(tmp_path: Path) -> None:
+    cache = Cache(tmp_path)
+    for i in range(4):
+        keep(cache, i)
+    before = cache_content(tmp_path)
+    removed = shrink_cache(before.n_bytes // 2, tmp_path)
+    assert removed.n_entries == 2
+    assert kept(cache, 4) == [2, 3]
+    assert shrink_cache(before.n_bytes, tmp_path) == CacheContent(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1000", 1000), ("2k", 2048), ("500M", 500 * 2**20), ("1.5 GiB", 3 * 2**29), ("4GB", 2**32), ("1T", 2**40)],
+)
+def test_sizes(text: str, size: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert parse_size(text) == size
+    monkeypatch.setenv("TORCH_MODAL_CACHE_LIMIT", text)
+    assert Cache.at(tmp_path).limit == size_limit() == size
+
+
+@pytest.mark.parametrize("text", ["", "much", "-1", "4 G 5", "1e9", "nan"])
+def test_no_sizes(text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="is no size; give"):
+        parse_size(text)
+    if text:
+        monkeypatch.setenv("TORCH_MODAL_CACHE_LIMIT", text)
+        with pytest.raises(ValueError, match="variable TORCH_MODAL_CACHE_LIMIT: "):
+            Cache.at(tmp_path)

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from torch_modal.errors import MeshWarning
-from torch_modal.precompute import tetrahedra
-from torch_modal.precompute.cache import cache_content, clear_cache
+from torch_modal.precompute import filling, tetrahedra
+from torch_modal.precompute.cache import Cache, cache_content, clear_cache
 from torch_modal.precompute.modes import extract_bases, extract_modes
+from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -50,7 +51,7 @@ def modes_of(mesh: Mesh, folder: Path, **chosen: object) -> object:
 CRASH = "os.kill(os.getpid(), signal.SIGSEGV)"
 
 
-@pytest.mark.parametrize("code", [CRASH, "os.abort()", "print('RuntimeError: no envelope'); sys.exit(3)"])
+@pytest.mark.parametrize("code", [CRASH, "print('RuntimeError: no envelope'); sys.exit(3)"])
 def test_a_crash_is_remembered(worker: Worker, capsule: Mesh, tmp_path: Path, code: str) -> None:
     worker.does(code)
     with pytest.raises(TetrahedralizationError) as first:
@@ -107,8 +108,14 @@ def test_a_timeout_is_remembered_up_to_its_length(worker: Worker, capsule: Mesh,
 
 @pytest.mark.parametrize(
     "code",
-    ["os.kill(os.getpid(), signal.SIGKILL)", "sys.exit('ModuleNotFoundError: pytetwild')", "pass"],
-    ids=["killed", "library missing", "no result"],
+    [
+        "os.kill(os.getpid(), signal.SIGKILL)",
+        "sys.exit('ModuleNotFoundError: pytetwild')",
+        "pass",
+        "os.abort()",
+        "os.kill(os.getpid(), signal.SIGBUS)",
+    ],
+    ids=["killed", "library missing", "no result", "aborted", "bus error"],
 )
 def test_what_is_not_the_meshers_fault_is_tried_again(worker: Worker, capsule: Mesh, tmp_path: Path, code: str) -> None:
     worker.does(code)
@@ -117,6 +124,49 @@ def test_what_is_not_the_meshers_fault_is_tried_again(worker: Worker, capsule: M
             modes_of(capsule, tmp_path)
     assert worker.runs == 2
     assert cache_content(tmp_path).n_entries == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of the address space")
+def test_too_little_memory_is_not_remembered(worker: Worker, capsule: Mesh, tmp_path: Path) -> None:
+    """The real mesher where threads and memory cannot be had, and then where they can."""
+    real = str(Path(tetrahedra.__file__).with_name("_tetwild_worker.py"))
+    limited = "import resource\nresource.setrlimit(resource.RLIMIT_AS, ({0}, {0}))\n"
+    run = f"import runpy\nsys.path.insert(0, '')\nsys.argv[0] = {real!r}\nrunpy.run_path({real!r}, run_name='__main__')"
+    worker.does(limited.format(180 * 2**20) + run)
+    with pytest.raises(TetrahedralizationError, match=r"SIGABRT|exit code 1"):
+        modes_of(capsule, tmp_path, settings=COARSE)
+    assert cache_content(tmp_path).n_entries == 0
+    worker.does(run)
+    modes_of(capsule, tmp_path, settings=COARSE)
+    assert worker.runs == 2
+
+
+def test_another_version_of_the_mesher_is_tried(
+    worker: Worker, capsule: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker.does(CRASH)
+    for runs, installed in enumerate(("0.4.2", "0.4.3", "0.4.2")):
+        monkeypatch.setattr(filling, "version", lambda _, installed=installed: installed)
+        with pytest.raises(TetrahedralizationError, match="SIGSEGV"):
+            modes_of(capsule, tmp_path)
+        assert worker.runs == min(runs + 1, 2)
+
+
+def test_another_version_of_the_mesher_makes_its_own_tetrahedra(
+    capsule: Mesh, capsule_tetrahedra: tetrahedra.Tetrahedra, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def mesher(*args: object, **kwargs: object) -> tetrahedra.Tetrahedra:
+        calls.append(args)
+        return capsule_tetrahedra
+
+    monkeypatch.setattr(filling, "tetrahedralize", mesher)
+    surface = Surface(*capsule, np.arange(len(capsule[0])), 1.0)
+    for installed in ("0.4.2", "0.4.3", "0.4.2"):
+        monkeypatch.setattr(filling, "version", lambda _, installed=installed: installed)
+        filling.Filler(COARSE, "tetwild", 1.0, Cache.at(tmp_path)).body(surface)
+    assert len(calls) == 2
 
 
 def test_success_after_a_failure_lasts(

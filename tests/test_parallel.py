@@ -2,11 +2,16 @@
 
 import threading
 import time
+from collections.abc import Iterator
+from typing import Any
 
+import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from torch_modal.precompute import parallel
-from torch_modal.precompute.parallel import Budget, StoppedError, n_cpus, run_all
+from torch_modal.precompute import eigen, parallel, solving
+from torch_modal.precompute.modes import extract_modes
+from torch_modal.precompute.parallel import Budget, StoppedError, n_cpus, one_blas_thread, run_all
 
 
 @pytest.fixture(params=[1, 3])
@@ -82,6 +87,53 @@ def test_a_budget_is_shared() -> None:
         thread.join(timeout=30)
     assert used == 0
     assert 8 <= most <= 10
+
+
+def blas_threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """BLAS with two threads, whatever the machine and its variables say."""
+    with threadpool_limits(2, user_api="blas"):
+        assert blas_threads() == {2}
+        yield
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_one_blas_thread_until_the_last_leaves() -> None:
+    inside, go = threading.Barrier(2), threading.Event()
+
+    def stay() -> None:
+        with one_blas_thread():
+            inside.wait(timeout=30)
+            go.wait(timeout=30)
+
+    thread = threading.Thread(target=stay)
+    with pytest.raises(ValueError, match="on the way"), one_blas_thread():
+        thread.start()
+        inside.wait(timeout=30)
+        raise ValueError("on the way")
+    assert blas_threads() == {1}
+    go.set()
+    thread.join(timeout=30)
+    assert blas_threads() == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_modes_are_computed_with_one(capsule: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    """With several, that wait for each other in a loop, a basis takes ten times as long."""
+    seen = []
+
+    def lowest_modes(*args: Any) -> Any:
+        seen.append(blas_threads())
+        return eigen.lowest_modes(*args)
+
+    monkeypatch.setattr(solving, "lowest_modes", lowest_modes)
+    extract_modes(*capsule, 5, mesher="lattice", cache=False)
+    assert seen == [{1}]
+    assert blas_threads() == {2}
 
 
 def test_number_of_processors() -> None:

@@ -1,7 +1,7 @@
 """In-betweens a second through ShapeDataset and DataLoader, and the memory of a dataset of many sets.
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/augment.py throughput
-    OMP_NUM_THREADS=1 python tests/benchmarks/augment.py memory
+    python tests/benchmarks/augment.py throughput
+    python tests/benchmarks/augment.py memory
 
 Everything compared is measured in one run, in turns and through the same loader, so that a busy machine slows all of
 it: what to read are the ratios. Two workers, batches of 16, float32; key-frames, bases and tables stand on disk, and
@@ -26,6 +26,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import numpy as np
 import torch
+from threads import limit_threads
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -194,6 +195,7 @@ def status() -> Iterator[tuple[str, int]]:
 
 
 if __name__ == "__main__":
+    limit_threads()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("throughput")

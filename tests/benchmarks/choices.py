@@ -16,10 +16,10 @@ from statistics import fmean, geometric_mean
 from typing import Any
 
 import cases
-import torch
 from cases import Case
 from measures import Yardstick
 from methods import SUBDIVIDE, InBetweens, linear
+from threads import limit_threads
 from timing import timed
 
 WAYS: dict[str, dict[str, Any]] = {
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--modes", nargs="+", type=int, default=[10, 20, 30, 50, 80], help="of each key-frame")
     parser.add_argument("--coarse-faces", nargs="+", type=int, default=[300, 1000, 3000])
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    limit_threads()
     choices = list(product(arguments.modes, arguments.coarse_faces, WAYS))
     choices += [DEFAULT] * (DEFAULT not in choices)
     found: dict[tuple[int, int, str], list[tuple[float, float, float]]] = {choice: [] for choice in choices}

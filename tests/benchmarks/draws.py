@@ -1,7 +1,7 @@
 """A thousand draws of each random transform: volumes, edge strains, and how many pass through themselves anew.
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/draws.py
-    OMP_NUM_THREADS=1 python tests/benchmarks/draws.py --meshes woman --intersections 250
+    python tests/benchmarks/draws.py
+    python tests/benchmarks/draws.py --meshes woman --intersections 250
 
 Volumes are relative to the source: the key-frame, or the two that a shape lies between, in proportion to its time. New
 crossings are pairs of faces that cross in the draw, both of them two rings or more away from any that cross in a source
@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from augment import MESHES, RandomLinear
+from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
@@ -106,6 +107,7 @@ def measure(name: str, n: int, n_intersections: int) -> None:
 
 
 if __name__ == "__main__":
+    limit_threads()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--meshes", nargs="+", default=["creature", "hand", "woman"])
     parser.add_argument("--draws", type=int, default=1000)

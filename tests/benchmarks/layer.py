@@ -1,6 +1,6 @@
 """How fast :class:`torch_modal.InBetween` is in a batch, forward and backward, and what its gradient costs in memory.
 
-    OMP_NUM_THREADS=2 python tests/benchmarks/layer.py
+    python tests/benchmarks/layer.py
     python tests/benchmarks/layer.py --device cuda --dtype float32 float64 --batches 1 4 16 64 256 1024
 
 Everything compared is measured in one run, in turns, so that a busy machine slows both sides; what to read are the
@@ -9,7 +9,7 @@ of its own. 30 + 30 and 50 + 50 modes make 60 and 100 unknowns, and one more for
 dependent modes are dropped.
 
 On a machine that others use too, threads wait for each other, small calls the most: the loop then looks bad without
-being so. ``OMP_NUM_THREADS=1 ... --cpu-time`` counts the time of the processor instead of the clock's.
+being so. ``--threads 1 --cpu-time`` counts the time of the processor instead of the clock's.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from statistics import median
 from typing import Any
 
 import torch
+from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
@@ -256,12 +257,14 @@ def main() -> None:
     parser.add_argument("--spread", type=float, default=0.003, help=spread_help)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--singles", type=int, default=64, help="samples of the loop that are measured one by one")
+    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--cpu-time", action="store_true", help="processor time; with one thread only")
     parser.add_argument("--no-memory", action="store_true")
     parser.add_argument("--probe", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.cpu_time and (arguments.device == "cuda" or torch.get_num_threads() > 1):
-        parser.error("--cpu-time counts all threads together: it needs --device cpu and OMP_NUM_THREADS=1")
+    limit_threads(arguments.threads)
+    if arguments.cpu_time and (arguments.device == "cuda" or arguments.threads > 1):
+        parser.error("--cpu-time counts all threads together: it needs --device cpu and --threads 1")
     if arguments.probe:
         probe(arguments)
         return

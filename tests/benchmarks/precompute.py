@@ -24,6 +24,7 @@ import torch
 from capture import table
 from numpy.typing import NDArray
 from solvers import solvers
+from threads import limit_threads
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
@@ -172,7 +173,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder in which references are kept")
     parser.add_argument("--in-child", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    limit_threads()
     warnings.simplefilter("ignore")
     creature = sample(arguments.samples / "creature")
     if "speed" in arguments.parts:

@@ -23,6 +23,7 @@ from measures import Row, Yardstick
 from methods import METHODS, Method, UnavailableError
 from sheet import draw_bars, draw_sheet
 from tables import case_table, load_rows, markdown, save_rows
+from threads import limit_threads
 from timing import untimed
 
 REFERENCE = "full"
@@ -139,5 +140,5 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
+    limit_threads()
     main()

@@ -122,11 +122,25 @@ def demo(args: argparse.Namespace) -> None:
 
 def cache(args: argparse.Namespace) -> None:
     """Run ``torch-modal cache``."""
-    from torch_modal.precompute.cache import cache_content, clear_cache, default_cache_dir
+    from torch_modal.precompute.cache import (
+        cache_content,
+        clear_cache,
+        default_cache_dir,
+        parse_size,
+        shrink_cache,
+        size_limit,
+    )
 
-    n_entries, n_bytes = (clear_cache if args.clear else cache_content)(args.cache_dir)
-    there = "removed from" if args.clear else "in"
-    print(f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB {there} {args.cache_dir or default_cache_dir()}")
+    folder = args.cache_dir or default_cache_dir()
+    if args.clear:
+        removed = clear_cache(folder)
+    elif args.shrink is not None:
+        removed = shrink_cache(parse_size(args.shrink), folder)
+    else:
+        removed = None
+    n_entries, n_bytes = cache_content(folder) if removed is None else removed
+    size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
+    print(f"{size} removed from {folder}" if removed else f"{size} in {folder} (limit: {size_limit() / 2**20:g} MiB)")
 
 
 def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:

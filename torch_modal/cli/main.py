@@ -68,10 +68,14 @@ example:
   torch-modal demo --sample hand --out hand-demo"""
 
 CACHE = """\
-Say how large the cache is, where tetrahedra and modes are kept between runs."""
+Say how large the cache is, where tetrahedra and modes are kept between runs.
+
+It never takes more than 4 GiB, or what the environment variable TORCH_MODAL_CACHE_LIMIT
+says (500M, 10G): what was not used for the longest makes room for what is new."""
 
 CACHE_EXAMPLES = """\
 example:
+  torch-modal cache --shrink 1G
   torch-modal cache --clear"""
 
 
@@ -296,7 +300,13 @@ def _parser() -> argparse.ArgumentParser:
     _add_common(sub)
 
     sub = command("cache", commands.cache, "size of the cache of tetrahedra and modes", CACHE, CACHE_EXAMPLES)
-    sub.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
+    which = sub.add_mutually_exclusive_group()
+    which.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
+    which.add_argument(
+        "--shrink",
+        metavar="SIZE",
+        help="remove what was not used for the longest, until the rest is no larger than SIZE (500M, 4G)",
+    )
     sub.add_argument(
         "--cache-dir", metavar="DIR", help="another folder (default: TORCH_MODAL_CACHE, or the user's cache folder)"
     )

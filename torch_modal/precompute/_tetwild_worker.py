@@ -12,7 +12,6 @@ import sys
 del sys.path[0]
 
 import ctypes  # noqa: E402
-import os  # noqa: E402
 import signal  # noqa: E402
 import traceback  # noqa: E402
 import types  # noqa: E402
@@ -63,19 +62,13 @@ def main(job_path: str, result_path: str) -> None:
             edge_length_fac=edge_length_fac,
             epsilon=epsilon,
             stop_energy=stop_energy,
-            num_threads=_threads(),
+            num_threads=1,  # more make it no faster
         )
-    except (RuntimeError, ValueError):
-        # Told apart from a missing library or too little memory: the parent remembers it.
+    except (RuntimeError, ValueError) as error:
+        # Told apart from a missing library, too little memory or too many threads: the parent remembers it.
         traceback.print_exc()
-        sys.exit(MESHER_RAISED)
+        sys.exit(1 if any(word in str(error) for word in ("alloc", "memory", "Resource")) else MESHER_RAISED)
     np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))
-
-
-def _threads() -> int:
-    """As many as ``OMP_NUM_THREADS`` says, where several processes share the cores; 0, for all, if it says nothing."""
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    return int(asked) if asked.isdecimal() else 0
 
 
 def _pytetwild() -> types.ModuleType:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import sys
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,6 +24,12 @@ from torch_modal.io.files import write_atomically
 CACHE_VERSION = 3
 """Part of every key: raise it when an algorithm of the pre-computation changes, and old entries are left."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
+LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
+DEFAULT_LIMIT = 4 * 2**30
+KEPT_PART = 0.9
+"""Of the limit is left when it was passed, so that not each new entry has to make room for itself."""
+ABANDONED = 3600.0
+"""Seconds after which a file that is still half-written has no process any more."""
 SUFFIX = ".safetensors"
 _DIGEST = "digest"
 _OWN_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
@@ -47,25 +54,58 @@ def default_cache_dir() -> Path:
     return base / "torch_modal"
 
 
+def size_limit() -> int:
+    """The largest size of a cache folder in bytes: ``TORCH_MODAL_CACHE_LIMIT``, or 4 GiB.
+
+    Raises:
+        ValueError: The variable is no size.
+    """
+    named = os.environ.get(LIMIT_VARIABLE)
+    try:
+        return parse_size(named) if named else DEFAULT_LIMIT
+    except ValueError as error:
+        raise ValueError(f"the environment variable {LIMIT_VARIABLE}: {error}") from None
+
+
+def parse_size(text: str) -> int:
+    """Bytes of ``"500M"``, ``"4G"`` or ``"1.5 GiB"``; all units are powers of 1,024.
+
+    Raises:
+        ValueError: It is no size.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?(?:([KMGT])(?:i?B)?|B)?", text.strip(), re.IGNORECASE)
+    if match is None:
+        raise ValueError(f"{text!r} is no size; give a number of bytes, or something like 500M or 4G")
+    number, unit = match.groups()
+    return int(float(number) * 1024 ** (" KMGT".index((unit or " ").upper())))
+
+
 @dataclass(frozen=True)
 class Cache:
     """A folder of safetensors files, one per result, each with a digest that every read verifies.
 
     Damaged, truncated or foreign entries are computed again and replaced. Several processes may share the
-    folder: entries are moved into place whole.
+    folder: entries are moved into place whole. When they take more than the limit, those that nobody has asked for
+    the longest are removed.
 
     Attributes:
         folder: Where entries stand; it is made when the first is written. None keeps nothing.
+        limit: Largest size of all entries, in bytes. A single entry may be larger.
     """
 
     folder: Path | None
+    limit: int = DEFAULT_LIMIT
 
     @classmethod
     def at(cls, cache_dir: str | os.PathLike[str] | None = None, *, enabled: bool = True) -> "Cache":
-        """The cache in a folder, by default in :func:`default_cache_dir`; or one that keeps nothing."""
+        """The cache in a folder, by default in :func:`default_cache_dir`; or one that keeps nothing.
+
+        Raises:
+            ValueError: ``TORCH_MODAL_CACHE_LIMIT`` is no size.
+        """
         if not enabled:
             return cls(None)
-        return cls(default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser())
+        return cls(default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser(), size_limit())
 
     def get(
         self,
@@ -93,7 +133,13 @@ class Cache:
 
     def find(self, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Arrays | None:
         """The kept result, if there is one; arguments as for :meth:`get`."""
-        return None if self.folder is None else _read(self._path(self.folder, kind, inputs, parameters))
+        if self.folder is None:
+            return None
+        path = self._path(self.folder, kind, inputs, parameters)
+        if (found := _read(path)) is not None:
+            with contextlib.suppress(OSError):  # gone since, or not ours to write
+                os.utime(path)  # the time of the last use
+        return found
 
     def keep(
         self,
@@ -117,6 +163,7 @@ class Cache:
             self.folder.mkdir(parents=True, exist_ok=True)
             path = self._path(self.folder, kind, inputs, parameters)
             write_atomically(path, save_arrays({**arrays, _DIGEST: _digest(arrays)}))
+            _make_room(self.folder, self.limit, path)
         except OSError as error:
             warnings.warn(
                 f"cannot keep {kind} in the cache folder {self.folder} ({error}); set {CACHE_VARIABLE} or "
@@ -165,8 +212,58 @@ def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent
     Raises:
         OSError: An entry cannot be removed.
     """
+    return _remove(_files(cache_dir))
+
+
+def shrink_cache(limit: int, cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
+    """Remove the entries that were not used for the longest, until the others take no more than a limit.
+
+    Args:
+        limit: In bytes.
+        cache_dir: The folder, by default :func:`default_cache_dir`.
+
+    Returns:
+        What was removed.
+
+    Raises:
+        OSError: An entry cannot be removed.
+    """
+    return _remove(_oldest(_files(cache_dir), limit))
+
+
+def _make_room(folder: Path, limit: int, newest: Path) -> None:
+    """Remove the oldest entries if all together are too large; the newest stays in any case."""
+    others = [path for path in _files(folder) if path != newest]
+    with contextlib.suppress(FileNotFoundError):  # another process has made room already
+        size = newest.stat().st_size
+        if _oldest(others, limit - size):
+            for path in _oldest(others, int(KEPT_PART * limit) - size):
+                with contextlib.suppress(OSError):  # removed by another process, or open there on some systems
+                    path.unlink()
+
+
+def _oldest(files: list[Path], limit: int) -> list[Path]:
+    """Which files to remove so that the rest takes no more than a limit: those not used for the longest."""
+    used = []
+    for path in files:
+        with contextlib.suppress(FileNotFoundError):
+            status = path.stat()
+            used.append((status.st_mtime_ns, status.st_size, path))
+    now, total, chosen = time.time(), sum(size for _, size, _ in used), []
+    for moment, size, path in sorted(used):
+        if path.suffix != SUFFIX and now - moment / 1e9 < ABANDONED:
+            continue  # somebody is writing it
+        if total <= limit:
+            break
+        chosen.append(path)
+        total -= size
+    return chosen
+
+
+def _remove(files: list[Path]) -> CacheContent:
+    """Remove files; what was removed."""
     sizes = []
-    for path in _files(cache_dir):
+    for path in files:
         with contextlib.suppress(FileNotFoundError):
             size = path.stat().st_size
             path.unlink()

@@ -1,9 +1,11 @@
 """Key-frames filled with tetrahedra: meshed once for the whole set where that works."""
 
+import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal
 
 import numpy as np
@@ -136,7 +138,7 @@ class Filler:
 
     def _by_tetwild(self, surface: Surface) -> Tetrahedra:
         """By fTetWild, unless it is known to fail: nobody should wait for the same failure twice."""
-        inputs, parameters = _content(surface), asdict(self.settings)
+        inputs, parameters = _content(surface), {**asdict(self.settings), **_mesher_versions()}
         if (failure := self.cache.find("failure", inputs, parameters)) is not None:
             self._raise_known(failure)
         try:
@@ -165,7 +167,8 @@ class Filler:
         return lattice(surface, self.settings.edge_length(surface.points, surface.faces))
 
     def _kept(self, mesher: str, surface: Surface, make: Callable[[Surface], Tetrahedra]) -> Tetrahedra:
-        parameters = {**asdict(self.settings), "mesher": mesher}
+        versions = _mesher_versions() if mesher == "tetwild" else {}
+        parameters = {**asdict(self.settings), **versions, "mesher": mesher}
         return Tetrahedra(
             **self.cache.get("tetrahedra", _content(surface), parameters, lambda: _as_arrays(make(surface)))
         )
@@ -182,6 +185,17 @@ class Filler:
         if not kept["is_good"][0]:
             return None
         return Filling(body, surface, body.tetrahedra._replace(vertices=kept["vertices"]))
+
+
+def _mesher_versions() -> dict[str, str | None]:
+    """What the result of fTetWild depends on beside the surface and the settings, for the cache."""
+
+    def installed(name: str) -> str | None:
+        with contextlib.suppress(PackageNotFoundError):
+            return version(name)
+        return None  # the worker will say so
+
+    return {name: installed(name) for name in ("pytetwild", "fast-simplification")}
 
 
 def _content(surface: Surface) -> Arrays:

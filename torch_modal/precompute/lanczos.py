@@ -1,6 +1,6 @@
 """The lowest eigenvectors of ``K phi = lambda M phi`` by shift-invert block Lanczos, piece by piece."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import scipy.linalg
@@ -13,6 +13,8 @@ from torch_modal.precompute.mass import Mass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Pairs = tuple[FloatArray, FloatArray]
+"""Eigenvalues ``(k,)`` and eigenvectors ``(n, k)``."""
 
 DENSE_BELOW = 600
 """Number of unknowns under which LAPACK is as fast as a factorisation and Lanczos."""
@@ -20,15 +22,20 @@ BLOCK = 8
 """Vectors in one step. Solves for several at once are three times as fast, and an eigenvalue may have as many equal
 ones; a single starting vector meets only one of each (and the rest by rounding)."""
 TOLERANCE = 1e-8
-"""Largest residual of a wanted pair of the inverted problem, relative to its eigenvalue."""
+"""Residual of the inverted problem, relative to its eigenvalue, at which a span is first handed out."""
+FLOOR = 1e-14
+"""The same where nothing is left to gain."""
 
 
 class NoConvergenceError(RuntimeError):
     """The iteration has used up its steps."""
 
 
-def lowest_eigenvectors(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> FloatArray:
-    """M-orthonormal basis of the ``n_pairs`` lowest eigenvectors.
+def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> Iterator[FloatArray]:
+    """M-orthonormal bases of about the ``n_pairs`` lowest eigenvectors, each nearer to them than the one before.
+
+    The iteration sees residuals of the inverted problem. What they amount to in ``K phi - lambda M phi`` depends on the
+    worst tetrahedra, so the caller decides when they are small enough, and asks for the next basis until then.
 
     Pieces that nothing connects are solved apart: their equal eigenvalues (six zeros each) would otherwise hide each
     other.
@@ -39,8 +46,9 @@ def lowest_eigenvectors(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float
         n_pairs: How many.
         shift: Positive; ``K + shift M`` is factored, which is positive definite, where ``K`` is singular.
 
-    Returns:
-        In ascending order of the eigenvalues. *Shape:* ``(3N, n_pairs)``.
+    Yields:
+        In ascending order of the eigenvalues; none after the one that rounding lets no further step improve.
+        *Shape:* ``(3N, n_pairs)``.
 
     Raises:
         NoConvergenceError: Lanczos did not find them.
@@ -48,42 +56,52 @@ def lowest_eigenvectors(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float
     graph = _vertex_graph(k)
     n_pieces, piece = connected_components(graph, directed=False)
     if n_pieces == 1:
-        return _of_piece(k, graph, mass, n_pairs, shift)[1]
-    values, vectors = [], []
-    for index in range(n_pieces):
-        vertices = np.flatnonzero(piece == index)
-        own = _of_coordinates(vertices)
-        wanted = min(n_pairs, len(own))
-        found, small = _of_piece(
+        yield from (vectors for _, vectors in _of_piece(k, graph, mass, n_pairs, shift))
+        return
+    owned = [_of_coordinates(np.flatnonzero(piece == index)) for index in range(n_pieces)]
+    rounds = [
+        _of_piece(
             sp.csc_matrix(k[own][:, own]),
-            sp.csc_matrix(graph[vertices][:, vertices]),
-            mass.of_vertices(vertices),
-            wanted,
+            sp.csc_matrix(graph[own[::3] // 3][:, own[::3] // 3]),
+            mass.of_vertices(own[::3] // 3),
+            min(n_pairs, len(own)),
             shift,
         )
-        whole = np.zeros((k.shape[0], wanted))
-        whole[own] = small
-        values.append(found)
-        vectors.append(whole)
-    order = np.argsort(np.concatenate(values), kind="stable")[:n_pairs]
-    return np.concatenate(vectors, axis=1)[:, order]
+        for own in owned
+    ]
+    # A piece that has no better vectors keeps its last ones while others go on.
+    latest = [next(of_piece) for of_piece in rounds]
+    improved = True
+    while improved:
+        yield _merged(latest, owned, k.shape[0], n_pairs)
+        better = [next(of_piece, None) for of_piece in rounds]
+        improved = any(found is not None for found in better)
+        latest = [old if new is None else new for old, new in zip(latest, better, strict=True)]
 
 
-def _of_piece(
-    k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float
-) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues and eigenvectors of a connected piece, ascending."""
+def _merged(found: list[Pairs], owned: list[IntArray], n: int, n_pairs: int) -> FloatArray:
+    """The lowest of the pairs of all pieces, as vectors of the whole. *Shape:* ``(n, n_pairs)``."""
+    whole = np.zeros((n, sum(len(values) for values, _ in found)))
+    first = 0
+    for (values, vectors), own in zip(found, owned, strict=True):
+        whole[own, first : first + len(values)] = vectors
+        first += len(values)
+    order = np.argsort(np.concatenate([values for values, _ in found]), kind="stable")[:n_pairs]
+    return whole[:, order]
+
+
+def _of_piece(k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> Iterator[Pairs]:
+    """Ever better eigenvalues, ascending, and eigenvectors of a connected piece."""
     n = k.shape[0]
     if n < DENSE_BELOW or 2 * n_pairs > n:
-        values, vectors = scipy.linalg.eigh(
-            k.toarray(), mass.for_coordinates().toarray(), subset_by_index=(0, n_pairs - 1)
-        )
-        return values, vectors
+        yield scipy.linalg.eigh(k.toarray(), mass.for_coordinates().toarray(), subset_by_index=(0, n_pairs - 1))
+        return
     vertices, solve = factored(k, graph, mass, shift)
-    inverse, vectors = _block_lanczos(solve, mass.of_vertices(vertices), n_pairs)
-    restored = np.empty_like(vectors)
-    restored[_of_coordinates(vertices)] = vectors
-    return 1 / inverse - shift, restored
+    order = _of_coordinates(vertices)
+    for inverse, vectors in _block_lanczos(solve, mass.of_vertices(vertices), n_pairs):
+        restored = np.empty_like(vectors)
+        restored[order] = vectors
+        yield 1 / inverse - shift, restored
 
 
 def factored(
@@ -105,10 +123,8 @@ def _of_coordinates(vertices: IntArray) -> IntArray:
     return (3 * vertices[:, None] + np.arange(3)).reshape(-1)
 
 
-def _block_lanczos(
-    solve: Callable[[FloatArray], FloatArray], mass: Mass, n_pairs: int
-) -> tuple[FloatArray, FloatArray]:
-    """Largest eigenvalues of ``A⁻¹ M``, descending, and their M-orthonormal eigenvectors.
+def _block_lanczos(solve: Callable[[FloatArray], FloatArray], mass: Mass, n_pairs: int) -> Iterator[Pairs]:
+    """Largest eigenvalues of ``A⁻¹ M``, descending, and their M-orthonormal eigenvectors, ever better.
 
     All vectors are kept, and each block is made M-orthogonal to all before it: a few hundred of them cost less than
     the solves. As only the last two blocks have a part in a new one, but for rounding, those are taken out first.
@@ -124,7 +140,7 @@ def _block_lanczos(
     projected = np.zeros((most, most))
     # Fixed, so that equal input gives equal modes.
     block = mass.orthonormal(np.random.default_rng(0).standard_normal((n, BLOCK)))[0]
-    check_at = 5 * n_pairs // 2
+    check_at, worst = 5 * n_pairs // 2, np.inf
     for start in range(0, most, BLOCK):
         stop = start + BLOCK
         basis[:, start:stop] = block
@@ -139,11 +155,16 @@ def _block_lanczos(
             continue
         values, rotation = np.linalg.eigh(projected[:stop, :stop], UPLO="U")
         values, rotation = values[::-1][:n_pairs], rotation[:, ::-1][:, :n_pairs]
-        residuals = np.linalg.norm(coupling @ rotation[start:stop], axis=0)
-        if (residuals <= TOLERANCE * np.abs(values)).all():
-            return values, basis[:, :stop] @ rotation
+        worst = (np.linalg.norm(coupling @ rotation[start:stop], axis=0) / np.abs(values)).max()
+        if worst <= TOLERANCE:
+            yield values, basis[:, :stop] @ rotation
+        if worst <= FLOOR:
+            return
         check_at = stop + 2 * BLOCK
-    raise NoConvergenceError(f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns")
+    if worst > TOLERANCE:
+        raise NoConvergenceError(
+            f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns"
+        )
 
 
 def _vertex_graph(k: sp.csc_matrix) -> sp.csc_matrix:

@@ -5,7 +5,9 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
+
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 Result = TypeVar("Result")
 
@@ -25,18 +27,24 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event) -> lis
     """The results of ``work(0)`` to ``work(n - 1)``, as many at a time as there are processors.
 
     The first error ends everything: ``stop`` is set, what has not begun is not begun, and the error is raised once the
-    running calls have returned. So it is with Ctrl-C, which only the calling thread is told of.
+    running calls have returned. So it is with Ctrl-C, which only the calling thread is told of. BLAS has one thread in
+    each of them.
 
     Args:
         work: Looks at ``stop`` from time to time if it takes long, and then raises `StoppedError`.
         n: How many.
         stop: Set when the results are no longer wanted.
     """
+
+    def alone(index: int) -> Result:
+        with one_blas_thread():
+            return work(index)
+
     n_threads = min(n, n_cpus())
     if n_threads < 2:
-        return [work(index) for index in range(n)]
-    with ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
-        futures = [pool.submit(work, index) for index in range(n)]
+        return [alone(index) for index in range(n)]
+    with one_blas_thread(), ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
+        futures = [pool.submit(alone, index) for index in range(n)]
         try:
             for future in as_completed(futures):
                 future.result()
@@ -46,6 +54,38 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event) -> lis
                 future.cancel()
             raise
     return [future.result() for future in futures]
+
+
+class _Inside:
+    """How many calls are inside `one_blas_thread` now, and what is undone when the last one leaves."""
+
+    lock = threading.Lock()
+    count = 0
+    limits: Any = None
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Inside, BLAS has one thread; a decorator too.
+
+    The products here are small, and BLAS threads that wait for each other in a loop cost ten times the work, the more
+    so where several key-frames are solved at once. With most builds of BLAS the number belongs to the process, so the
+    last that leaves puts it back; with some, to each thread, so every thread comes in.
+    """
+    with _Inside.lock:
+        limits = ThreadpoolController().select(user_api="blas").limit(limits=1)
+        if _Inside.count == 0:
+            _Inside.limits = limits
+        _Inside.count += 1
+    try:
+        yield
+    finally:
+        with _Inside.lock:
+            _Inside.count -= 1
+            if _Inside.count == 0:
+                # Later versions of threadpoolctl obey the thread alone that came first, unless it is told off.
+                getattr(OpenBLASController, "clear_controlling_thread", lambda **_: None)(force=True)
+                _Inside.limits.__exit__(None, None, None)
 
 
 class Budget:

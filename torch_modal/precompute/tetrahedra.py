@@ -31,8 +31,9 @@ EDGE_RANGE = (0.018, 0.04)
 
 MESHER_RAISED = 3
 """Exit code of the worker when the mesher itself raised, and not, say, its import."""
-_OWN_FAILURES = {MESHER_RAISED, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGABRT", "SIGFPE", "SIGBUS"))}
-"""Ends that are fTetWild's doing. Others, such as SIGKILL, come from outside."""
+_OWN_FAILURES = {MESHER_RAISED, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGFPE"))}
+"""Ends that the surface brings about. Others may not come again: SIGKILL is sent from outside, and SIGABRT is how C++
+ends where memory or threads run out."""
 
 DEBRIS = 0.01
 """Largest volume of a piece that is dropped if it only hangs on others, as a fraction of the whole."""
