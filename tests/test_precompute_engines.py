@@ -183,7 +183,7 @@ def by_shards(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     for i, shard in enumerate(shards):
         said = shard.communicate(timeout=1200)[0]
         assert shard.returncode == 0, said
-        assert said.startswith(f"10 of 40 sets of key-frames in {root}\n")
+        assert said.startswith(f"shard {i + 1}/4: 10 of 40 sets of key-frames in {root}\n")
         assert list(report(out, Shard(i + 1, 4)).values()) == [DONE] * 10
     return root, out
 

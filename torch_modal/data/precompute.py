@@ -76,7 +76,7 @@ def precompute_tree(
     shard, options, source, target = shard or Shard(), options or Options(), root.resolve(), out.resolve()
     new = [Record(name, output=at, parameters=options.parameters()) for name, at in places(tree.sets, root).items()]
     tasks = [SetTask(one, source / one.set, target, options) for one in new[shard.number - 1 :: shard.of]]
-    part = f"{len(tasks)} of " if shard.of > 1 else ""
+    part = f"shard {shard.number}/{shard.of}: {len(tasks)} of " if shard.of > 1 else ""
     say(f"{part}{len(new)} sets of key-frames in {root}" + (f"; {engine.name}" if engine.name else ""))
 
     known: dict[str, Record] = {}
