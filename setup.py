@@ -36,7 +36,8 @@ setup(
     ],
     extras_require={
         "pyg": ["torch_geometric>=2.4"],
-        "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4"],
+        "dask": ["distributed>=2024.5"],
+        "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4", "distributed>=2024.5"],
     },
     entry_points={"console_scripts": ["torch-modal = torch_modal.cli.main:main"]},
 )

@@ -1,7 +1,8 @@
 """Fixtures that several test files share; everything made once per run."""
 
 import signal
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -157,6 +158,27 @@ def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
 def listen_to_ctrl_c() -> None:
     """For ``preexec_fn``: a run in the background of a shell has SIGINT ignored, and its children inherit that."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def processes(mark: str) -> list[str]:
+    """Command lines of running processes that have a text in them, such as a folder they work in."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:
+            continue
+        if mark in command:
+            found.append(command)
+    return found
+
+
+def wait_until(holds: Callable[[], bool], seconds: float = 100.0) -> None:
+    """Look now and then whether something holds."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, f"not within {seconds} s"
+        time.sleep(0.05)
 
 
 def random_rotation(generator: torch.Generator) -> torch.Tensor:

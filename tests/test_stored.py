@@ -1,13 +1,26 @@
 """Key-frame sets on disk: whole or absent, mapped into memory, the same after reading."""
 
+import os
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
 from conftest import Shapes
+from safetensors.torch import save_file
 
-from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, StoredSet, find_sets, open_set, write_set
+from torch_modal.data.dataset import stored_labels
+from torch_modal.data.stored import (
+    BASES_FILE,
+    KEYFRAMES_FILE,
+    LABELS_FILE,
+    RECORD_FILE,
+    StoredSet,
+    find_sets,
+    open_set,
+    write_set,
+)
 from torch_modal.precompute.basis import ModalBasis
 
 NAMES = ("straight.obj", "bent.obj", "twisted.obj")
@@ -68,10 +81,53 @@ def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> No
     (folder / "between-0-1.safetensors").write_bytes(b"")  # made from a set, and out of date with it
     write_set(folder, *small_bars, NAMES)
     assert sorted(path.name for path in folder.iterdir()) == [BASES_FILE, KEYFRAMES_FILE]
-    (folder / "labels.csv").write_text("mine")
-    with pytest.raises(FileExistsError, match="no stored key-frame set"):
-        write_set(folder, *small_bars, NAMES)
-    assert (folder / "labels.csv").read_text() == "mine"
+
+
+def test_files_of_the_user_stay_when_a_set_is_replaced(small_bars: Shapes, folder: Path) -> None:
+    save_file({"vertex_labels": torch.arange(30)}, folder / LABELS_FILE)
+    (folder / "notes.txt").write_text("mine")
+    (folder / RECORD_FILE).write_text("of the set that was there")
+    write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES, beside={"x": b"y"})
+    assert torch.equal(open_set(folder).keyframes, 2 * small_bars.keyframes)
+    assert torch.equal(stored_labels(open_set(folder))["vertex_labels"], torch.arange(30))
+    assert (folder / "notes.txt").read_text() == "mine" and (folder / "x").read_bytes() == b"y"
+    assert not (folder / RECORD_FILE).exists()
+    write_set(folder.parent / "new", *small_bars, NAMES)
+    for place, what in ((folder.parent, "holds the folder bars"), (folder / "notes.txt", "is no folder")):
+        with pytest.raises(FileExistsError, match=what):
+            write_set(place, *small_bars, NAMES)
+    (folder.parent / "other").mkdir()
+    (folder.parent / "other" / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"holds notes\.txt and no stored key-frame set"):
+        write_set(folder.parent / "other", *small_bars, NAMES)
+    assert [path.name for path in (folder.parent / "other").iterdir()] == ["notes.txt"]
+
+
+def test_several_may_write_one_set_at_once(small_bars: Shapes, folder: Path) -> None:
+    """The last one's set stays, whole, with the labels; nobody fails, and no temporary folder is left."""
+    (folder / LABELS_FILE).write_text("mine")
+
+    def write(scale: int) -> None:
+        for _ in range(30):
+            write_set(folder, scale * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, range(1, 5)))
+    scale = float(open_set(folder).keyframes.abs().max() / small_bars.keyframes.abs().max())
+    assert scale in (1.0, 2.0, 3.0, 4.0)
+    assert len(open_set(folder).bases) == 3
+    assert (folder / LABELS_FILE).read_text() == "mine"
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["bars"]
+
+
+def test_leftovers_are_removed_when_nobody_can_be_writing_them(small_bars: Shapes, folder: Path) -> None:
+    names = [".bars.77-0123abcd.tmp", ".bars.78-0123abcd.tmp", ".bars.mine.tmp", ".other.77-0123abcd.tmp"]
+    for name in names:
+        (folder.parent / name).mkdir()
+        if "77" in name:
+            os.utime(folder.parent / name, (0, 0))
+    write_set(folder, *small_bars, NAMES)
+    assert sorted(path.name for path in folder.parent.iterdir()) == sorted(["bars", *names[1:]])
 
 
 def test_a_failure_leaves_nothing_behind(small_bars: Shapes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.bulk import command as bulk
-from torch_modal.cli import commands
+from torch_modal.cli import commands, precompute
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -275,10 +274,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_modes(sub)
     _add_common(sub)
 
-    sub = command("precompute", bulk.run, bulk.SUMMARY, bulk.DESCRIPTION, bulk.EXAMPLES)
-    bulk.add_arguments(sub, _number)
+    sub = command("precompute", precompute.run, precompute.SUMMARY, precompute.DESCRIPTION, precompute.EXAMPLES)
+    precompute.add_arguments(sub, _number)
     _add_modes(sub)
-    bulk.add_common(sub)
+    precompute.add_common(sub)
 
     sub = command("demo", commands.demo, "try it on the samples that come with it", DEMO, DEMO_EXAMPLES)
     sub.add_argument(

@@ -15,10 +15,8 @@ from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBa
 from torch_modal.data.random_in_between import RandomInBetween
 from torch_modal.data.sequential import AugmentationSequential
 from torch_modal.data.space import Recent, ShapeSpace
-from torch_modal.data.stored import StoredSet, find_sets, open_set
+from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets, open_set
 from torch_modal.geometry.normals import vertex_normals
-
-LABELS_FILE = "labels.safetensors"
 
 Labels = Mapping[str, Tensor]
 Sample = dict[str, Any]

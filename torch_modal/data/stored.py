@@ -2,15 +2,18 @@
 
 A folder holds ``keyframes.safetensors`` (``keyframes``, ``faces``; names of the source files in its metadata) and
 ``bases.safetensors``, where the tensors of each :class:`~torch_modal.ModalBasis` have the number of the key-frame and a
-dot before their names.
+dot before their names. Other files in it, ``labels.safetensors`` for example, are the user's.
 """
 
 import contextlib
+import errno
 import json
 import os
+import re
 import shutil
+import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
@@ -29,8 +32,13 @@ FORMAT = "torch_modal.set"
 VERSION = "1"
 KEYFRAMES_FILE = "keyframes.safetensors"
 BASES_FILE = "bases.safetensors"
+LABELS_FILE = "labels.safetensors"
+#: How the set was made, if ``torch-modal precompute`` made it.
+RECORD_FILE = "precompute.json"
 #: Made from a set and kept beside it: replaced along with it.
 DERIVED_FILES = "between-*.safetensors"
+STALE = 86400.0
+"""Seconds after which a temporary folder is no longer somebody's who is about to rename it."""
 _PARTS = tuple(field.name for field in fields(ModalBasis))
 
 
@@ -103,11 +111,14 @@ def write_set(
     faces: Tensor,
     bases: Sequence[ModalBasis],
     names: Sequence[str],
+    *,
+    beside: Mapping[str, bytes] | None = None,
 ) -> None:
     """Write a key-frame set; its folder is whole or absent.
 
     The files are written to a temporary folder beside it, which is then renamed. A stored set that is there already is
-    replaced.
+    replaced, with the tables that were made from it; all other files in its folder stay. Of several processes that
+    write one set at once, the last one's stays.
 
     Args:
         folder: Where to; the folders above it are made.
@@ -115,6 +126,7 @@ def write_set(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         bases: The basis of each key-frame.
         names: Name of each key-frame, for example its file's.
+        beside: Name and content of files that are to appear in the folder at the same moment.
 
     Raises:
         FileExistsError: Something else is there.
@@ -123,9 +135,10 @@ def write_set(
     """
     folder = Path(folder)
     _check_parts(keyframes, faces, bases, names)
-    if os.path.lexists(folder) and not _is_replaceable(folder):
-        raise FileExistsError(f"{folder} exists and is no stored key-frame set; remove it or write elsewhere")
+    if obstacle := why_not_replaceable(folder):
+        raise FileExistsError(f"{obstacle}; move it away or write elsewhere")
     folder.parent.mkdir(parents=True, exist_ok=True)
+    _remove_stale(folder)
     mark = f"{os.getpid()}-{uuid.uuid4().hex[:8]}"
     fresh, old = (folder.with_name(f".{folder.name}.{mark}.{end}") for end in ("tmp", "old.tmp"))
     try:
@@ -138,13 +151,64 @@ def write_set(
         parts = {f"{i}.{part}": _plain(getattr(basis, part)) for i, basis in enumerate(bases) for part in _PARTS}
         metadata = {"format": BASIS_FORMAT, "version": BASIS_VERSION}
         (fresh / BASES_FILE).write_bytes(save_tensors(parts, metadata))
-        if folder.exists():
-            with contextlib.suppress(FileNotFoundError):  # another process may be replacing it too
-                folder.rename(old)
-        fresh.rename(folder)
+        for name, content in (beside or {}).items():
+            (fresh / name).write_bytes(content)
+        _put_in_place(fresh, folder, old)
     finally:
-        for leftover in (fresh, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def why_not_replaceable(folder: Path) -> str:
+    """What is at the place of a set and cannot be replaced; empty if a set can be written there."""
+    if not os.path.lexists(folder):
+        return ""
+    if not folder.is_dir():
+        return f"{folder} exists and is no folder"
+    there = sorted(folder.iterdir())
+    if below := [path.name for path in there if path.is_dir()]:
+        return f"{folder} holds the folder {below[0]}, which is no part of a stored key-frame set"
+    if there and not {path.name for path in there} & {KEYFRAMES_FILE, BASES_FILE, LABELS_FILE, RECORD_FILE}:
+        return f"{folder} holds {there[0].name} and no stored key-frame set"
+    return ""
+
+
+def _put_in_place(fresh: Path, folder: Path, old: Path) -> None:
+    """Rename a complete folder to its place, with the user's files of the one that was there."""
+    while True:
+        try:
+            with contextlib.suppress(FileNotFoundError):  # there is none, or another process is replacing it too
+                folder.rename(old)
+                _keep_users_files(old, fresh)
+            fresh.rename(folder)
+            return
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                continue  # another process was faster; its set is the older one now
+            if old.exists():
+                old.rename(folder)
+            raise
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _keep_users_files(old: Path, fresh: Path) -> None:
+    own = {KEYFRAMES_FILE, BASES_FILE, RECORD_FILE}
+    for path in old.iterdir():
+        if path.name in own or path.match(DERIVED_FILES) or path.match(".*.tmp") or (fresh / path.name).exists():
+            continue
+        try:  # a second name for it, so that it is in neither folder alone at any time
+            os.link(path, fresh / path.name, follow_symlinks=False)
+        except (OSError, NotImplementedError):
+            shutil.copy2(path, fresh / path.name, follow_symlinks=False)
+
+
+def _remove_stale(folder: Path) -> None:
+    """Remove what processes that were killed while they wrote this set have left, but nobody's work."""
+    mark = re.compile(rf"\.{re.escape(folder.name)}\.\d+-[0-9a-f]{{8}}\.tmp")
+    for path in folder.parent.iterdir():
+        with contextlib.suppress(OSError):
+            if mark.fullmatch(path.name) and time.time() - path.stat().st_mtime > STALE:
+                shutil.rmtree(path, ignore_errors=True)
 
 
 def find_sets(root: str | os.PathLike[str]) -> list[Path]:
@@ -166,12 +230,6 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
 
 def _plain(x: Tensor, dtype: torch.dtype | None = None) -> Tensor:
     return x.detach().to("cpu", dtype).contiguous()
-
-
-def _is_replaceable(folder: Path) -> bool:
-    """Whether a folder holds nothing but what belongs to a set."""
-    own = {KEYFRAMES_FILE, BASES_FILE}
-    return folder.is_dir() and all(path.name in own or path.match(DERIVED_FILES) for path in folder.iterdir())
 
 
 def _check_parts(keyframes: Tensor, faces: Tensor, bases: Sequence[ModalBasis], names: Sequence[str]) -> None:

@@ -2,8 +2,7 @@
 
 import os
 import re
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -93,19 +92,18 @@ def places(names: Sequence[str], root: Path) -> dict[str, str]:
     return found
 
 
-def same_stems(files: Iterable[Path]) -> list[Path]:
-    """Files that have their name without extension in common: probably one shape in two formats."""
-    listed = list(files)
-    n_users = Counter(file.stem for file in listed)
-    return [file for file in listed if n_users[file.stem] > 1]
-
-
 def natural(name: str) -> list[tuple[list[str | int], str]]:
     """A key to sort by, with which ``frame-2`` comes before ``frame-10``, and a folder before what is in it."""
     return [
         ([int(part) if i % 2 else part.casefold() for i, part in enumerate(re.split(r"([0-9]+)", level))], level)
         for level in name.split("/")
     ]
+
+
+def printable(name: str) -> str:
+    """A name as one line of a terminal can show it; names of folders may hold anything but a slash."""
+    text = name.encode("utf-8", "backslashreplace").decode()
+    return text if text.isprintable() else repr(text)
 
 
 def _name(folder: Path, root: Path) -> str:

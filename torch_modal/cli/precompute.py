@@ -1,11 +1,12 @@
 """``torch-modal precompute``: its arguments, and from them to lines and an exit status."""
 
 import argparse
-import contextlib
+import os
+import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ EXAMPLES = """\
 examples:
   torch-modal precompute shapes --out bases
   torch-modal precompute shapes --out bases --workers 4 --timeout 120 --retry
-on two machines that share their files, the work shared by a counter in PyTorch's TCPStore:
-  torchrun --nnodes 2 --nproc-per-node 1 --rdzv-backend c10d --rdzv-endpoint HOST:29400 \\
-      -m torch_modal precompute shapes --out bases"""
+on machines that share their files, with a Dask cluster or an array of jobs:
+  torch-modal precompute shapes --out bases --scheduler tcp://HOST:8786
+  sbatch --array=1-16 --wrap "torch-modal precompute shapes --out bases\""""
 
 INCOMPLETE = 3
 """Exit status when some sets have no bases."""
@@ -47,8 +48,15 @@ def add_arguments(sub: argparse.ArgumentParser, number: Callable[..., Callable[[
         "--workers",
         type=number(int, 1),
         metavar="N",
-        help="sets at a time, each in a process with one thread (default: one for each processor; under torchrun "
-        "those of the machine are shared among its processes)",
+        help="sets at a time, each in a process with one thread (default: one for each processor)",
+    )
+    sub.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead")
+    sub.add_argument(
+        "--shard",
+        type=_shard,
+        metavar="I/N",
+        help="only the I-th of N parts of the sets (default: by SLURM_ARRAY_TASK_ID, or RANK and WORLD_SIZE, if they "
+        "are set and there is no --scheduler; 1/1 for all)",
     )
     sub.add_argument(
         "--timeout",
@@ -81,44 +89,56 @@ def run(args: argparse.Namespace) -> int:
     """Run ``torch-modal precompute``; the exit status."""
     if args.out.suffix.lower() in (".safetensors", ".jsonl"):
         args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
+    if args.scheduler and (args.workers or args.shard):
+        args.fail("--scheduler shares the sets among the workers of its cluster; leave out --workers and --shard")
+    try:
+        shard = args.shard or ((1, 1) if args.scheduler else _shard_by_environment())
+    except (ValueError, argparse.ArgumentTypeError) as error:
+        args.fail(f"the variables SLURM_ARRAY_TASK_* or RANK and WORLD_SIZE make no sense ({error}); give --shard")
+    if threading.current_thread() is threading.main_thread():  # a batch system's request ends it as Ctrl-C does
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
-    from torch_modal.bulk.review import Options
-    from torch_modal.bulk.run import precompute_tree
+    from torch_modal.data.engines import dask_cluster, local_processes
+    from torch_modal.data.precompute import DONE, Options, Shard, precompute_tree
 
+    say: Callable[[str], None] = (lambda _: None) if args.quiet else _say
     options = Options(
         n_modes=args.modes,
         mesher=args.mesher,
         quality=args.quality,
+        cache_dir=args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir)),
         timeout=args.timeout,
-        workers=args.workers,
         retry=args.retry,
         overwrite=args.overwrite,
-        cache_dir=args.cache_dir,
     )
-    say: Callable[[str], None] = (lambda _: None) if args.quiet else _say
-    with _terminated_like_interrupted():
-        result = precompute_tree(args.root, args.out, options, say=say, bar=not args.quiet and sys.stderr.isatty())
-    return 0 if result.complete else INCOMPLETE
+    bar = not args.quiet and sys.stderr.isatty()
+    with dask_cluster(args.scheduler) if args.scheduler else local_processes(args.workers) as engine:
+        records = precompute_tree(args.root, args.out, engine, options, shard=Shard(*shard), say=say, bar=bar)
+    if all(record.status == DONE for record in records):
+        return 0
+    # torchrun would end the other shards, now and each time that it is started again.
+    return 0 if "TORCHELASTIC_RUN_ID" in os.environ else INCOMPLETE
+
+
+def _shard_by_environment() -> tuple[int, int]:
+    """The part of the sets that falls to this process of an array of jobs or a group of processes."""
+    for job, first, count in (
+        ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_MIN", "SLURM_ARRAY_TASK_COUNT"),
+        ("RANK", "", "WORLD_SIZE"),
+    ):
+        if job in os.environ and count in os.environ:
+            return _shard(f"{int(os.environ[job]) - int(os.environ.get(first, 0)) + 1}/{os.environ[count]}")
+    return 1, 1
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]+)/([0-9]+)", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise argparse.ArgumentTypeError(f"a shard is I/N with I from 1 to N, 3/16 for example; got {text!r}")
+    return int(match[1]), int(match[2])
 
 
 def _say(line: str) -> None:
     """Print a line, whatever names are in it."""
     encoding = sys.stdout.encoding or "utf-8"
     print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)
-
-
-@contextlib.contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """End as after Ctrl-C when torchrun or a batch system asks for it: the sets' processes are to end as well."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

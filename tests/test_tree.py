@@ -1,14 +1,12 @@
 """What counts as a set of key-frames in a folder tree, in which order, and where its bases go."""
 
-import json
 import os
 from pathlib import Path
 
 import pytest
 
-from torch_modal.bulk import records as r
-from torch_modal.bulk.records import Record, Records
-from torch_modal.bulk.tree import find_keyframe_sets, mesh_files, natural, places, same_stems
+from torch_modal.data.record import CRASHED, DONE, Record, inputs_key, read_record
+from torch_modal.data.tree import find_keyframe_sets, mesh_files, natural, places, printable
 
 
 def make(root: Path, *files: str) -> Path:
@@ -78,18 +76,12 @@ def test_places_mirror_the_tree(tmp_path: Path) -> None:
     assert len(set(taken.values())) == 5
 
 
-def test_one_shape_in_two_formats() -> None:
-    files = [Path(name) for name in ("a.obj", "b.obj", "a.ply")]
-    assert same_stems(files) == [files[0], files[2]]
-    assert same_stems(files[:2]) == []
-
-
 def test_key_depends_on_names_and_content(tmp_path: Path) -> None:
     make(tmp_path, "s/1.obj", "s/2.obj", "s/notes.txt")
-    first = r.inputs_key(mesh_files(tmp_path / "s"))
+    first = inputs_key(mesh_files(tmp_path / "s"))
     (tmp_path / "s" / "notes.txt").write_text("says nothing about the shape")
     os.utime(tmp_path / "s" / "1.obj", (0, 0))
-    assert r.inputs_key(mesh_files(tmp_path / "s")) == first
+    assert inputs_key(mesh_files(tmp_path / "s")) == first
     seen = {first}
     for change in (
         lambda: (tmp_path / "s" / "1.obj").write_text("v 0 0 0"),
@@ -98,50 +90,29 @@ def test_key_depends_on_names_and_content(tmp_path: Path) -> None:
         lambda: (tmp_path / "s" / "4.bin").write_text("the vertices of 4.gltf"),
     ):
         change()
-        seen.add(r.inputs_key(mesh_files(tmp_path / "s")))
+        seen.add(inputs_key(mesh_files(tmp_path / "s")))
     assert len(seen) == 5
 
 
 def test_record_comes_back_and_a_damaged_one_is_none(tmp_path: Path) -> None:
-    records = Records(tmp_path)
-    records.prepare()
-    record = Record(
-        "a\udcff/ü\n", r.CRASHED, "why", "place/" + "x" * 300, 1.5, 3, 90, ["1.obj"], inputs="ab", ours=True
-    )
-    records.write(record)
-    assert records.read(record.output) == record
-    assert records.read("a") is None
-    (file,) = (tmp_path / r.STATE / "sets").iterdir()
-    for damaged in ("", "[]", "{", '{"set": "a"}', '{"set": "a", "status": "done", "colour": 1}'):
+    record = Record("a\udcff/ü\n", CRASHED, "why", "place", 1.5, 3, 90, ["1.obj"], inputs="ab")
+    file = tmp_path / "record.json"
+    file.write_bytes(record.line())
+    assert read_record(file) == record
+    assert read_record(tmp_path / "missing") is None
+    for damaged in ("", "[]", "{", '{"status": "done"}', '{"set": "a", "status": "done", "colour": 1}'):
         file.write_text(damaged)
-        assert records.read(record.output) is None
-
-
-def test_report_has_a_line_for_each_set_in_order(tmp_path: Path) -> None:
-    records = Records(tmp_path)
-    records.prepare()
-    assert records.is_own_report()
-    records.write(Record("b", r.DONE, output="b", seconds=2.0))
-    records.write(Record("a", r.STARTED, output="a/a"))
-    found = records.write_report({"b": "b", "a": "a/a", "c": "c"}, {"d": "holds one mesh only"})
-    assert [record.status for record in found] == ["done", "unfinished", "unfinished"]
-    lines = [json.loads(line) for line in records.report.read_text().splitlines()]
-    assert [(line["set"], line["status"]) for line in lines] == [
-        ("b", "done"),
-        ("a", "unfinished"),
-        ("c", "unfinished"),
-        ("d", "left out"),
-    ]
-    assert lines[0]["seconds"] == 2.0 and lines[3]["reason"] == "holds one mesh only"
-    assert records.is_own_report()
-    for foreign in ("my notes", '{"a": 1}', "[1]"):
-        records.report.write_text(foreign)
-        assert not records.is_own_report()
+        assert read_record(file) is None
 
 
 def test_what_changed_names_the_options() -> None:
-    old = Record("a", r.DONE, inputs="1", parameters={"n_modes": 30, "mesher": "auto"})
-    assert r.what_changed(old, "1", {"mesher": "auto", "n_modes": 30}) == ""
-    assert r.what_changed(old, "2", {"mesher": "auto", "n_modes": 40}) == (
-        "its files changed, n_modes changed from 30 to 40"
-    )
+    old = Record("a", DONE, inputs="1", parameters={"n_modes": 30, "mesher": "auto"})
+    assert old.what_changed(Record("a", inputs="1", parameters={"mesher": "auto", "n_modes": 30})) == ""
+    new = Record("a", inputs="2", parameters={"mesher": "auto", "n_modes": 40})
+    assert old.what_changed(new) == "its files changed, n_modes changed from 30 to 40"
+
+
+def test_names_that_no_terminal_shows() -> None:
+    assert printable("a/ü") == "a/ü"
+    assert printable("a\nb") == "'a\\nb'"
+    assert printable("\udcff") == "\\udcff"

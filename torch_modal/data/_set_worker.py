@@ -1,0 +1,94 @@
+"""The process that computes one set, seen from inside: ``main(RESULT)``, with a line of JSON on its standard input.
+
+The line has the set's ``record`` so far, its folders ``source`` and ``target``, and ``options``. The result is the
+record of the set with its end, which stands beside the bases too. A crash leaves neither.
+"""
+
+import _thread
+import faulthandler
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+import warnings
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torch_modal.data.record import DONE, FAILED, REFUSED, Record, inputs_key
+from torch_modal.data.set_task import Options
+from torch_modal.data.stored import RECORD_FILE, write_set
+from torch_modal.errors import MeshError
+from torch_modal.io.files import write_atomically
+from torch_modal.keyframes.load import load_keyframes
+from torch_modal.precompute.modes import extract_bases
+
+ENOUGH = 30.0
+"""Seconds after which a process that was told to end does so at once."""
+
+
+def main(result_path: str) -> None:
+    """Compute a set and say how it went."""
+    # Whatever started the command may have SIGINT ignored, which children inherit.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    job = json.loads(sys.stdin.buffer.readline())
+    # Of a crash, the stack. And an end, even where a library hangs that lets no other thread of Python run.
+    faulthandler.enable()
+    faulthandler.dump_traceback_later(job["options"]["timeout"] + ENOUGH, exit=True)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    write_atomically(Path(result_path), compute(job).line())
+
+
+def compute(job: dict[str, Any]) -> Record:
+    """Write the bases of a set; its record, or what is wrong with it."""
+    record, options, started = Record(**job["record"]), Options(**job["options"]), time.monotonic()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+
+        def ended(status: str, reason: str = "", log: str = "") -> Record:
+            texts = (" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning))
+            seconds = round(time.monotonic() - started, 2)
+            return record.ended(status, reason, log=log, warnings=list(dict.fromkeys(texts)), seconds=seconds)
+
+        try:
+            files = [Path(job["source"], name) for name in record.files]
+            stem, n_files = Counter(file.stem for file in files).most_common(1)[0]
+            if n_files > 1:
+                raise MeshError(
+                    f"{n_files} files have the name {stem}; one shape in several formats is to be there once"
+                )
+            keyframes, faces = load_keyframes(files)
+            if inputs_key(files) != record.inputs:
+                raise RuntimeError("its files were written to while they were read; start again")
+            record = replace(record, keyframes=keyframes.shape[0], vertices=keyframes.shape[1])
+            bases = extract_bases(
+                keyframes,
+                faces,
+                options.n_modes,
+                mesher=options.mesher,  # type: ignore[arg-type]
+                settings=options.quality,
+                timeout=options.timeout / 2,  # so that its failure can still be told, or made good
+                cache_dir=options.cache_dir,
+                cache=options.cache_dir is not None,
+                progress=False,
+            )
+            done = ended(DONE)
+            write_set(job["target"], keyframes, faces, bases, record.files, beside={RECORD_FILE: done.line()})
+            return done
+        except (ValueError, RuntimeError) as error:
+            return ended(REFUSED if isinstance(error, ValueError) else FAILED, " ".join(str(error).split()))
+        except Exception as error:  # the machine, or a bug, which should not take the other sets' time
+            return ended(FAILED, f"{type(error).__name__}: {error}", traceback.format_exc()[-2000:])
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the pipe from the parent, then end this process and what it started."""
+    while os.read(0, 1):  # not sys.stdin, whose lock would be missed at the interpreter's end
+        pass
+    _thread.interrupt_main()
+    time.sleep(ENOUGH)
+    os._exit(1)

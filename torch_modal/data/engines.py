@@ -1,0 +1,68 @@
+"""What the tasks of a folder tree run on: processes of this machine, or a Dask cluster.
+
+Any other executor of `concurrent.futures` will do as well, as tasks share nothing.
+"""
+
+import os
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from torch_modal.precompute.parallel import n_cpus
+
+RETRIES = 2
+"""How often a cluster tries a task again that has raised an error: a machine without the package or the folders."""
+
+
+class Engine(NamedTuple):
+    """Where tasks run."""
+
+    executor: Executor
+    stop: Any = None
+    """An event of `threading` or `distributed` that tells the tasks to end."""
+    name: str = ""
+
+
+@contextmanager
+def local_processes(workers: int | None = None) -> Iterator[Engine]:
+    """A thread for each set at a time, which waits for the process of its set.
+
+    Args:
+        workers: Sets at a time; by default one for each processor, shared with the neighbours of the same ``torchrun``.
+    """
+    workers = workers or max(1, n_cpus() // int(os.environ.get("LOCAL_WORLD_SIZE") or 1))
+    stop = threading.Event()
+    executor = ThreadPoolExecutor(workers, thread_name_prefix="torch_modal-set")
+    try:
+        yield Engine(executor, stop)
+    finally:
+        stop.set()
+        executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def dask_cluster(address: str) -> Iterator[Engine]:
+    """The workers of a running Dask cluster, a set for each of their threads at a time.
+
+    The scheduler gives the sets of a dead worker to others, and a set that has taken several with it is given up
+    (``distributed.scheduler.allowed-failures``). A task that runs cannot be cancelled from outside, so the tasks look
+    at an event on the scheduler.
+
+    Args:
+        address: Of the scheduler, ``tcp://HOST:8786`` for example.
+
+    Raises:
+        ValueError: dask.distributed is not installed.
+        OSError: There is no scheduler.
+    """
+    try:
+        from distributed import Client, Event
+    except ImportError as error:
+        raise ValueError("a Dask cluster needs dask.distributed: pip install 'torch_modal[dask]'") from error
+    with Client(address, set_as_default=False) as client:
+        n_threads = sum(client.nthreads().values())
+        there = f"{n_threads} sets at a time" if n_threads else "which has no workers yet: sets wait for one"
+        executor = client.get_executor(pure=False, retries=RETRIES)
+        yield Engine(executor, Event(client=client), f"Dask cluster at {address}, {there}")

@@ -1,0 +1,212 @@
+"""The task of one set of a folder tree: compute its bases, in a process of its own, unless they are there.
+
+It is idempotent and shares nothing with other tasks but the file system: what is known of a set stands in its folder,
+which is renamed into place as a whole. So it can be run anywhere, any number of times, and by several at once.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torch_modal.data.record import CRASHED, DONE, FAILED, REFUSED, TIMEOUT, Record, inputs_key, read_record
+from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, RECORD_FILE, open_set, why_not_replaceable
+from torch_modal.data.tree import mesh_files
+from torch_modal.io.files import write_atomically
+from torch_modal.io.processes import describe_exit, end_process, last_line
+from torch_modal.precompute.cache import CACHE_VERSION
+from torch_modal.precompute.modes import QUALITIES
+
+BOOT = """\
+import sys
+root = sys.argv.pop(1)
+if root not in sys.path:
+    sys.path.insert(0, root)
+from torch_modal.data._set_worker import main
+main(sys.argv[1])
+"""
+COMMAND = [sys.executable, "-c", BOOT, str(Path(__file__).resolve().parents[2])]
+"""What is started, with the path of the result after it."""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+POLL = 0.5
+GRACE = 5.0
+"""Seconds between asking a process to end and killing it."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How sets are worked on: as for `extract_bases`, and whether to try again or to replace sets of others."""
+
+    n_modes: int = 30
+    mesher: str = "auto"
+    quality: str = "fast"
+    cache_dir: str | None = None
+    """None keeps nothing but the results."""
+    timeout: float = 600.0
+    """Seconds for a set; the mesher may take half of them."""
+    retry: bool = False
+    overwrite: bool = False
+
+    def parameters(self) -> dict[str, Any]:
+        """What the bases depend on besides the files."""
+        settings = asdict(QUALITIES[self.quality])
+        return {"n_modes": self.n_modes, "mesher": self.mesher, "settings": settings, "algorithm": CACHE_VERSION}
+
+
+class SetTask(NamedTuple):
+    """A set that is to have its bases; with absolute paths, as it may be done elsewhere."""
+
+    record: Record
+    """Its name, its place below the output folder, and the parameters."""
+    source: Path
+    """The folder with its meshes."""
+    out: Path
+    """The output folder, which must exist."""
+    options: Options
+
+    @property
+    def target(self) -> Path:
+        """The folder that gets its bases."""
+        return self.out / self.record.output
+
+
+class Outcome(NamedTuple):
+    """What came of a task."""
+
+    record: Record
+    now: bool
+    """Whether it was found out by this task, and not by an earlier one."""
+
+
+def run_set(task: SetTask, stop: threading.Event | None = None) -> Outcome:
+    """Compute the bases of a set, if there are none of the same files and settings.
+
+    Args:
+        task: The set.
+        stop: Anything with ``is_set()``. Once it is set, the set's process is ended and the set stays as it was.
+
+    Raises:
+        RuntimeError: This machine has another version of the package, or does not see the output folder.
+    """
+    new, target = replace(task.record, host=socket.gethostname()), task.target
+    if new.parameters != task.options.parameters() or not task.out.is_dir():
+        why = f"no folder {task.out}" if not task.out.is_dir() else "another version of torch_modal than the command"
+        raise RuntimeError(f"{new.host} has {why}; all machines need the same package and the same folders")
+    try:
+        files = mesh_files(task.source)
+        new = replace(new, files=[file.name for file in files], inputs=inputs_key(files))
+    except OSError as error:
+        return Outcome(new.ended(FAILED, f"its files cannot be read: {error}"), True)
+    before = read_record(target / RECORD_FILE)
+    if before is not None:
+        why = before.what_changed(new) or _why_again(before, task)
+        if not why:
+            return Outcome(before, False)
+        new = replace(new, reason=why)
+    if obstacle := _obstacle(target, task.options.overwrite):
+        return Outcome(new.ended(REFUSED, obstacle), True)
+
+    record = _in_own_process(task._replace(record=new), stop)
+    if record.status == DONE or not record.finished:
+        return Outcome(record, True)
+    meanwhile = read_record(target / RECORD_FILE)  # another run may have had more luck
+    if meanwhile is not None and meanwhile.status == DONE and not meanwhile.what_changed(new):
+        return Outcome(meanwhile, True)
+    if (target / BASES_FILE).exists():
+        record.warnings.append(f"{target} still holds the bases of earlier files or settings")
+    with contextlib.suppress(OSError):  # then it is tried again next time
+        target.mkdir(parents=True, exist_ok=True)
+        write_atomically(target / RECORD_FILE, record.line())
+    return Outcome(record, True)
+
+
+def _why_again(before: Record, task: SetTask) -> str:
+    """Why a set is worked on again though nothing changed; nothing if it is not."""
+    if before.status != DONE:
+        return f"tried again after: {before.reason}" if task.options.retry else ""
+    try:
+        open_set(task.target)
+        return ""
+    except (OSError, ValueError) as error:
+        return f"its bases are gone or damaged: {error}"
+
+
+def _obstacle(folder: Path, overwrite: bool) -> str:
+    """What is in the way of the bases; files of the user are never touched, sets of others only if asked."""
+    if obstacle := why_not_replaceable(folder):
+        return f"{obstacle}; move it away"
+    there = any((folder / name).exists() for name in (KEYFRAMES_FILE, BASES_FILE))
+    if there and not (folder / RECORD_FILE).exists() and not overwrite:
+        return f"{folder} holds a stored set that this command did not write; --overwrite replaces it"
+    return ""
+
+
+def _in_own_process(task: SetTask, stop: threading.Event | None) -> Record:
+    """Start a fresh interpreter on the set and wait for it; unfinished if that was stopped.
+
+    It has a session of its own, so that Ctrl-C reaches this process alone, and a pipe from it, whose end tells it that
+    this process is gone. It is no process of `multiprocessing`, as a Dask worker is daemonic and may not have those.
+    """
+    started, timeout = time.monotonic(), task.options.timeout
+    job = {"record": asdict(task.record), "options": asdict(task.options), "source": task.source, "target": task.target}
+    with tempfile.TemporaryDirectory(prefix="torch_modal-set-", ignore_cleanup_errors=True) as scratch:
+        result, log_file = Path(scratch) / "record.json", Path(scratch) / "log.txt"
+        with log_file.open("wb") as log:
+            process = subprocess.Popen(
+                [*COMMAND, str(result)],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=scratch,
+                env={**os.environ, **dict.fromkeys(THREADS, "1"), "TMPDIR": scratch},
+                start_new_session=True,
+            )
+        try:
+            assert process.stdin is not None
+            with contextlib.suppress(BrokenPipeError):  # it ended at once; its exit status says more
+                process.stdin.write(json.dumps(job, default=str).encode() + b"\n")
+                process.stdin.flush()
+            in_time = _wait(process, started + timeout, stop)
+            seconds = round(time.monotonic() - started, 2)
+        finally:
+            _end(process)
+        said, record = log_file.read_text(errors="replace")[-2000:], read_record(result)
+    if record is not None or in_time is None:
+        return record or task.record
+    new, code = replace(task.record, seconds=seconds, log=said), process.returncode
+    if not in_time:
+        return new.ended(TIMEOUT, f"no result after the timeout of {timeout:g} s")
+    hint = "perhaps memory ran out" if code == -signal.SIGKILL else last_line(said)
+    reason = f"its process ended with {describe_exit(code)}" + (f" ({hint})" if hint else "")
+    return new.ended(CRASHED if code < 0 else FAILED, reason)
+
+
+def _wait(process: subprocess.Popen[bytes], end: float, stop: threading.Event | None) -> bool | None:
+    """Whether a process ended before a time; None if it was stopped."""
+    while stop is None or not stop.is_set():
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(min(POLL, max(end - time.monotonic(), 0.0)))
+            return True
+        if time.monotonic() >= end:
+            return False
+    return None
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Interrupt a process, so that it ends the mesher, whose session is another; kill it if that does not help."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(GRACE)
+    end_process(process)
+    with contextlib.suppress(OSError):
+        process.communicate()  # closes the pipe
