@@ -17,7 +17,7 @@ setup(
     license="MIT",
     python_requires=">=3.10",
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
-    package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply"]},
+    package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply", "view/page_assets/*"]},
     install_requires=[
         "torch>=2.4",
         "numpy>=1.24",

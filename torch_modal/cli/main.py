@@ -1,4 +1,4 @@
-"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``demo`` and ``cache``.
+"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``view``, ``demo`` and ``cache``.
 
 Nothing heavy is imported before the arguments are known to make sense.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from torch_modal.bulk import command as bulk
-from torch_modal.cli import commands
+from torch_modal.cli import commands, view
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -275,6 +275,9 @@ def _parser() -> argparse.ArgumentParser:
     bulk.add_arguments(sub, _number)
     _add_modes(sub)
     bulk.add_common(sub)
+
+    sub = command("view", view.run, view.SUMMARY, view.DESCRIPTION, view.EXAMPLES)
+    view.add_arguments(sub, _number)
 
     sub = command("demo", commands.demo, "try it on the samples that come with it", DEMO, DEMO_EXAMPLES)
     sub.add_argument(
