@@ -37,7 +37,7 @@ setup(
     ],
     extras_require={
         "pyg": ["torch_geometric>=2.4"],
-        "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4"],
+        "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4", "selenium>=4.20"],
     },
     entry_points={"console_scripts": ["torch-modal = torch_modal.cli.main:main"]},
 )

@@ -24,6 +24,8 @@ class Viewer {
     this.clock = new Clock(data.times, data.closed);
     this.keyframes = data.keyframes;
     this.frame = 0;
+    this.drawn = 0;
+    this.busy = 0;
     this.playing = false;
     this.forward = true;
     this.overlaid = false;
@@ -158,12 +160,13 @@ class Viewer {
       actor.setLook(this.overlaid && order > 0 ? 0.45 : 1, order + 1);
     });
     find("labels").replaceChildren();
-    for (const port of this.overlaid ? [] : this.stage.viewports) {
-      const number = port.shown[0];
-      const label = make("div", { class: "name", id: `name-${number}` }, this.names[number], make("small"));
-      label.style.setProperty("--color", LOOKS[number % LOOKS.length].line);
-      Object.assign(label.style, { left: `${port.x}px`, top: `${port.y}px` });
-      find("labels").append(label);
+    for (const port of this.stage.viewports) {
+      port.shown.forEach((number, line) => {
+        const label = make("div", { class: "name", id: `name-${number}` }, this.names[number], make("small"));
+        label.style.setProperty("--color", LOOKS[number % LOOKS.length].line);
+        Object.assign(label.style, { left: `${port.x}px`, top: `${port.y + 22 * line}px` });
+        find("labels").append(label);
+      });
     }
     this.shapeChanged = true;
   }
@@ -205,7 +208,6 @@ class Viewer {
     find("highest").textContent = "";
     if (!this.measure) return;
     const { signed, label } = this.measures[this.measure];
-    find("quantity").textContent = label;
     const stops = (signed ? TWO_SIDED : SEQUENTIAL).map((rgb) => `rgb(${rgb.map((c) => 255 * c)})`);
     find("scale").style.background = `linear-gradient(to right, ${stops})`;
     const values = new Float32Array(this.nVertices);
@@ -228,8 +230,8 @@ class Viewer {
     const all = curves.filter(Boolean).flat();
     const low = signed ? Math.min(0, ...all) : 0;
     const high = Math.max(0, ...all);
-    const range = signed ? `${low.toFixed(2)} to ${high.toFixed(2)} %` : `up to ${high.toFixed(2)} %`;
-    find("highest").textContent = `mean ${label}: ${range}`;
+    const range = signed ? `${low.toFixed(2)} to ${high.toFixed(2)} %` : `up to ${high.toFixed(2)} % in the mean`;
+    find("highest").textContent = `${label}: ${range}`;
     this.timeline.draw(curves, this.names.map((_, number) => LOOKS[number % LOOKS.length].line), low, high);
   }
 
@@ -361,13 +363,15 @@ class Viewer {
   start() {
     let last = performance.now();
     const turn = (now) => {
+      const began = performance.now();
       if (this.playing) this.#advance(Math.min((now - last) / 1000, 0.25));
       last = now;
       if (this.shapeChanged) this.#updateShapes();
       if (this.shapeChanged || this.viewChanged) {
         this.stage.draw();
         this.#placeMarks();
-        this.drawn = (this.drawn ?? 0) + 1;
+        this.drawn += 1;
+        this.busy += performance.now() - began;
       }
       this.shapeChanged = this.viewChanged = false;
       requestAnimationFrame(turn);
@@ -398,7 +402,11 @@ async function main() {
     },
     /** How many pictures have been drawn so far. */
     get drawn() {
-      return viewer.drawn ?? 0;
+      return viewer.drawn;
+    },
+    /** Milliseconds that the page's scripts took for them. */
+    get busy() {
+      return viewer.busy;
     },
     /** Where a vertex is at the present frame, in the coordinates of the caller. */
     positionOf(vertex, sequence = 0) {

@@ -23,13 +23,13 @@ const SURFACE_SHADER = {
     void main() {
       vec3 view = normalize(vView);
       vec3 n = normalize(vNormal);
-      if (dot(n, view) < 0.0) n = -n; // open meshes show their inside too
+      if (!gl_FrontFacing) n = -n; // open meshes show their inside too
       float light = lit(n, vec3(-2.0, 3.0, 4.0), 0.82) + lit(n, vec3(4.0, 1.0, 3.0), 0.30)
                   + lit(n, vec3(0.0, -3.0, 2.0), 0.14);
       float rim = 0.8 + 0.2 * sqrt(max(dot(n, view), 0.0)); // darker outlines part what overlaps
       float shine = 0.07 * pow(max(dot(n, normalize(normalize(vec3(-2.0, 3.0, 4.0)) + view)), 0.0), 24.0);
       vec3 base = mix(tint, vPaint, painted);
-      gl_FragColor = vec4(base * (0.25 + 0.85 * light) * rim + shine, opacity);
+      gl_FragColor = vec4(base * (0.25 + 0.77 * light) * rim + shine, opacity);
     }`,
 };
 
