@@ -310,10 +310,13 @@ class Opened:
         return self.chrome.execute_script(text, *arguments)
 
     def settle(self) -> None:
-        """Wait until nothing more is drawn."""
-        before = None
-        while before != (before := self.script("return torchModal.drawn")):
-            time.sleep(0.25)
+        """Wait until all is drawn and nothing moves, also after two more turns of the page's loop."""
+        look = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(() =>"
+        for _ in range(200):
+            if self.chrome.execute_async_script(f"{look} done(torchModal.idle))))"):
+                return
+            time.sleep(0.05)
+        raise AssertionError("the page does not come to rest")
 
     def seek(self, frame: float) -> None:
         self.script("torchModal.seek(arguments[0])", frame)
@@ -419,13 +422,12 @@ def test_scrubbing_and_keys(page: Opened) -> None:
 
 
 def test_playing(page: Opened) -> None:
+    before = page.script("return torchModal.drawn")
     page.choose("ending", "stop")
-    page.chrome.find_element("id", "play").click()
-    time.sleep(0.5)
-    assert 0 < page.script("return torchModal.frame") <= 6
-    page.settle()  # a second in all
+    page.click("#play")  # and waits for the end
     assert page.text("#readout") == "frame 6 / 6"
     assert page.chrome.find_element("id", "play").get_attribute("aria-pressed") == "false"
+    assert page.script("return torchModal.drawn") >= before + 3, "it went through frames between"
 
 
 def test_picking(page: Opened, growing: np.ndarray) -> None:
@@ -545,6 +547,8 @@ def test_cyclic_times_and_notebook(
         if page.script("return window.torchModal?.readyAfter"):
             break
         time.sleep(0.1)
+    else:
+        raise AssertionError("the page in the notebook does not start")
     page.seek(6.5)  # half-way back to the first
     np.testing.assert_allclose(page.position(5), 0.5 * (growing[6, 5] + growing[0, 5]), atol=1e-3)
     page.seek(5.5)

@@ -26,6 +26,7 @@ class Viewer {
     this.frame = 0;
     this.drawn = 0;
     this.busy = 0;
+    this.measuring = false;
     this.playing = false;
     this.forward = true;
     this.overlaid = false;
@@ -206,6 +207,7 @@ class Viewer {
     this.layOut();
     this.timeline.draw(null);
     find("highest").textContent = "";
+    this.measuring = Boolean(this.measure);
     if (!this.measure) return;
     const { signed, label } = this.measures[this.measure];
     const stops = (signed ? TWO_SIDED : SEQUENTIAL).map((rgb) => `rgb(${rgb.map((c) => 255 * c)})`);
@@ -226,6 +228,7 @@ class Viewer {
       if (this.run !== run) return;
       since = performance.now();
     }
+    this.measuring = false;
     this.setScale(rounded(top));
     const all = curves.filter(Boolean).flat();
     const low = signed ? Math.min(0, ...all) : 0;
@@ -238,7 +241,7 @@ class Viewer {
   setScale(most) {
     this.most = most;
     find("most").value = most;
-    find("least").textContent = this.measures[this.measure].signed ? `−${most} %` : "0";
+    find("least").textContent = this.measures[this.measure].signed ? `-${most} %` : "0";
     this.shapeChanged = true;
   }
 
@@ -399,6 +402,10 @@ async function main() {
     seek: (frame) => viewer.seek(frame),
     get frame() {
       return viewer.frame;
+    },
+    /** Whether all is drawn, and nothing moves. */
+    get idle() {
+      return !(viewer.playing || viewer.measuring || viewer.shapeChanged || viewer.viewChanged);
     },
     /** How many pictures have been drawn so far. */
     get drawn() {
