@@ -17,7 +17,7 @@ setup(
     license="MIT",
     python_requires=">=3.10",
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
-    package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply"]},
+    package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply", "view/page_assets/*"]},
     install_requires=[
         "torch>=2.4",
         "numpy>=1.24",
@@ -37,7 +37,14 @@ setup(
     extras_require={
         "pyg": ["torch_geometric>=2.4"],
         "dask": ["distributed>=2024.5"],
-        "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4", "distributed>=2024.5"],
+        "test": [
+            "pytest>=8",
+            "ruff>=0.6",
+            "mypy>=1.11",
+            "torch_geometric>=2.4",
+            "distributed>=2024.5",
+            "selenium>=4.20",
+        ],
     },
     entry_points={"console_scripts": ["torch-modal = torch_modal.cli.main:main"]},
 )

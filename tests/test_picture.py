@@ -119,13 +119,13 @@ def test_numbers_become_colours_with_one_bar(tmp_path):
 def test_automatic_camera():
     """Which way is up, and from where a flat shape is seen, in three worlds."""
     plate = np.asarray(trimesh.creation.box((4, 6, 0.5)).vertices)  # stands in a Y-up world, faces Z
-    right, up, front = picture._view_rotation(plate, None, None)
+    right, up, front = picture.view_rotation(plate, None, None)
     assert up[1] > 0.9 and right[1] == pytest.approx(0) and front[2] > 0.85
     z_up = plate[:, [0, 2, 1]] * [1, -1, 1]  # the same in a Z-up world, where front is -Y
-    right, up, front = picture._view_rotation(z_up, None, None)
+    right, up, front = picture.view_rotation(z_up, None, None)
     assert up[2] > 0.9 and front[1] < -0.85
     from_side = plate[:, [2, 1, 0]]  # faces X: the camera walks round, and Y stays up
-    right, up, front = picture._view_rotation(from_side, None, None)
+    right, up, front = picture.view_rotation(from_side, None, None)
     assert up[1] > 0.9 and abs(front[0]) > 0.85
 
 
@@ -141,7 +141,7 @@ def test_automatic_camera():
 )
 def test_camera_directions(view, up, expected):
     """Right, up and to the viewer, by hand."""
-    np.testing.assert_allclose(picture._view_rotation(np.eye(3), view, up), expected, atol=1e-12)
+    np.testing.assert_allclose(picture.view_rotation(np.eye(3), view, up), expected, atol=1e-12)
 
 
 def test_what_rests_stays_and_what_travels_is_followed():

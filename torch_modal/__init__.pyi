@@ -47,6 +47,9 @@ from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
 from .sequence.subdivide import keyframe_places as keyframe_places
 from .sequence.subdivide import linear_sequence as linear_sequence
 from .sequence.subdivide import subdivide as subdivide
+from .view.page import Page as Page
+from .view.page import show as show
+from .view.page import write_page as write_page
 from .view.picture import render_sequence as render_sequence
 
 __version__: str

@@ -1,4 +1,4 @@
-"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``demo`` and ``cache``.
+"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``view``, ``demo`` and ``cache``.
 
 Nothing heavy is imported before the arguments are known to make sense.
 """
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli import commands, precompute
+from torch_modal.cli import commands, precompute, view
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -278,6 +278,9 @@ def _parser() -> argparse.ArgumentParser:
     precompute.add_arguments(sub, _number)
     _add_modes(sub)
     precompute.add_common(sub)
+
+    sub = command("view", view.run, view.SUMMARY, view.DESCRIPTION, view.EXAMPLES)
+    view.add_arguments(sub, _number)
 
     sub = command("demo", commands.demo, "try it on the samples that come with it", DEMO, DEMO_EXAMPLES)
     sub.add_argument(

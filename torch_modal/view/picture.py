@@ -28,16 +28,27 @@ CELL_PIXELS = 420  # the longer side of a cell
 MARGIN = 1.06  # of a cell against the largest shape in it
 
 
-def _view_rotation(shape: FloatArray, view: tuple[float, float] | None, up: Literal["y", "z"] | None) -> FloatArray:
+def check_view(view: tuple[float, float] | None, up: str | None) -> None:
+    """Raise if these do not say from where to look."""
+    if view is not None and not (len(view) == 2 and np.isfinite(view).all()):
+        raise ValueError(f"view must be two numbers of degrees, azimuth and elevation, got {view}.")
+    if up not in (None, "y", "z"):
+        raise ValueError(f"up must be 'y' or 'z', got {up!r}.")
+
+
+def up_axis(shape: FloatArray, up: Literal["y", "z"] | None = None) -> Literal["y", "z"]:
+    """What is up, if not said: Y, unless the shape is flat in Y (less than half of both other extents), then Z."""
+    extent = np.ptp(shape, axis=0)
+    return up or ("z" if extent[1] < 0.5 * min(extent[0], extent[2]) else "y")
+
+
+def view_rotation(shape: FloatArray, view: tuple[float, float] | None, up: Literal["y", "z"] | None) -> FloatArray:
     """Rows are the directions right, up and to the viewer. *Shape:* ``(3, 3)``.
 
-    Y is up unless the shape is flat in Y (less than half of both other extents): then Z. Without a ``view``
-    the viewer stands where the least principal direction points, and so sees the widest side, a little from
-    the side and from above so that depth shows.
+    Without a ``view`` the viewer stands where the least principal direction points, and so sees the widest side, a
+    little from the side and from above so that depth shows.
     """
-    extent = np.ptp(shape, axis=0)
-    if up is None:
-        up = "z" if extent[1] < 0.5 * min(extent[0], extent[2]) else "y"
+    up = up_axis(shape, up)
     # Columns: the directions of azimuth 0 and 90 degrees, and up. Front is +Z where Y is up, -Y where Z is.
     world = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]] if up == "y" else [[0, -1, 0], [1, 0, 0], [0, 0, 1]]).T
     if view is None:
@@ -178,10 +189,7 @@ def render_sequence(
         raise ValueError(f"out must end in .png or .pdf, got {path.name!r}.")
     if renderer not in ("auto", "pyvista", "matplotlib"):
         raise ValueError(f"renderer must be auto, pyvista or matplotlib, got {renderer!r}.")
-    if view is not None and not (len(view) == 2 and np.isfinite(view).all()):
-        raise ValueError(f"view must be two numbers of degrees, azimuth and elevation, got {view}.")
-    if up not in (None, "y", "z"):
-        raise ValueError(f"up must be 'y' or 'z', got {up!r}.")
+    check_view(view, up)
     refuse_existing(path, overwrite)
 
     rows = list(frames_by_row)
@@ -205,7 +213,7 @@ def render_sequence(
     keyframes = check_indices(given, n_frames, "keyframe_indices")
 
     shown = np.stack([frames[chosen] for frames in shapes])  # (R, C, V, 3)
-    rotation = _view_rotation(shapes[0][0], view, up)
+    rotation = view_rotation(shapes[0][0], view, up)
     points, half = _centred(shown @ rotation.T)
     paint = np.empty(shown.shape)
     paint[:] = np.array([KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR for n in chosen])[:, None]

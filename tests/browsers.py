@@ -1,0 +1,96 @@
+"""A browser without a window, driven by selenium: for the tests of the page and its benchmark."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+READY_SECONDS = 60
+
+
+class NoBrowser(Exception):
+    """No page can be opened here, and why."""
+
+
+def find_browser() -> tuple[str, str]:
+    """Files of a browser and of its driver; the driver is never downloaded."""
+    try:
+        import selenium.webdriver  # noqa: F401
+    except ImportError:
+        raise NoBrowser("selenium is not installed") from None
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    driver = shutil.which("chromedriver")
+    if browser is None or driver is None:
+        missing = "no Chromium or Chrome" if browser is None else "no chromedriver"
+        raise NoBrowser(f"{missing} on the PATH (on Debian: apt-get install chromium chromium-driver)")
+    return browser, driver
+
+
+@contextmanager
+def open_browser(width: int = 1200, height: int = 800, *extra: str) -> Iterator[Chrome]:
+    """A browser that reaches nothing but files, and writes down every request. It draws in software."""
+    from selenium.common.exceptions import WebDriverException
+    from selenium.webdriver import Chrome, ChromeOptions
+    from selenium.webdriver.chrome.service import Service
+
+    browser, driver = find_browser()
+    options = ChromeOptions()
+    options.binary_location = browser
+    for argument in (
+        "--headless=new",
+        "--no-sandbox",  # which root, as in containers, cannot have
+        "--disable-dev-shm-usage",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--hide-scrollbars",
+        "--force-device-scale-factor=1",
+        "--host-resolver-rules=MAP * ~NOTFOUND",
+        f"--window-size={width},{height}",
+        *extra,
+    ):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    try:
+        chrome = Chrome(options=options, service=Service(driver))
+    except WebDriverException as error:
+        raise NoBrowser(f"{browser} does not start: {str(error).splitlines()[0]}") from None
+    try:
+        yield chrome
+    finally:
+        chrome.quit()
+
+
+def open_page(chrome: Chrome, path: Path) -> float:
+    """Open a page of shapes; milliseconds from the navigation to after its first picture."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    chrome.get(path.absolute().as_uri())
+    # A message says that it is loading, is hidden, or says what is wrong.
+    script = (
+        "const message = document.querySelector('#message');"
+        "if (window.torchModal?.readyAfter) return window.torchModal.readyAfter;"
+        "return message.hidden || message.innerText.startsWith('Loading') ? null : message.innerText"
+    )
+    ready = WebDriverWait(chrome, READY_SECONDS).until(lambda driver: driver.execute_script(script))
+    if not isinstance(ready, (int, float)):
+        raise AssertionError(f"the page says: {ready}; {console(chrome)}")
+    return float(ready)
+
+
+def console(chrome: Chrome) -> list[str]:
+    """What the page has put on the console since it was last asked."""
+    return [f"{entry['level']}: {entry['message']}" for entry in chrome.get_log("browser")]
+
+
+def requests(chrome: Chrome) -> list[str]:
+    """Addresses that the page has asked for since it was last asked."""
+    events = (json.loads(entry["message"])["message"] for entry in chrome.get_log("performance"))
+    return [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]

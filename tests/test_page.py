@@ -1,0 +1,571 @@
+"""The page: what it holds, what it refuses, and in a real browser what it shows and does."""
+
+import base64
+import json
+import re
+import time
+import zlib
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from browsers import NoBrowser, console, open_browser, open_page, requests
+
+import torch_modal as tm
+from torch_modal.cli.main import main
+from torch_modal.errors import MeshError
+from torch_modal.view.page_data import LEVELS, grid_of, pack_faces, pack_frames, quantise
+from torch_modal.view.page_input import read_shapes
+
+NASTY = "</script><script>document.title='broken'</script><img src=x onerror=\"document.title='broken'\">&amp;'"
+
+
+@pytest.fixture(scope="module")
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    """A sphere around (1, 2, 3), of radius 2, with one vertex straight towards +z: vertices (V, 3), faces (F, 3)."""
+    mesh = trimesh.creation.uv_sphere(radius=2.0, count=(16, 16))
+    assert np.isclose(mesh.vertices[:, 2].max(), 2.0)
+    return np.array(mesh.vertices) + np.array([1.0, 2.0, 3.0]), np.array(mesh.faces, dtype=np.int64)
+
+
+@pytest.fixture(scope="module")
+def growing(ball: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Seven frames of the ball: from its size to 1.6 times that, a tenth a frame."""
+    vertices, _ = ball
+    centre = np.array([1.0, 2.0, 3.0])
+    return np.stack([centre + (1 + 0.1 * n) * (vertices - centre) for n in range(7)])
+
+
+def data_of(page: tm.Page) -> dict[str, Any]:
+    """What the page's scripts find in it."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.html, re.S)
+    assert found
+    return json.loads(found.group(1))
+
+
+def unpacked(text: str, width: int) -> np.ndarray:
+    """Signed numbers from a page's text, as page_data.py describes it: one at a time, the plain way."""
+    planes = zlib.decompress(base64.b64decode(text))
+    count = len(planes) // width
+    numbers = [sum(planes[p * count + i] << (8 * p) for p in range(width)) for i in range(count)]
+    return np.array([n // 2 if n % 2 == 0 else -(n + 1) // 2 for n in numbers])
+
+
+# ---------------------------------------------------------------------------------------------------------- the data
+def test_frames_come_back_within_half_a_step(generator: torch.Generator) -> None:
+    # Jumps over the whole range: differences wrap.
+    frames = 1e3 * torch.rand(5, 40, 3, generator=generator, dtype=torch.float64).numpy() - 700
+    frames[1, 0], frames[2, 0] = 300.0, -700.0
+    grid = grid_of([frames])
+    residual = unpacked(pack_frames(quantise(frames, grid)), 2).reshape(5, 3, 40).transpose(0, 2, 1)
+    numbers = np.zeros_like(residual)
+    for n in range(5):
+        guess = 2 * numbers[n - 1] - numbers[n - 2] if n > 1 else numbers[0] if n else 0
+        numbers[n] = (guess + residual[n]) % 2**16
+    assert np.abs(grid.origin + grid.step * numbers - frames).max() <= 0.5001 * grid.step
+    assert grid.step == pytest.approx(np.ptp(frames, axis=(0, 1)).max() / LEVELS)
+
+
+def test_faces_come_back(ball: tuple[np.ndarray, np.ndarray]) -> None:
+    many = np.concatenate([ball[1], ball[1] + 70_000])  # more than 16 bits
+    np.testing.assert_array_equal(np.cumsum(unpacked(pack_faces(many), 4)), many.reshape(-1))
+
+
+def test_smooth_motion_is_small() -> None:
+    """33 shapes of 8,000 vertices on smooth ways take less than 3 MB, with everything that the page needs."""
+    mesh = trimesh.creation.uv_sphere(count=(90, 90))
+    rough = 0.02 * np.random.default_rng(0).standard_normal(mesh.vertices.shape)
+    vertices, faces = mesh.vertices + rough, mesh.faces
+    assert len(vertices) >= 7900
+    turns = np.linspace(0, 1, 33)[:, None] * vertices[None, :, 2]
+    c, s = np.cos(turns), np.sin(turns)
+    x, y, z = vertices.T
+    frames = np.stack([c * x - s * y, s * x + c * y, np.broadcast_to(z, c.shape)], axis=-1)
+    assert len(tm.show(frames, faces).html.encode()) < 3e6
+
+
+def test_one_shape_and_points_at_one_place() -> None:
+    corners, faces = np.eye(4, 3)[None], np.array([[0, 1, 2]])
+    assert data_of(tm.show(corners, faces))["keyframes"] == [0]
+    assert data_of(tm.show(0 * corners + 5, faces))["step"] == 1.0
+
+
+def test_what_the_page_is_told(ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+    faces = ball[1]
+    page = tm.show({"a": torch.from_numpy(growing).float(), "b": growing}, torch.from_numpy(faces), cyclic=True)
+    data = data_of(page)
+    assert [one["name"] for one in data["sequences"]] == ["a", "b"]
+    assert data["closed"] and data["keyframes"] == [0, 6] and data["fps"] == 24.0
+    assert data["diagonal"] * data["step"] == pytest.approx(np.linalg.norm(np.ptp(growing[0], axis=0)), rel=1e-4)
+    centre = data["origin"] + data["step"] * np.array(data["view"]["centre"])
+    np.testing.assert_allclose(centre, [1, 2, 3], atol=0.05)
+    there_and_back = np.concatenate([growing, growing[-2::-1]])
+    assert not data_of(tm.show(there_and_back, faces, cyclic=True))["closed"], "the last frame is the first already"
+    assert data_of(tm.show(growing[:, :, [0, 2, 1]], faces, up="z"))["view"]["world_up"] == [0, 0, 1]
+
+
+def test_page_needs_nothing_else(ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+    page = tm.show({NASTY: growing}, ball[1], title=NASTY)
+    references, titles = [], []
+
+    class Parser(HTMLParser):
+        last = ""
+
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            references.extend(value for name, value in attrs if name in ("src", "href", "srcset", "action"))
+            assert not [name for name, _ in attrs if name.startswith("on") or name == "style"]
+            self.last = tag
+
+        def handle_data(self, text: str) -> None:
+            if self.last in ("title", "h1"):
+                titles.append(text.strip())
+
+    Parser().feed(page.html)
+    assert references == ["data:,"]
+    assert [title for title in titles if title] == [NASTY, NASTY]
+    assert "connect-src" not in page.html.split("<style>")[0], "default-src 'none' stands for it"
+    assert page.html.count("<script") == 3
+
+
+def test_save_and_notebook(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+    page = tm.show(growing, ball[1], height=321)
+    path = page.save(tmp_path / "new" / "page.html")
+    assert path.read_text(encoding="utf-8") == page.html
+    with pytest.raises(FileExistsError, match="overwrite"):
+        page.save(path)
+    with pytest.raises(ValueError, match=r"\.html"):
+        page.save(tmp_path / "page.png")
+    assert "height: 321px" in page._repr_html_()
+    assert len(repr(page)) < 100
+    written = tm.write_page(growing, ball[1], path, overwrite=True)
+    assert "<title>page</title>" in written.read_text(encoding="utf-8")
+    with pytest.raises(FileExistsError):
+        tm.write_page(growing, ball[1], path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sequences": {}}, "empty"),
+        ({"sequences": {"a": np.zeros((2, 4, 3)), "b": np.zeros((3, 4, 3))}}, r"'a' \(2, 4, 3\), 'b' \(3, 4, 3\)"),
+        ({"sequences": np.zeros((4, 3))}, r"frames\[None\]"),
+        ({"sequences": np.full((2, 4, 3), np.nan)}, "finite"),
+        ({"faces": np.array([[0, 1, 9]])}, "index the 4 vertices"),
+        ({"keyframe_indices": [5]}, "from 0 to 1"),
+        ({"times": [0.0]}, "2 finite numbers"),
+        ({"times": [1.0, 1.0]}, "larger than the one before"),
+        ({"fps": 0.0}, "fps"),
+        ({"height": 0}, "height"),
+        ({"view": (0.0, float("inf"))}, "view"),
+        ({"up": "x"}, "up"),
+    ],
+)
+def test_what_cannot_be_shown(changes: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"sequences": np.zeros((2, 4, 3)), "faces": np.array([[0, 1, 2]])} | changes
+    with pytest.raises(ValueError, match=message):
+        tm.show(**given)
+
+
+# -------------------------------------------------------------------------------------------------------- its input
+def test_animation_is_read_back(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+    path = tm.save_animation(growing, ball[1], tmp_path / "a.glb", fps=12, keyframe_indices=[0, 4], cyclic=True)
+    read = read_shapes([path])
+    np.testing.assert_allclose(read.frames, growing, atol=1e-6)
+    np.testing.assert_array_equal(read.faces, ball[1])
+    assert read[2:] == ([0, 4], 12.0, None, True)
+    with pytest.warns(UserWarning, match="holds 4 of the 7"):
+        tm.save_animation(growing, ball[1], path, fps=12, keyframe_indices=[0, 3, 6], max_targets=3, overwrite=True)
+    thin = read_shapes([path])
+    kept = np.rint(12 * np.array(thin.times)).astype(int)
+    np.testing.assert_allclose(thin.frames, growing[kept], atol=1e-6)
+    assert [kept[i] for i in thin.keyframe_indices or []] == [0, 3, 6]
+    assert thin.fps == pytest.approx(3 / 0.5)
+    tm.save_animation(growing[:1], ball[1], path, overwrite=True)
+    assert read_shapes([path]).frames.shape == (1, *growing[0].shape)
+
+
+def test_folder_is_read_in_its_numbers_order(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray]) -> None:
+    vertices, faces = ball
+    for n in (10, 2, 1):
+        trimesh.Trimesh(vertices + n, faces, process=False).export(tmp_path / f"f{n}.ply")
+    (tmp_path / "notes.txt").write_text("not a mesh")
+    starts = read_shapes([tmp_path]).frames[:, 0] - vertices[0]
+    np.testing.assert_allclose(starts, np.array([[1], [2], [10]]).repeat(3, axis=1), atol=1e-5)
+    (tmp_path / "other.obj").write_text("v 0 0 0")
+    with pytest.raises(MeshError, match="several kinds"):
+        read_shapes([tmp_path])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MeshError, match="no meshes"):
+        read_shapes([tmp_path / "empty"])
+
+
+def test_animations_of_others_are_refused(
+    tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray
+) -> None:
+    path = tm.save_animation(growing, ball[1], tmp_path / "a.glb")
+    written = path.read_bytes()
+    path.write_bytes(written.replace(b'"generator":"torch_modal"', b'"generator":"other_thing"'))
+    with pytest.raises(MeshError, match="save_animation did not write"):
+        read_shapes([path])
+    path.write_bytes(written.replace(b'"keyframes":[]', b'"keyfrmaes":[]'))
+    with pytest.raises(MeshError, match="cannot be read as an animation"):
+        read_shapes([path])
+    path.write_bytes(written[:4000])
+    with pytest.raises(MeshError, match=r"a\.glb"):
+        read_shapes([path])
+
+
+def test_command(
+    tmp_path: Path,
+    ball: tuple[np.ndarray, np.ndarray],
+    growing: np.ndarray,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    glb = tm.save_animation(growing, ball[1], tmp_path / "grow.glb", keyframe_indices=[0, 6])
+    tm.save_frames(growing, ball[1], tmp_path / "frames")
+    out = tmp_path / "page.html"
+    arguments = ["view", str(glb), "--compare", str(tmp_path / "frames"), "--linear", "--page", str(out)]
+    assert main(arguments) == 0
+    assert "3 x 7 shapes" in capsys.readouterr().out
+    data = data_of(tm.Page(out.read_text(encoding="utf-8")))
+    names, packed = zip(*[(one["name"], one["frames"]) for one in data["sequences"]], strict=True)
+    assert names == ("grow", "frames", "linear")
+    assert len(set(packed)) == 1, "the ball grows linearly"
+    assert main(arguments) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*arguments, "--overwrite", "--names", "a", "b", "c", "--keyframes", "0", "3", "6", "--quiet"]) == 0
+    data = data_of(tm.Page(out.read_text(encoding="utf-8")))
+    assert [one["name"] for one in data["sequences"]] == ["a", "b", "c"]
+    assert data["keyframes"] == [0, 3, 6]
+
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda address: bool(opened.append(address)))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert main(["view", str(glb)]) == 0
+    assert "no browser was found" in capsys.readouterr().out
+    assert Path(opened[0].removeprefix("file://")).is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--compare", "short"], "3 shapes"),
+        (["--compare", "cube.ply"], "vertices"),
+        (["--linear", "--keyframes", "1", "6"], r"first frame \(0\)"),
+        (["--linear", "--keyframes", "0", "5"], r"the last \(6\)"),
+        (["--keyframes", "7"], "from 0 to 6"),
+        (["--compare", "missing.ply"], "no such file"),
+    ],
+)
+def test_command_says_what_is_wrong(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    ball: tuple[np.ndarray, np.ndarray],
+    growing: np.ndarray,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tm.save_animation(growing, ball[1], "grow.glb", keyframe_indices=[0, 6])
+    tm.save_frames(growing[:3], ball[1], "short")
+    trimesh.creation.box().export("cube.ply")
+    assert main(["view", "grow.glb", *arguments, "--page", "page.html"]) == 1
+    assert re.search(message, capsys.readouterr().err)
+    assert not Path("page.html").exists()
+
+
+@pytest.mark.parametrize("arguments", [["--page", "page.png"], ["--names", "a", "b"], ["--fps", "0"]])
+def test_command_refuses_wrong_usage(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as leaving:
+        main(["view", "a.glb", *arguments])
+    assert leaving.value.code == 2
+
+
+# ----------------------------------------------------------------------------------------------------- in a browser
+@pytest.fixture(scope="module")
+def chrome() -> Iterator[Any]:
+    try:
+        with open_browser() as browser:
+            yield browser
+    except NoBrowser as reason:
+        pytest.skip(f"no page can be opened: {reason}")
+
+
+class Opened:
+    """A page in the browser, and what is done with it."""
+
+    def __init__(self, chrome: Any, path: Path) -> None:
+        self.chrome = chrome
+        console(chrome), requests(chrome)  # of the page before
+        open_page(chrome, path)
+
+    def script(self, text: str, *arguments: Any) -> Any:
+        return self.chrome.execute_script(text, *arguments)
+
+    def settle(self) -> None:
+        """Wait until all is drawn and nothing moves, also after two more turns of the page's loop."""
+        look = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(() =>"
+        for _ in range(200):
+            if self.chrome.execute_async_script(f"{look} done(torchModal.idle))))"):
+                return
+            time.sleep(0.05)
+        raise AssertionError("the page does not come to rest")
+
+    def seek(self, frame: float) -> None:
+        self.script("torchModal.seek(arguments[0])", frame)
+        self.settle()
+
+    def text(self, selector: str) -> str:
+        return self.chrome.find_element("css selector", selector).text
+
+    def click(self, selector: str) -> None:
+        self.chrome.find_element("css selector", selector).click()
+        self.settle()
+
+    def choose(self, name: str, value: str) -> None:
+        change = "const s = document.getElementById(arguments[0]); s.value = arguments[1];"
+        self.script(change + "s.dispatchEvent(new Event('change'))", name, value)
+        self.settle()
+
+    def press(self, *keys: str) -> None:
+        from selenium.webdriver import ActionChains
+
+        ActionChains(self.chrome).send_keys(*keys).perform()
+        self.settle()
+
+    def click_at(self, x: float, y: float) -> None:
+        from selenium.webdriver.common.actions.action_builder import ActionBuilder
+
+        builder = ActionBuilder(self.chrome)
+        builder.pointer_action.move_to_location(round(x), round(y)).click()
+        builder.perform()
+        self.settle()
+
+    def pixels(self) -> np.ndarray:
+        """The shapes as they are seen, without what lies over them. *Shape:* ``(height, width, 3)``."""
+        import io
+
+        from PIL import Image
+
+        png = self.chrome.find_element("id", "canvas").screenshot_as_png
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(np.int64)
+
+    def position(self, vertex: int, sequence: int = 0) -> np.ndarray:
+        return np.array(self.script("return torchModal.positionOf(arguments[0], arguments[1])", vertex, sequence))
+
+    def picks(self) -> list[int]:
+        value = self.chrome.find_element("id", "indices").get_attribute("value")
+        return [int(word) for word in value.split(",") if word.strip()]
+
+    def drawn_area(self) -> int:
+        """How many pixels are not background, which is nearly white."""
+        return int((self.pixels().min(axis=-1) < 225).sum())
+
+    def reddish(self) -> int:
+        """How many pixels are of the warm colours, of key-frames and of large numbers."""
+        pixels = self.pixels()
+        return int((pixels[..., 0] > pixels[..., 2] + 30).sum())
+
+
+@pytest.fixture
+def page(chrome: Any, tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> Iterator[Opened]:
+    """Two sequences, the second standing still; nothing may appear on the console, and nothing may be asked for."""
+    rows = {"growing": growing, "still": growing[:1].repeat(7, axis=0)}
+    path = tm.write_page(rows, ball[1], tmp_path / "page.html", keyframe_indices=[0, 2, 6], view=(0, 0), fps=6)
+    opened = Opened(chrome, path)
+    yield opened
+    assert not console(chrome)
+    assert [address for address in requests(chrome) if address != "data:,"] == [path.absolute().as_uri()]
+
+
+def test_frames_change(page: Opened, growing: np.ndarray) -> None:
+    step = 1.6 * 4 / LEVELS
+    start, small = page.pixels(), page.drawn_area()
+    assert page.reddish() > 1000, "a key-frame"
+    assert page.text("#readout") == "frame 0 / 6"
+    for frame in (6, 2.5):
+        page.seek(frame)
+        low = int(frame)
+        expected = growing[low] + (frame - low) * (growing[min(low + 1, 6)] - growing[low])
+        for vertex in (0, 17, 100):
+            np.testing.assert_allclose(page.position(vertex), expected[vertex], atol=step)
+            np.testing.assert_allclose(page.position(vertex, 1), growing[0, vertex], atol=step)
+    assert page.text("#readout") == "frame 2.5 / 6"
+    assert (page.pixels() != start).any()
+    assert page.drawn_area() > 1.2 * small
+
+
+def test_scrubbing_and_keys(page: Opened) -> None:
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    slider = page.chrome.find_element("id", "time")
+    ActionChains(page.chrome).move_to_element_with_offset(slider, 0, 0).click().perform()
+    page.settle()
+    assert page.script("return torchModal.frame") == pytest.approx(3, abs=0.1)
+    page.press(Keys.ARROW_RIGHT)
+    assert page.text("#readout") == "frame 4 / 6"
+    ActionChains(page.chrome).key_down(Keys.SHIFT).send_keys(Keys.ARROW_LEFT).key_up(Keys.SHIFT).perform()
+    page.settle()
+    assert page.text("#readout") == "frame 2 / 6"
+    page.press(Keys.END)
+    assert page.text("#readout") == "frame 6 / 6"
+    page.click('#keyframes button[title="Key-frame 2"]')
+    assert page.text("#readout") == "frame 2 / 6"
+
+
+def test_playing(page: Opened) -> None:
+    before = page.script("return torchModal.drawn")
+    page.choose("ending", "stop")
+    page.click("#play")  # and waits for the end
+    assert page.text("#readout") == "frame 6 / 6"
+    assert page.chrome.find_element("id", "play").get_attribute("aria-pressed") == "false"
+    assert page.script("return torchModal.drawn") >= before + 3, "it went through frames between"
+
+
+def test_picking(page: Opened, growing: np.ndarray) -> None:
+    canvas = page.chrome.find_element("id", "canvas").rect
+    nearest = int(growing[0, :, 2].argmax())  # straight towards the viewer
+    middle = canvas["y"] + canvas["height"] / 2
+    page.click_at(canvas["x"] + 0.25 * canvas["width"], middle)
+    assert page.picks() == [nearest]
+    page.click_at(canvas["x"] + 0.75 * canvas["width"], middle)  # the same vertex of the other sequence: taken back
+    assert page.picks() == []
+    page.click_at(canvas["x"] + 3, canvas["y"] + canvas["height"] - 3)  # beside the shapes
+    assert page.picks() == []
+    # Vertices that face the viewer, in both sequences and at another frame.
+    facing = np.flatnonzero(growing[0, :, 2] > 3 + 1.2)
+    wanted = facing[:: len(facing) // 6].tolist()
+    page.seek(4)
+    for i, vertex in enumerate(wanted):
+        place = page.script("return torchModal.placeOf(arguments[0], arguments[1])", vertex, i % 2)
+        page.click_at(place["x"], place["y"])
+    assert page.picks() == wanted
+    assert [mark.text for mark in page.chrome.find_elements("css selector", ".mark")] == 2 * [str(v) for v in wanted]
+    page.click("#clear")
+    assert page.picks() == []
+
+
+def test_dragging_turns_and_does_not_pick(page: Opened) -> None:
+    from selenium.webdriver.common.actions.action_builder import ActionBuilder
+
+    canvas, before = page.chrome.find_element("id", "canvas").rect, page.pixels()
+    x, y = canvas["x"] + canvas["width"] / 4, canvas["y"] + canvas["height"] / 2
+    builder = ActionBuilder(page.chrome)
+    builder.pointer_action.move_to_location(round(x), round(y)).pointer_down()
+    builder.pointer_action.move_to_location(round(x + 80), round(y + 30)).pointer_up()
+    builder.perform()
+    page.settle()
+    assert page.picks() == []
+    assert (page.pixels() != before).any()
+    page.click("#reset")
+    assert (page.pixels() == before).all()
+
+
+def test_trails(page: Opened) -> None:
+    canvas, before = page.chrome.find_element("id", "canvas").rect, page.pixels()
+    page.click_at(canvas["x"] + canvas["width"] / 4, canvas["y"] + canvas["height"] / 2)
+    page.script("document.querySelectorAll('.card, #marks').forEach((card) => (card.style.visibility = 'hidden'))")
+    with_trail = page.pixels()
+    assert (with_trail != before).any()
+    page.script("document.getElementById('trails').click()")
+    page.settle()
+    assert (page.pixels() != with_trail).any()
+
+
+@pytest.mark.parametrize(
+    ("measure", "expected"),
+    # The ball at 1.3 of its size: edges by 30 %, volume by 1.3³; vertices by 0.3 of the radius 2, and the sphere's box
+    # has the diagonal 2 * 2 * sqrt(3).
+    [("strain", 30.0), ("volume", 100 * (1.3**3 - 1)), ("distance", 100 * 0.6 / (4 * 3**0.5))],
+)
+def test_measures(page: Opened, measure: str, expected: float) -> None:
+    page.seek(3)
+    assert page.reddish() < 200  # the dot beside the second name
+    page.choose("measure", measure)
+    page.choose("reference", "first")
+    assert float(page.text("#name-0 small").removesuffix(" %")) == pytest.approx(expected, rel=5e-3)
+    assert float(page.text("#name-1 small").removesuffix(" %")) == pytest.approx(0, abs=0.01)
+    assert page.reddish() > 1000
+    page.choose("reference", "1")  # against the ball that stands still: the same
+    assert float(page.text("#name-0 small").removesuffix(" %")) == pytest.approx(expected, rel=5e-3)
+    # Between key-frames, the ball that grows linearly has their edges and positions, but less than their volume.
+    page.choose("reference", "keys")
+    between = 1.3**3 / (0.75 * 1.2**3 + 0.25 * 1.6**3) - 1
+    wanted = {"strain": 0.0, "distance": 0.0, "volume": 100 * between}[measure]
+    assert float(page.text("#name-0 small").removesuffix(" %")) == pytest.approx(wanted, abs=0.02)
+    assert len(page.chrome.find_elements("css selector", "#curves path")) == 2
+
+
+def test_layouts(page: Opened) -> None:
+    page.seek(6)
+    both = page.drawn_area()
+    page.click("#sequences button:nth-child(2)")
+    assert page.drawn_area() < both
+    assert len(page.chrome.find_elements("css selector", ".name")) == 1
+    page.click("#sequences button:nth-child(2)")
+    page.click("#layout button[value=over]")
+    overlaid = page.pixels()
+    page.click("#sequences button:nth-child(1)")
+    alone = page.pixels()
+    assert (alone != overlaid).any()
+    page.click("#wireframe")
+    assert page.pixels().sum() < alone.sum(), "the lines are dark"
+
+
+def test_user_texts_are_texts(
+    chrome: Any, tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray
+) -> None:
+    path = tm.write_page({NASTY: growing, "b": growing}, ball[1], tmp_path / "page.html", title=NASTY)
+    page = Opened(chrome, path)
+    assert chrome.title == NASTY
+    assert page.text("h1") == page.text("#sequences button") == page.text(".name") == NASTY
+    assert not console(chrome)
+
+
+def test_cyclic_times_and_notebook(
+    chrome: Any, tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray
+) -> None:
+    """A closed sequence in the frame that a notebook makes."""
+    times = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0]
+    shown = tm.show(growing, ball[1], cyclic=True, times=times)
+    path = tmp_path / "notebook.html"
+    path.write_text(f"<!doctype html><title>notebook</title><p id=message hidden></p>{shown._repr_html_()}")
+    console(chrome)
+    chrome.get(path.as_uri())
+    chrome.switch_to.frame(chrome.find_element("css selector", "iframe"))
+    page = Opened.__new__(Opened)
+    page.chrome = chrome
+    for _ in range(100):
+        if page.script("return window.torchModal?.readyAfter"):
+            break
+        time.sleep(0.1)
+    else:
+        raise AssertionError("the page in the notebook does not start")
+    page.seek(6.5)  # half-way back to the first
+    np.testing.assert_allclose(page.position(5), 0.5 * (growing[6, 5] + growing[0, 5]), atol=1e-3)
+    page.seek(5.5)
+    assert page.text("#readout") == "frame 5.5 / 6, t = 7.5"
+    places = [
+        float(tick.get_attribute("style").split("--place:")[1].strip(" ;"))
+        for tick in chrome.find_elements("css selector", "#keyframes button")
+    ]
+    assert places == pytest.approx([0.0, 10 / (10 + 10 / 6)])
+    chrome.switch_to.default_content()
+    assert not console(chrome)
+
+
+def test_without_webgl(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
+    path = tm.write_page(growing, ball[1], tmp_path / "page.html")
+    try:
+        with open_browser(800, 600, "--disable-3d-apis") as browser, pytest.raises(AssertionError, match="needs WebGL"):
+            open_page(browser, path)
+    except NoBrowser as reason:
+        pytest.skip(f"no page can be opened: {reason}")

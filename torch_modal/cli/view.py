@@ -1,0 +1,153 @@
+"""``torch-modal view``: shapes of files as a page, opened in the browser or written."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+SUMMARY = "look at sequences of shapes, in a page for the browser"
+
+DESCRIPTION = """\
+Look at sequences of shapes in a page: play, orbit, compare, colour by edge strain,
+distance or volume change, pick vertices and copy their indices.
+
+The page is one HTML file that needs no network. Shapes are numbered mesh files, a
+folder of them, or a GLB that `subdivide` or save_animation wrote."""
+
+EXAMPLES = """\
+examples:
+  open a page of an animation, beside linear interpolation of its key-frames:
+    torch-modal view hand.glb --linear
+  write a page of three sequences side by side:
+    torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html"""
+
+
+def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None:
+    """Add the arguments of the command; ``number`` makes argument types."""
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="FILE", help="shapes in their order, a folder, or one GLB")
+    sub.add_argument(
+        "--compare",
+        nargs="+",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="another sequence of as many shapes, of the same faces; may be given several times",
+    )
+    sub.add_argument(
+        "--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence"
+    )
+    sub.add_argument(
+        "--names", nargs="+", metavar="NAME", help="of the sequences, in their order (default: of files or folders)"
+    )
+    sub.add_argument(
+        "--keyframes",
+        nargs="+",
+        type=number(int, 0),
+        metavar="N",
+        help="which frames are key-frames, from 0 (default: the GLB's, or the first and the last)",
+    )
+    sub.add_argument("--cyclic", action="store_true", help="the last frame leads on to the first")
+    sub.add_argument(
+        "--fps",
+        type=number(float, 0, above=True),
+        metavar="X",
+        help="frames a second (default: the GLB's, or 24)",
+    )
+    sub.add_argument("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
+    sub.add_argument("--title", metavar="TEXT", help="of the page (default: the name of the first sequence)")
+    sub.add_argument(
+        "--page", type=Path, metavar="FILE", help="write the page there, as .html (default: a temporary file, opened)"
+    )
+    group = sub.add_argument_group("files and messages")
+    group.add_argument("--overwrite", action="store_true", help="replace the file if it exists (default: refuse)")
+    group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
+    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    if args.page and args.page.suffix.lower() not in (".html", ".htm"):
+        args.fail(f"--page must end in .html, got {args.page.name!r}")
+    given = [args.meshes, *args.compare]
+    n_sequences = len(given) + args.linear
+    if args.names and len(args.names) != n_sequences:
+        args.fail(f"--names names {len(args.names)} sequences, but there are {n_sequences}")
+    if args.page and args.page.exists() and not args.overwrite:
+        raise FileExistsError(f"{args.page} exists; --overwrite replaces it")
+
+    import torch_modal as tm
+
+    sequences, first = _sequences(given, args)
+    page = tm.show(
+        sequences,
+        first.faces,
+        keyframe_indices=first.keyframe_indices if args.keyframes is None else args.keyframes,
+        times=first.times,
+        fps=args.fps or first.fps or 24.0,
+        cyclic=args.cyclic or first.cyclic,
+        up=args.up,
+        title=args.title or next(iter(sequences)),
+    )
+    written = page.save(args.page or _temporary_file(), args.overwrite)
+    if not args.quiet:
+        shapes = next(iter(sequences.values()))
+        times = f"{len(sequences)} x " if len(sequences) > 1 else ""
+        print(f"{times}{len(shapes)} shapes of {shapes.shape[1]} vertices: {written}", flush=True)
+    if not args.page and not webbrowser.open(written.absolute().as_uri()):
+        print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {written}")
+
+
+def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[dict[str, Any], Any]:
+    """The sequences under their names, and the first as it was read."""
+    from torch_modal.io.read import require_same_mesh
+    from torch_modal.view.page_input import read_shapes
+
+    read = [read_shapes(paths) for paths in given]
+    first = read[0]
+    for paths, other in zip(given[1:], read[1:], strict=True):
+        require_same_mesh(given[0][0], first.frames[0], first.faces, paths[0], other.frames[0], other.faces)
+        if len(other.frames) != len(first.frames):
+            raise ValueError(
+                f"{paths[0]} has {len(other.frames)} shapes, {given[0][0]} has {len(first.frames)}; sequences are "
+                "compared shape by shape, so both need as many"
+            )
+    shapes = [one.frames for one in read]
+    names = [_name(paths) for paths in given]
+    if args.linear:
+        keys = args.keyframes or first.keyframe_indices or [0, len(first.frames) - 1]
+        shapes.append(_linear(first.frames, sorted(set(keys)), args.cyclic or first.cyclic))
+        names.append("linear")
+    names = args.names or names
+    if len(set(names)) < len(names):
+        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
+    return dict(zip(names, shapes, strict=True)), first
+
+
+def _name(paths: list[Path]) -> str:
+    """What a sequence is called: its one file or folder, or the folder of its files."""
+    path = paths[0].absolute() if len(paths) == 1 else paths[0].absolute().parent
+    return path.stem if path.is_file() else path.name
+
+
+def _linear(frames: Any, keys: list[int], cyclic: bool) -> Any:
+    """Straight lines between the key-frames, for as many frames."""
+    import torch
+
+    import torch_modal as tm
+
+    last = len(frames) - 1
+    if keys[0] != 0 or keys[-1] > last or (keys[-1] != last and not cyclic):
+        ends = "the first frame (0)" if cyclic else f"the first frame (0) and the last ({last})"
+        raise ValueError(f"--linear needs {ends} among the key-frames, got {' '.join(map(str, keys))}")
+    places = [*keys, len(frames)] if cyclic else keys
+    return tm.linear_sequence(torch.from_numpy(frames[keys]), places).numpy()
+
+
+def _temporary_file() -> Path:
+    """Where a page that is only to be looked at goes; it stays, as the browser reads it after this process."""
+    return Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")

@@ -1,0 +1,285 @@
+"""A page to look at: sequences of shapes in one HTML file that needs nothing else, neither files nor a network.
+
+The files in page_assets are joined with the shapes (page_data.py). The page names the scripts that may run by their
+hashes, and forbids itself all else, so that nothing that stands in a file name or title can do anything.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from torch_modal.io.write import (
+    FloatArray,
+    IntArray,
+    check_frames,
+    check_indices,
+    refuse_existing,
+    to_numpy,
+    write_file,
+)
+from torch_modal.version import __version__
+from torch_modal.view.page_data import grid_of, pack_faces, pack_frames, quantise
+from torch_modal.view.picture import check_view, up_axis, view_rotation
+
+if TYPE_CHECKING:
+    from torch_modal.io.write import Array
+
+__all__ = ["Page", "show", "write_page"]
+
+PROGRAM = ("decode.js", "measure.js", "stage.js", "timeline.js", "page.js")
+POLICY = "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 'none'"
+
+
+class Page:
+    """A page of shapes: shown by notebooks where it is the last value of a cell, or saved.
+
+    Attributes:
+        html: The whole page.
+        height: Pixels that it takes in a notebook.
+    """
+
+    def __init__(self, html: str, height: int = 600) -> None:
+        self.html = html
+        self.height = height
+
+    def __repr__(self) -> str:
+        return f"<torch_modal.Page of {len(self.html) / 1e6:.1f} MB; its save(path) writes it>"
+
+    def _repr_html_(self) -> str:
+        # The sandbox keeps the page's scripts apart from the notebook's.
+        return (
+            '<iframe sandbox="allow-scripts" allow="clipboard-write" loading="lazy" '
+            f'style="width: 100%; height: {self.height}px; border: 1px solid #dde3e9; border-radius: 8px" '
+            f'srcdoc="{html.escape(self.html)}"></iframe>'
+        )
+
+    def save(self, out: str | Path, overwrite: bool = False) -> Path:
+        """Write the page as one HTML file.
+
+        Args:
+            out: File to write, ``*.html``.
+            overwrite: Replace the file if it exists.
+
+        Returns:
+            The file.
+
+        Raises:
+            ValueError: ``out`` does not end in .html.
+            FileExistsError: The file exists and ``overwrite`` is off.
+        """
+        path = _checked_path(out, overwrite)
+        write_file(path, self.html.encode("utf-8"))
+        return path
+
+
+def show(
+    sequences: Mapping[str, Array] | Array,
+    faces: Array,
+    *,
+    keyframe_indices: Sequence[int] | None = None,
+    times: Sequence[float] | None = None,
+    fps: float = 24.0,
+    cyclic: bool = False,
+    view: tuple[float, float] | None = None,
+    up: Literal["y", "z"] | None = None,
+    title: str = "torch_modal",
+    height: int = 600,
+) -> Page:
+    """A page to look at sequences of shapes, in a notebook or saved: play, orbit, compare, measure, pick vertices.
+
+    In the page, shapes between two neighbouring frames are blended linearly. Positions are stored in 65,535 steps along
+    the longest side of all shapes together, so they are off by at most 8e-6 of it.
+
+    Args:
+        sequences: Shapes, or several sequences under their names, for example ``{"torch_modal": x, "linear": y}``,
+            shown side by side or overlaid. *Shape of each:* ``(N, V, 3)``, the same for all.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        keyframe_indices: Frames that are key-frames: drawn in the other colour and marked on the time line. The first
+            and the last by default.
+        times: The time of each frame, rising; shown beside its number, and the time line keeps their distances. Evenly
+            spaced by default. *Shape:* ``(N,)``.
+        fps: Frames a second, on average if ``times`` are given.
+        cyclic: Add the step from the last frame back to the first, unless the two are equal already.
+        view: Azimuth and elevation of the first view in degrees, as for :func:`torch_modal.render_sequence`.
+        up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
+        title: Of the page.
+        height: Pixels that it takes in a notebook.
+
+    Returns:
+        The page. Notebooks show it; ``save(path)`` writes it.
+
+    Raises:
+        ValueError: An argument cannot be used; the message says why.
+    """
+    check_view(view, up)
+    named = sequences if isinstance(sequences, Mapping) else {"shapes": sequences}
+    if not named:
+        raise ValueError("sequences is empty; it needs at least one sequence of shapes.")
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps must be a positive number, got {fps}.")
+    if height < 1:
+        raise ValueError(f"height is a number of pixels, at least 1; got {height}.")
+    checked: dict[str, FloatArray] = {}
+    for name, frames in named.items():
+        checked[str(name)], triangles = check_frames(frames, faces, f"sequences[{name!r}]")
+    shapes = list(checked.values())
+    if len({frames.shape for frames in shapes}) > 1:
+        sizes = ", ".join(f"{name!r} {frames.shape}" for name, frames in checked.items())
+        raise ValueError(f"all sequences must have the same shape (N, V, 3), got {sizes}.")
+    n_frames = len(shapes[0])
+    given = [0, n_frames - 1] if keyframe_indices is None else keyframe_indices
+    keyframes = check_indices(given, n_frames, "keyframe_indices")
+    stamps = np.arange(n_frames, dtype=np.float64) if times is None else _checked_times(times, n_frames)
+    closed = cyclic and n_frames > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes)
+    data = {
+        "times": stamps.tolist(),
+        "has_times": times is not None,
+        "fps": float(fps),
+        "closed": closed,
+        "keyframes": keyframes,
+        **_content(checked, triangles, view_rotation(shapes[0][0], view, up)),
+    }
+    data["view"]["world_up"] = [0, 1, 0] if up_axis(shapes[0][0], up) == "y" else [0, 0, 1]
+    return Page(_document(title, data), height)
+
+
+def write_page(
+    sequences: Mapping[str, Array] | Array,
+    faces: Array,
+    out: str | Path,
+    *,
+    keyframe_indices: Sequence[int] | None = None,
+    times: Sequence[float] | None = None,
+    fps: float = 24.0,
+    cyclic: bool = False,
+    view: tuple[float, float] | None = None,
+    up: Literal["y", "z"] | None = None,
+    title: str | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a page to look at sequences of shapes, as one HTML file that works without a network.
+
+    Args:
+        sequences: As for :func:`show`, like all that is not named here.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        out: File to write, ``*.html``.
+        keyframe_indices: Frames that are key-frames.
+        times: The time of each frame. *Shape:* ``(N,)``.
+        fps: Frames a second.
+        cyclic: Add the step from the last frame back to the first.
+        view: Azimuth and elevation of the first view in degrees.
+        up: ``"y"`` or ``"z"``.
+        title: Of the page; by default the file's name.
+        overwrite: Replace the file if it exists.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: An argument cannot be used; the message says why.
+        FileExistsError: The file exists and ``overwrite`` is off.
+    """
+    path = _checked_path(out, overwrite)
+    page = show(
+        sequences,
+        faces,
+        keyframe_indices=keyframe_indices,
+        times=times,
+        fps=fps,
+        cyclic=cyclic,
+        view=view,
+        up=up,
+        title=path.stem if title is None else title,
+    )
+    return page.save(path, overwrite)
+
+
+def _checked_path(out: str | Path, overwrite: bool) -> Path:
+    path = Path(out)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"out must end in .html, got {path.name!r}.")
+    refuse_existing(path, overwrite)
+    return path
+
+
+def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
+    stamps: FloatArray = np.asarray(to_numpy(times), dtype=np.float64)  # type: ignore[arg-type]
+    if stamps.shape != (n_frames,) or not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
+        raise ValueError(
+            f"times must be {n_frames} finite numbers, one a frame, each larger than the one before; got "
+            f"{np.array2string(stamps, threshold=8)} of shape {stamps.shape}."
+        )
+    return stamps
+
+
+def _content(sequences: dict[str, FloatArray], faces: IntArray, rotation: FloatArray) -> dict[str, Any]:
+    """Shapes and faces packed, and how they are first seen; lengths in steps of the grid."""
+    grid = grid_of(list(sequences.values()))
+    numbers = {name: quantise(frames, grid) for name, frames in sequences.items()}
+    # The box around everything along right, up and front: its middle is what the camera turns around.
+    low = np.min([_extreme(frames, rotation, np.min) for frames in numbers.values()], axis=0)
+    high = np.max([_extreme(frames, rotation, np.max) for frames in numbers.values()], axis=0)
+    first = next(iter(sequences.values()))[0]
+    return {
+        "origin": grid.origin.tolist(),
+        "step": grid.step,
+        "n_vertices": len(first),
+        "n_faces": len(faces),
+        "faces": pack_faces(faces),
+        "sequences": [{"name": name, "frames": pack_frames(frames)} for name, frames in numbers.items()],
+        "diagonal": max(float(np.linalg.norm(np.ptp(first, axis=0))) / grid.step, 1.0),
+        "view": {
+            "front": rotation[2].tolist(),
+            "centre": (0.5 * (low + high) @ rotation).tolist(),
+            "half": (0.5 * (high - low)).tolist(),
+        },
+    }
+
+
+def _extreme(numbers: Any, rotation: FloatArray, which: Any) -> FloatArray:
+    """Least or largest coordinates of shapes ``(N, V, 3)`` in view directions, a frame at a time to save memory."""
+    found: FloatArray = which([which(shape @ rotation.T, axis=0) for shape in numbers], axis=0)
+    return found
+
+
+def _document(title: str, data: dict[str, Any]) -> str:
+    """The page's text. What callers named is escaped; scripts and style are allowed by their hashes."""
+    assets = files("torch_modal.view") / "page_assets"
+
+    def asset(*names: str) -> str:
+        return "\n".join((assets / name).read_text(encoding="utf-8") for name in names)
+
+    style, library = asset("page.css"), asset("three.min.js")
+    # In a function of its own, and strict.
+    program = f'(() => {{\n"use strict";\n{asset(*PROGRAM)}}})();\n'
+    policy = f"{POLICY}; style-src {_hash(style)}; script-src {_hash(library)} {_hash(program)}"
+    parts = {
+        "@POLICY@": policy,
+        "@GENERATOR@": f"torch_modal {__version__}",
+        "@TITLE@": html.escape(title),
+        "@STYLE@": style,
+        "@DATA@": json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
+        "@LIBRARY@": library,
+        "@PROGRAM@": program,
+    }
+    # Each marker is replaced where it stands in the template, not in what came in its place.
+    text, pieces = asset("page.html"), []
+    while text:
+        place, marker = min(((text.find(m), m) for m in parts if m in text), default=(len(text), ""))
+        pieces += [text[:place], parts.get(marker, "")]
+        text = text[place + len(marker) :]
+    return "".join(pieces)
+
+
+def _hash(text: str) -> str:
+    """What a content security policy calls an inline script or style."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
