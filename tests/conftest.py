@@ -146,7 +146,7 @@ def modal(
 def problem_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
     """The in-betweens of placed key-frames as the layer's minimisation."""
     whole = layer.in_between
-    samples = Samples(pair.first, pair.second, None, t, whole._mu(t, t.shape), whole._stiffness(t, t.shape))
+    samples = Samples(pair.first, pair.second, None, t, whole.mu_of(t, t.shape), whole.stiffness_of(t, t.shape))
     return whole.members[0].problem(pair, samples)
 
 

@@ -44,6 +44,7 @@ from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
 from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
+from .sequence.path import Path as Path
 from .sequence.subdivide import keyframe_places as keyframe_places
 from .sequence.subdivide import linear_sequence as linear_sequence
 from .sequence.subdivide import subdivide as subdivide

@@ -29,7 +29,7 @@ def dihedral_angle(spokes: Tensor) -> Tensor:
 
     Args:
         spokes: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` of a row of
-            :func:`~torch_modal.geometry.connectivity.hinges`, components second. *Shape:* ``(3, 3, ...)``.
+            :attr:`~torch_modal.geometry.connectivity.Connectivity.hinges`, components second. *Shape:* ``(3, 3, ...)``.
     """
     e, a, b = spokes
     n1 = cross(e, a)
@@ -83,8 +83,8 @@ def dihedral_hessian(spokes: Tensor) -> Tensor:
         spokes: As above. *Shape:* ``(3, 3, ...)``.
 
     Returns:
-        The blocks of the vertices ``ij, ki, kj, li, lj`` (:func:`~torch_modal.geometry.connectivity.hinges`), indexed
-        by row, then column; zero where a triangle is collapsed. *Shape:* ``(5, 3, 3, ...)``.
+        The blocks of the vertices ``ij, ki, kj, li, lj`` of a hinge, indexed by row, then column; zero where a triangle
+        is collapsed. *Shape:* ``(5, 3, 3, ...)``.
     """
     e, a, b = spokes
     n1, n2 = cross(e, a), cross(b, e)

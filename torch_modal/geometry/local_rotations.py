@@ -1,12 +1,16 @@
 """Between two shapes by local rotations: every triangle turns at constant speed."""
 
+from itertools import pairwise
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
-from torch_modal.geometry.rotations import power, quaternion, rotate
+from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess
+from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import Frames, Sides, edge_means, frames, sides
-from torch_modal.geometry.vectors import pick
+from torch_modal.geometry.vectors import norm, pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
 # of its longest side counts like a turn of one radian against its neighbour.
@@ -14,6 +18,31 @@ SLIVER = 0.02
 
 # Edges without a length count like one of this part of the mean.
 SHORTEST = 1e-9
+
+
+class Course(NamedTuple):
+    """How triangles move between two shapes of a motion. Components first. *Shape of each:* ``(3, P, F)``."""
+
+    e1: Tensor
+    """The frames of the shape at 0."""
+    e2: Tensor
+    normal: Tensor
+    turn: Tensor
+    """Axis times angle to the shape at 1, in the coordinates of the frames."""
+    turn_first: Tensor
+    """The excess of that."""
+    turn_last: Tensor
+    size: Tensor
+    """Length, and coordinates along and across, at 0."""
+    growth: Tensor
+    """What they gain until 1."""
+    growth_first: Tensor
+    """The excess of that."""
+    growth_last: Tensor
+
+    def rows(self, index: Tensor) -> "Course":
+        """Of some of the shapes."""
+        return Course._make(part.index_select(-2, index) for part in self)
 
 
 class LocalRotations(nn.Module):
@@ -70,11 +99,58 @@ class LocalRotations(nn.Module):
         a, b = (_frames(x, self.faces) for x in (first, second))
         areas, t = a.doubled_areas + b.doubled_areas, t[:, None]
         length, along, height = (torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))
-        quaternions = _turn_between(a, b)
-        signs = self._senses(quaternions.detach(), areas.detach())
-        turn = power(signs * quaternions, t)
+        turn = power(self._sensed(a, b), t)
         wanted = Sides(rotate(turn, length * a.e1), rotate(turn, a.world(along, height)))
         return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, len(self.per_length))
+
+    def course(
+        self, before: Tensor | None, first: Tensor, second: Tensor, after: Tensor | None, spacing: Spacing
+    ) -> Course:
+        """A smooth course through four shapes, between the two in the middle. *Shape of each:* ``(P, V, 3)``.
+
+        Args:
+            before: The shape before the first; None where there is none.
+            first: The shape at 0.
+            second: The shape at 1.
+            after: The shape after the second.
+            spacing: Durations of the three intervals. *Shape of each:* ``(P,)``.
+        """
+        earlier, a, b, later = (None if x is None else _frames(x, self.faces) for x in (before, first, second, after))
+        assert a is not None and b is not None
+        wide = Spacing(*(h[:, None] for h in spacing))
+        turns = [None if p is None or q is None else self._turn(p, q) for p, q in ((earlier, a), (b, later))]
+        sizes = [None if x is None else torch.stack(x[3:]) for x in (earlier, a, b, later)]
+        steps = [None if x is None or y is None else y - x for x, y in pairwise(sizes)]
+        turn, step = self._turn(a, b), torch.stack(b[3:]) - torch.stack(a[3:])
+        turning = excess(turn, turns[0], turns[1], wide, norm)
+        growing = excess(step, steps[0], steps[2], wide)
+        return Course(a.e1, a.e2, a.normal, turn, *turning, torch.stack(a[3:]), step, *growing)
+
+    def along(self, course: Course, t: Tensor) -> Tensor:
+        """Edge vectors on a course, components first. *Shape:* ``(B,) -> (3, B, E)``."""
+        u = t[:, None]
+        length, along, height = course.size + u * course.growth + beyond(Excess(*course[8:]), u)
+        bent, straight = beyond(Excess(*course[4:6]), u), u * course.turn
+        flat = torch.zeros_like(length)
+
+        def placed(x: Tensor, y: Tensor) -> Tensor:
+            x, y, z = turned(straight, turned(bent, torch.stack([x, y, flat])))
+            return x * course.e1 + y * course.e2 + z * course.normal
+
+        areas = course.size[0] * course.size[2] + (course.size + course.growth)[0] * (course.size + course.growth)[2]
+        wanted = Sides(placed(length, flat), placed(along, height))
+        return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, len(self.per_length))
+
+    def _turn(self, a: Frames, b: Frames) -> Tensor:
+        """How triangles turn, axis times angle in the coordinates of their frames. *Shape:* ``(3, P, F)``."""
+        turn = turn_of(self._sensed(a, b))
+        return torch.stack([(turn * axis).sum(0) for axis in (a.e1, a.e2, a.normal)])
+
+    def _sensed(self, a: Frames, b: Frames) -> Tensor:
+        """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""
+        quaternions = _turn_between(a, b)
+        areas = (a.doubled_areas + b.doubled_areas).detach()
+        return self._senses(quaternions.detach(), areas) * quaternions
 
     def _senses(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """A sign for each quaternion. *Shape:* ``(4, B, F), (B, F) -> (B, F)``."""

@@ -83,6 +83,14 @@ def turned(turn: Tensor, v: Tensor) -> Tensor:
     return rotate(torch.cat([cosine[None], sinc * half]), v)
 
 
+def turn_of(q: Tensor) -> Tensor:
+    """Axis times angle of a quaternion, the way round that its sign tells: below a whole turn.
+
+    *Shape:* ``(4, ...) -> (3, ...)``.
+    """
+    return 2 * _arc(q)
+
+
 def _arc(q: Tensor) -> Tensor:
     """Axis times half the angle: the logarithm of a quaternion of any size. *Shape:* ``(4, ...) -> (3, ...)``."""
     real, imaginary = q[0], q[1:]

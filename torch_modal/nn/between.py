@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, Rest
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Mesh, Term
+from torch_modal.geometry.hermite import Spacing
 from torch_modal.nn import trees
 from torch_modal.nn.adjoint import ConvergenceWarning, Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.frame import Frame, Pair
@@ -18,7 +19,7 @@ from torch_modal.nn.levels import Levels, Stiffness, coarse_values
 from torch_modal.nn.paired import PairedSpace
 from torch_modal.nn.relax import relax
 from torch_modal.nn.settings import Objective, Solver
-from torch_modal.nn.solver import GaussNewtonStep, Solution, Status
+from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, unmoved
 
 # Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
 # of the gap in energy between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
@@ -60,6 +61,12 @@ class Samples(NamedTuple):
     """*Shape:* ``(B,)``."""
     stiffness: list[Tensor]
     """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    before: Tensor | None = None
+    """The key-frames before those at 0, where the course is to be smooth in time. *Shape:* ``(P, V, 3)``."""
+    after: Tensor | None = None
+    """The key-frames after those at 1. *Shape:* ``(P, V, 3)``."""
+    spacing: Spacing | None = None
+    """Durations of the three intervals; None if the course is of the pair alone. *Shape of each:* ``(P,)``."""
 
 
 class Between(nn.Module):
@@ -72,6 +79,7 @@ class Between(nn.Module):
         objective: What is minimised.
         solver: How.
         terms: The terms of the energy, which the layer owns.
+        weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
     """
 
     def __init__(
@@ -82,10 +90,13 @@ class Between(nn.Module):
         objective: Objective,
         solver: Solver,
         terms: Sequence[Term],
+        weights: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.solver = solver
-        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces)
+        #: Whether Eq. 5 has no company: what has no strain then stays as it is.
+        self.bare = not objective.terms
+        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, weights)
         levels = Levels(self.frame, mesh, terms)
         turned = self.frame.modes(*modes)
         if objective.space == "joint":
@@ -110,14 +121,21 @@ class Between(nn.Module):
         frame, space, solver = self.frame, self.space, self.solver
         index, t = samples.which, samples.t
         # A sample that is not finite must not reach the factorisations of the others: the reference stands in for it.
-        finite = samples.x_a.isfinite().flatten(1).all(1) & samples.x_b.isfinite().flatten(1).all(1)
+        given = [samples.before, samples.x_a, samples.x_b, samples.after]
+        finite = torch.stack([x.isfinite().flatten(1).all(1) for x in given if x is not None]).all(0)
         stand_in = frame.reference / frame.scale
-        pair = frame.place(*(torch.where(finite[:, None, None], x, stand_in) for x in (samples.x_a, samples.x_b)))
-        usable = finite & self._solvable(pair)
-        placed = pair
-        if index is not None:
-            usable, placed = trees.rows((usable, pair), index)
+        before, x_a, x_b, after = (
+            None if x is None else torch.where(finite[:, None, None], x, stand_in) for x in given
+        )
+        pair = frame.place(x_a, x_b)  # type: ignore[arg-type]
+        if samples.spacing is not None:
+            pair = frame.surround(pair, before, after, samples.spacing)
+        usable, placed = trees.picked((finite & self._solvable(pair), pair), index)
         usable = usable & (t >= 0) & (t <= 1)
+        if pair.around is not None and self.bare:
+            # The course is a shape at rest: there is nothing to minimise.
+            solution = unmoved(t, space.n_unknowns, usable)
+            return self._restored(space.on_course(pair, index, t), placed, t, solution)
         anchors = self._anchors(placed, t)
         problem = self.problem(pair, samples, anchors)
         least_gain = 0.0 if exact or isinstance(space, PairedSpace) else solver.least_gain
@@ -126,11 +144,11 @@ class Between(nn.Module):
         solution = solve(minimisation, problem.placement, problem.start, usable, t)
         x = space.lift(solution.amplitudes, problem)
         if solver.local_steps or solver.polish:
-            chunk = max(1, FINE_CHUNK // x.shape[-2])
-            per_item = (x, placed.first, placed.second, t, samples.stiffness, anchors)
-            parts = (trees.rows(per_item, slice(i, i + chunk)) for i in range(0, len(x), chunk))
-            x = torch.cat([self._relax(*part) for part in parts])
-        shapes = frame.restore(x, placed, t)
+            x = self._refine(x, problem.base, pair, samples, anchors)
+        return self._restored(x, placed, t, solution)
+
+    def _restored(self, x: Tensor, placed: Pair, t: Tensor, solution: Solution) -> InBetweenResult:
+        shapes = self.frame.restore(x, placed, t)
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
 
@@ -144,16 +162,31 @@ class Between(nn.Module):
         """What is repeated. It has no state: registered, it would name all buffers of the energy twice."""
         return GaussNewtonStep(self.space.energy)
 
-    def _relax(
-        self, x: Tensor, first: Tensor, second: Tensor, t: Tensor, stiffness: list[Tensor], anchors: Tensor | None
-    ) -> Tensor:
+    def _refine(self, x: Tensor, base: Tensor, pair: Pair, samples: Samples, anchors: Tensor | None) -> Tensor:
         """Local interpolation and polish: what the modes cannot do. *Shape:* ``(B, V, 3)``."""
         energy, solver = self.fine, self.solver
-        fixed = None if anchors is None else anchors.movedim(-1, 0)
-        a, b = (energy.rest(energy.extend(end.movedim(-1, 0).contiguous(), fixed)) for end in (first, second))
-        reference = energy.between(a, b, t, stiffness)
-        x = relax(energy, x, reference, solver.local_steps, LOCAL_PRODUCTS, anchors)
-        return relax(energy, x, reference, solver.polish, POLISH_PRODUCTS, anchors)
+        chunk = max(1, FINE_CHUNK // x.shape[-2])
+        ends = pair.first, pair.second
+        known = None if samples.which is None else [self._fine_rest(end) for end in ends]
+        parts = []
+        for i in range(0, len(x), chunk):
+            own = slice(i, i + chunk)
+            start, course, t, stiffness, fixed = trees.rows((x, base, samples.t, samples.stiffness, anchors), own)
+            if pair.around is not None:
+                reference = Energy.against(self._fine_rest(course), stiffness)
+            else:
+                if known is None or samples.which is None:
+                    first, second = (self._fine_rest(end[own]) for end in ends)
+                else:
+                    first, second = trees.rows(known, samples.which[own])
+                reference = energy.between(first, second, t, stiffness)
+            moved = relax(energy, start, reference, solver.local_steps, LOCAL_PRODUCTS, fixed)
+            parts.append(relax(energy, moved, reference, solver.polish, POLISH_PRODUCTS, fixed))
+        return torch.cat(parts)
+
+    def _fine_rest(self, x: Tensor) -> Rest:
+        """Shapes as rest shapes on the fine mesh. *Shape:* ``(B, V, 3)``."""
+        return self.fine.rest(self.fine.extend(x.movedim(-1, 0).contiguous()))
 
     def _levelled(self, stiffness: list[Tensor]) -> Stiffness:
         """Stiffnesses of the elements of the fine mesh, on those of each level."""

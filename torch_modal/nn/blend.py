@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.geometry.poisson import Poisson
 
 
@@ -26,5 +26,17 @@ class RotationBlend(nn.Module):
 
     def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t``. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``."""
-        straight = torch.lerp(first, second, t[:, None, None])
-        return self.poisson(self.rotations(first, second, t), straight.movedim(-1, 0)).movedim(0, -1)
+        return self._reached(self.rotations(first, second, t), torch.lerp(first, second, t[:, None, None]))
+
+    def along(self, course: Course, straight: Tensor, t: Tensor) -> Tensor:
+        """The shape at the time ``t`` of a course.
+
+        Args:
+            course: Of :meth:`LocalRotations.course`.
+            straight: Shapes whose pieces have their centroids where they are wanted. *Shape:* ``(B, V, 3)``.
+            t: *Shape:* ``(B,)``.
+        """
+        return self._reached(self.rotations.along(course, t), straight)
+
+    def _reached(self, edges: Tensor, near: Tensor) -> Tensor:
+        return self.poisson(edges, near.movedim(-1, 0)).movedim(0, -1)

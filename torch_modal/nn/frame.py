@@ -7,11 +7,29 @@ from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import vertex_areas
-from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess
+from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
+from torch_modal.geometry.rotations import exp, log
+from torch_modal.geometry.vectors import norm
 from torch_modal.precompute.coarsening import coarsen
 
 # Combinations of columns whose squared norm is below this part of the largest are rounding, not directions.
 DEPENDENT = 1e-9
+
+
+class Around(NamedTuple):
+    """The key-frames before and after two others, and the rigid motion that passes through all."""
+
+    before: Tensor | None
+    """Turned on to the first of the pair; None where there is none. *Shape:* ``(B, V, 3)``."""
+    after: Tensor | None
+    """Turned on to the second. *Shape:* ``(B, V, 3)``."""
+    spacing: Spacing
+    """Durations of the three intervals."""
+    turn: Excess
+    """Of the rotation, axis times angle in coordinates that turn along. *Shape:* ``(B, 3)``."""
+    move: Excess
+    """Of the centroid. *Shape:* ``(B, 3)``."""
 
 
 class Pair(NamedTuple):
@@ -25,6 +43,8 @@ class Pair(NamedTuple):
     """From the caller's first key-frame to that of the frame, in the caller's units."""
     between: RigidMotion
     """From the first key-frame's pose to the second's, in the frame and its units."""
+    around: Around | None = None
+    """What the neighbours in time say, where the course is to be smooth."""
 
 
 class Columns(nn.Module):
@@ -55,6 +75,7 @@ class Frame(nn.Module):
         shapes: The reference of the basis at each end, float64 on the CPU, checked. *Shape:* ``(2, V, 3)``.
         faces: Vertex indices, likewise. *Shape:* ``(F, 3)``.
         coarse_faces: Number of faces of the coarse mesh.
+        weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
     """
 
     scale: Tensor
@@ -67,13 +88,11 @@ class Frame(nn.Module):
     reference: Tensor
     turn: Tensor
 
-    def __init__(self, shapes: Tensor, faces: Tensor, coarse_faces: int) -> None:
+    def __init__(self, shapes: Tensor, faces: Tensor, coarse_faces: int, weights: Tensor | None = None) -> None:
         super().__init__()
         used = shapes[0][faces.unique()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
-        # The areas of both ends, so that neither of them comes first.
-        areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
-        weights = (areas / areas.sum(1, keepdim=True)).mean(0)
+        weights = mean_areas(shapes, faces) if weights is None else weights
         turn = best_fit(shapes[1], shapes[0], weights)
         references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale
         coarsening = coarsen(references.numpy(), faces.numpy(), coarse_faces)
@@ -144,19 +163,57 @@ class Frame(nn.Module):
         back = best_fit(second, first, self.weights)
         return Pair(first, back.apply(second), placed, back.inverse())
 
+    def surround(self, pair: Pair, before: Tensor | None, after: Tensor | None, spacing: Spacing) -> Pair:
+        """The pair with its neighbours in time, of the caller. *Shape of each:* ``(B, V, 3)``."""
+        wide = Spacing(*(h[:, None] for h in spacing))
+        turns: list[Tensor | None] = [None, None]
+        moves: list[Tensor | None] = [None, None]
+        if before is not None:
+            placed = pair.placed.apply(before) * self.scale
+            back = best_fit(placed, pair.first, self.weights)
+            before, turns[0], moves[0] = back.apply(placed), log(back.rotation), back.target - back.source
+        if after is not None:
+            placed = pair.placed.apply(after) * self.scale
+            unturned = pair.between.inverse().apply(placed)
+            back = best_fit(unturned, pair.second, self.weights)
+            moves[1] = centroid(placed, self.weights) - pair.between.target
+            after, turns[1] = back.apply(unturned), log(back.rotation.mT)
+
+        def size(x: Tensor) -> Tensor:
+            return norm(x.movedim(-1, 0))[..., None]
+
+        turn = excess(log(pair.between.rotation), turns[0], turns[1], wide, size)
+        move = excess(pair.between.target - pair.between.source, moves[0], moves[1], wide, size)
+        return pair._replace(around=Around(before, after, spacing, turn, move))
+
+    def _motion(self, pair: Pair, t: Tensor) -> RigidMotion:
+        """From the frame to the pose at the time ``t``, in its units."""
+        straight = pair.between.fraction(t)
+        if pair.around is None:
+            return straight
+        bent = exp(beyond(pair.around.turn, t[:, None]))
+        moved = straight.target + beyond(pair.around.move, t[:, None])
+        return RigidMotion(straight.rotation @ bent, straight.source, moved)
+
     def restore(self, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
-        """Bring a shape at the time ``t`` back to the caller, moved along the geodesic of the rigid motion.
+        """Bring a shape at the time ``t`` back to the caller, moved along the course of the rigid motion.
 
         Args:
             x: Shapes of the frame. *Shape:* ``(B, V, 3)``.
             pair: The key-frames that they lie between.
             t: *Shape:* ``(B,)``.
         """
-        return pair.placed.inverse().apply(pair.between.fraction(t).apply(x) / self.scale)
+        return pair.placed.inverse().apply(self._motion(pair, t).apply(x) / self.scale)
 
     def bring(self, points: Tensor, pair: Pair, t: Tensor) -> Tensor:
         """The inverse of :meth:`restore`, of points of the caller's. *Shape:* ``(B, P, 3), (B,) -> (B, P, 3)``."""
-        return pair.between.fraction(t).inverse().apply(pair.placed.apply(points) * self.scale)
+        return self._motion(pair, t).inverse().apply(pair.placed.apply(points) * self.scale)
+
+
+def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:
+    """Vertex areas of several shapes, as parts of the whole: none of them comes first. *Shape:* ``(K, V, 3)``."""
+    areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
+    return (areas / areas.sum(1, keepdim=True)).mean(0)
 
 
 def _rigid_fields(x: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch_modal.energy.terms import Mesh
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.between import Between, InBetweenResult, Samples, report
+from torch_modal.nn.frame import mean_areas
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
@@ -84,6 +85,8 @@ class InBetween(nn.Module):
         _, self._faces = check_keyframes(shapes, self._faces.cpu(), warn=False)
         ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
         mesh = Mesh.of(self._faces, len(shapes[0]))
+        # The same for all pairs: a motion through several has one course.
+        weights = mean_areas(torch.stack(shapes), self._faces)
         made = [
             Between(
                 torch.stack([ends[i][0], ends[j][0]]),
@@ -92,6 +95,7 @@ class InBetween(nn.Module):
                 self.objective,
                 self.solver,
                 list(self.terms),
+                weights,
             )
             for i, j in self.pairs
         ]
@@ -143,7 +147,7 @@ class InBetween(nn.Module):
     def _batched(
         self, x_a: Tensor, x_b: Tensor, t: Tensor | float, pair: Tensor | int, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
-        times = self._check(x_a, x_b, t)
+        times = self.check(x_a, x_b, t)
         chosen = self._chosen(pair)
         item = x_a.shape[-2:]
         own = torch.broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], *([] if chosen is None else [chosen.shape]))
@@ -153,11 +157,16 @@ class InBetween(nn.Module):
         if own != lead:
             index = torch.arange(len(flat_a), device=times.device).reshape(own).expand(lead).reshape(-1)
         samples = Samples(
-            flat_a, flat_b, index, times.expand(lead).reshape(-1), self._mu(times, lead), self._stiffness(times, lead)
+            flat_a,
+            flat_b,
+            index,
+            times.expand(lead).reshape(-1),
+            self.mu_of(times, lead),
+            self.stiffness_of(times, lead),
         )
         recorded = (x_a, x_b, times, samples.mu, *samples.stiffness)
         exact = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in recorded)
-        with _full_precision(times.device.type):
+        with full_precision(times.device.type):
             if chosen is None:
                 result = self.members[0 if isinstance(pair, Tensor) else pair](samples, exact, report)
             else:
@@ -215,8 +224,8 @@ class InBetween(nn.Module):
             raise ValueError(f"pair holds whole numbers from 0 to {last}; got {pair.dtype} up to {pair.max()}")
         return pair if last else None
 
-    def _check(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
-        """Times as a tensor."""
+    def check(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
+        """Refuse what does not fit; times as a tensor."""
         reference = self.members[0].frame.reference
         for name, x in (("x_a", x_a), ("x_b", x_b)):
             if not isinstance(x, Tensor):
@@ -238,8 +247,8 @@ class InBetween(nn.Module):
             ) from None
         return times
 
-    def _mu(self, times: Tensor, lead: torch.Size) -> Tensor:
-        """*Shape:* ``(B,)``."""
+    def mu_of(self, times: Tensor, lead: torch.Size) -> Tensor:
+        """``mu`` of a flat batch of these leading dimensions. *Shape:* ``(B,)``."""
         mu = torch.as_tensor(self.mu, dtype=times.dtype, device=times.device)
         try:
             return mu.expand(lead).reshape(-1)
@@ -248,8 +257,8 @@ class InBetween(nn.Module):
                 f"mu of shape {tuple(mu.shape)} does not broadcast against samples of {tuple(lead)}"
             ) from None
 
-    def _stiffness(self, times: Tensor, lead: torch.Size) -> list[Tensor]:
-        """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    def stiffness_of(self, times: Tensor, lead: torch.Size) -> list[Tensor]:
+        """Stiffnesses of a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
         found = []
         for term, part in zip(self.terms, self.members[0].fine.parts, strict=True):
             values = torch.as_tensor(term.stiffness, dtype=times.dtype, device=times.device)
@@ -287,7 +296,7 @@ def _rebuild(layer: InBetween, *_: Any) -> None:
 
 
 @contextmanager
-def _full_precision(device: str) -> Iterator[None]:
+def full_precision(device: str) -> Iterator[None]:
     """No autocast, and no TF32 or bfloat16 inside products of float32: factorisations would fail."""
     precision = torch.get_float32_matmul_precision()
     with torch.autocast(device, enabled=False):

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
+from torch_modal.geometry.hermite import Spacing, beyond, excess
+from torch_modal.geometry.vectors import norm
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Frame, Pair
@@ -75,33 +77,57 @@ class JointSpace(nn.Module):
         """
         levels = self.levels
         difference = self._difference(pair)
-        coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
-        ends = [levels.seen(pair.first, coarse_first), levels.seen(pair.second, coarse_second)]
         extras = levels.seen(difference, self.frame.coarsen(difference))
-        rests_a, rests_b = (levels.rests(end) for end in ends)
+        difference, extras = trees.picked((difference, extras), index)
+        start = t.new_zeros(len(t), self.n_unknowns)
+        if pair.around is not None:
+            base = self.on_course(pair, index, t)
+            coarse = self.frame.coarsen(base)
+            references = levels.against(base, coarse, stiffness)
+            placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
+            return JointProblem(placement, start, base, difference)
+        coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
+        rests_a, rests_b = (
+            levels.rests(levels.seen(x, own)) for x, own in ((pair.first, coarse_first), (pair.second, coarse_second))
+        )
         references = levels.between(rests_a, rests_b, index, t, stiffness)
-        own = (pair.first, pair.second, difference, coarse_first, coarse_second, extras)
-        first, second, difference, coarse_first, coarse_second, extras = (
-            own if index is None else trees.rows(own, index)
+        first, second, coarse_first, coarse_second = trees.picked(
+            (pair.first, pair.second, coarse_first, coarse_second), index
         )
         base = torch.lerp(first, second, t[:, None, None])
-        coarse_base = torch.lerp(coarse_first, coarse_second, t[:, None, None])
-        placement = levels.place(self.energy, levels.seen(base, coarse_base), references, extras, anchors)
-        start = t.new_zeros(len(t), self.n_unknowns)
+        coarse = torch.lerp(coarse_first, coarse_second, t[:, None, None])
+        placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
         if self.guess is not None:
             with torch.no_grad():
                 start = self.guess(coarse_first, coarse_second, extras[0], t)
         if self.blend is not None:
             blend = self.blend(first, second, t)
-            turned = levels.place(
-                self.energy, levels.seen(blend, self.frame.coarsen(blend)), references, extras, anchors
-            )
+            seen = levels.seen(blend, self.frame.coarsen(blend))
+            turned = levels.place(self.energy, seen, references, extras, anchors)
             with torch.no_grad():
                 better = self.energy.value(start, turned) < self.energy.value(start, placement)
             base = torch.where(better[:, None, None], blend, base)
-            chosen = zip(turned, placement, strict=True)
-            placement = tuple(b._replace(base=torch.where(better[:, None, None], a.base, b.base)) for a, b in chosen)
+            placement = tuple(
+                straight._replace(base=torch.where(better[:, None, None], bent.base, straight.base))
+                for bent, straight in zip(turned, placement, strict=True)
+            )
         return JointProblem(placement, start, base, difference)
+
+    def on_course(self, pair: Pair, index: Tensor | None, t: Tensor) -> Tensor:
+        """The shape that the motion passes through, by what the neighbours in time say. *Shape:* ``(B, V, 3)``."""
+        around = pair.around
+        assert around is not None
+        earlier = None if around.before is None else pair.first - around.before
+        later = None if around.after is None else around.after - pair.second
+        wide = Spacing(*(h[:, None, None] for h in around.spacing))
+        bend = excess(pair.second - pair.first, earlier, later, wide, _lengths)
+        first, second, bend = trees.picked((pair.first, pair.second, bend), index)
+        u = t[:, None, None]
+        straight = torch.lerp(first, second, u) + beyond(bend, u)
+        if self.blend is None:
+            return straight
+        course = self.blend.rotations.course(around.before, pair.first, pair.second, around.after, around.spacing)
+        return self.blend.along(course if index is None else course.rows(index), straight, t)
 
     @staticmethod
     def require(t: Tensor) -> None:
@@ -126,3 +152,8 @@ class JointSpace(nn.Module):
         # Coincident key-frames leave no difference: its column is then zero, not a quotient of rounding errors.
         rounding = 1e3 * torch.finfo(own.dtype).eps * pair.first.abs().amax((-1, -2), keepdim=True)
         return own * (squared + rounding**2).rsqrt()
+
+
+def _lengths(x: Tensor) -> Tensor:
+    """*Shape:* ``(..., 3) -> (..., 1)``."""
+    return norm(x.movedim(-1, 0))[..., None]

@@ -62,11 +62,15 @@ class Levels(nn.Module):
     def between(
         self, first: list[Rest], second: list[Rest], index: Tensor | None, t: Tensor, stiffness: Stiffness
     ) -> list[Reference]:
-        """What in-betweens at the times ``t`` are compared with, of the pairs ``index`` (all in turn where None)."""
-        if index is not None:
-            first, second = trees.rows(first, index), trees.rows(second, index)
+        """What in-betweens at the times ``t`` are compared with, of the pairs ``index`` (each its own where None)."""
+        first, second = trees.picked((first, second), index)
         parts = zip(self.energies, first, second, stiffness.levels, strict=True)
         return [energy.between(a, b, t, own) for energy, a, b, own in parts]
+
+    def against(self, x: Tensor, coarse: Tensor, stiffness: Stiffness) -> list[Reference]:
+        """Shapes as what others are compared with. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
+        parts = zip(self.rests(self.seen(x, coarse)), stiffness.levels, strict=True)
+        return [Energy.against(rest, own) for rest, own in parts]
 
     def place(
         self,

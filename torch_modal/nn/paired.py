@@ -6,7 +6,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import Energy
 from torch_modal.nn import trees
 from torch_modal.nn.frame import Columns, Frame, Pair
 from torch_modal.nn.levels import Levels, Stiffness
@@ -129,13 +128,12 @@ class PairedSpace(nn.Module):
     ) -> PairedProblem:
         """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. Arguments as for the joint space."""
         ends = (pair.first, pair.second)
-        first, second = ends if index is None else trees.rows(ends, index)
+        first, second = trees.picked(ends, index)
 
         def place(x: Tensor, modal: SumOfEnergies) -> tuple[Placement, ...]:
-            seen = self.levels.seen(x, self.frame.coarsen(x))
-            rests = zip(self.levels.rests(seen), stiffness.levels, strict=True)
-            references = [Energy.against(rest, own) for rest, own in rests]
-            return self.levels.place(modal, seen, references, None, anchors)
+            coarse = self.frame.coarsen(x)
+            references = self.levels.against(x, coarse, stiffness)
+            return self.levels.place(modal, self.levels.seen(x, coarse), references, None, anchors)
 
         places = place(first, self.energy.first), place(second, self.energy.second)
         apart = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)

@@ -337,6 +337,12 @@ def _blank_solution(a: Tensor) -> Solution:
     return Solution(torch.zeros_like(a), number, number.clone(), whole, whole.clone())
 
 
+def unmoved(t: Tensor, n_unknowns: int, usable: Tensor) -> Solution:
+    """Where there is nothing to do: amplitudes of zero, at the optimum. *Shape:* ``(B,)``."""
+    blank = _blank_solution(t.detach().new_zeros(len(t), n_unknowns))
+    return blank._replace(status=torch.where(usable, Status.CONVERGED, Status.INVALID))
+
+
 def _second_order(energy: AmplitudeEnergy, a: Tensor, placement: Any, where: Tensor) -> Tensor:
     """The second-order term of some samples; NaN, which rules its direction out, for the others."""
     chosen = torch.nonzero(where).flatten()

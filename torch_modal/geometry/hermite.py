@@ -1,0 +1,88 @@
+r"""Cubic motion through key-frames: what it has beyond the straight step between two of them.
+
+Of any quantity that steps by ``d`` from one key-frame to the next, in the time ``h``, the cubic with the velocities
+``m_0`` and ``m_1`` at both is
+
+.. math::
+    q(u) = q_0 + u\, d + u (1 - u) \bigl((1 - u)\, e_0 - u\, e_1\bigr), \qquad e_i = h\, m_i - d,
+
+with ``u`` from 0 to 1 (Hermite). The excess ``e`` is all that neighbours in time have to say. Quantities may be
+vectors, or rotations, whose steps are axis times angle in coordinates that turn along.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+# A velocity is at most this many times the slower one of the steps before and after it: what stops, stops, and no
+# quantity that grows overshoots (Fritsch and Carlson 1980).
+LIMIT = 3.0
+
+
+class Excess(NamedTuple):
+    """How far the velocities at both ends are from the straight step's."""
+
+    first: Tensor
+    last: Tensor
+
+
+class Spacing(NamedTuple):
+    """How long the intervals are: the one before, this one, and the one after. *Shape of each:* ``(B,)``."""
+
+    before: Tensor
+    own: Tensor
+    after: Tensor
+
+
+def excess(
+    step: Tensor,
+    before: Tensor | None,
+    after: Tensor | None,
+    spacing: Spacing,
+    size: Callable[[Tensor], Tensor] = torch.abs,
+) -> Excess:
+    r"""The excess that follows from the steps before and after.
+
+    Velocities are those of the parabola through three key-frames, :math:`(h_+ v_- + h_- v_+) / (h_- + h_+)` of the
+    velocities of both steps, limited (:data:`LIMIT`). Evenly spaced, that is Catmull and Rom's spline, and half-way
+    the four-point scheme of Dyn, Levin and Gregory 1987. An end has no acceleration (a natural end).
+
+    Args:
+        step: From one key-frame to the next. *Shape:* ``(...)``.
+        before: The step before it; None at the first key-frame.
+        after: The step after it; None at the last.
+        spacing: Durations, that broadcast against the steps.
+        size: The size of a quantity, whose dimensions broadcast against it.
+    """
+    first: Tensor | None = None
+    last: Tensor | None = None
+    if before is not None:
+        first = spacing.own * _velocity(before / spacing.before, step / spacing.own, spacing.before, spacing.own, size)
+        first = first - step
+    if after is not None:
+        last = spacing.own * _velocity(step / spacing.own, after / spacing.after, spacing.own, spacing.after, size)
+        last = last - step
+    if first is None and last is None:
+        return Excess(torch.zeros_like(step), torch.zeros_like(step))
+    # No second derivative at an end: -4 e_0 - 2 e_1 = 0 at the first.
+    if first is None:
+        assert last is not None
+        return Excess(-0.5 * last, last)
+    return Excess(first, -0.5 * first if last is None else last)
+
+
+def _velocity(
+    before: Tensor, after: Tensor, h_before: Tensor, h_after: Tensor, size: Callable[[Tensor], Tensor]
+) -> Tensor:
+    wanted = (h_after * before + h_before * after) / (h_before + h_after)
+    most = LIMIT * torch.minimum(size(before), size(after))
+    found = size(wanted)
+    fast = found > most
+    return torch.where(fast, wanted * (most / torch.where(fast, found, 1)), wanted)
+
+
+def beyond(bend: Excess, u: Tensor) -> Tensor:
+    """What the cubic adds to the straight step at ``u``, which broadcasts against the excess."""
+    return u * (1 - u) * ((1 - u) * bend.first - u * bend.last)

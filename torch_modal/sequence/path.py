@@ -1,0 +1,188 @@
+r"""Motion through many key-frames: smooth in time, at any time, differentiable.
+
+Between two key-frames a path is the in-between of :class:`torch_modal.InBetween`, with what the neighbours in time know
+beyond the pair: everything that moves (rotations and sizes of triangles, lengths, angles and the volume that the energy
+compares with, the rigid motion) follows a cubic through four key-frames (:mod:`torch_modal.geometry.hermite`) in the
+place of a straight line through two. The minimisation is the same.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.geometry.hermite import Spacing
+from torch_modal.nn.between import Samples, report
+from torch_modal.nn.in_between import InBetween, full_precision
+from torch_modal.nn.settings import Objective, Preset, Solver
+from torch_modal.nn.solver import Solution
+from torch_modal.precompute.basis import ModalBasis
+
+
+class Path(nn.Module):
+    """Shapes at any time of a motion through key-frames.
+
+    Velocities are continuous at the key-frames, which are reproduced exactly. They are limited to three times the
+    slower one of both sides, triangle by triangle, so that what stops does stop. The ends have no acceleration.
+
+    Args:
+        bases: The basis of each key-frame, two or more (:func:`torch_modal.extract_bases`).
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        times: When the key-frames are, ascending; if cyclic, one more, when the first comes again. Default: 0, 1, 2,
+            and so on. *Shape:* ``(K,)``, or ``(K + 1,)`` if cyclic.
+        cyclic: Whether the last key-frame leads on to the first. Times are then taken modulo the period.
+        smooth: Whether neighbours in time have a say; False treats each pair alone.
+        preset: As for :class:`torch_modal.InBetween`; not ``"paper"``, which knows the middle of a pair only.
+        objective: What is minimised, in the place of the preset's.
+        solver: How it is solved, in the place of the preset's.
+
+    Raises:
+        ValueError: An argument is not usable.
+    """
+
+    times: Tensor
+
+    def __init__(
+        self,
+        bases: Sequence[ModalBasis],
+        faces: Tensor,
+        times: Tensor | Sequence[float] | None = None,
+        cyclic: bool = False,
+        smooth: bool = True,
+        preset: Preset = "accurate",
+        *,
+        objective: Objective | None = None,
+        solver: Solver | None = None,
+    ) -> None:
+        super().__init__()
+        n = len(bases)
+        if n < 2:
+            raise ValueError(f"a path needs two key-frames or more, got {n} bases")
+        pairs = [(i, (i + 1) % n) for i in range(n if cyclic else n - 1)]
+        self.layer = InBetween(list(bases), faces, preset, objective=objective, solver=solver, pairs=pairs)
+        if self.layer.objective.space == "paired":
+            raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
+        self.register_buffer("times", checked_times(times, n, cyclic))
+        self.n_keyframes = n
+        self.cyclic = cyclic
+        self.smooth = smooth
+
+    def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
+        """The shapes at given times.
+
+        Args:
+            keyframes: Near those that the bases were made from. *Shape:* ``(..., K, V, 3)``.
+            t: Times, broadcast against the leading dimensions of the key-frames. *Shape:* ``(...)``, or a number.
+
+        Returns:
+            The key-frames exactly at theirs. *Shape:* ``(..., V, 3)``.
+
+        Raises:
+            ValueError: Shapes that do not fit, or a time before the first or after the last key-frame.
+            ConvergenceError: As for :class:`torch_modal.InBetween`.
+        """
+        layer = self.layer
+        if keyframes.dim() < 3 or keyframes.shape[-3] != self.n_keyframes:
+            raise ValueError(
+                f"keyframes of this path have the shape (..., {self.n_keyframes}, V, 3); got {tuple(keyframes.shape)}"
+            )
+        layer.check(keyframes[..., 0, :, :], keyframes[..., -1, :, :], 0.0)
+        t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
+        own, item = keyframes.shape[:-3], keyframes.shape[-2:]
+        try:
+            lead = torch.broadcast_shapes(own, t.shape)
+        except RuntimeError:
+            raise ValueError(
+                f"t of shape {tuple(t.shape)} does not broadcast against motions of {tuple(own)}; for all times of all "
+                "motions pass keyframes[:, None]"
+            ) from None
+        flat = keyframes.reshape(-1, *keyframes.shape[-3:])
+        which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
+        segment, u = self._located(t.expand(lead).reshape(-1))
+        exact = torch.is_grad_enabled() and (keyframes.requires_grad or t.requires_grad or _any_recorded(layer))
+        order, shapes, solutions = [], [], []
+        for i in segment.unique().tolist():
+            mine = torch.nonzero(segment == i).flatten()
+            found, solution = self._between(flat, i, which[mine], u[mine], exact)
+            order.append(mine)
+            shapes.append(found)
+            solutions.append(solution)
+        if not shapes:
+            return keyframes.new_zeros(*lead, *item)
+        self._report(solutions)
+        back = torch.argsort(torch.cat(order))
+        return torch.cat(shapes)[back].reshape(*lead, *item)
+
+    def _located(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
+        times = self.times
+        if self.cyclic:
+            period = times[-1] - times[0]
+            t = t - period * torch.floor((t.detach() - times[0]) / period)
+        outside = ~((t >= times[0]) & (t <= times[-1]))
+        if bool(outside.any()):
+            raise ValueError(
+                f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
+                f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
+            )
+        segment = (torch.searchsorted(times, t.detach(), right=True) - 1).clamp(0, len(times) - 2)
+        return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
+
+    def _between(self, keyframes: Tensor, i: int, which: Tensor, u: Tensor, exact: bool) -> tuple[Tensor, Solution]:
+        """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
+        layer, n = self.layer, self.n_keyframes
+        x = keyframes.to(layer.dtype)
+        around: dict[str, Any] = {}
+        if self.smooth and n > 2:
+            last = len(self.times) - 2
+            before = x[:, (i - 1) % n] if self.cyclic or i > 0 else None
+            after = x[:, (i + 2) % n] if self.cyclic or i < last else None
+            h = self.times.diff().to(x)
+            spacing = Spacing(*(h[j % len(h)].expand(len(x)) for j in (i - 1, i, i + 1)))
+            around = {"before": before, "after": after, "spacing": spacing}
+        u = u.to(x)
+        samples = Samples(
+            x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), layer.stiffness_of(u, u.shape), **around
+        )
+        with full_precision(x.device.type):
+            shapes, solution = layer.members[i](samples, exact, None)
+        shapes = shapes.to(keyframes.dtype)
+        for end, j in ((0, i), (1, (i + 1) % n)):
+            exactly = keyframes[which, j].detach() + (shapes - shapes.detach())
+            shapes = torch.where((u == end)[:, None, None], exactly, shapes)
+        return shapes, solution
+
+    def _report(self, solutions: list[Solution]) -> None:
+        solver = self.layer.solver
+        forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
+        told = partial(report, max_steps=solver.max_steps, forbid=forbid)
+        # Amplitudes of intervals differ in number; what is told does not look at them.
+        parts = zip(*(solution[1:] for solution in solutions), strict=True)
+        told(Solution(solutions[0].amplitudes, *(torch.cat(each) for each in parts)))
+
+
+def checked_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor:
+    """The times of key-frames; if cyclic, with the time when the first comes again. *Shape:* ``(K,)`` or ``(K + 1,)``.
+
+    Raises:
+        ValueError: Another number of times, or times that do not ascend.
+    """
+    n = n_keyframes + cyclic
+    if times is None:
+        return torch.arange(n, dtype=torch.float64)
+    found = torch.as_tensor(times).detach().to("cpu", torch.float64)
+    if found.shape != (n,):
+        also = ", and one when the first comes again" if cyclic else ""
+        raise ValueError(
+            f"times has the shape {tuple(found.shape)}; it needs one time for each key-frame{also}: ({n},)"
+        )
+    if not bool(found.isfinite().all()) or bool((found.diff() <= 0).any()):
+        raise ValueError(f"times must ascend from key-frame to key-frame; got {found.tolist()}")
+    return found
+
+
+def _any_recorded(layer: InBetween) -> bool:
+    stiffness = [layer.mu, *(term.stiffness for term in layer.terms)]
+    return any(isinstance(value, Tensor) and value.requires_grad for value in stiffness)
