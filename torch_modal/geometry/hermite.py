@@ -16,9 +16,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-# A velocity is at most this many times the slower one of the steps before and after it: what stops, stops, and no
-# quantity that grows overshoots (Fritsch and Carlson 1980).
-LIMIT = 3.0
+# Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
+# what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
+LIMIT = 2.75
 
 
 class Excess(NamedTuple):
@@ -41,7 +41,7 @@ def excess(
     before: Tensor | None,
     after: Tensor | None,
     spacing: Spacing,
-    size: Callable[[Tensor], Tensor] = torch.abs,
+    squared: Callable[[Tensor], Tensor] = torch.square,
 ) -> Excess:
     r"""The excess that follows from the steps before and after.
 
@@ -54,16 +54,16 @@ def excess(
         before: The step before it; None at the first key-frame.
         after: The step after it; None at the last.
         spacing: Durations, that broadcast against the steps.
-        size: The size of a quantity, whose dimensions broadcast against it.
+        squared: The square of a quantity's size, which broadcasts against it.
     """
     first: Tensor | None = None
     last: Tensor | None = None
     if before is not None:
-        first = spacing.own * _velocity(before / spacing.before, step / spacing.own, spacing.before, spacing.own, size)
-        first = first - step
+        speed = _velocity(before / spacing.before, step / spacing.own, spacing.before, spacing.own, squared)
+        first = spacing.own * speed - step
     if after is not None:
-        last = spacing.own * _velocity(step / spacing.own, after / spacing.after, spacing.own, spacing.after, size)
-        last = last - step
+        speed = _velocity(step / spacing.own, after / spacing.after, spacing.own, spacing.after, squared)
+        last = spacing.own * speed - step
     if first is None and last is None:
         return Excess(torch.zeros_like(step), torch.zeros_like(step))
     # No second derivative at an end: -4 e_0 - 2 e_1 = 0 at the first.
@@ -74,15 +74,23 @@ def excess(
 
 
 def _velocity(
-    before: Tensor, after: Tensor, h_before: Tensor, h_after: Tensor, size: Callable[[Tensor], Tensor]
+    before: Tensor, after: Tensor, h_before: Tensor, h_after: Tensor, squared: Callable[[Tensor], Tensor]
 ) -> Tensor:
     wanted = (h_after * before + h_before * after) / (h_before + h_after)
-    most = LIMIT * torch.minimum(size(before), size(after))
-    found = size(wanted)
-    fast = found > most
-    return torch.where(fast, wanted * (most / torch.where(fast, found, 1)), wanted)
+    slow, fast, found = squared(before), squared(after), squared(wanted)
+    both = slow + fast
+    most = LIMIT**2 * slow * fast / torch.where(both > 0, both, 1)
+    # Up to the limit nothing changes; beyond it, velocities fall so that no corner is left, there or at rest.
+    cut = most < found
+    part = torch.where(cut, most, 1) / torch.where(cut, found, 1)
+    return wanted * (part * (2 - part))
 
 
 def beyond(bend: Excess, u: Tensor) -> Tensor:
     """What the cubic adds to the straight step at ``u``, which broadcasts against the excess."""
     return u * (1 - u) * ((1 - u) * bend.first - u * bend.last)
+
+
+def squared_length(x: Tensor) -> Tensor:
+    """Of vectors, components last. *Shape:* ``(..., 3) -> (..., 1)``."""
+    return x.square().sum(-1, keepdim=True)

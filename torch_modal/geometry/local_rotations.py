@@ -1,6 +1,5 @@
 """Between two shapes by local rotations: every triangle turns at constant speed."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -10,7 +9,7 @@ from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import Frames, Sides, edge_means, frames, sides
-from torch_modal.geometry.vectors import norm, pick
+from torch_modal.geometry.vectors import pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
 # of its longest side counts like a turn of one radian against its neighbour.
@@ -21,24 +20,22 @@ SHORTEST = 1e-9
 
 
 class Course(NamedTuple):
-    """How triangles move between two shapes of a motion. Components first. *Shape of each:* ``(3, P, F)``."""
+    """How triangles move between two shapes of a motion. Components first."""
 
     e1: Tensor
-    """The frames of the shape at 0."""
+    """The frames of the shape at 0. *Shape:* ``(3, P, F)``."""
     e2: Tensor
     normal: Tensor
-    turn: Tensor
-    """Axis times angle to the shape at 1, in the coordinates of the frames."""
-    turn_first: Tensor
-    """The excess of that."""
-    turn_last: Tensor
     size: Tensor
-    """Length, and coordinates along and across, at 0."""
-    growth: Tensor
-    """What they gain until 1."""
-    growth_first: Tensor
-    """The excess of that."""
-    growth_last: Tensor
+    """Length, and coordinates along and across, at 0. *Shape:* ``(3, P, F)``."""
+    step: Tensor
+    """To the shape at 1: axis times angle in the coordinates of the frames, then the growth of the size over the mean
+    length, so that all are turns or strains. *Shape:* ``(6, P, F)``."""
+    first: Tensor
+    """The excess of that. *Shape:* ``(6, P, F)``."""
+    last: Tensor
+    unit: Tensor
+    """The mean length. *Shape:* ``(P, F)``."""
 
     def rows(self, index: Tensor) -> "Course":
         """Of some of the shapes."""
@@ -117,34 +114,37 @@ class LocalRotations(nn.Module):
         """
         earlier, a, b, later = (None if x is None else _frames(x, self.faces) for x in (before, first, second, after))
         assert a is not None and b is not None
+        unit = 0.5 * (a.length + b.length)
+
+        def step(p: Frames | None, q: Frames | None, at: Frames) -> Tensor | None:
+            if p is None or q is None:
+                return None
+            turn = turn_of(self._sensed(p, q))
+            # The axis has the same coordinates in either frame.
+            turns = [(turn * axis).sum(0) for axis in (at.e1, at.e2, at.normal)]
+            return torch.stack([*turns, *((y - x) / unit for x, y in zip(p[3:], q[3:], strict=True))])
+
+        own = step(a, b, a)
+        assert own is not None
         wide = Spacing(*(h[:, None] for h in spacing))
-        turns = [None if p is None or q is None else self._turn(p, q) for p, q in ((earlier, a), (b, later))]
-        sizes = [None if x is None else torch.stack(x[3:]) for x in (earlier, a, b, later)]
-        steps = [None if x is None or y is None else y - x for x, y in pairwise(sizes)]
-        turn, step = self._turn(a, b), torch.stack(b[3:]) - torch.stack(a[3:])
-        turning = excess(turn, turns[0], turns[1], wide, norm)
-        growing = excess(step, steps[0], steps[2], wide)
-        return Course(a.e1, a.e2, a.normal, turn, *turning, torch.stack(a[3:]), step, *growing)
+        bend = excess(own, step(earlier, a, a), step(b, later, b), wide, lambda x: x.square().sum(0))
+        return Course(a.e1, a.e2, a.normal, torch.stack(a[3:]), own, *bend, unit)
 
     def along(self, course: Course, t: Tensor) -> Tensor:
         """Edge vectors on a course, components first. *Shape:* ``(B,) -> (3, B, E)``."""
         u = t[:, None]
-        length, along, height = course.size + u * course.growth + beyond(Excess(*course[8:]), u)
-        bent, straight = beyond(Excess(*course[4:6]), u), u * course.turn
+        straight, bent = u * course.step, beyond(Excess(course.first, course.last), u)
+        length, along, height = course.size + course.unit * (straight + bent)[3:]
         flat = torch.zeros_like(length)
 
         def placed(x: Tensor, y: Tensor) -> Tensor:
-            x, y, z = turned(straight, turned(bent, torch.stack([x, y, flat])))
+            x, y, z = turned(straight[:3], turned(bent[:3], torch.stack([x, y, flat])))
             return x * course.e1 + y * course.e2 + z * course.normal
 
-        areas = course.size[0] * course.size[2] + (course.size + course.growth)[0] * (course.size + course.growth)[2]
+        end = course.size + course.unit * course.step[3:]
+        areas = course.size[0] * course.size[2] + end[0] * end[2]
         wanted = Sides(placed(length, flat), placed(along, height))
         return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, len(self.per_length))
-
-    def _turn(self, a: Frames, b: Frames) -> Tensor:
-        """How triangles turn, axis times angle in the coordinates of their frames. *Shape:* ``(3, P, F)``."""
-        turn = turn_of(self._sensed(a, b))
-        return torch.stack([(turn * axis).sum(0) for axis in (a.e1, a.e2, a.normal)])
 
     def _sensed(self, a: Frames, b: Frames) -> Tensor:
         """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""

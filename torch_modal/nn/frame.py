@@ -7,10 +7,9 @@ from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import vertex_areas
-from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess
+from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, squared_length
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
-from torch_modal.geometry.vectors import norm
 from torch_modal.precompute.coarsening import coarsen
 
 # Combinations of columns whose squared norm is below this part of the largest are rounding, not directions.
@@ -178,12 +177,8 @@ class Frame(nn.Module):
             back = best_fit(unturned, pair.second, self.weights)
             moves[1] = centroid(placed, self.weights) - pair.between.target
             after, turns[1] = back.apply(unturned), log(back.rotation.mT)
-
-        def size(x: Tensor) -> Tensor:
-            return norm(x.movedim(-1, 0))[..., None]
-
-        turn = excess(log(pair.between.rotation), turns[0], turns[1], wide, size)
-        move = excess(pair.between.target - pair.between.source, moves[0], moves[1], wide, size)
+        turn = excess(log(pair.between.rotation), turns[0], turns[1], wide, squared_length)
+        move = excess(pair.between.target - pair.between.source, moves[0], moves[1], wide, squared_length)
         return pair._replace(around=Around(before, after, spacing, turn, move))
 
     def _motion(self, pair: Pair, t: Tensor) -> RigidMotion:

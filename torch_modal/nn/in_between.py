@@ -74,7 +74,7 @@ class InBetween(nn.Module):
         else:
             self.mu = mu
         self.bases = nn.ModuleList(_Basis(basis) for basis in bases)
-        self._faces = torch.as_tensor(faces)
+        self.faces = torch.as_tensor(faces)
         self._build()
         self.register_load_state_dict_post_hook(_rebuild)
 
@@ -82,11 +82,11 @@ class InBetween(nn.Module):
         """What follows from the bases, on their device and in their dtype."""
         like = self.bases[0].reference
         shapes = [basis.reference.double().cpu() for basis in self.bases]
-        _, self._faces = check_keyframes(shapes, self._faces.cpu(), warn=False)
+        _, self.faces = check_keyframes(shapes, self.faces.cpu(), warn=False)
         ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
-        mesh = Mesh.of(self._faces, len(shapes[0]))
+        mesh = Mesh.of(self.faces, len(shapes[0]))
         # The same for all pairs: a motion through several has one course.
-        weights = mean_areas(torch.stack(shapes), self._faces)
+        weights = mean_areas(torch.stack(shapes), self.faces)
         made = [
             Between(
                 torch.stack([ends[i][0], ends[j][0]]),

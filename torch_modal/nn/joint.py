@@ -7,8 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
-from torch_modal.geometry.hermite import Spacing, beyond, excess
-from torch_modal.geometry.vectors import norm
+from torch_modal.geometry.hermite import Spacing, beyond, excess, squared_length
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Frame, Pair
@@ -120,7 +119,7 @@ class JointSpace(nn.Module):
         earlier = None if around.before is None else pair.first - around.before
         later = None if around.after is None else around.after - pair.second
         wide = Spacing(*(h[:, None, None] for h in around.spacing))
-        bend = excess(pair.second - pair.first, earlier, later, wide, _lengths)
+        bend = excess(pair.second - pair.first, earlier, later, wide, squared_length)
         first, second, bend = trees.picked((pair.first, pair.second, bend), index)
         u = t[:, None, None]
         straight = torch.lerp(first, second, u) + beyond(bend, u)
@@ -152,8 +151,3 @@ class JointSpace(nn.Module):
         # Coincident key-frames leave no difference: its column is then zero, not a quotient of rounding errors.
         rounding = 1e3 * torch.finfo(own.dtype).eps * pair.first.abs().amax((-1, -2), keepdim=True)
         return own * (squared + rounding**2).rsqrt()
-
-
-def _lengths(x: Tensor) -> Tensor:
-    """*Shape:* ``(..., 3) -> (..., 1)``."""
-    return norm(x.movedim(-1, 0))[..., None]

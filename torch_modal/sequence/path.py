@@ -17,7 +17,6 @@ from torch_modal.geometry.hermite import Spacing
 from torch_modal.nn.between import Samples, report
 from torch_modal.nn.in_between import InBetween, full_precision
 from torch_modal.nn.settings import Objective, Preset, Solver
-from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
 
 
@@ -102,16 +101,13 @@ class Path(nn.Module):
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = self._located(t.expand(lead).reshape(-1))
         exact = torch.is_grad_enabled() and (keyframes.requires_grad or t.requires_grad or _any_recorded(layer))
-        order, shapes, solutions = [], [], []
+        order, shapes = [], []
         for i in segment.unique().tolist():
             mine = torch.nonzero(segment == i).flatten()
-            found, solution = self._between(flat, i, which[mine], u[mine], exact)
             order.append(mine)
-            shapes.append(found)
-            solutions.append(solution)
+            shapes.append(self._between(flat, i, which[mine], u[mine], exact))
         if not shapes:
             return keyframes.new_zeros(*lead, *item)
-        self._report(solutions)
         back = torch.argsort(torch.cat(order))
         return torch.cat(shapes)[back].reshape(*lead, *item)
 
@@ -127,10 +123,10 @@ class Path(nn.Module):
                 f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
                 f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
             )
-        segment = (torch.searchsorted(times, t.detach(), right=True) - 1).clamp(0, len(times) - 2)
+        segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
         return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
 
-    def _between(self, keyframes: Tensor, i: int, which: Tensor, u: Tensor, exact: bool) -> tuple[Tensor, Solution]:
+    def _between(self, keyframes: Tensor, i: int, which: Tensor, u: Tensor, exact: bool) -> Tensor:
         """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
         layer, n = self.layer, self.n_keyframes
         x = keyframes.to(layer.dtype)
@@ -146,21 +142,14 @@ class Path(nn.Module):
         samples = Samples(
             x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), layer.stiffness_of(u, u.shape), **around
         )
+        forbid = layer.solver.unconverged == "raise" and torch.is_grad_enabled()
+        told = partial(report, max_steps=layer.solver.max_steps, forbid=forbid)
         with full_precision(x.device.type):
-            shapes, solution = layer.members[i](samples, exact, None)
-        shapes = shapes.to(keyframes.dtype)
+            shapes = layer.members[i](samples, exact, told).shapes.to(keyframes.dtype)
         for end, j in ((0, i), (1, (i + 1) % n)):
             exactly = keyframes[which, j].detach() + (shapes - shapes.detach())
             shapes = torch.where((u == end)[:, None, None], exactly, shapes)
-        return shapes, solution
-
-    def _report(self, solutions: list[Solution]) -> None:
-        solver = self.layer.solver
-        forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
-        told = partial(report, max_steps=solver.max_steps, forbid=forbid)
-        # Amplitudes of intervals differ in number; what is told does not look at them.
-        parts = zip(*(solution[1:] for solution in solutions), strict=True)
-        told(Solution(solutions[0].amplitudes, *(torch.cat(each) for each in parts)))
+        return shapes
 
 
 def checked_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor:

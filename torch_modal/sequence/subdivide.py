@@ -1,6 +1,6 @@
 """From key-frames to a dense sequence: recursive subdivision (section 3.3 of the paper) and linear fill."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import extract_bases
+from torch_modal.sequence.path import Path, checked_times
 
 MAX_LEVELS = 12
 
@@ -28,6 +29,8 @@ def subdivide(
     n_modes: int = 30,
     cyclic: bool = False,
     n_frames: int | None = None,
+    times: Tensor | Sequence[float] | None = None,
+    smooth: bool | None = None,
     preset: Preset = "accurate",
     objective: Objective | None = None,
     solver: Solver | None = None,
@@ -35,8 +38,9 @@ def subdivide(
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
 
-    Each level inserts a mid-shape between all neighbours. A mid-shape then serves as a key-frame of the next level,
-    with the modes of the key-frames around it: of both in the joint space, of the nearest in the paired space.
+    Smooth in time, the shapes are those of :class:`torch_modal.Path`. Otherwise each level inserts a mid-shape between
+    all neighbours, which then serves as a key-frame of the next level (section 3.3 of the paper), with the modes of the
+    key-frames around it: of both in the joint space, of the nearest in the paired space.
 
     Args:
         keyframes: Vertex positions, two key-frames or more, in any units. *Shape:* ``(K, V, 3)``.
@@ -46,9 +50,12 @@ def subdivide(
         n_modes: Modes of each key-frame where the bases are not given.
         cyclic: Whether the last key-frame leads on to the first. The sequence then ends one frame before it would
             repeat the first key-frame.
-        n_frames: Number of frames of the result, by linear fill (along the geodesic of the rigid motion) between the
-            subdivided shapes. The key-frames keep their place in it: intervals differ by one frame where the number
-            does not divide. Default: the subdivided shapes as they are.
+        n_frames: Number of frames of the result, evenly in time. The key-frames keep their places in it
+            (:func:`keyframe_places`): frames are even within each interval. Pairs alone are filled linearly between
+            their subdivided shapes, along the geodesic of the rigid motion. Default: ``2**levels`` to each interval.
+        times: When the key-frames are, as for :class:`torch_modal.Path`. Default: evenly.
+        smooth: Whether neighbours in time have a say. Default: where there are three key-frames or more, in the joint
+            space.
         preset: As for :class:`torch_modal.InBetween`.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
@@ -63,41 +70,79 @@ def subdivide(
     """
     keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2, warn=bases is not None)
     n_keys = len(keyframes)
-    places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames)
+    places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
+    chosen = settings(preset, objective, solver)
+    if smooth is None:
+        smooth = n_keys > 2 and chosen.objective.space == "joint"
+    if smooth and chosen.objective.space == "paired":
+        raise ValueError("the paired space (Eq. 4) knows pairs only: smooth=True needs space='joint'")
     if bases is None:
         bases = extract_bases(keyframes, faces, n_modes, progress=progress)
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
-
-    areas = vertex_areas(keyframes[0].cpu().double().numpy(), working_faces.cpu().numpy())
-    weights = torch.from_numpy(areas).to(keyframes)
-    intervals = len(places) - 1
-    bar = tqdm(
-        total=intervals * levels,
-        desc="in-between shapes",
-        unit="level",
-        leave=False,
-        disable=None if progress is None else not progress,
-    )
-    chosen = settings(preset, objective, solver)
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
+    hidden = None if progress is None else not progress
+    total = len(places) - 1 if smooth else (len(places) - 1) * levels
+    bar = tqdm(total=total, desc="in-between shapes", unit="step", leave=False, disable=hidden)
     with bar, torch.no_grad():
-        for i in range(intervals):
-            j = (i + 1) % n_keys
-            segment = _Segment((bases[i], bases[j]), working_faces, chosen, keyframes.device)
-            shapes = torch.stack([keyframes[i], keyframes[j]])
-            for _ in range(levels):
-                shapes = _interleave(shapes, segment.mid_shapes(shapes))
-                bar.update()
-            if n_frames is not None:
-                shapes = _resample(shapes, places[i + 1] - places[i], weights)
+        if smooth:
+            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, chosen)
+        else:
+            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar)
+        for i, shapes in enumerate(parts):
             sequence[places[i] : places[i + 1] + 1] = shapes
-            sequence[places[i]], sequence[places[i + 1]] = keyframes[i], keyframes[j]
+            sequence[places[i]], sequence[places[i + 1]] = keyframes[i], keyframes[(i + 1) % n_keys]
+            bar.update(smooth)
     return sequence[:-1] if cyclic else sequence
 
 
+def _along_path(
+    keyframes: Tensor,
+    faces: Tensor,
+    bases: Sequence[ModalBasis],
+    places: Sequence[int],
+    times: Tensor | Sequence[float] | None,
+    cyclic: bool,
+    chosen: Settings,
+) -> Iterator[Tensor]:
+    """Shapes of each interval, smooth in time."""
+    path = Path(bases, faces.cpu(), times, cyclic, objective=chosen.objective, solver=chosen.solver)
+    path.to(keyframes.device)
+    for (start, end), n in zip(pairwise(path.times.tolist()), (b - a for a, b in pairwise(places)), strict=True):
+        inner = torch.linspace(start, end, n + 1, dtype=torch.float64, device=keyframes.device)[1:-1]
+        ends = keyframes[:1]  # the key-frames are put there by the caller
+        yield torch.cat([ends, path(keyframes, inner), ends])
+
+
+def _by_recursion(
+    keyframes: Tensor,
+    faces: Tensor,
+    bases: Sequence[ModalBasis],
+    places: Sequence[int],
+    levels: int,
+    n_frames: int | None,
+    chosen: Settings,
+    bar: Any,
+) -> Iterator[Tensor]:
+    """Shapes of each interval, of the pair alone."""
+    weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
+    for i, n in enumerate(b - a for a, b in pairwise(places)):
+        j = (i + 1) % len(keyframes)
+        segment = _Segment((bases[i], bases[j]), faces, chosen, keyframes.device)
+        shapes = torch.stack([keyframes[i], keyframes[j]])
+        for _ in range(levels):
+            shapes = _interleave(shapes, segment.mid_shapes(shapes))
+            bar.update()
+        yield shapes if n_frames is None else _resample(shapes, n, weights)
+
+
 def keyframe_places(
-    n_keyframes: int, levels: int = 3, *, cyclic: bool = False, n_frames: int | None = None
+    n_keyframes: int,
+    levels: int = 3,
+    *,
+    cyclic: bool = False,
+    n_frames: int | None = None,
+    times: Tensor | Sequence[float] | None = None,
 ) -> list[int]:
     """Where :func:`subdivide` puts the key-frames.
 
@@ -105,11 +150,12 @@ def keyframe_places(
         The frame number of each key-frame; if cyclic, a further one where the first key-frame would come again.
 
     Raises:
-        ValueError: ``levels`` or ``n_frames`` is out of range.
+        ValueError: ``levels`` or ``n_frames`` is out of range, or ``times`` do not fit.
     """
     if not isinstance(levels, int) or not 0 <= levels <= MAX_LEVELS:
         raise ValueError(f"levels is a whole number from 0 to {MAX_LEVELS} (each doubles the frames), got {levels!r}")
     intervals = n_keyframes if cyclic else n_keyframes - 1
+    when = checked_times(times, n_keyframes, cyclic)
     if n_frames is None:
         return [i * 2**levels for i in range(intervals + 1)]
     if n_frames < n_keyframes:
@@ -117,7 +163,36 @@ def keyframe_places(
             f"n_frames={n_frames} leaves no room for {n_keyframes} key-frames; ask for {n_keyframes} or more"
         )
     total = n_frames if cyclic else n_frames - 1
-    return [(2 * total * i + intervals) // (2 * intervals) for i in range(intervals + 1)]
+    share = (when - when[0]) / (when[-1] - when[0])
+    places = torch.floor(share * total + 0.5).long().tolist()
+    # No two key-frames share a frame, however near in time.
+    for i in range(1, intervals + 1):
+        places[i] = max(places[i], places[i - 1] + 1)
+    for i in range(intervals, 0, -1):
+        places[i] = min(places[i], total - (intervals - i))
+    return places
+
+
+def frame_times(
+    n_keyframes: int,
+    levels: int = 3,
+    *,
+    cyclic: bool = False,
+    n_frames: int | None = None,
+    times: Tensor | Sequence[float] | None = None,
+) -> Tensor:
+    """When the frames of :func:`subdivide` are: even within each interval of key-frames. Arguments as there.
+
+    Returns:
+        *Shape:* ``(T,)``, float64.
+    """
+    when = checked_times(times, n_keyframes, cyclic)
+    places = keyframe_places(n_keyframes, levels, cyclic=cyclic, n_frames=n_frames, times=times)
+    parts = [
+        torch.linspace(float(a), float(b), n + 1, dtype=torch.float64)[:-1]
+        for (a, b), n in zip(pairwise(when.tolist()), (b - a for a, b in pairwise(places)), strict=True)
+    ]
+    return torch.cat(parts if cyclic else [*parts, when[-1:]])
 
 
 def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
