@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity, IntArray, vertex_areas
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
+from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import Sides, edge_means
 from torch_modal.geometry.vectors import pick
 
@@ -54,7 +54,6 @@ class Poisson(nn.Module):
         self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), held)), persistent=False)
         self._made: tuple[Tensor, SparseSolver] | None = None
 
-    @property
     def solver(self) -> SparseSolver:
         """The Laplacian's inverse, of what the weights are now: others may stand in for them, as in functional_call."""
         now = self.weights
@@ -78,7 +77,7 @@ class Poisson(nn.Module):
         pulls = wanted * self.weights.to(wanted)
         both = torch.cat([-pulls, pulls], -1)
         right = torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both)
-        x = self.solver(right.movedim(0, -1)).movedim(-1, 0)
+        x = solve_by(self.solver, right.movedim(0, -1)).movedim(-1, 0)
         return x + self.centres(near - x)
 
     def centres(self, x: Tensor) -> Tensor:
