@@ -51,12 +51,15 @@ def main() -> None:
     parser.add_argument("--modes", nargs="+", type=int, default=[10, 20, 30, 50, 80], help="of each key-frame")
     parser.add_argument("--coarse-faces", nargs="+", type=int, default=[300, 1000, 3000])
     parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS), metavar="NAME")
+    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
     arguments = parser.parse_args()
     limit_threads()
     choices = list(product(arguments.modes, arguments.coarse_faces, arguments.ways))
     choices += [DEFAULT] * (DEFAULT not in choices)
     found: dict[tuple[int, int, str], list[tuple[float, float, float]]] = {choice: [] for choice in choices}
     for case in chosen():
+        if not any(text in case.name for text in arguments.only):
+            continue
         print(f"{case.name} ...", flush=True)
         yardstick = Yardstick(case)
         halfway = case.at([cases.HALF])

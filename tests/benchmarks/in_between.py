@@ -3,8 +3,9 @@
     python tests/benchmarks/in_between.py [--repeats 20] [--skip-mesher]
 
 One in-between is a whole `MidShape.solve` with the bases given: 30 + 30 modes, 1,000 coarse faces, from the key-frames
-to the fine shape, the modes alone added to linear interpolation, to the last digit (`presets.py` has the presets). Linear interpolation is one `lerp` of the same vertices. The mesher is a bare
-`pytetwild.tetrahedralize` of the first key-frame, in a process of its own, without its imports. Times are medians.
+to the fine shape, the modes alone added to linear interpolation, to the last digit (`presets.py` has the presets).
+Linear interpolation is one `lerp` of the same vertices. The mesher is a bare `pytetwild.tetrahedralize` of the first
+key-frame, in a process of its own, without its imports. Times are medians.
 """
 
 import argparse
