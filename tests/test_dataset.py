@@ -302,7 +302,7 @@ def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> No
     assert not list(tmp_path.rglob("between-*"))
     space = tm.ShapeSpace(bars.bases, bars.faces, solver=hasty, times=None)
     with pytest.warns(tm.ConvergenceWarning, match=r"1 of 1 in-betweens near the key-frames 0 and 1"):
-        space.keyframe_in_between(1, 0, torch.tensor([0.5]))
+        space.keyframe_in_between(1, 0, torch.tensor([0.5], dtype=torch.float64))
     x = bars.keyframes + 0.01 * torch.sin(bars.keyframes)
     with pytest.warns(tm.ConvergenceWarning, match="OUT_OF_STEPS"):
         between(x, space=space)
