@@ -15,7 +15,6 @@ import torch_modal as tm
 from torch_modal.data.deformation import deform, linear_strain
 from torch_modal.data.samples import load_sample
 from torch_modal.data.table import interpolate
-from torch_modal.energy.shell import enclosed_volume
 from torch_modal.geometry.rigid import best_fit
 
 F64 = torch.float64
@@ -39,7 +38,7 @@ def seeded(number: int = 0) -> torch.Generator:
 
 
 def volume(x: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    return enclosed_volume(x.movedim(-1, 0), faces)
+    return tm.ShellEnergy(faces).measure(x).volume
 
 
 # ---------------------------------------------------------------------------------------------------- conventions
@@ -164,10 +163,8 @@ def test_in_between_is_the_layers(bars: Shapes, space: tm.ShapeSpace) -> None:
     out = augment(x)
     for own in range(3):
         other = (own + 1 + int(2 * augment.params["partner"][own])) % 3
-        layer = tm.InBetween(
-            [bars.bases[own], bars.bases[other]], bars.faces, coarse_faces=space.coarse_faces, tolerance=space.tolerance
-        )
-        expected = layer(x[own], x[other], augment.params["t"][own])[0]
+        layer = tm.InBetween([bars.bases[own], bars.bases[other]], bars.faces, "fast")
+        expected = layer(x[own], x[other], augment.params["t"][own])
         torch.testing.assert_close(out[own], expected, rtol=0, atol=1e-4)
     assert len({(own + 1 + int(2 * p)) % 3 for own, p in enumerate(augment.params["partner"])}) > 1
 
@@ -241,13 +238,13 @@ def extrapolated(space: tm.ShapeSpace, x: torch.Tensor, t: float) -> torch.Tenso
 @pytest.mark.parametrize(("i", "j"), [(0, 1), (1, 0), (2, 1)])
 def test_extrapolation_goes_on_smoothly(bars: Shapes, space: tm.ShapeSpace, i: int, j: int) -> None:
     x = bars.keyframes[[i, j]]
-    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, coarse_faces=space.coarse_faces, tolerance=1e-10)
+    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, "fast")
     for end, sign in ((x[0], -1), (x[1], 1)):
         gaps = []
         for step in (1e-2, 1e-3):
             t_end = 0.0 if sign < 0 else 1.0
             beyond = extrapolated(space, x, t_end + sign * step) - end
-            before = end - layer(x[0], x[1], t_end - sign * step)[0]
+            before = end - layer(x[0], x[1], t_end - sign * step)
             gaps.append(float((beyond - before).norm() / before.norm()))
         assert gaps[0] < 0.05
         assert gaps[1] == pytest.approx(gaps[0] / 10, rel=0.5)
@@ -262,8 +259,8 @@ def test_the_end_is_the_in_between_of_start_and_extrapolation(
     s = 0.2
     found = extrapolated(space, x, 1 + s)
     linear = x[1] + s * (x[1] - x[0])
-    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, coarse_faces=space.coarse_faces)
-    back, linear_back = (layer(x[0], y, 1 / (1 + s))[0] for y in (found, linear))
+    layer = tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, "fast")
+    back, linear_back = (layer(x[0], y, 1 / (1 + s)) for y in (found, linear))
     moved = float((found - x[1]).norm())
     assert float((back - x[1]).norm()) < 0.2 * moved
     assert float((back - x[1]).norm()) < 0.5 * float((linear_back - x[1]).norm())
@@ -394,7 +391,8 @@ def test_rotations_about_an_axis() -> None:
 # ------------------------------------------------------------------------------------------------------ gradients
 @each_kind
 def test_gradients_flow_to_the_shapes(small_bars: Shapes, kind: str) -> None:
-    space = tm.ShapeSpace(small_bars.bases, small_bars.faces, dtype=F64, tolerance=1e-12)
+    solver = tm.Solver(tolerance=1e-12, local_steps=0)
+    space = tm.ShapeSpace(small_bars.bases, small_bars.faces, solver=solver, dtype=F64)
     options = {"deformation": {"strain": 0.05, "max_strain": 0.9}}.get(kind, {})
     augment = KINDS[kind](p=1.0, generator=seeded(1), space=space, **options)
     x = (small_bars.keyframes[:2] + 0.05 * torch.sin(3 * small_bars.keyframes[:2])).requires_grad_()

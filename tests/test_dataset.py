@@ -2,12 +2,14 @@
 
 import gc
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from conftest import Shapes
+from safetensors import safe_open
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader, default_collate
 
@@ -85,9 +87,9 @@ def test_samples_are_the_transforms(root: Path, bars: Shapes) -> None:
     for i in range(3):
         assert torch.equal(still[i]["vertices"], bars.keyframes[i])
     middle = tm.ShapeDataset(root, tm.RandomInBetween(t=(0.5, 0.5), p=1.0), samples_per_set=12, dtype=torch.float64)
-    layer = tm.InBetween(bars.bases, bars.faces, coarse_faces=300, pairs=[(0, 1), (1, 2), (0, 2)])
+    layer = tm.InBetween(bars.bases, bars.faces, "fast", pairs=[(0, 1), (1, 2), (0, 2)])
     truths = {
-        pair: layer(bars.keyframes[pair[0]], bars.keyframes[pair[1]], 0.5, i)[0]
+        pair: layer(bars.keyframes[pair[0]], bars.keyframes[pair[1]], 0.5, i)
         for i, pair in enumerate([(0, 1), (1, 2), (0, 2)])
     }
     seen = set()
@@ -236,6 +238,78 @@ def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
     without = tm.ShapeDataset(tmp_path, folder=None)
     assert_same(batches(without), first)
     assert not list((tmp_path / "set").glob("between-*"))
+
+
+class Area(tm.Term):
+    def elements(self, mesh: Any) -> torch.Tensor:
+        return mesh.faces
+
+    def measure(self, spokes: torch.Tensor) -> torch.Tensor:
+        return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+
+
+def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
+    bars: Shapes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is exchanged for zeros under the same key: whoever reads it is found out."""
+    path = tmp_path / "between-0-1.safetensors"
+
+    def table(bases: list[tm.ModalBasis] = bars.bases, faces: torch.Tensor = bars.faces, **options: Any) -> Any:
+        return tm.ShapeSpace(bases, faces, folder=tmp_path, **options).table(0, 1)
+
+    right = table()
+    with safe_open(path, framework="pt") as file:
+        key = file.metadata()
+
+    def plant() -> None:
+        path.unlink()
+        save_file({"shapes": torch.zeros_like(right)}, path, key)
+
+    plant()
+    assert float(table().abs().max()) == 0
+    first = bars.bases[0]
+    modes = first.modes + 0.1 * torch.sin(first.reference)  # eigenvalues and shape stay
+    other = tm.ModalBasis(first.reference, first.eigenvalues, modes, first.rigid_eigenvalues)
+    changes: list[dict[str, Any]] = [
+        {"bases": [other, *bars.bases[1:]]},
+        {"faces": bars.faces.roll(1, 1)},
+        {"preset": "accurate"},
+        {"objective": tm.Objective(coarse_faces=300, beta=torch.full((1,), 20.0))},
+        {"objective": tm.Objective(coarse_faces=300, terms=(Area(2.0),))},
+        {"objective": tm.Objective(coarse_faces=300, terms=(Area(3.0),))},
+        {"objective": tm.Objective(coarse_faces=300, terms=(Area(torch.tensor([3.0])),))},
+        {"solver": tm.Solver(tolerance=1e-5, local_steps=1)},
+    ]
+    for change in changes:
+        plant()
+        found = table(**change)
+        assert torch.equal(found[0], bars.keyframes[0].float()), change
+        path.unlink()
+        assert torch.equal(table(**change), found)
+    plant()
+    monkeypatch.setattr("torch_modal.data.space.__version__", "0.0.1")
+    assert torch.equal(table(), right)
+
+
+def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> None:
+    hasty = tm.Solver(max_steps=1, tolerance=1e-12, least_gain=0.0, local_steps=0)
+    tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
+    between = tm.RandomInBetween(t=(0.4, 0.6), p=1.0)
+    data = tm.ShapeDataset(tmp_path, between, solver=hasty, samples_per_set=3)
+    with pytest.warns(tm.ConvergenceWarning, match=r"of 17 in-betweens near the key-frames . and . .*OUT_OF_STEPS"):
+        data[0]
+    # It is not kept, so that the next run hears of it too.
+    assert not list(tmp_path.rglob("between-*"))
+    space = tm.ShapeSpace(bars.bases, bars.faces, solver=hasty, times=None)
+    with pytest.warns(tm.ConvergenceWarning, match=r"1 of 1 in-betweens near the key-frames 0 and 1"):
+        space.keyframe_in_between(1, 0, torch.tensor([0.5], dtype=torch.float64))
+    x = bars.keyframes + 0.01 * torch.sin(bars.keyframes)
+    with pytest.warns(tm.ConvergenceWarning, match="OUT_OF_STEPS"):
+        between(x, space=space)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert bool(tm.ShapeDataset(tmp_path, between)[0]["vertices"].isfinite().all())
+        between(x, space=tm.ShapeSpace(bars.bases, bars.faces))
 
 
 def test_sets_with_one_key_frame(bars: Shapes, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def compare(name: str, folder: Path, arguments: argparse.Namespace) -> None:
         "linear": tm.ShapeDataset(folder.parent, RandomLinear(p=1.0), **options),
         "in-between, from the table": tm.ShapeDataset(folder.parent, between, **options),
         "in-between, each solved": tm.ShapeDataset(
-            folder.parent, between, times=None, tolerance=1e-3, samples_per_set=max(BATCH * 4, arguments.shapes // 8)
+            folder.parent, between, times=None, samples_per_set=max(BATCH * 4, arguments.shapes // 8)
         ),
         "modal deformation": tm.ShapeDataset(folder.parent, deform, samples_per_set=arguments.shapes // 4),
         "extrapolation": tm.ShapeDataset(folder.parent, beyond, samples_per_set=arguments.shapes // 4),

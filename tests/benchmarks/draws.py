@@ -19,7 +19,6 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.energy.shell import enclosed_volume
 
 TRANSFORMS: dict[str, tm.ShapeAugmentation] = {
     "linear": RandomLinear(p=1.0),
@@ -72,7 +71,8 @@ def measure(name: str, n: int, n_intersections: int) -> None:
     space = tm.ShapeSpace(tm.extract_bases(keyframes, faces, 30), faces)
     pool = tm.ShapeBatch.of_keyframes(space)
     k = len(space)
-    volumes = enclosed_volume(pool.shapes.double().movedim(-1, 0), faces)
+    shell = tm.ShellEnergy(faces)
+    volumes = shell.measure(pool.shapes.double()).volume
     old = [None if pairs is None else around(pairs, faces) for pairs in (crossings(x, faces) for x in pool.shapes)]
     for kind, augment in TRANSFORMS.items():
         generator = torch.Generator().manual_seed(0)
@@ -88,7 +88,7 @@ def measure(name: str, n: int, n_intersections: int) -> None:
             if "t" in params:
                 partner = (rows + 1 + (params["partner"] * (k - 1)).long()) % k
                 source = torch.lerp(source, volumes[partner], params["t"].clamp(0, 1))
-            ratios.append(enclosed_volume(y.double().movedim(-1, 0), faces) / source)
+            ratios.append(shell.measure(y.double()).volume / source)
             strains.append(space.strain(y, pool.shapes[rows]).abs().amax(1))
             for row in range(len(rows)):
                 if old[0] is not None and len(new) < n_intersections:

@@ -12,10 +12,10 @@ from torch import Tensor
 from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 
 import torch_modal as tm
-from torch_modal.energy.shell import wrap_angle
+from torch_modal.energy.measures import wrap_angle
+from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.nn.frame import DIAGONAL
 
 NAN = float("nan")
 FLAT = 1e-3  # volumes below this part of (surface area)^(3/2) are not compared; a sphere has 0.094

@@ -22,10 +22,11 @@ from timing import timed
 
 import torch_modal as tm
 from torch_modal.geometry.rigid import blend
-from torch_modal.sequence.subdivide import LEAST_GAIN
 
 PEER_SECONDS = 180
-SUBDIVIDE = {"rotations": True, "least_gain": LEAST_GAIN}
+# The modes alone, in two ways: as plain as can be, to the last digit, and as the preset "accurate" has it.
+BARE = {"objective": tm.Objective(base="linear"), "solver": tm.Solver(least_gain=0.0, local_steps=0)}
+MODES_ONLY = {"solver": tm.Solver(local_steps=0)}
 MOST_VERTICES = 15_000  # over all vertices: more take minutes a step
 # One thread, as for all others; with more, jax 0.10 waits for itself for ever on few cores and large meshes.
 PEER_ENVIRONMENT = {
@@ -91,46 +92,52 @@ def linear(case: Case) -> Outcome:
 
 @method("paired", half_only=True)
 def paired(case: Case) -> Outcome:
-    """The paper's space, with the default mu."""
-    layer = tm.MidShape(case.bases(30), case.faces, space="paired")
+    """The paper's space, with the default mu: the preset "paper"."""
+    layer = tm.MidShape(case.bases(30), case.faces, preset="paper")
     result, seconds = timed(lambda: layer.solve(case.x_a, case.x_b))
     return Outcome(result.shapes[None], seconds, convergence(result))
 
 
 @method("joint")
 def joint(case: Case) -> Outcome:
-    """The default of the layers: 30 modes of each end, 1,000 coarse faces, to the last digit."""
-    return by_layer(case, 30)
+    """The modes added to linear interpolation: 30 of each end, 1,000 coarse faces, to the last digit."""
+    return by_layer(case, 30, **BARE)
 
 
 @method("joint 80/3000")
 def joint_fine(case: Case) -> Outcome:
     """More modes and coarse faces."""
-    return by_layer(case, 80, coarse_faces=3000)
+    return by_layer(case, 80, objective=tm.Objective(base="linear", coarse_faces=3000), solver=BARE["solver"])
 
 
 @method("joint + rotations")
 def rotations(case: Case) -> Outcome:
-    """As ``subdivide(local=False)`` has it: onto a blend by local rotations, and not to the last digit."""
-    return by_layer(case, 30, **SUBDIVIDE)
+    """As "accurate" without its local steps: onto a blend by local rotations, and not to the last digit."""
+    return by_layer(case, 30, **MODES_ONLY)
+
+
+@method("fast")
+def fast(case: Case) -> Outcome:
+    """The preset "fast": the same on 300 coarse faces."""
+    return by_layer(case, 30, preset="fast")
 
 
 @method("subdivide")
 def subdivide(case: Case) -> Outcome:
-    """The default of ``subdivide``: the same, with steps on the fine mesh after it."""
-    return by_layer(case, 30, local=True, **SUBDIVIDE)
+    """The preset "accurate", the default of ``subdivide``: the same, with steps on the fine mesh after it."""
+    return by_layer(case, 30, preset="accurate")
 
 
 @method("subdivide, polish 2")
 def polished(case: Case) -> Outcome:
     """The same with two longer steps."""
-    return by_layer(case, 30, local=True, polish=2, **SUBDIVIDE)
+    return by_layer(case, 30, solver=tm.Solver(polish=2))
 
 
 @method("full", half_only=True)
 def full(case: Case) -> Outcome:
     """The optimum over all vertices: the best of what a modal and a linear start lead to."""
-    starts = InBetweens(case, 30, {"rotations": True, "local": True})()
+    starts = InBetweens(case, 30, {"solver": tm.Solver(least_gain=0.0)})()
     return by_full_space(
         case,
         lambda x_a, x_b, t, k: min(
@@ -196,7 +203,7 @@ def by_full_space(case: Case, solve: Callable[..., Any]) -> Outcome:
 def convergence(result: Any) -> str:
     """The number of steps where all went well, the statuses where not."""
     solution = result.solution
-    if bool(solution.converged.all()):
+    if bool(solution.usable.all()):
         return f"{int(solution.n_steps.max())} steps"
     return f"not converged: statuses {sorted(set(solution.status.reshape(-1).tolist()))}"
 

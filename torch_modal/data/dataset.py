@@ -60,7 +60,7 @@ class ShapeDataset(Dataset[Sample]):
         faces: Whether samples have their faces. A loader stacks them with the rest; :meth:`faces` gives them once.
         normals: Whether samples have normals.
         open_sets: How many sets are kept open, in each process.
-        options: Of the spaces (:class:`ShapeSpace`), such as ``coarse_faces`` or ``times``.
+        options: Of the spaces (:class:`ShapeSpace`), such as ``preset`` or ``times``.
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
@@ -18,8 +19,11 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
 from torch_modal.geometry.vectors import norm, pick
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.nn.adjoint import ConvergenceWarning
+from torch_modal.nn.between import InBetweenResult
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
+from torch_modal.nn.solver import Status
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.version import __version__
 
@@ -229,8 +233,9 @@ class ShapeSpace:
             x_i, x_j = (self.bases[key].reference.double() for key in (i, j))
             with torch.no_grad():
                 result = self._layer(i, j).solve(x_i, x_j, torch.linspace(0, 1, self.times, dtype=torch.float64))
-            table = _usable(result.shapes, i, j).to(self.dtype)
-            if path is not None:
+            table = _shapes(result, i, j).to(self.dtype)
+            # What did not converge is warned of by every run: it is not kept.
+            if path is not None and bool(result.solution.usable.all()):
                 write_table(path, table, key)
             return table
 
@@ -244,8 +249,10 @@ class ShapeSpace:
         values = [self.faces, *tensors]
         for name, value in sorted({**vars(self.settings.objective), **vars(self.settings.solver)}.items()):
             if isinstance(value, tuple):
-                digest.update(repr([(type(term).__qualname__, term.stiffness) for term in value]).encode())
-                values += [tensor for term in value for tensor in term.state_dict().values()]
+                for term in value:
+                    own = {key: part for key, part in vars(term).items() if not key.startswith("_")}
+                    digest.update(f"{type(term).__module__} {type(term).__qualname__} {own}".encode())
+                    values += [*term.parameters(), *term.buffers()]
             elif isinstance(value, Tensor):
                 values.append(value)
             else:
@@ -261,7 +268,7 @@ class ShapeSpace:
             return self.keyframe_in_between(j, i, 1 - t)  # one table serves both ways
         if self.times is None:
             x_i, x_j = self.keyframes(t)[[i, j]]
-            return _usable(self.layer(i, j, t).solve(x_i, x_j, t).shapes, i, j)
+            return _shapes(self.layer(i, j, t).solve(x_i, x_j, t), i, j)
         table = self._tables.get((i, j, t.device), lambda: self.table(i, j).to(t.device))
         return interpolate(table, t.to(table.dtype)).to(t.dtype)
 
@@ -269,14 +276,25 @@ class ShapeSpace:
         """Between any shapes, with the modes of two key-frames. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``."""
         if i > j:
             return self.in_between(x_b, x_a, 1 - t, j, i)
-        return _usable(self.layer(i, j, x_a).solve(x_a, x_b, t).shapes, i, j)
+        return _shapes(self.layer(i, j, x_a).solve(x_a, x_b, t), i, j)
 
 
-def _usable(x: Tensor, i: int, j: int) -> Tensor:
-    """What training must never see is said here."""
-    if not bool(x.isfinite().all()):
+def _shapes(result: InBetweenResult, i: int, j: int) -> Tensor:
+    """The in-betweens. What training must never see is said here, and what it should not see."""
+    if not bool(result.shapes.isfinite().all()):
         raise ValueError(
             f"there is no in-between of some shapes near the key-frames {i} and {j}: one is not finite, has no size, "
             "or is the mirror image of the other"
         )
-    return x
+    status = result.solution.status
+    missed = ~result.solution.usable
+    if bool(missed.any()):
+        names = ", ".join(sorted({Status(value).name for value in status[missed].tolist()}))
+        warnings.warn(
+            f"{int(missed.sum())} of {missed.numel()} in-betweens near the key-frames {i} and {j} did not converge "
+            f"({names}) and are only the best shapes found: give the space a solver of more max_steps or a larger "
+            "tolerance, or key-frames that are nearer to each other",
+            ConvergenceWarning,
+            stacklevel=2,
+        )
+    return result.shapes

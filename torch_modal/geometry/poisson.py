@@ -1,5 +1,7 @@
 """Vertices from the edges or the sides that are asked for: a Poisson problem, factorised once for a connectivity."""
 
+from functools import cache, partial
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -8,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity, IntArray, vertex_areas
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
+from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import Sides, edge_means
 from torch_modal.geometry.vectors import pick
 
@@ -57,10 +59,12 @@ class Poisson(nn.Module):
     @property
     def solver(self) -> SparseSolver:
         """The Laplacian's inverse, of what the weights are now: others may stand in for them, as in functional_call."""
-        now = self.weights
-        if self._made is None or not _equal(now, self._made[0]):
-            laplacian = graph_laplacian(self.edges.cpu().numpy(), now.double().cpu().numpy(), len(self.piece))
-            self._made = now, SparseSolver(laplacian, self.free.cpu().numpy())
+        return self._solver_of(self.weights)
+
+    def _solver_of(self, weights: Tensor) -> SparseSolver:
+        if self._made is None or not _equal(weights, self._made[0]):
+            laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
+            self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy())
         return self._made[1]
 
     def forward(self, wanted: Tensor, near: Tensor) -> Tensor:
@@ -78,7 +82,9 @@ class Poisson(nn.Module):
         pulls = wanted * self.weights.to(wanted)
         both = torch.cat([-pulls, pulls], -1)
         right = torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both)
-        x = self.solver(right.movedim(0, -1)).movedim(-1, 0)
+        # Once, of these weights: the backward solve may come when others are back in their place.
+        solver = cache(partial(self._solver_of, self.weights))
+        x = solve_by(solver, right.movedim(0, -1)).movedim(-1, 0)
         return x + self.centres(near - x)
 
     def centres(self, x: Tensor) -> Tensor:

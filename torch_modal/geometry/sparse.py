@@ -1,5 +1,6 @@
 """Sparse symmetric systems: factorised by SciPy, and for tensors differentiable, the same for every sample."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ class SparseSolver:
 
     def __call__(self, right: Tensor) -> Tensor:
         """Solve for one or more columns. *Shape:* ``(..., V, m) -> (..., V, m)``."""
-        return _Solve.apply(self, right)
+        return solve_by(lambda: self, right)
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same for arrays. *Shape:* ``(V, m) -> (V, m)``."""
@@ -55,11 +56,19 @@ class SparseSolver:
         return out
 
 
+def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
+    """Solve with what is made only then: inside ``torch.func`` transforms, no tensor can be read before.
+
+    *Shape:* ``(..., V, m) -> (..., V, m)``.
+    """
+    return _Solve.apply(solver, right)
+
+
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(solver: SparseSolver, right: Tensor) -> Tensor:
+    def forward(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
         columns = right.detach().double().cpu().movedim(-2, 0)
-        solved = solver.solve(np.ascontiguousarray(columns.flatten(1).numpy()))
+        solved = solver().solve(np.ascontiguousarray(columns.flatten(1).numpy()))
         return torch.from_numpy(solved).reshape(columns.shape).movedim(0, -2).to(right).contiguous()
 
     @staticmethod
@@ -71,7 +80,9 @@ class _Solve(torch.autograd.Function):
         return None, _Solve.apply(ctx.solver, grads[0])
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], solver: SparseSolver, right: Tensor) -> tuple[Tensor, int]:
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], solver: Callable[[], SparseSolver], right: Tensor
+    ) -> tuple[Tensor, int]:
         return _Solve.apply(solver, right.movedim(in_dims[1], 0)), 0
 
 

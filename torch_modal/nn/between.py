@@ -143,7 +143,7 @@ class Between(nn.Module):
         solve = solve_implicit if solver.gradient == "implicit" else solve_unrolled
         solution = solve(minimisation, problem.placement, problem.start, usable, t)
         x = space.lift(solution.amplitudes, problem)
-        if solver.local_steps or solver.polish:
+        if len(x) and (solver.local_steps or solver.polish):
             x = self._refine(x, problem.base, pair, samples, anchors)
         return self._restored(x, placed, t, solution)
 

@@ -1,0 +1,157 @@
+"""What each preset costs and gives, and what the closed forms of the shell's terms save over ``torch.func``.
+
+    python tests/benchmarks/presets.py [--only TEXT ...]
+    python tests/benchmarks/presets.py --terms [--only TEXT ...]
+
+The first prints the table of docs/layer.md: in-betweens at t = 1/2 with 30 modes of each key-frame, their mean relative
+error of edge lengths where a truth is known, their energy over that of linear interpolation, the time of one, alone and
+with its gradient to both key-frames, and what the layer's ``state_dict`` holds. The second takes the derivatives of
+lengths, angles and volume from :class:`torch_modal.Term` instead, which has them from ``torch.func``. Times are
+processor time on one thread, best of several: what to read are the ratios, of one run.
+"""
+
+import argparse
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+import cases
+import torch
+from cases import Case
+from measures import Yardstick
+from methods import linear
+from tables import geometric_mean, number, percent
+from timing import timed
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.energy.terms import Bend, Stretch, Volume
+
+N_MODES = 30
+REFERENCE = "accurate"
+
+
+class _Derived:
+    """Derivatives from ``torch.func`` in the place of closed forms."""
+
+    gradients = tm.Term.gradients
+    pairs = tm.Term.pairs
+    blocks = tm.Term.blocks
+
+
+class DerivedStretch(_Derived, Stretch):
+    """Edge lengths."""
+
+
+class DerivedBend(_Derived, Bend):
+    """Dihedral angles."""
+
+
+class DerivedVolume(_Derived, Volume):
+    """Enclosed volume."""
+
+
+@dataclass(frozen=True)
+class Derived(tm.Objective):
+    """The same objective, with derivatives of all terms from ``torch.func``."""
+
+    def all_terms(self) -> list[tm.Term]:
+        """Those of Eq. 5."""
+        return [DerivedStretch(self.alpha), DerivedBend(self.beta), DerivedVolume(self.gamma), *self.terms]
+
+
+def chosen(only: list[str]) -> Iterator[Case]:
+    """The samples, and larger key-frames where they are there."""
+    for case in chain(cases.samples(), cases.hand_path(), cases.women()):
+        if any(text in case.name for text in only):
+            yield case.at([cases.HALF])
+
+
+def alone(layer: tm.InBetween, case: Case) -> Callable[[], Tensor]:
+    """One in-between."""
+
+    def run() -> Tensor:
+        with torch.no_grad():
+            return layer(case.x_a, case.x_b, cases.HALF)
+
+    return run
+
+
+def with_gradient(layer: tm.InBetween, case: Case) -> Callable[[], tuple[Tensor, ...]]:
+    """One in-between, and the gradient of a weighted sum of its coordinates to both key-frames."""
+    weights = torch.linspace(-1, 1, case.x_a.numel(), dtype=case.x_a.dtype).view_as(case.x_a)
+
+    def run() -> tuple[Tensor, ...]:
+        ends = [x.clone().requires_grad_() for x in (case.x_a, case.x_b)]
+        return torch.autograd.grad((layer(*ends, cases.HALF) * weights).sum(), ends)
+
+    return run
+
+
+def presets(only: list[str]) -> None:
+    """Print a line for each preset on each case, and their means."""
+    found: dict[str, list[tuple[float, ...]]] = {preset: [] for preset in tm.PRESETS}
+    print("| | preset | edge error | energy over linear | ms | over accurate | with gradient | over accurate | MiB |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for case in chosen(only):
+        yardstick = Yardstick(case)
+        straight = linear(case).frames[0]
+        true = cases.HALF in case.truths
+        of_lines = yardstick.edge_error(straight, cases.HALF) if true else math.nan
+        print(f"| {case.name}, {len(case.x_a)} vertices | linear | {percent(of_lines)} | 1.000 | | | | | |")
+        first: list[float] = []
+        for preset in tm.PRESETS:
+            layer = tm.InBetween(case.bases(N_MODES), case.faces, preset)
+            shape, seconds = timed(alone(layer, case))
+            _, both = timed(with_gradient(layer, case))
+            first = first or [seconds, both]
+            error = yardstick.edge_error(shape, cases.HALF) if true else math.nan
+            energy = yardstick.energy(shape) / yardstick.energy(straight)
+            held = sum(value.numel() * value.element_size() for value in layer.state_dict().values()) / 2**20
+            found[preset].append((error / of_lines, energy, seconds / first[0], both / first[1]))
+            print(
+                f"| | {preset} | {percent(error)} | {energy:.3f} | {1e3 * seconds:.0f} | {seconds / first[0]:.2f} | "
+                f"{1e3 * both:.0f} | {both / first[1]:.2f} | {held:.1f} |",
+                flush=True,
+            )
+    print("\n| geometric means | edge error over linear | energy over linear | time over accurate | with gradient |")
+    print("|---|---|---|---|---|")
+    for preset, rows in found.items():
+        means = [geometric_mean(list(column)) for column in zip(*rows, strict=True)]
+        print(f"| {preset} | " + " | ".join(number(mean, ".3f") for mean in means) + " |")
+
+
+def terms(only: list[str]) -> None:
+    """Print how far results are apart, and how much longer it takes."""
+    exactly = tm.Solver(least_gain=0.0)
+    print("| | distance, of the diagonal | of the gradient | time over closed forms | with gradient |")
+    print("|---|---|---|---|---|")
+    for case in chosen(only):
+        results: list[Any] = []
+        for objective in (tm.Objective(), Derived()):
+            layer = tm.InBetween(case.bases(N_MODES), case.faces, objective=objective, solver=exactly)
+            results.append([timed(alone(layer, case)), timed(with_gradient(layer, case))])
+        (shape, seconds), (gradient, both) = results[0]
+        (other, longer), (other_gradient, longest) = results[1]
+        diagonal = (case.x_a.amax(0) - case.x_a.amin(0)).norm()
+        apart = float((other - shape).norm(dim=-1).max() / diagonal)
+        gradient, other_gradient = torch.stack(gradient), torch.stack(other_gradient)
+        of_gradient = float((other_gradient - gradient).norm() / gradient.norm())
+        ratios = f"{longer / seconds:.2f} | {longest / both:.2f}"
+        print(f"| {case.name} | {apart:.0e} | {of_gradient:.0e} | {ratios} |", flush=True)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--terms", action="store_true", help="closed forms against torch.func instead")
+    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    (terms if arguments.terms else presets)(arguments.only)
+
+
+if __name__ == "__main__":
+    main()
