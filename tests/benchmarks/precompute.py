@@ -1,6 +1,6 @@
 """What the pre-computation costs and gives, as ratios measured in one run, with nothing taken from a cache.
 
-    python tests/benchmarks/precompute.py [--samples DIR] [--data DIR] [--parts speed memory carrying solvers capture]
+    python tests/benchmarks/precompute.py [--samples DIR] [--data DIR] [--parts PART ...]
 
 Each line says what is asked for, in brackets. ``--parts capture`` prints the table of modes against fine references:
 half an hour, most of it for the references, which ``--keep DIR`` keeps for the next time. Times are wall-clock and
@@ -9,6 +9,7 @@ processor seconds of this run and its children; compare the ratios, and the proc
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from capture import table
+from eigensolvers import eigensolvers
 from numpy.typing import NDArray
 from solvers import solvers
 from threads import limit_threads
@@ -34,7 +36,7 @@ IntArray = NDArray[np.int64]
 ROOT = Path(__file__).parents[2]
 BARE = {"edge_length_fac": 0.03, "epsilon": 2e-3}
 N_MODES = 30
-PARTS = ("speed", "memory", "carrying", "solvers", "capture")
+PARTS = ("speed", "threads", "memory", "carrying", "eigensolvers", "solvers", "capture")
 MORE = {"hand": "mh-hand-path", "woman": "mh-woman"}
 
 
@@ -119,6 +121,30 @@ def speed(name: str, keyframes: FloatArray, faces: IntArray) -> None:
         )
 
 
+def threads(folder: Path, mesher: str, repeats: int = 3) -> None:
+    """Six key-frames of 8k vertices to a sequence, with no variable set against ``OMP_NUM_THREADS=1``, in turns."""
+    if "--in-child" in sys.argv:
+        keyframes, faces = refined(*sample(folder), 8000)
+        bases: list[tm.ModalBasis] = []
+        first = measured(lambda: bases.extend(tm.extract_bases(keyframes, faces, mesher=mesher, cache=False)))
+        second = measured(lambda: tm.subdivide(keyframes[:3], faces, levels=2, bases=bases[:3]))
+        print(json.dumps([*first, *second]))
+        return
+    command = [sys.executable, __file__, *sys.argv[1:], "--in-child", "--parts", "threads", "--mesher", mesher]
+    unset = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    costs: dict[str, list[list[float]]] = {"unset": [], "one": []}
+    for _ in range(repeats):
+        for way, variables in (("unset", unset), ("one", {**unset, "OMP_NUM_THREADS": "1"})):
+            run = subprocess.run(command, check=True, capture_output=True, text=True, env=variables)
+            costs[way].append(json.loads(run.stdout))
+    ratios = np.median(np.array(costs["unset"]) / np.array(costs["one"]), axis=0)
+    for what, (wall, processor) in {"bases": ratios[:2], "subdivide": ratios[2:]}.items():
+        print(
+            f"{what}, six key-frames of 8,000 vertices, {mesher}, no variable set, against OMP_NUM_THREADS=1: "
+            f"{wall:.2f} wall [not above 1], {processor:.2f} cpu"
+        )
+
+
 def memory(keyframes: FloatArray, faces: IntArray) -> None:
     """Peak memory of a process that makes two bases of 26k vertices, and of its worker."""
     if "--in-child" not in sys.argv:
@@ -169,11 +195,13 @@ def main() -> None:
     more = ROOT.parent / "shared" / "data"
     parser.add_argument("--data", type=Path, default=more, help="more meshes, if they are there")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--mesher", choices=("auto", "tetwild", "lattice"), default="auto", help="of the part threads")
     parser.add_argument("--runs", type=int, default=3, help="of the default in the table of captured modes")
     parser.add_argument("--keep", type=Path, help="folder in which references are kept")
     parser.add_argument("--in-child", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    limit_threads()
+    if not (arguments.in_child and "threads" in arguments.parts):
+        limit_threads()
     warnings.simplefilter("ignore")
     creature = sample(arguments.samples / "creature")
     if "speed" in arguments.parts:
@@ -181,6 +209,8 @@ def main() -> None:
         speed("creature", *creature)
         if arguments.data.is_dir():
             speed("woman", *sample(arguments.data / MORE["woman"], "0*"))
+    if "threads" in arguments.parts:
+        threads(arguments.samples / "creature", arguments.mesher)
     if "memory" in arguments.parts:
         memory(*creature)
     if "carrying" in arguments.parts:
@@ -192,6 +222,12 @@ def main() -> None:
             sets["hand"] = (*sample(arguments.data / MORE["hand"], "0*"), [(0, 8), (0, 4), (4, 8)])
             sets["woman"] = (*sample(arguments.data / MORE["woman"], "0*"), [(0, 1), (0, 2), (1, 2)])
         carrying(sets)
+    if "eigensolvers" in arguments.parts:
+        eigensolvers("creature", creature[0][0], creature[1])
+        if arguments.data.is_dir():
+            for name in MORE:
+                keyframes, faces = sample(arguments.data / MORE[name], "0*")
+                eigensolvers(name, keyframes[0], faces)
     if "solvers" in arguments.parts:
         solvers(creature[0][0], creature[1])
     if "capture" in arguments.parts:
