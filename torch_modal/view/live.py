@@ -123,7 +123,9 @@ class LiveSession:
     def _see(self, first: FloatArray) -> None:
         scene, camera = self.server.scene, self.server.initial_camera
         scene.set_up_direction("+y" if up_axis(first) == "y" else "+z")
-        camera.position, camera.look_at = 2.6 * view_rotation(first, None, None)[2], (0.0, 0.0, 0.0)
+        scene.configure_default_lights(cast_shadow=False)  # drawn many times a second, also without a graphics card
+        camera.position, camera.look_at = 3.3 * view_rotation(first, None, None)[2], (0.0, 0.0, 0.0)
+        camera.fov = np.radians(40.0)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
 
     def _add_meshes(self, first: FloatArray) -> None:
@@ -265,7 +267,11 @@ class LiveSession:
             self.server.scene.remove_by_name(f"/way {key[0]} {key[1]}")
         for (keyframe, vertex), way in ways.items():
             self.server.scene.add_spline_catmull_rom(
-                f"/way {keyframe} {vertex}", self._to_scene(way), color=(74, 120, 171), thickness=3.0
+                f"/way {keyframe} {vertex}",
+                self._to_scene(way),
+                color=(74, 120, 171),
+                thickness=3.0,
+                thickness_units="screen",
             )
         self._shown_ways = set(ways)
 
