@@ -36,6 +36,7 @@ setup(
     ],
     extras_require={
         "pyg": ["torch_geometric>=2.4"],
+        "view": ["viser>=1.0"],
         "dask": ["distributed>=2024.5"],
         "test": [
             "pytest>=8",
@@ -44,6 +45,7 @@ setup(
             "torch_geometric>=2.4",
             "distributed>=2024.5",
             "selenium>=4.20",
+            "viser>=1.0",
         ],
     },
     entry_points={"console_scripts": ["torch-modal = torch_modal.cli.main:main"]},

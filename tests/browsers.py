@@ -52,7 +52,7 @@ def open_browser(width: int = 1200, height: int = 800, *extra: str) -> Iterator[
         "--enable-unsafe-swiftshader",
         "--hide-scrollbars",
         "--force-device-scale-factor=1",
-        "--host-resolver-rules=MAP * ~NOTFOUND",
+        "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
         f"--window-size={width},{height}",
         *extra,
     ):

@@ -49,6 +49,8 @@ from .sequence.subdivide import frame_times as frame_times
 from .sequence.subdivide import keyframe_places as keyframe_places
 from .sequence.subdivide import linear_sequence as linear_sequence
 from .sequence.subdivide import subdivide as subdivide
+from .view.live import LiveSession as LiveSession
+from .view.live import live as live
 from .view.page import Page as Page
 from .view.page import show as show
 from .view.page import write_page as write_page

@@ -1,4 +1,4 @@
-"""``torch-modal view``: shapes of files as a page, opened in the browser or written."""
+"""``torch-modal view``: shapes of files as a page, opened in the browser or written; key-frames in a live session."""
 
 from __future__ import annotations
 
@@ -16,14 +16,19 @@ Look at sequences of shapes in a page: play, orbit, compare, colour by edge stra
 distance or volume change, pick vertices and copy their indices.
 
 The page is one HTML file that needs no network. Shapes are numbered mesh files, a
-folder of them, or a GLB that `subdivide` or save_animation wrote."""
+folder of them, or a GLB that `subdivide` or save_animation wrote.
+
+With --live, they are key-frames, and what lies between is computed while you drag
+the time, the stiffnesses, single modes, or handles of the key-frames."""
 
 EXAMPLES = """\
 examples:
   open a page of an animation, beside linear interpolation of its key-frames:
     torch-modal view hand.glb --linear
   write a page of three sequences side by side:
-    torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html"""
+    torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
+  drag what lies between two key-frames (pip install 'torch_modal[view]'):
+    torch-modal view --live open.obj fist.obj"""
 
 
 def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None:
@@ -63,6 +68,10 @@ def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None
     sub.add_argument(
         "--page", type=Path, metavar="FILE", help="write the page there, as .html (default: a temporary file, opened)"
     )
+    sub.add_argument("--live", action="store_true", help="a live session of key-frames, in place of a page")
+    sub.add_argument(
+        "--port", type=number(int, 1), metavar="N", default=8080, help="of --live, the first to try (default: 8080)"
+    )
     group = sub.add_argument_group("files and messages")
     group.add_argument("--overwrite", action="store_true", help="replace the file if it exists (default: refuse)")
     group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
@@ -71,6 +80,9 @@ def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
+    if args.live:
+        _live(args)
+        return
     if args.page and args.page.suffix.lower() not in (".html", ".htm"):
         args.fail(f"--page must end in .html, got {args.page.name!r}")
     given = [args.meshes, *args.compare]
@@ -100,6 +112,28 @@ def run(args: argparse.Namespace) -> None:
         print(f"{times}{len(shapes)} shapes of {shapes.shape[1]} vertices: {written}", flush=True)
     if not args.page and not webbrowser.open(written.absolute().as_uri()):
         print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {written}")
+
+
+def _live(args: argparse.Namespace) -> None:
+    """Key-frames in a live session, until Ctrl-C."""
+    of_pages = {"--page": args.page, "--compare": args.compare, "--linear": args.linear, "--names": args.names}
+    given = [option for option, value in of_pages.items() if value]
+    if given:
+        args.fail(f"{', '.join(given)} belong to pages; --live shows what is computed now")
+    if len(args.meshes) < 2:
+        args.fail("--live needs two key-frames or more")
+
+    import torch_modal as tm
+    from torch_modal.view.live import require_viser
+
+    try:
+        require_viser()
+    except ImportError as error:
+        raise ValueError(str(error)) from None
+    session = tm.live(*tm.load_keyframes(args.meshes), port=args.port)
+    print(f"open {session.url} in a browser; Ctrl-C ends the session", flush=True)
+    webbrowser.open(session.url)
+    session.wait()
 
 
 def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[dict[str, Any], Any]:
