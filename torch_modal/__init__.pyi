@@ -22,10 +22,12 @@ from .energy.terms import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals
-from .io.write import save_animation as save_animation
-from .io.write import save_frames as save_frames
+from .io.asset import Asset as Asset
+from .io.frames import save_frames as save_frames
+from .io.read import open_asset as open_asset
 from .keyframes.check import check_keyframes as check_keyframes
 from .keyframes.load import load_keyframes as load_keyframes
+from .keyframes.seams import weld_seams as weld_seams
 from .nn.adjoint import ConvergenceWarning as ConvergenceWarning
 from .nn.between import ConvergenceError as ConvergenceError
 from .nn.between import InBetweenResult as InBetweenResult
@@ -47,6 +49,7 @@ from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
 from .sequence.subdivide import keyframe_places as keyframe_places
 from .sequence.subdivide import linear_sequence as linear_sequence
 from .sequence.subdivide import subdivide as subdivide
+from .view.animation import save_animation as save_animation
 from .view.page import Page as Page
 from .view.page import show as show
 from .view.page import write_page as write_page
