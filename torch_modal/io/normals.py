@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.geometry.normals import vertex_normals
-from torch_modal.geometry.turning import turn
+from torch_modal.geometry.turning import surface_frames, turn
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -29,11 +29,16 @@ class CarriedNormals:
         _, self.first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         self.group = group.reshape(-1)
         self.triangles = self.group[triangles]
+        # The other end of an edge of each point: with the normal it tells how the surface turns.
+        self.neighbour = np.arange(len(self.first))
+        for corner in (2, 1, 0):
+            self.neighbour[self.triangles[:, corner]] = self.triangles[:, (corner + 1) % 3]
         self.before = self._surface(positions)
 
     def _surface(self, positions: FloatArray) -> FloatArray:
-        """Normals of the triangles around each point. *Shape:* ``(P, 3)``."""
-        return vertex_normals(positions[self.first], self.triangles)[self.group]
+        """Frames of the surface at each point. *Shape:* ``(P, 3, 3)``."""
+        x = positions[self.first]
+        return surface_frames(vertex_normals(x, self.triangles), x[self.neighbour] - x)[self.group]
 
     def at(self, positions: FloatArray, vectors: FloatArray | None = None) -> FloatArray:
         """The normals, or other vectors (tangents), on the surface with other positions.

@@ -19,8 +19,8 @@ class OffAsset(Asset):
         self.lines = path.read_bytes().decode("utf-8", errors="surrogateescape").splitlines()
         content = [n for n, line in enumerate(self.lines) if line.partition("#")[0].strip()]
         # The header and the counts stand on one line or on two.
-        first = 1 if len(self.lines[content[0]].split()) > 1 else 2
-        kind = self.lines[content[0]].split()[0]
+        header = self.lines[content[0]].partition("#")[0].split()
+        first, kind = 1 if len(header) > 1 else 2, header[0]
         self._rows = content[first : first + len(self.positions)]
         words = [len(self.lines[n].partition("#")[0].split()) for n in self._rows]
         if len(words) < len(self.positions) or min(words, default=0) < 3:  # not a vertex a line: only the mesh stays

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".glb", ".mp4", ".gif", ".usd", ".usda", ".usdc", ".mdd", ".pc2", ".npz")
 
-_VIDEO, _USD = (("imageio", "imageio_ffmpeg"), "video"), (("pxr",), "usd")
+_USD = (("pxr",), "usd")
 # Modules that a suffix needs, and the extra that brings them.
-_NEEDS = {".mp4": _VIDEO, ".gif": _VIDEO, ".usd": _USD, ".usda": _USD, ".usdc": _USD}
+_NEEDS = {".mp4": (("imageio", "imageio_ffmpeg"), "video"), ".usd": _USD, ".usda": _USD, ".usdc": _USD}
 
 
 def require_packages(path: Path) -> None:
@@ -61,9 +61,9 @@ def save_animation(
     ``.glb`` is glTF 2.0 with a morph target for each frame after the first; viewers interpolate linearly between
     neighbouring frames. glTF calls Y up and metres the unit; the caller's coordinates are written as they are
     (float32), so a Z-up sequence lies on its back there. Normals move with the shape, except where that would make
-    a very large file (with a warning). ``.usd``, ``.usda`` and ``.usdc`` hold the points over time in the same manner.
+    a very large file (with a warning). ``.usd``, ``.usda`` and ``.usdc`` (extra ``usd``) hold the points over time in the same manner.
 
-    ``.mp4`` and ``.gif`` are drawn (extra ``video``). ``.mdd`` and ``.pc2`` are point caches, for a mesh that is
+    ``.mp4`` (extra ``video``) and ``.gif`` are drawn. ``.mdd`` and ``.pc2`` are point caches, for a mesh that is
     already in Blender, Maya or Houdini. ``.npz`` holds ``frames``, ``faces``, ``times`` and ``keyframes`` as arrays.
 
     Args:

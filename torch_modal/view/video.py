@@ -1,4 +1,4 @@
-"""A sequence as a video or GIF. Needs ``imageio`` (``pip install torch_modal[video]``)."""
+"""A sequence as a video, by imageio and its ffmpeg (``pip install torch_modal[video]``), or as a GIF, by Pillow."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from torch_modal.io.files import temporary_beside
 from torch_modal.io.timing import Timing, resample
-from torch_modal.view.drawing import Scene, draw
+from torch_modal.view.drawing import ByteArray, Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, centred, view_rotation
 
 PIXELS = 640
@@ -34,7 +34,6 @@ def save_video(
         view: Azimuth and elevation of the camera, as for :func:`torch_modal.render_sequence`.
         renderer: ``"auto"``, ``"pyvista"`` or ``"matplotlib"``.
     """
-    writer_of = _writer(path)
     places = timing.samples(len(shapes))
     # A frame that is shown twice, as on the way back, is drawn once.
     unique, which = np.unique(places, return_inverse=True)
@@ -45,21 +44,25 @@ def save_video(
     paint = np.broadcast_to((np.array(BETWEEN_COLOR) * 255).round().astype(np.uint8), points[0].shape)
     images = draw(Scene(points[0], paint.copy(), faces, half, size), renderer)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_beside(path, path.suffix.lower()) as temporary, writer_of(temporary, timing.fps) as writer:
-        for number in which.reshape(-1):
-            writer.append_data(images[number])
+    with temporary_beside(path, path.suffix.lower()) as temporary:
+        write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+        write(temporary, [images[number] for number in which.reshape(-1)], timing.fps)
     return path
 
 
-def _writer(path: Path) -> Any:
-    """Opens a writer of the suffix, given a path and the pictures a second."""
+def _write_gif(path: Path, pictures: list[ByteArray], fps: float) -> None:
+    from PIL import Image
+
+    # GIF counts in hundredths of a second, and players slow down below two of them.
+    milliseconds = max(20, 10 * round(100 / fps))
+    first, *others = (Image.fromarray(picture) for picture in pictures)
+    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+
+def _write_mp4(path: Path, pictures: list[ByteArray], fps: float) -> None:
     import imageio.v2 as imageio
 
-    if path.suffix.lower() == ".gif":
-        # GIF counts in hundredths of a second, and players slow down below two of them.
-        return lambda file, fps: imageio.get_writer(
-            file, format="GIF-PIL", mode="I", duration=max(20, 10 * round(100 / fps)), loop=0
-        )
-    return lambda file, fps: imageio.get_writer(
-        file, format="FFMPEG", mode="I", fps=fps, codec="libx264", macro_block_size=1, ffmpeg_log_level="error"
-    )
+    options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "error"}
+    with imageio.get_writer(path, format="FFMPEG", mode="I", fps=fps, **options) as writer:
+        for picture in pictures:
+            writer.append_data(picture)
