@@ -63,6 +63,7 @@ def _write_mp4(path: Path, pictures: list[ByteArray], fps: float) -> None:
     import imageio.v2 as imageio
 
     options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "error"}
-    with imageio.get_writer(path, format="FFMPEG", mode="I", fps=fps, **options) as writer:
+    writer: Any = imageio.get_writer(path, format="FFMPEG", mode="I", fps=fps, **options)
+    with writer:
         for picture in pictures:
             writer.append_data(picture)
