@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,7 @@ def test_glb_alone_cyclic_with_a_number_of_frames(meshes: list[str], tmp_path: P
     assert times.max == [pytest.approx(0.7)]  # seven frames and the step back to the first
 
 
-def test_paired_space_and_mu_arrive(
+def test_preset_and_mu_arrive(
     meshes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen: dict[str, object] = {}

@@ -13,7 +13,7 @@ from torch_modal.cli import main as cli
 from torch_modal.geometry.connectivity import boundary_edges
 from torch_modal.geometry.seams import merge_seams
 
-FAST = ["--modes", "6", "--levels", "2", "--mesher", "lattice", "--coarse-faces", "200", "--quiet"]
+FAST = ["--modes", "6", "--levels", "2", "--mesher", "lattice", "--preset", "fast", "--quiet"]
 
 
 def split_keyframes(turn: float = 0.9) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
