@@ -170,7 +170,8 @@ def render_sequence(
             99.5th percentile of what is shown, with an arrow if there is more.
             *Shape of each:* ``(N, V)``.
         color_label: What those numbers are, with their unit.
-        renderer: ``"auto"`` is pyvista, and matplotlib (with a warning) where pyvista cannot render.
+        renderer: ``"auto"`` is pyvista where it is installed (extra ``view``), otherwise matplotlib; also, with a
+            warning, where pyvista cannot render.
         overwrite: Replace the file if it exists.
 
     Returns:
