@@ -10,7 +10,7 @@ from textured import bend, split_at_seams, textured_glb, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.geometry.connectivity import boundary_edges
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.seams import merge_seams
 
 FAST = ["--modes", "6", "--levels", "2", "--mesher", "lattice", "--preset", "fast", "--quiet"]
@@ -33,9 +33,9 @@ def gap(frames: np.ndarray, original: np.ndarray) -> float:
 
 def test_split_vertices_are_joined_and_scattered_back():
     keyframes, split, original, whole, faces = split_keyframes()
-    assert len(boundary_edges(split)) and not len(boundary_edges(faces))
+    assert len(Connectivity(split).boundary_edges) and not len(Connectivity(faces).boundary_edges)
     welded = tm.weld_seams(keyframes, split)
-    assert welded.keyframes.shape == whole.shape and not len(boundary_edges(welded.faces.numpy()))
+    assert welded.keyframes.shape == whole.shape and not len(Connectivity(welded.faces.numpy()).boundary_edges)
     assert welded.n_merged == len(original) - len(whole[0])
     assert torch.equal(welded.scatter(welded.keyframes), torch.from_numpy(keyframes))
     # The same grouping as the true one.

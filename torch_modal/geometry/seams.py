@@ -2,11 +2,9 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import unique_edges
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 
 IntArray = NDArray[np.int64]
 
@@ -29,16 +27,11 @@ def merge_seams(shapes: NDArray[np.float64], faces: IntArray) -> IntArray:
         vertices. *Shape:* ``(V,)``.
     """
     n = shapes.shape[1]
-    edges, counts = unique_edges(faces)
-    boundary = np.unique(edges[counts == 1])
+    boundary = np.unique(Connectivity(faces).boundary_edges)
     if not len(boundary):
         return np.arange(n)
     used = np.unique(faces)
     tolerance = TOLERANCE * float(np.linalg.norm(np.ptp(shapes[:, used], axis=1), axis=1).min())
     pairs = boundary[cKDTree(shapes[0, boundary]).query_pairs(tolerance, output_type="ndarray")]
     apart = np.linalg.norm(shapes[:, pairs[:, 0]] - shapes[:, pairs[:, 1]], axis=2).max(axis=0, initial=0.0)
-    i, j = pairs[apart <= tolerance].T
-    _, group = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)
-    _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
-    order = np.argsort(np.argsort(first))
-    return order[inverse.reshape(-1)].astype(np.int64)
+    return connected_pieces(pairs[apart <= tolerance], n)

@@ -78,7 +78,9 @@ def save_glb(
     if len(kept) > 1:
         times, shown = timing.knots(kept, len(shapes))
         steps = len(shapes) if timing.cyclic else len(shapes) - 1
-        extras = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": list(keyframes)}
+        extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": list(keyframes)}
+        if timing.ping_pong:
+            extras["ping_pong"] = True
         animate(document, nodes, kept.tolist(), times, shown, extras)
     write_file(path, document.to_glb())
     return path

@@ -124,6 +124,25 @@ class GltfAsset(Asset):
         triangles = np.stack([first, np.where(odd, third, second), np.where(odd, second, third)], axis=1)
         return triangles[(np.diff(np.sort(triangles, axis=1)) > 0).all(axis=1)]  # strips turn by empty ones
 
+    def morphs(self) -> FloatArray:
+        """The shapes that its morph targets stand for, each shown fully, after the file's own. *Shape:* ``(N, V, 3)``.
+
+        Raises:
+            ValueError: Its meshes do not have the same number of targets.
+        """
+        counts = {len(primitive.json.get("targets", [])) for primitive in self._primitives}
+        if len(counts) > 1:
+            raise ValueError(f"meshes of {sorted(counts)} morph targets")
+        shapes = np.repeat(self.positions[None], 1 + max(counts, default=0), axis=0)
+        for primitive in self._primitives:
+            linear = self._world[primitive.node][:3, :3].T
+            for number, target in enumerate(primitive.json.get("targets", []), start=1):
+                moved = self.positions[primitive.points]
+                if "POSITION" in target:
+                    moved = moved + self.document.floats(target["POSITION"]) @ linear
+                shapes[number, primitive.points] = moved
+        return shapes
+
     # ------------------------------------------------------------------------------------------------ the file again
     def rebuilt(self, frames: FloatArray) -> tuple[Document, list[Drawn], list[int]]:
         """A copy without positions and normals, with nothing in it that is not used.
