@@ -171,6 +171,15 @@ def test_a_crash_of_the_child_falls_back_to_matplotlib(tmp_path, monkeypatch):
     assert not (tmp_path / "no.png").exists()
 
 
+def test_without_pyvista_matplotlib_draws_and_says_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(drawing.importlib.util, "find_spec", lambda name: None)
+    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
+    path = render_sequence(rows, faces, tmp_path / "auto.png")
+    assert path.read_bytes() == render_sequence(rows, faces, tmp_path / "m.png", renderer="matplotlib").read_bytes()
+    with pytest.raises(RuntimeError, match=r"pip install torch_modal\[view\]"):
+        render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
+
+
 @pytest.mark.parametrize(
     ("code", "reason"),
     [
