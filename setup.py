@@ -7,14 +7,62 @@ from setuptools import find_packages, setup
 
 ROOT = Path(__file__).parent
 VERSION = re.search(r'^__version__ = "(.+)"', (ROOT / "torch_modal/version.py").read_text(), re.M).group(1)
+REPOSITORY = "https://github.com/torch-modal/torch_modal"
+"""The one place that names it; a fork changes it here."""
+
+
+def description_for_pypi() -> str:
+    """README, whose links within the repository PyPI can follow only as whole addresses: of pages, and of pictures."""
+
+    def whole(match: re.Match[str]) -> str:
+        path = match.group(1)
+        kind = "raw" if path.endswith((".png", ".jpg", ".gif", ".svg")) else "blob"
+        return f"]({REPOSITORY}/{kind}/HEAD/{path})"
+
+    return re.sub(r"\]\((?!https?:|mailto:|#)([^)\s]+)\)", whole, (ROOT / "README.md").read_text(encoding="utf-8"))
+
+
+EXTRAS = {
+    "view": ["viser>=1.0"],  # a session in which key-frames are deformed by hand
+    "pictures": ["pyvista>=0.43"],  # pictures and videos in better light, on the graphics card
+    "video": ["imageio[ffmpeg]>=2.28"],  # MP4
+    "usd": ["usd-core>=24.5"],
+    "pyg": ["torch_geometric>=2.4"],
+    "dask": ["distributed>=2024.5"],
+}
 
 setup(
     name="torch_modal",
     version=VERSION,
     description="Physically plausible in-between shapes from key-frame meshes, in a space of vibration modes",
-    long_description=(ROOT / "README.md").read_text(),
+    long_description=description_for_pypi(),
     long_description_content_type="text/markdown",
+    author="torch_modal contributors",
     license="MIT",
+    license_files=["LICENSE"],
+    url=REPOSITORY,
+    project_urls={
+        "Documentation": f"{REPOSITORY}/tree/HEAD/docs",
+        "Changelog": f"{REPOSITORY}/blob/HEAD/CHANGELOG.md",
+        "Issues": f"{REPOSITORY}/issues",
+    },
+    keywords=[
+        *["mesh", "shape interpolation", "in-betweening", "key-frames", "animation", "vibration modes"],
+        *["differentiable", "geometry processing", "data augmentation", "pytorch"],
+    ],
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Developers",
+        "Intended Audience :: Science/Research",
+        "Operating System :: OS Independent",
+        "Programming Language :: Python :: 3",
+        "Programming Language :: Python :: 3 :: Only",
+        *[f"Programming Language :: Python :: 3.{minor}" for minor in (10, 11, 12, 13)],
+        "Topic :: Multimedia :: Graphics :: 3D Modeling",
+        "Topic :: Scientific/Engineering :: Artificial Intelligence",
+        "Topic :: Scientific/Engineering :: Mathematics",
+        "Typing :: Typed",
+    ],
     python_requires=">=3.10",
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
     package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply", "view/page_assets/*"]},
@@ -24,28 +72,23 @@ setup(
         "scipy>=1.11",
         "trimesh>=4.6.13",  # earlier ones lose the mesh of some files
         "networkx>=3.0",
-        "pytetwild[all]>=0.4.2",
+        "pytetwild>=0.4.2",
         "fast-simplification>=0.1.11",
         "kornia>=0.8.2",
         "safetensors>=0.4.3",
-        "pygltflib>=1.16",
         "matplotlib>=3.7",
         "threadpoolctl>=3.1",
+        "pillow>=10",
         "tqdm>=4.65",
         "lazy_loader>=0.4",
     ],
     extras_require={
-        "pyg": ["torch_geometric>=2.4"],
-        "view": ["viser>=1.0"],
-        "dask": ["distributed>=2024.5"],
+        **EXTRAS,
+        "all": sorted(each for extra in EXTRAS.values() for each in extra),
         "test": [
-            "pytest>=8",
-            "ruff>=0.6",
-            "mypy>=1.11",
-            "torch_geometric>=2.4",
-            "distributed>=2024.5",
-            "selenium>=4.20",
-            "viser>=1.0",
+            *sorted(each for extra in EXTRAS.values() for each in extra),
+            *["pytest>=8", "ruff>=0.6", "mypy>=1.11", "pygltflib>=1.16", "selenium>=4.20"],
+            *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],
         ],
     },
     entry_points={"console_scripts": ["torch-modal = torch_modal.cli.main:main"]},

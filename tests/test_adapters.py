@@ -140,3 +140,116 @@ def test_graphs_from_the_dataset(bars: Shapes, tmp_path: Path) -> None:
 
 def graph_labels(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
     return {**number_vertices(stored), "shape_labels": torch.arange(len(stored))}
+
+
+def test_batches_of_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
+    """A batch is transformed as its shapes would be."""
+    geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
+    from torch_modal.data.pyg import RandomShape
+
+    graphs = [
+        geometric.data.Data(
+            pos=x, face=bars.faces.T.contiguous(), normal=torch.zeros(164, 3, dtype=F64), y=torch.eye(3)[i : i + 1]
+        )
+        for i, x in enumerate(bars.keyframes)
+    ]
+    batch = geometric.data.Batch.from_data_list(graphs)
+
+    def make() -> tm.AugmentationSequential:
+        return tm.AugmentationSequential(
+            tm.RandomInBetween(p=1.0, blend_labels=True), generator=torch.Generator().manual_seed(2), space=spaces[0]
+        )
+
+    transform = RandomShape(make(), y=torch.eye(3))
+    found = transform(batch)
+    pool = tm.ShapeBatch.of_keyframes(spaces[0], batch.pos)
+    expected = make()(bars.keyframes, pool=pool)
+    torch.testing.assert_close(found.pos, expected.flatten(0, 1))
+    torch.testing.assert_close(found.normal, tm.vertex_normals(expected, bars.faces).flatten(0, 1))
+    assert torch.equal(batch.pos, bars.keyframes.flatten(0, 1)), "the batch that came has changed"
+    torch.testing.assert_close(found.y.sum(1), torch.ones(3))
+    t = transform.augmentation.params[0]["t"].float()
+    torch.testing.assert_close(found.y.diagonal(), 1 - t)
+    apart = found.to_data_list()
+    assert len(apart) == 3 and torch.equal(apart[1].pos, found.pos[164:328])
+    uneven = geometric.data.Batch.from_data_list(
+        [geometric.data.Data(pos=torch.zeros(n, 3, dtype=F64)) for n in (100, 228)]
+    )
+    with pytest.raises(ValueError, match=r"2 graphs of this space has the shape \(328, 3\)"):
+        RandomShape(make())(uneven)
+
+
+# -------------------------------------------------------------------------------------------------------- PyTorch3D
+class Meshes:
+    """A stand-in with what is used of PyTorch3D's ``Meshes`` (which has no wheels), by its documentation."""
+
+    def __init__(
+        self,
+        verts: list[torch.Tensor] | torch.Tensor,
+        faces: list[torch.Tensor] | torch.Tensor,
+        textures: object = None,
+    ) -> None:
+        self.verts, self.faces, self.textures = list(verts), list(faces), textures
+
+    def __getitem__(self, index: int) -> "Meshes":
+        return Meshes([self.verts[index]], [self.faces[index]], self.textures)
+
+    def verts_packed(self) -> torch.Tensor:
+        return torch.cat(self.verts)
+
+    def verts_padded(self) -> torch.Tensor:
+        return torch.nn.utils.rnn.pad_sequence(self.verts, batch_first=True)
+
+    def faces_padded(self) -> torch.Tensor:
+        return torch.nn.utils.rnn.pad_sequence(self.faces, batch_first=True, padding_value=-1)
+
+    def num_verts_per_mesh(self) -> torch.Tensor:
+        return torch.tensor([len(x) for x in self.verts])
+
+    def num_faces_per_mesh(self) -> torch.Tensor:
+        return torch.tensor([len(f) for f in self.faces])
+
+    def offset_verts(self, vert_offsets_packed: torch.Tensor) -> "Meshes":
+        moved = self.verts_packed() + vert_offsets_packed
+        return Meshes(moved.split(self.num_verts_per_mesh().tolist()), self.faces, self.textures)
+
+    def extend(self, N: int) -> "Meshes":
+        return Meshes(
+            [x for x in self.verts for _ in range(N)], [f for f in self.faces for _ in range(N)], self.textures
+        )
+
+    def update_padded(self, new_verts_padded: torch.Tensor) -> "Meshes":
+        assert new_verts_padded.shape == self.verts_padded().shape
+        return Meshes(new_verts_padded, self.faces, self.textures)
+
+
+def test_meshes_in_and_out(bars: Shapes, small_bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
+    from torch_modal.data.pytorch3d import as_meshes, augment_meshes, keyframes_of
+
+    meshes = Meshes(bars.keyframes, [bars.faces] * 3, "textures")
+    keyframes, faces = keyframes_of(meshes)
+    assert torch.equal(keyframes, bars.keyframes) and torch.equal(faces, bars.faces)
+    frames = tm.subdivide(keyframes, faces, 1, bases=bars.bases, progress=False)
+    found = as_meshes(frames, meshes)
+    assert torch.equal(found.verts_padded(), frames) and found.textures == "textures"
+    assert len(found.faces) == 5 and all(torch.equal(f, bars.faces) for f in found.faces)
+    with pytest.raises(ValueError, match=r"\(N, 164, 3\); got \(5, 30, 3\)"):
+        as_meshes(torch.zeros(5, 30, 3), meshes)
+
+    mixed = Meshes([bars.keyframes[0].requires_grad_(), small_bars.keyframes[0]], [bars.faces, small_bars.faces], 7)
+    augment = tm.RandomRigidMotion(p=1.0, generator=torch.Generator().manual_seed(0))
+    moved = augment_meshes(augment, mixed, spaces)
+    assert moved.textures == 7 and moved.faces == mixed.faces
+    expected = tm.augment_packed(
+        tm.RandomRigidMotion(p=1.0, generator=torch.Generator().manual_seed(0)),
+        mixed.verts_packed(),
+        mixed.num_verts_per_mesh(),
+        spaces,
+    )
+    torch.testing.assert_close(moved.verts_packed(), expected)
+    assert moved.verts_packed().requires_grad
+    with pytest.raises(ValueError, match=r"\[164, 30\] vertices"):
+        keyframes_of(mixed)
+    flipped = Meshes(bars.keyframes[:2], [bars.faces, bars.faces.flip(1)])
+    with pytest.raises(ValueError, match="mesh 1 has others than mesh 0"):
+        keyframes_of(flipped)

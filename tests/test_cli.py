@@ -14,10 +14,11 @@ import torch
 from conftest import listen_to_ctrl_c
 
 import torch_modal as tm
+from torch_modal import progress
 from torch_modal.cli import demo
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
-from torch_modal.io.write import save_frames
+from torch_modal.io.frames import save_frames
 from torch_modal.precompute import filling
 from torch_modal.precompute import modes as modes_module
 from torch_modal.precompute.cache import Cache
@@ -42,6 +43,12 @@ def coarse_tetrahedra(monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the mesher's time; nothing here depends on how fine the tetrahedra are."""
     coarse = TetrahedraSettings(edge_length_fac=0.05, epsilon=3e-3)
     monkeypatch.setitem(modes_module.QUALITIES, "fast", coarse)
+
+
+@pytest.fixture(autouse=True)
+def no_progress_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine there would be some; one test asks for them."""
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 1e9)
 
 
 @pytest.fixture
@@ -115,7 +122,7 @@ def test_glb_alone_cyclic_with_a_number_of_frames(meshes: list[str], tmp_path: P
     assert times.max == [pytest.approx(0.7)]  # seven frames and the step back to the first
 
 
-def test_paired_space_and_mu_arrive(
+def test_preset_and_mu_arrive(
     meshes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen: dict[str, object] = {}
@@ -142,7 +149,8 @@ def test_nothing_is_overwritten_and_no_work_is_done_for_it(
     for existing, argv in (
         (glb, ["--out", str(glb)]),
         (folder / "animation.glb", ["--out", str(folder)]),
-        (folder / "frame-017.ply", ["--out", str(folder)]),
+        (folder / "frame-017.obj", ["--out", str(folder)]),
+        (folder / "frame-017.ply", ["--out", str(folder), "--format", "ply"]),
         (picture, ["--out", str(tmp_path / "other.glb"), "--picture", str(picture)]),
     ):
         existing.write_text("mine")
@@ -159,15 +167,15 @@ def test_nothing_is_overwritten_and_no_work_is_done_for_it(
 def test_overwrite_replaces_and_names_what_is_left_over(
     meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("animation.glb", "frame-000.ply", "frame-009.ply"):
+    for name in ("animation.glb", "frame-000.obj", "frame-009.obj"):
         (tmp_path / name).write_text("old")
     assert cli.main(["subdivide", *meshes, "--out", str(tmp_path), *FAST, "--overwrite", "--quiet"]) == 0
     assert (tmp_path / "animation.glb").read_bytes().startswith(b"glTF")
-    assert (tmp_path / "frame-000.ply").read_bytes().startswith(b"ply")
-    assert (tmp_path / "frame-009.ply").read_text() == "old"
+    assert (tmp_path / "frame-000.obj").read_bytes().startswith(b"v ")
+    assert (tmp_path / "frame-009.obj").read_text() == "old"
     said = capsys.readouterr()
     assert said.out == ""
-    assert "warning: " in said.err and "1 frames of an earlier run, from frame-009.ply" in said.err
+    assert "warning: " in said.err and "1 frames of an earlier run, from frame-009.obj" in said.err
 
 
 def test_key_frames_are_never_overwritten(
@@ -240,7 +248,10 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
     assert "required: COMMAND" in misused(capsys)
     assert "two key-frames or more" in misused(capsys, "subdivide", meshes[0], *out)
     assert "required: --out" in misused(capsys, "subdivide", *meshes)
-    assert "ending in .glb or a folder" in misused(capsys, "subdivide", *meshes, "--out", "a.obj")
+    for name in ("a.obj", "a.xyz", "a.GLTF", "a.mp5"):  # not a folder of that name
+        assert ".glb, .mp4" in misused(capsys, "subdivide", *meshes, "--out", name)
+    for option in ("--ping-pong", "--ease"):
+        assert "begin and end" in misused(capsys, "subdivide", *meshes, *out, "--cyclic", option)
     assert "--preset paper" in misused(capsys, "subdivide", *meshes, *out, "--mu", "1")
     assert "must end in .png or .pdf" in misused(capsys, "subdivide", *meshes, *out, "--picture", "a.jpg")
     assert "one file, but there are 2" in misused(capsys, "modes", *meshes, "--out", "a.safetensors")
@@ -250,6 +261,7 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
         ("--levels", "-1"),
         ("--levels", "1.5"),
         ("--frames", "1"),
+        ("--duration", "0"),
         ("--fps", "0"),
         ("--fps", "nan"),
         ("--fps", "inf"),

@@ -14,8 +14,9 @@ import pytest
 import torch
 import trimesh
 
-from torch_modal.io import write as export
-from torch_modal.io.write import save_animation, save_frames
+from torch_modal.io import glb
+from torch_modal.io.frames import save_frames
+from torch_modal.view.animation import save_animation
 
 HAND = Path(__file__).parents[1].parent / "shared" / "data" / "mh-hand-path"
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -288,7 +289,7 @@ def test_long_sequences_are_thinned(tmp_path):
 
 
 def test_large_files_do_without_moving_normals(tmp_path, monkeypatch):
-    monkeypatch.setattr(export, "LARGEST_FILE_WITH_NORMALS", 5 * 4 * 3 * 4 - 1)
+    monkeypatch.setattr(glb, "LARGEST_FILE_WITH_NORMALS", 5 * 4 * 3 * 4 - 1)
     with pytest.warns(UserWarning, match="normals"):
         gltf = pygltflib.GLTF2().load(save_animation(tetrahedra(), FACES, tmp_path / "a.glb"))
     assert all(target.get("NORMAL") is None for target in gltf.meshes[0].primitives[0].targets)
@@ -319,7 +320,9 @@ def test_normals_have_unit_length_everywhere(tmp_path):
 
 
 def test_the_import_is_light():
-    code = "import sys, torch_modal.io.write, torch_modal.view.picture; print(*sys.modules)"
-    root = str(Path(export.__file__).parents[1])
+    code = (
+        "import sys, torch_modal.io.frames, torch_modal.view.animation, torch_modal.view.picture; print(*sys.modules)"
+    )
+    root = str(Path(glb.__file__).parents[1])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert not {"pyvista", "vtkmodules", "matplotlib", "pygltflib"} & set(done.stdout.split())

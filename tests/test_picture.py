@@ -147,15 +147,15 @@ def test_camera_directions(view, up, expected):
 def test_what_rests_stays_and_what_travels_is_followed():
     ball = np.asarray(BALL.vertices)
     rest = np.stack([ball, 1.2 * ball + np.array([0.2, 0, 0])])[None]
-    moved, _ = picture._centred(rest)
+    moved, _ = picture.centred(rest)
     np.testing.assert_allclose(moved[0, 1] - moved[0, 0], rest[0, 1] - rest[0, 0], atol=1e-12)
     far = np.stack([ball, ball + np.array([9, 0, 0])])[None]
     both = np.concatenate([far, far + np.array([0, 0.3, 0])])
-    moved, half = picture._centred(both)
+    moved, half = picture.centred(both)
     np.testing.assert_allclose(moved[:, 1], moved[:, 0], atol=1e-12)  # followed
     np.testing.assert_allclose(moved[1] - moved[0], np.broadcast_to([0, 0.3, 0], moved[0].shape), atol=1e-12)
     assert half[0] == pytest.approx(1.06 * 1, rel=0.03)
-    moved, half = picture._centred(np.concatenate([far, far + np.array([0, 7, 0])]))  # rows apart too: each by itself
+    moved, half = picture.centred(np.concatenate([far, far + np.array([0, 7, 0])]))  # rows apart too: each by itself
     assert np.abs(moved).max() <= 1.0 + 1e-12
 
 
@@ -169,6 +169,15 @@ def test_a_crash_of_the_child_falls_back_to_matplotlib(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="signal 11"):
         render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
     assert not (tmp_path / "no.png").exists()
+
+
+def test_without_pyvista_matplotlib_draws_and_says_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(drawing.importlib.util, "find_spec", lambda name: None)
+    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
+    path = render_sequence(rows, faces, tmp_path / "auto.png")
+    assert path.read_bytes() == render_sequence(rows, faces, tmp_path / "m.png", renderer="matplotlib").read_bytes()
+    with pytest.raises(RuntimeError, match=r"pip install torch_modal\[view\]"):
+        render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,12 @@ from .energy.terms import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals
-from .io.write import save_animation as save_animation
-from .io.write import save_frames as save_frames
+from .io.asset import Asset as Asset
+from .io.frames import save_frames as save_frames
+from .io.read import open_asset as open_asset
 from .keyframes.check import check_keyframes as check_keyframes
 from .keyframes.load import load_keyframes as load_keyframes
+from .keyframes.seams import weld_seams as weld_seams
 from .nn.adjoint import ConvergenceWarning as ConvergenceWarning
 from .nn.between import ConvergenceError as ConvergenceError
 from .nn.between import InBetweenResult as InBetweenResult
@@ -49,6 +51,7 @@ from .sequence.subdivide import frame_times as frame_times
 from .sequence.subdivide import keyframe_places as keyframe_places
 from .sequence.subdivide import linear_sequence as linear_sequence
 from .sequence.subdivide import subdivide as subdivide
+from .view.animation import save_animation as save_animation
 from .view.live import LiveSession as LiveSession
 from .view.live import live as live
 from .view.page import Page as Page

@@ -5,14 +5,12 @@ Each refuses what it could not write before it imports anything heavy, and befor
 
 import argparse
 import os
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
-
-OUTPUT_SUFFIXES = (".obj", ".ply", ".off", ".glb", ".gltf", ".stl", ".png", ".pdf", ".safetensors")
-"""Of files: an ``--out`` that ends so is not meant as a folder."""
 
 
 def subdivide(args: argparse.Namespace) -> None:
@@ -23,23 +21,33 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
         args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
-    single = _is_file(args, ".glb")
+    if args.cyclic and (args.ping_pong or args.ease):
+        args.fail(
+            f"--{'ping-pong' if args.ping_pong else 'ease'} is for sequences that begin and end; a cycle does not"
+        )
+    from torch_modal.view.animation import SUFFIXES, require_packages
+
+    single = _is_file(args, *SUFFIXES)
     animation = args.out if single else args.out / "animation.glb"
     files = [animation, *([args.picture] if args.picture else [])]
-    pattern = None if single else f"frame-*.{args.format}"
+    fmt = args.format or {".gltf": "glb"}.get(args.meshes[0].suffix.lower(), args.meshes[0].suffix.lower()[1:])
+    pattern = None if single else f"frame-*.{fmt}"
     _check_output(args, files, pattern)
+    require_packages(animation)
 
     import torch_modal as tm
 
     places = tm.keyframe_places(len(args.meshes), args.levels, cyclic=args.cyclic, n_frames=args.frames)
     keyframes, faces = tm.load_keyframes(args.meshes)
+    asset = tm.open_asset(args.meshes[0])
+    welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
-    bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
+    bases = tm.extract_bases(welded.keyframes, welded.faces, args.modes, **_precompute_options(args))
     objective, solver = tm.PRESETS[args.preset]
     objective = objective if args.mu is None else replace(objective, mu=args.mu)
-    frames = tm.subdivide(
-        keyframes,
-        faces,
+    solved = tm.subdivide(
+        welded.keyframes,
+        welded.faces,
         args.levels,
         bases=bases,
         cyclic=args.cyclic,
@@ -48,15 +56,28 @@ def subdivide(args: argparse.Namespace) -> None:
         objective=objective,
         solver=replace(solver, polish=args.polish),
     )
-    report = _reporter(args)
-    report(f"{len(keyframes)} key-frames of {keyframes.shape[1]} vertices -> {len(frames)} frames")
+    frames = welded.scatter(solved)
     keys = [place for place in places if place < len(frames)]
+    frames[keys] = keyframes
+    report = _reporter(args)
+    seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
+    report(f"{len(keyframes)} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
     if not single:
-        written = tm.save_frames(frames, faces, args.out, fmt=args.format, overwrite=args.overwrite)
+        written = tm.save_frames(frames, faces, args.out, fmt, overwrite=args.overwrite, asset=asset)
         report(f"frames:    {written[0]} to {written[-1].name}")
         _warn_of_leftovers(args.out, pattern, written)
     tm.save_animation(
-        frames, faces, animation, args.fps, keyframe_indices=keys, cyclic=args.cyclic, overwrite=args.overwrite
+        frames,
+        faces,
+        animation,
+        args.fps,
+        keyframe_indices=keys,
+        cyclic=args.cyclic,
+        overwrite=args.overwrite,
+        duration=args.duration,
+        ping_pong=args.ping_pong,
+        ease=args.ease,
+        asset=asset,
     )
     report(f"animation: {animation}")
     if args.picture:
@@ -104,7 +125,7 @@ def modes(args: argparse.Namespace) -> None:
 def demo(args: argparse.Namespace) -> None:
     """Run ``torch-modal demo``."""
     names = [args.sample] if args.sample else ["creature", "hand"]
-    if args.out.suffix.lower() in OUTPUT_SUFFIXES:
+    if _looks_like_file(args.out):
         args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
     _check_output(args, [args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")])
 
@@ -160,12 +181,21 @@ def _reporter(args: argparse.Namespace) -> Callable[[str], None]:
 
 
 # ---------------------------------------------------------------------------------------------------- output
-def _is_file(args: argparse.Namespace, suffix: str) -> bool:
-    """Whether --out names a file of this suffix rather than a folder."""
-    given = args.out.suffix.lower()
-    if given != suffix and given in OUTPUT_SUFFIXES:
-        args.fail(f"--out is a file ending in {suffix} or a folder, got {args.out.name!r}")
-    return given == suffix
+def _is_file(args: argparse.Namespace, *suffixes: str) -> bool:
+    """Whether --out names a file of one of these suffixes rather than a folder."""
+    if args.out.suffix.lower() in suffixes:
+        return True
+    if _looks_like_file(args.out):
+        args.fail(
+            f"--out is a file ending in {', '.join(suffixes)}, or a folder, got {args.out.name!r}; a folder whose name "
+            "has an ending must exist"
+        )
+    return False
+
+
+def _looks_like_file(out: Path) -> bool:
+    """Whether a name has an ending: letters, not the number of a version, and no folder has it already."""
+    return re.fullmatch(r"\.\w*[A-Za-z]\w*", out.suffix) is not None and not out.is_dir()
 
 
 def _check_output(args: argparse.Namespace, files: list[Path], pattern: str | None = None) -> None:

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch_modal.data.samples import Sample, load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.io.write import save_animation
 from torch_modal.precompute.modes import extract_bases
 from torch_modal.sequence.subdivide import keyframe_places, linear_sequence, subdivide
+from torch_modal.view.animation import save_animation
 from torch_modal.view.picture import render_sequence
 
 # Columns of the picture, in intervals of key-frames: the truth is known at all of them.

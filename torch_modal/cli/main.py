@@ -7,15 +7,13 @@ import argparse
 import contextlib
 import os
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from torch_modal.cli import commands, precompute, view
+from torch_modal.cli.messages import PROGRAM, log_as_lines, say, warnings_as_lines
 from torch_modal.version import __version__
-
-PROGRAM = "torch-modal"
 
 DESCRIPTION = """\
 Fill key-frame meshes with physically plausible shapes in between.
@@ -40,7 +38,11 @@ examples:
   one animated file, with a picture beside linear interpolation:
     torch-modal subdivide open.obj fist.obj --out hand.glb --picture hand.png
   a cycle of six key-frames as 96 numbered OBJ files and animation.glb in a folder:
-    torch-modal subdivide gait-?.ply --cyclic --levels 4 --out gait --format obj"""
+    torch-modal subdivide gait-?.ply --cyclic --levels 4 --out gait --format obj
+  a GIF that goes there and back again:
+    torch-modal subdivide open.obj fist.obj --out hand.gif --ping-pong --ease
+  a point cache for the mesh that is already in Blender:
+    torch-modal subdivide open.obj fist.obj --out hand.mdd --duration 3 --fps 24"""
 
 MODES = """\
 Compute the vibration modes of key-frames: the lowest elastic modes of the solid
@@ -90,12 +92,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         args = _parser().parse_args(argv)
-        with _warnings_as_lines():
+        with warnings_as_lines(), log_as_lines(args):
             code = _run(args)
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:
-        _say("interrupted")
+        say("interrupted")
         return 130
     except BrokenPipeError:
         # The reader (head, less) has what it wanted. Python flushes once more at exit: into nothing.
@@ -113,7 +115,7 @@ def _run(args: argparse.Namespace) -> int:
     except Exception as error:
         if args.debug or not isinstance(error, _expected_errors()):
             raise
-        _say(f"error: {_one_line(error)}")
+        say(f"error: {_one_line(error)}")
         return 1
 
 
@@ -124,6 +126,7 @@ def _expected_errors() -> tuple[type[Exception], ...]:
     for module, name in (
         ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
         ("torch_modal.precompute.eigen", "ModalAnalysisError"),
+        ("torch_modal.errors", "MissingPackageError"),
     ):
         if module in sys.modules:
             expected.append(getattr(sys.modules[module], name))
@@ -136,27 +139,6 @@ def _one_line(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return "out of memory; take fewer levels or a smaller mesh"
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def _say(message: str) -> None:
-    print(f"{PROGRAM}: {message}", file=sys.stderr, flush=True)
-
-
-@contextlib.contextmanager
-def _warnings_as_lines() -> Iterator[None]:
-    """Show each warning about input or result once, as one line; leave those of libraries to developers."""
-    seen = set()
-
-    def show(message: Warning | str, category: type[Warning], *_: Any) -> None:
-        text = " ".join(str(message).split())
-        if issubclass(category, UserWarning) and text not in seen:
-            seen.add(text)
-            _say(f"warning: {text}")
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = show  # type: ignore[assignment]
-        yield
 
 
 # ------------------------------------------------------------------------------------------------- arguments
@@ -202,7 +184,8 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         required=True,
         metavar="FILE_OR_FOLDER",
-        help="FILE.glb: the animation alone; a folder: numbered frames and animation.glb",
+        help="the animation alone: .glb, .mp4, .gif, .usd(a|c), .mdd, .pc2, .npz; a folder: numbered frames and "
+        "animation.glb",
     )
     sub.add_argument(
         "--levels",
@@ -238,15 +221,25 @@ def _parser() -> argparse.ArgumentParser:
         help="further steps on the fine mesh, towards the optimum over all vertices (default: %(default)s)",
     )
     sub.add_argument(
-        "--format", choices=("ply", "obj", "off"), default="ply", help="of the frames (default: %(default)s)"
+        "--format",
+        choices=("ply", "obj", "off", "glb"),
+        help="of the numbered frames (default: that of the first key-frame, with all that its file carries)",
     )
-    sub.add_argument(
+    group = sub.add_argument_group("animation")
+    group.add_argument(
+        "--duration",
+        type=_number(float, 0, above=True),
+        metavar="SECONDS",
+        help="of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)",
+    )
+    group.add_argument(
         "--fps",
         type=_number(float, 0, above=True),
         metavar="X",
-        default=24.0,
-        help="frames a second of the animation (default: 24)",
+        help="frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)",
     )
+    group.add_argument("--ping-pong", action="store_true", help="there and back again")
+    group.add_argument("--ease", action="store_true", help="slow at both ends")
     sub.add_argument(
         "--picture",
         type=Path,
@@ -349,4 +342,5 @@ def _add_common(sub: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--no-cache", action="store_true", help="compute everything anew and keep nothing")
     group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
+    group.add_argument("--verbose", action="store_true", help="also say what is done step by step")
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")

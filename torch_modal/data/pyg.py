@@ -9,7 +9,7 @@ from torch_modal.data.sequential import AugmentationSequential
 from torch_modal.data.space import ShapeSpace
 
 try:
-    from torch_geometric.data import Data
+    from torch_geometric.data import Batch, Data
     from torch_geometric.transforms import BaseTransform
 except ImportError as error:  # pragma: no cover
     raise ImportError(
@@ -18,7 +18,7 @@ except ImportError as error:  # pragma: no cover
 
 
 class RandomShape(BaseTransform):
-    """A random transform of ``Data(pos, face)``; compose it with others as usual.
+    """A random transform of ``Data(pos, face)``, or of a ``Batch`` of them; compose it with others as usual.
 
     Partners of in-betweens are the key-frames of the space. ``normal`` is computed anew where a graph has it; all else,
     labels of nodes among it, stays as it is, since nodes keep their order. Only ``y`` changes, and only if the
@@ -54,26 +54,34 @@ class RandomShape(BaseTransform):
         )
 
     def forward(self, data: Data) -> Data:
-        """Transform a graph, in place (``BaseTransform`` hands over a copy).
+        """Transform a graph or a ``Batch`` of graphs, in place (``BaseTransform`` hands over a copy).
 
         Raises:
-            ValueError: It has not as many nodes as the space has vertices.
+            ValueError: A graph has not as many nodes as the space has vertices.
         """
+        n_vertices = self.space.n_vertices
+        n_graphs = data.num_graphs if isinstance(data, Batch) else 1
         pos: Any = data.pos
-        if pos is None or pos.shape != (self.space.n_vertices, 3):
+        if pos is None or pos.shape != (n_graphs * n_vertices, 3) or not self._even(data):
             got = None if pos is None else tuple(pos.shape)
-            raise ValueError(f"data.pos of this space has the shape ({self.space.n_vertices}, 3); got {got}")
+            of = f"{n_graphs} graphs of " if isinstance(data, Batch) else ""
+            raise ValueError(f"data.pos of {of}this space has the shape ({n_graphs * n_vertices}, 3); got {got}")
         label = data.y if self.y is not None else None
         pool = ShapeBatch.of_keyframes(self.space, pos, shape_labels=None if self.y is None else self.y.to(pos.device))
-        # A graph's labels have one row, or none.
-        rows = None if label is None else label.reshape(1, *pool.shape_labels.shape[1:])  # type: ignore[union-attr]
-        shapes, normals, labels = self.augmentation(pos[None], None, rows, pool=pool)
-        data.pos = shapes[0]
+        # Labels have one row a graph; of a single one, it may be missing.
+        rows = None if label is None else label.reshape(n_graphs, *pool.shape_labels.shape[1:])  # type: ignore[union-attr]
+        shapes, normals, labels = self.augmentation(pos.unflatten(0, (n_graphs, n_vertices)), None, rows, pool=pool)
+        data.pos = shapes.flatten(0, 1)
         if "normal" in data:
-            data.normal = normals[0]
+            data.normal = normals.flatten(0, 1)
         if label is not None:
             data.y = labels.reshape(label.shape)
         return data
+
+    def _even(self, data: Data) -> bool:
+        """Whether each graph of a batch has the space's number of nodes."""
+        ptr = data.ptr if isinstance(data, Batch) else None
+        return ptr is None or bool((ptr.diff() == self.space.n_vertices).all())
 
     def __repr__(self) -> str:
         inside = ", ".join(repr(each) for each in self.augmentation.transforms)

@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from kornia.geometry.conversions import quaternion_to_axis_angle
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
@@ -48,6 +49,7 @@ class RandomRigidMotion(ShapeAugmentation):
         if translation < 0:
             raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
         self.translation = translation
+        self._matrix: Tensor | None = None
 
     def extra_repr(self) -> str:
         """Settings."""
@@ -71,9 +73,58 @@ class RandomRigidMotion(ShapeAugmentation):
         self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
     ) -> ShapeBatch:
         """Move each shape."""
-        x = batch.shapes
-        diagonal = (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
-        centre = x.mean(1)
-        motion = RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * diagonal)
         given = None if batch.given is None else torch.zeros_like(batch.given)
-        return batch._replace(shapes=motion.apply(x), given=given)
+        return batch._replace(shapes=_motion(batch.shapes, params).apply(batch.shapes), given=given)
+
+    def transform(
+        self,
+        batch: ShapeBatch,
+        params: Parameters,
+        space: ShapeSpace | None = None,
+        pool: ShapeBatch | None = None,
+    ) -> ShapeBatch:
+        """Move those shapes of a batch that the parameters say, and keep :attr:`transform_matrix`."""
+        out = super().transform(batch, params, space, pool)
+        with torch.no_grad():
+            self._matrix = self.compute_transformation(batch.shapes, params)
+        return out
+
+    @property
+    def transform_matrix(self) -> Tensor | None:
+        """What the last call did: ``y = R x + s`` as homogeneous matrices; None before. *Shape:* ``(B, 4, 4)``."""
+        return self._matrix
+
+    def compute_transformation(self, shapes: Tensor, params: Parameters) -> Tensor:
+        """The motions that parameters mean for shapes, as homogeneous matrices; the unit matrix for those that stay.
+
+        Args:
+            shapes: *Shape:* ``(B, V, 3)``.
+            params: From :meth:`forward_parameters`, or :attr:`params`.
+
+        Returns:
+            *Shape:* ``(B, 4, 4)``.
+        """
+        own = self._own_rows(shapes, params)
+        motion = _motion(shapes, own)
+        stay = torch.eye(4, dtype=shapes.dtype, device=shapes.device).expand(len(shapes), 4, 4)
+        shift = motion.target - (motion.rotation @ motion.source[..., None])[..., 0]
+        moved = torch.cat([torch.cat([motion.rotation, shift[..., None]], -1), stay[:, 3:]], 1)
+        return torch.where(own["batch_prob"][:, None, None], moved, stay)
+
+    def undo(self, shapes: Tensor, params: Parameters) -> Tensor:
+        """Move back. The diagonal that the translation is counted in is that of the shape turned back."""
+        rotation = exp(params["rotation"])
+        centre = shapes.mean(1)
+        back = (shapes - centre[:, None]) @ rotation
+        return back + (centre - params["translation"] * _diagonal(back))[:, None]
+
+
+def _motion(x: Tensor, params: Parameters) -> RigidMotion:
+    """The motion of each shape about the mean of its vertices. *Shape:* ``(B, V, 3)``."""
+    centre = x.mean(1)
+    return RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * _diagonal(x))
+
+
+def _diagonal(x: Tensor) -> Tensor:
+    """Of the bounding boxes, a constant. *Shape:* ``(B, 1)``."""
+    return (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()

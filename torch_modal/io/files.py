@@ -3,25 +3,47 @@
 import contextlib
 import os
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name in the same folder, then move it to its place.
+@contextlib.contextmanager
+def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
+    """A temporary name in the same folder; the file of that name is moved to ``path`` at the end.
 
     Readers, and other processes that write the same file, see the old content or the new one, never a part.
+
+    Args:
+        path: Where the file goes; its folder must exist.
+        ending: Of the temporary name, for libraries that choose a format by it.
+
+    Raises:
+        OSError: The folder is missing, full, or not writable; the error names ``path``, not the temporary file. That
+            is not left behind.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{uuid.uuid4().hex[:8]}{ending}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is None or (error.filename is not None and Path(error.filename) != temporary):
+            raise
+        # The caller knows the name that they gave, not the temporary one.
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a whole file or nothing.
 
     Args:
         path: Where the file goes; its folder must exist.
         data: The whole content.
 
     Raises:
-        OSError: The folder is missing, full, or not writable. No temporary file is left behind.
+        OSError: As for :func:`temporary_beside`.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp")
-    try:
+    with temporary_beside(path) as temporary:
         temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()

@@ -1,27 +1,42 @@
-"""Reading one mesh file, with its vertices in the order and number in which they stand there."""
+"""Reading mesh files, with their vertices in the order and number in which they stand there."""
 
 import os
-import re
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
+from torch_modal.io.asset import Asset
 
 SUFFIXES = (".obj", ".ply", ".off", ".glb", ".gltf")
 
 
 def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Read one triangle mesh.
+    """Read the positions and triangles of a file.
 
     Args:
-        path: An OBJ, PLY, OFF, GLB or GLTF file. Polygons are cut into triangles.
+        path: As for :func:`open_asset`.
 
     Returns:
         Vertices, *shape* ``(V, 3)``, in the file's units; faces, *shape* ``(F, 3)``.
+
+    Raises:
+        FileNotFoundError, MeshError: As for :func:`open_asset`.
+    """
+    asset = open_asset(path)
+    return asset.positions, asset.faces
+
+
+def open_asset(path: str | os.PathLike[str]) -> Asset:
+    """Read a mesh file with everything that it carries.
+
+    Args:
+        path: An OBJ, PLY, OFF, GLB or GLTF file.
+
+    Returns:
+        The asset: ``positions`` and ``faces`` are those of :func:`torch_modal.load_keyframes`; ``write`` makes the
+        same file with other positions.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -43,13 +58,13 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArra
     try:
         if not path.stat().st_size:
             raise MeshError(f"{path}: the file is empty")
-        vertices, faces = _read_obj(path) if suffix == ".obj" else _read_with_trimesh(path)
+        asset = _reader(suffix)(path)
     except MeshError:
         raise
     except Exception as error:  # A reader fed with garbage may raise anything; the file's name must not get lost.
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: cannot be read as {suffix[1:].upper()} ({reason[:200]})") from error
-
+    vertices, faces = asset.positions, asset.faces
     if len(faces) == 0:
         what = f" (a point cloud of {len(vertices)} vertices)" if len(vertices) else ""
         raise MeshError(f"{path}: no faces in this file{what}; key-frames are surfaces of triangles")
@@ -59,7 +74,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArra
             f"{path}: face {face} uses the vertices {faces[face].tolist()}, but the file has {len(vertices)} "
             f"vertices (counted from 0); the file is damaged"
         )
-    return vertices, faces
+    return asset
 
 
 def require_same_mesh(
@@ -95,65 +110,20 @@ def require_same_mesh(
         )
 
 
-def _read_with_trimesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """PLY, OFF, GLB, GLTF; the transforms of a scene are applied and its meshes joined."""
-    # Without process=False vertices are merged; with fix_texture a PLY is split at texture seams.
-    options = {"fix_texture": False} if path.suffix.lower() == ".ply" else {}
-    mesh = trimesh.load_mesh(path, process=False, maintain_order=True, **options)
-    vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
-    faces = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    promised = _promised_counts(path)
-    if promised and promised[1] and (len(vertices) != promised[0] or len(faces) < promised[1]):
-        raise MeshError(
-            f"{path}: the header promises {promised[0]} vertices and {promised[1]} faces, the file holds "
-            f"{len(vertices)} and {len(faces)}; it was cut off or is damaged"
-        )
-    return vertices, faces
+def _reader(suffix: str) -> type[Asset]:
+    """The class for a suffix; readers are imported where they are used."""
+    if suffix == ".obj":
+        from torch_modal.io.obj import ObjAsset
 
+        return ObjAsset
+    if suffix == ".ply":
+        from torch_modal.io.ply import PlyAsset
 
-def _promised_counts(path: Path) -> tuple[int, int] | None:
-    """Vertices and faces that the header of a PLY or OFF file announces; trimesh accepts cut-off files."""
-    with path.open("rb") as file:
-        head = file.read(1 << 16)
-    if path.suffix.lower() == ".ply":
-        head = head.partition(b"end_header")[0]
-        found = [re.search(rb"^\s*element\s+%s\s+(\d+)" % name, head, re.M) for name in (b"vertex", b"face")]
-        counts = [int(match.group(1)) if match else 0 for match in found]
-    elif path.suffix.lower() == ".off":
-        words = re.sub(rb"^\s*\w*OFF", b"", re.sub(rb"#[^\n]*", b"", head)).split()
-        if not all(word.isdigit() for word in words[:2]):
-            return None
-        counts = [int(word) for word in words[:2]]
-    else:
-        return None
-    return counts[0], counts[1]
+        return PlyAsset
+    if suffix == ".off":
+        from torch_modal.io.off import OffAsset
 
+        return OffAsset
+    from torch_modal.io.gltf_asset import GltfAsset
 
-def _read_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The ``v`` lines as they are, the first index of each corner of the ``f`` lines.
-
-    trimesh has no options for this: with texture coordinates it drops unused vertices and splits and reorders
-    the rest at seams, and with several materials it repeats all vertices per material and reorders the faces.
-    """
-    vertices: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    text = path.read_bytes().decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    for line in text.splitlines():
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        if words[0] == "v":
-            if len(words) < 4:
-                raise MeshError(f"{path}: vertex line with fewer than three numbers: {line.strip()[:60]!r}")
-            vertices.append([float(word) for word in words[1:4]])
-        elif words[0] == "f":
-            corners = [int(word.partition("/")[0]) for word in words[1:]]
-            if len(corners) < 3 or 0 in corners:
-                raise MeshError(
-                    f"{path}: face line with fewer than three corners or index 0 (OBJ counts from 1): "
-                    f"{line.strip()[:60]!r}"
-                )
-            # Negative indices count back from the last vertex that was read so far.
-            corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
-            faces.extend((corners[0], b, c) for b, c in pairwise(corners[1:]))
-    return np.array(vertices, dtype=np.float64).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
+    return GltfAsset

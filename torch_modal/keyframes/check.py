@@ -277,4 +277,8 @@ def _seam_hint(vertices: NDArray[np.float64], boundary: NDArray[np.int64]) -> st
     ends = np.unique(boundary)
     _, copies = np.unique(vertices[ends], axis=0, return_counts=True)
     split = int(copies[copies > 1].sum())
-    return f"; {split} of its vertices lie exactly on each other, perhaps a seam: weld them" if split else ""
+    return (
+        f"; {split} of its vertices lie exactly on each other, perhaps a seam: torch_modal.weld_seams joins them"
+        if split
+        else ""
+    )

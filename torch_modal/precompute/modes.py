@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
@@ -18,6 +17,7 @@ from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings
+from torch_modal.progress import Progress, ProgressReport
 
 QUALITIES = {
     "fast": TetrahedraSettings(),
@@ -87,7 +87,7 @@ def extract_bases(
     timeout: float = 600.0,
     cache_dir: str | None = None,
     cache: bool = True,
-    progress: bool | None = None,
+    progress: Progress = None,
 ) -> list[ModalBasis]:
     """Lowest vibration modes of each key-frame.
 
@@ -108,7 +108,8 @@ def extract_bases(
         timeout: Seconds that the child process of fTetWild may take for a key-frame.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
-        progress: Whether a bar shows key-frame and stage; by default on terminals only.
+        progress: Whether a bar shows key-frame and stage; by default on terminals, with lines of the log elsewhere. Or
+            a function ``(done, total, what)``, which may be called from several threads, one at a time.
 
     Returns:
         One basis for each key-frame: float64, on the CPU, without gradient.
@@ -138,12 +139,12 @@ def extract_bases(
             surfaces.append(Surface.of(shape, triangles))
 
     filler = Filler(_settings(settings), mesher, timeout, Cache.at(cache_dir, enabled=cache))
-    with tqdm(total=2 * len(shapes), disable=None if progress is None else not progress, leave=False) as bar:
+    with ProgressReport(2 * len(shapes), "vibration modes", progress) as bar:
 
         def report(index: int, stage: str) -> None:
             if filler.stop.is_set():
                 raise StoppedError
-            bar.set_description(f"key-frame {index + 1}/{len(shapes)}: {stage}")
+            bar.describe(f"key-frame {index + 1}/{len(shapes)}: {stage}")
 
         work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, report, bar.update)
         solved = work.solve_carried() if carry and len(shapes) > 1 else work.solve_each()

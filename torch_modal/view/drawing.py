@@ -6,6 +6,8 @@ neither EGL nor OSMesa exists; then matplotlib draws.
 
 from __future__ import annotations
 
+import importlib.util
+import logging
 import subprocess
 import sys
 import tempfile
@@ -18,6 +20,8 @@ from numpy.typing import NDArray
 
 from torch_modal.geometry.normals import vertex_normals
 from torch_modal.io.write import FloatArray, IntArray
+
+logger = logging.getLogger("torch_modal")
 
 ByteArray = NDArray[np.uint8]
 
@@ -181,12 +185,18 @@ def draw(scene: Scene, renderer: str) -> ByteArray:
 
     Args:
         scene: What to draw.
-        renderer: ``"pyvista"``, ``"matplotlib"``, or ``"auto"``: the first, and the second where the first fails.
+        renderer: ``"pyvista"``, ``"matplotlib"``, or ``"auto"``: the first where it is installed, and the second where
+            it is not or fails.
 
     Raises:
-        RuntimeError: ``renderer="pyvista"`` and pyvista cannot render here.
+        RuntimeError: ``renderer="pyvista"`` and pyvista cannot render here, or is not installed.
     """
     if renderer == "matplotlib":
+        return _draw_matplotlib(scene)
+    if importlib.util.find_spec("pyvista") is None:
+        if renderer == "pyvista":
+            raise RuntimeError("pyvista is not installed: pip install torch_modal[pictures]; matplotlib draws without it.")
+        logger.info("matplotlib draws; pyvista draws better: pip install torch_modal[pictures]")
         return _draw_matplotlib(scene)
     try:
         return _draw_in_child(scene)

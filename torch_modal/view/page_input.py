@@ -6,11 +6,13 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from torch_modal.errors import MeshError
+from torch_modal.io.gltf_asset import GltfAsset
+from torch_modal.io.read import open_asset
 from torch_modal.io.write import FloatArray, IntArray
 from torch_modal.keyframes.load import load_keyframes
 
@@ -74,54 +76,38 @@ def _numbered(folder: Path) -> list[Path]:
 def _read_animation(path: Path) -> Shapes | None:
     """The frames of a GLB with morph targets; None if it has none, and is a mesh that stands still.
 
-    What `save_animation` writes is read back: one primitive, POSITION of float32, frame 0 and a target for each further
-    frame, which shows fully at its time. Of other programs' files it is not known what their targets are.
+    What `save_animation` writes is read back: frame 0 and a target for each further frame, which shows fully at its
+    time. Of other programs' files it is not known what their targets are.
     """
-    import pygltflib as gl
-
+    asset = open_asset(path)
+    assert isinstance(asset, GltfAsset)
+    document = asset.document
     try:
-        gltf = gl.GLTF2().load_binary(str(path))
-        blob = gltf.binary_blob() or b""
-        primitives = [primitive for mesh in gltf.meshes for primitive in mesh.primitives]
-        if not any(primitive.targets for primitive in primitives):
+        frames = asset.morphs()
+        if len(frames) == 1:
             return None
-        if gltf.asset.generator != GENERATOR or len(primitives) != 1 or len(gltf.animations) != 1:
+        if document.root["asset"].get("generator") != GENERATOR or len(document.get("animations")) != 1:
             raise MeshError(
                 f"{path}: morph targets that save_animation did not write, so their times are not known; export one "
                 "mesh a frame instead"
             )
-        (primitive,), (animation,) = primitives, gltf.animations
-        base = _accessor(gltf, blob, primitive.attributes.POSITION)
-        moved = [_accessor(gltf, blob, target["POSITION"]) for target in primitive.targets]
-        faces = _accessor(gltf, blob, primitive.indices).reshape(-1, 3).astype(np.int64)
-        seconds = _accessor(gltf, blob, animation.samplers[0].input).reshape(-1).astype(np.float64)
-        kept, fps = [int(number) for number in animation.extras["frames"]], float(animation.extras["fps"])
+        (animation,) = document.get("animations")
+        extras = animation["extras"]
+        seconds = document.floats(animation["samplers"][0]["input"])[:, 0]
+        kept = [int(number) for number in extras["frames"]]
         places = {number: place for place, number in enumerate(kept)}
-        keyframes = [places[number] for number in animation.extras["keyframes"] if number in places]
-        frames = base.astype(np.float64)[None] + np.stack([np.zeros_like(base), *moved])
-        closed = len(seconds) == len(frames) + 1
-        if len(kept) != len(frames) or len(seconds) - closed != len(frames):
-            raise ValueError(f"{len(frames)} shapes, {len(kept)} frames, {len(seconds)} times")
+        keyframes = [places[number] for number in extras["keyframes"] if number in places]
+        n, back = len(frames), bool(extras.get("ping_pong"))
+        closed = len(seconds) == n + 1 and not back
+        if len(kept) != n or len(seconds) != (2 * n - 1 if back else n + closed):
+            raise ValueError(f"{n} shapes, {len(kept)} frames, {len(seconds)} times")
     except MeshError:
         raise
     except Exception as error:  # A reader fed with garbage may raise anything; the file's name must not get lost.
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: cannot be read as an animation of this package ({reason[:200]})") from error
-    # Frames left out of a long sequence leave wider steps in time, and fewer frames a second.
-    even = kept == list(range(len(kept)))
-    rate = fps if even else (len(frames) - 1) / (seconds[len(frames) - 1] - seconds[0])
-    times = None if even else seconds[: len(frames)].tolist()
-    return Shapes(frames, faces, keyframes or None, rate, times, closed)
-
-
-def _accessor(gltf: Any, blob: bytes, number: int) -> Any:
-    """The rows of an accessor. Raises ValueError where the file does not hold them."""
-    import pygltflib as gl
-
-    accessor = gltf.accessors[number]
-    view = gltf.bufferViews[accessor.bufferView]
-    kind = {gl.FLOAT: "<f4", gl.UNSIGNED_SHORT: "<u2", gl.UNSIGNED_INT: "<u4"}[accessor.componentType]
-    width = {gl.SCALAR: 1, gl.VEC3: 3}[accessor.type]
-    start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
-    rows = np.frombuffer(blob, kind, accessor.count * width, start)
-    return rows.reshape(accessor.count, width)
+    # Frames left out of a long sequence leave wider steps in time; so does ease.
+    times = seconds[:n]
+    even = np.allclose(np.diff(times), times[-1] / (n - 1), rtol=1e-4)
+    rate = float(extras["fps"]) if even and kept == list(range(n)) else float((n - 1) / times[-1])
+    return Shapes(frames, asset.faces, keyframes or None, rate, None if even else times.tolist(), closed)

@@ -64,7 +64,7 @@ def view_rotation(shape: FloatArray, view: tuple[float, float] | None, up: Liter
     return np.stack([right, np.cross(front, right), front])
 
 
-def _centred(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+def centred(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Move shapes ``(R, C, V, 3)`` into their cells; also the half width and height that hold them all.
 
     One centre serves all cells, so that what rests stays at its place and rows can be compared. Where the
@@ -170,7 +170,8 @@ def render_sequence(
             99.5th percentile of what is shown, with an arrow if there is more.
             *Shape of each:* ``(N, V)``.
         color_label: What those numbers are, with their unit.
-        renderer: ``"auto"`` is pyvista, and matplotlib (with a warning) where pyvista cannot render.
+        renderer: ``"auto"`` is pyvista where it is installed (extra ``view``), otherwise matplotlib; also, with a
+            warning, where pyvista cannot render.
         overwrite: Replace the file if it exists.
 
     Returns:
@@ -214,7 +215,7 @@ def render_sequence(
 
     shown = np.stack([frames[chosen] for frames in shapes])  # (R, C, V, 3)
     rotation = view_rotation(shapes[0][0], view, up)
-    points, half = _centred(shown @ rotation.T)
+    points, half = centred(shown @ rotation.T)
     paint = np.empty(shown.shape)
     paint[:] = np.array([KEYFRAME_COLOR if n in keyframes else BETWEEN_COLOR for n in chosen])[:, None]
     color_bar = None

@@ -1,0 +1,197 @@
+"""Animations of all formats, read back by other libraries or by the letter of the format."""
+
+import importlib.util
+import struct
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+from PIL import Image
+from textured import bend, textured_obj, triangles_of_tube
+
+import torch_modal as tm
+from torch_modal.errors import MeshWarning, MissingPackageError
+from torch_modal.io.timing import make_timing, resample
+from torch_modal.view import animation
+
+X, FACES = triangles_of_tube()
+FRAMES = np.stack([bend(X, turn) for turn in (0.01, 0.3, 0.6, 0.9)])
+
+
+# ------------------------------------------------------------------------------------------------------------ timing
+@pytest.mark.parametrize(
+    ("n_keyframes", "options", "duration"),
+    [
+        (2, {}, 2.0),
+        (3, {}, 2.0),
+        (6, {}, 5.0),
+        (6, {"cyclic": True}, 1.0),
+        (2, {"duration": 7.5}, 7.5),
+        (2, {"fps": 10}, 0.8),
+        (2, {"fps": 10, "cyclic": True}, 0.9),
+        (2, {"fps": 10, "duration": 3}, 3.0),
+    ],
+)
+def test_durations(n_keyframes, options, duration):
+    assert make_timing(9, n_keyframes, **options).duration == pytest.approx(duration)
+
+
+def test_knots_and_samples_agree():
+    """Both are the same motion: linear between knots, seen at a fixed rate."""
+    for options in ({}, {"cyclic": True}, {"ping_pong": True}):
+        timing = make_timing(9, duration=2, fps=16, **options)
+        times, places = timing.knots(np.arange(9), 9)
+        assert times[0] == 0 and (np.diff(times) > 0).all()
+        assert times[-1] == (4 if "ping_pong" in options else 2)
+        unrolled = np.where((np.arange(len(places)) == len(places) - 1) & ("cyclic" in options), 9, places)
+        samples = timing.samples(9)
+        np.testing.assert_allclose(samples, np.interp(np.arange(len(samples)) / 16, times, unrolled), atol=1e-12)
+        # A video that starts again does not show its first picture twice.
+        assert len(samples) == {"ping_pong": 64, "cyclic": 32}.get(next(iter(options), ""), 33)
+
+
+def test_ease_is_slow_at_both_ends():
+    timing = make_timing(9, duration=2, fps=100, ease=True)
+    speed = np.diff(timing.samples(9))
+    assert speed[0] < 0.1 * speed[100] and speed[-1] < 0.1 * speed[100]
+    times, places = timing.knots(np.arange(9), 9)
+    np.testing.assert_allclose(8 * (1 - np.cos(np.pi * times / 2)) / 2, places, atol=1e-9)
+
+
+def test_thinned_frames_keep_their_times():
+    times, places = make_timing(9, duration=8).knots(np.array([0, 3, 8]), 9)
+    assert times.tolist() == [0, 3, 8] and places.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"duration": 0}, "duration must be a positive"),
+        ({"fps": float("nan")}, "fps must be a positive"),
+        ({"cyclic": True, "ping_pong": True}, "ping_pong is for sequences that begin"),
+        ({"cyclic": True, "ease": True}, "ease is for"),
+    ],
+)
+def test_timing_that_cannot_be(options, match):
+    with pytest.raises(ValueError, match=match):
+        make_timing(9, **options)
+
+
+def test_resampling_is_exact_at_frames():
+    np.testing.assert_array_equal(resample(FRAMES, np.array([0.0, 2, 3])), FRAMES[[0, 2, 3]])
+    np.testing.assert_allclose(resample(FRAMES, np.array([3.5]))[0], (FRAMES[3] + FRAMES[0]) / 2)
+
+
+# ----------------------------------------------------------------------------------------------------------- formats
+def test_two_keyframes_make_two_seconds(tmp_path):
+    def end(**options):
+        gltf = pygltflib.GLTF2().load(tm.save_animation(FRAMES, FACES, tmp_path / "a.glb", overwrite=True, **options))
+        return gltf.accessors[gltf.animations[0].samplers[0].input].max[0]
+
+    assert end() == 2
+    assert end(keyframe_indices=[0, 1, 2, 3]) == 3
+    assert end(cyclic=True) == 1
+    assert end(ping_pong=True, duration=1.5) == 3
+    assert end(fps=6) == 0.5
+
+
+def test_unknown_suffix_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match=r"\.glb, \.mp4, .* or \.npz, got 'a\.avi'"):
+        tm.save_animation(FRAMES, FACES, tmp_path / "a.avi")
+    assert not list(tmp_path.iterdir())
+
+
+def test_npz(tmp_path):
+    path = tm.save_animation(FRAMES, FACES, tmp_path / "a.npz", keyframe_indices=[0, 3], duration=6)
+    with np.load(path) as stored:
+        np.testing.assert_array_equal(stored["frames"], FRAMES)
+        np.testing.assert_array_equal(stored["faces"], FACES)
+        assert stored["times"].tolist() == [0, 2, 4, 6] and stored["keyframes"].tolist() == [0, 3]
+
+
+def test_mdd_by_the_letter(tmp_path):
+    data = tm.save_animation(FRAMES, FACES, tmp_path / "a.mdd", duration=3, fps=2).read_bytes()
+    n, v = struct.unpack_from(">2i", data)
+    assert (n, v) == (7, len(X)) and len(data) == 8 + 4 * n + 12 * n * v
+    np.testing.assert_array_equal(np.frombuffer(data, ">f4", n, 8), np.arange(7) / 2)
+    points = np.frombuffer(data, ">f4", n * v * 3, 8 + 4 * n).reshape(n, v, 3)
+    np.testing.assert_array_equal(points[::2], FRAMES.astype("f4"))
+    np.testing.assert_allclose(points[1], (FRAMES[0] + FRAMES[1]) / 2, atol=1e-6)
+
+
+def test_pc2_by_the_letter(tmp_path):
+    data = tm.save_animation(FRAMES, FACES, tmp_path / "a.pc2", duration=3, fps=1).read_bytes()
+    mark, version, v, start, rate, n = struct.unpack_from("<12siiffi", data)
+    assert (mark, version, v, start, rate, n) == (b"POINTCACHE2\0", 1, len(X), 0.0, 1.0, 4)
+    np.testing.assert_array_equal(np.frombuffer(data, "<f4", offset=32).reshape(n, v, 3), FRAMES.astype("f4"))
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc", "usd"])
+def test_usd_read_back(tmp_path, suffix):
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
+    from pxr import UsdGeom
+
+    asset = tm.open_asset(textured_obj(tmp_path, "bar.obj"))
+    frames = np.stack([bend(asset.positions, turn) for turn in (0.01, 0.5, 0.9)])
+    with pytest.warns(MeshWarning, match="without the normals, 2 materials and groups"):
+        path = tm.save_animation(frames, asset.faces, tmp_path / f"a.{suffix}", duration=3, fps=24, asset=asset)
+    stage = usd.Stage.Open(str(path))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (24, 72)
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("mesh"))
+    assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
+    assert list(mesh.GetFaceVertexCountsAttr().Get()) == [4] * 84 + [3] * 24
+    for time, frame in ((0, frames[0]), (36, frames[1]), (72, frames[2]), (18, (frames[0] + frames[1]) / 2)):
+        np.testing.assert_allclose(mesh.GetPointsAttr().Get(time), frame, atol=1e-6)
+    st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
+    assert st.GetInterpolation() == "faceVarying" and len(st.Get()) == 84 * 4 + 24 * 3
+    assert np.allclose(next(iter(mesh.GetDisplayColorPrimvar().Get())), [0.2140, 0.0509, 1.0], atol=1e-3)
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_gif_read_back(tmp_path):
+    path = tm.save_animation(FRAMES[:2], FACES, tmp_path / "a.gif", duration=0.4, fps=10, ping_pong=True)
+    image = Image.open(path)
+    assert image.n_frames == 8 and image.info["loop"] == 0 and image.info["duration"] == 100
+    assert max(image.size) == 640
+    pictures = []
+    for number in range(8):
+        image.seek(number)
+        pictures.append(np.asarray(image.convert("RGB"), dtype=float))
+    assert np.abs(pictures[0] - pictures[4]).mean() > 1  # it moves
+    assert np.abs(pictures[1] - pictures[7]).mean() < 0.5  # and comes back
+    assert (pictures[0] < 250).any(axis=2).mean() > 0.1  # there is something to see
+
+
+def test_mp4_read_back(tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
+    import imageio.v2 as imageio
+
+    path = tm.save_animation(FRAMES[:2], FACES, tmp_path / "a.mp4", duration=1, fps=8)
+    with imageio.get_reader(path) as reader:
+        meta = reader.get_meta_data()
+        pictures = [np.asarray(picture, dtype=float) for picture in reader]
+    assert meta["codec"] == "h264" and meta["fps"] == 8 and len(pictures) == 9
+    assert max(meta["size"]) == 640 and not any(side % 2 for side in meta["size"])
+    assert np.abs(pictures[0] - pictures[-1]).mean() > 1
+
+
+@pytest.mark.parametrize(("suffix", "extra"), [("mp4", "video"), ("usdc", "usd")])
+def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffix, extra):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingPackageError, match=rf"pip install torch_modal\[{extra}\]"):
+        animation.require_packages(Path(f"a.{suffix}"))
+    with pytest.raises(MissingPackageError):
+        tm.save_animation(FRAMES, FACES, tmp_path / f"a.{suffix}")
+    animation.require_packages(Path("a.glb"))
+
+
+@pytest.mark.parametrize("suffix", ["mdd", "pc2", "npz", "usda", "gif"])
+def test_one_frame_and_nothing_overwritten(tmp_path, suffix):
+    if suffix == "usda":
+        pytest.importorskip("pxr")
+    path = tm.save_animation(FRAMES[:1], FACES, tmp_path / "new" / f"a.{suffix}")
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        tm.save_animation(FRAMES, FACES, path)
+    assert path.read_bytes() == before and list(path.parent.iterdir()) == [path]

@@ -1,0 +1,176 @@
+"""Mesh files with everything that they carry besides positions."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_modal.errors import MeshWarning
+from torch_modal.io.write import check_frames, refuse_existing, to_numpy, write_file
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
+
+CLAY = (0.66, 0.52, 0.42, 1.0)
+"""Linear RGBA of what has no colour of its own."""
+
+
+class Image(NamedTuple):
+    """A picture file."""
+
+    data: bytes
+    mime: str
+    """``image/png`` or ``image/jpeg``."""
+
+
+class Material(NamedTuple):
+    """What a surface looks like, in glTF's terms."""
+
+    name: str = "clay"
+    color: tuple[float, ...] = CLAY
+    """Linear RGBA; multiplies the texture and the vertex colours."""
+    metallic: float = 0.0
+    roughness: float = 0.85
+    texture: Image | None = None
+
+
+class Part(NamedTuple):
+    """Triangles of one material. A point is a vertex with one texture coordinate and one normal."""
+
+    vertices: IntArray
+    """The vertex of each point. *Shape:* ``(P,)``."""
+    triangles: IntArray
+    """Of points. *Shape:* ``(F, 3)``."""
+    material: Material
+    texcoords: FloatArray | None = None
+    """Origin at the upper left, as in glTF. *Shape:* ``(P, 2)``."""
+    colors: FloatArray | None = None
+    """Linear RGBA. *Shape:* ``(P, 4)``."""
+    normals: FloatArray | None = None
+    """As the file has them. *Shape:* ``(P, 3)``."""
+
+
+class Polygons(NamedTuple):
+    """Faces before they were cut into triangles."""
+
+    sizes: IntArray
+    """Corners of each. *Shape:* ``(P,)``."""
+    corners: IntArray
+    """Vertices, one polygon after the other. *Shape:* ``(sum of sizes,)``."""
+    texcoords: FloatArray | None = None
+    """Of each corner, origin at the lower left. *Shape:* ``(sum of sizes, 2)``."""
+
+
+class Asset(ABC):
+    """A mesh file: positions and triangles for the solve, and all else for writing it again with other positions.
+
+    Args:
+        path: The file.
+    """
+
+    positions: FloatArray
+    """In the file's units, transforms of a scene applied. *Shape:* ``(V, 3)``."""
+    faces: IntArray
+    """Polygons are cut into triangles. *Shape:* ``(F, 3)``."""
+    carries: dict[str, str]
+    """What else is in the file: one of :data:`FEATURES`, and its name with numbers for people."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.carries = {}
+
+    @property
+    def suffix(self) -> str:
+        """Of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
+        return self.path.suffix.lower()
+
+    @abstractmethod
+    def with_positions(self, positions: FloatArray) -> bytes:
+        """The file with other positions. Its normals turn with the surface; all else stays as it is.
+
+        Args:
+            positions: *Shape:* ``(V, 3)``.
+        """
+
+    @abstractmethod
+    def parts(self) -> list[Part]:
+        """The surface as it is drawn, for other formats."""
+
+    def polygons(self) -> Polygons:
+        """The faces for formats that hold polygons; triangles where the file's are not known."""
+        return Polygons(np.full(len(self.faces), 3), self.faces.reshape(-1))
+
+    @cached_property
+    def companions(self) -> dict[str, bytes]:
+        """Files that must lie beside a copy: material libraries, textures."""
+        return {}
+
+    def write(self, path: str | os.PathLike[str], positions: Any, overwrite: bool = False) -> Path:
+        """Write the file with other positions, and beside it the material libraries and textures that it names.
+
+        Args:
+            path: Ends like the file itself; ``.glb`` where that is ``.gltf``.
+            positions: A tensor or array. *Shape:* ``(V, 3)``.
+            overwrite: Replace files that exist. One with the same content is no obstacle.
+
+        Returns:
+            The file.
+
+        Raises:
+            ValueError: The positions or the ending do not fit.
+            FileExistsError: A file exists and ``overwrite`` is off; then none is written.
+        """
+        path = Path(path)
+        if path.suffix.lower() != self.suffix:
+            raise ValueError(f"{self.path.name} is written as {self.suffix}, got {path.name!r}.")
+        x = to_numpy(positions)
+        self.check(x[None] if x.ndim == 2 else x)
+        refuse_existing(path, overwrite)
+        self.write_companions(path.parent, overwrite)
+        write_file(path, self.with_positions(x.astype(np.float64)))
+        return path
+
+    def write_companions(self, folder: Path, overwrite: bool = False) -> list[Path]:
+        """Write what must lie beside a copy in this folder, unless it is there already."""
+        written = []
+        for name, data in self.companions.items():
+            path = folder / name
+            if path.is_file() and path.read_bytes() == data:
+                continue
+            refuse_existing(path, overwrite)
+            written.append((path, data))
+        for path, data in written:
+            write_file(path, data)
+        return [path for path, _ in written]
+
+    def check(self, frames: Any) -> FloatArray:
+        """Refuse frames that are not of this mesh. *Shape:* ``(N, V, 3)``."""
+        shapes, _ = check_frames(frames, self.faces)
+        if shapes.shape[1] != len(self.positions):
+            raise ValueError(
+                f"{self.path} has {len(self.positions)} vertices, the frames have {shapes.shape[1]}; an asset takes "
+                "frames of its own mesh."
+            )
+        return shapes
+
+    def say_lost(self, out: Path, holds: Collection[str]) -> None:
+        """Warn of what a file cannot hold, or is not given.
+
+        Args:
+            out: The file.
+            holds: Some of :data:`FEATURES`.
+        """
+        lost = [name for feature, name in self.carries.items() if feature not in holds]
+        if lost:
+            listed = lost[0] if len(lost) == 1 else ", ".join(lost[:-1]) + " and " + lost[-1]
+            warnings.warn(f"{out.name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=3)

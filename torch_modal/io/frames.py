@@ -1,0 +1,97 @@
+"""A sequence as numbered meshes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torch_modal.io.asset import Asset
+from torch_modal.io.glb import HOLDS, HOLDS_OF_ITS_OWN, shape_bytes
+from torch_modal.io.gltf_asset import GltfAsset
+from torch_modal.io.write import MESH_FORMATS, check_frames, mesh_bytes, refuse_existing, write_file
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+    Array = torch.Tensor | NDArray[Any]
+
+FORMATS = (*MESH_FORMATS, "glb")
+
+
+def save_frames(
+    frames: Array,
+    faces: Array,
+    out: str | Path,
+    fmt: str | None = None,
+    stem: str = "frame",
+    overwrite: bool = False,
+    asset: Asset | None = None,
+) -> list[Path]:
+    """Write every shape as a mesh of its own: ``frame-000.ply``, ``frame-001.ply``, ...
+
+    Vertices and faces keep their order. OBJ and OFF are text and hold float64 exactly; PLY is binary and
+    holds float32 (about seven digits), which is what viewers expect: take OBJ where the files are computed
+    with again.
+
+    With an asset, each file is that of the asset with other positions: polygons, texture coordinates, materials, groups
+    and all else stay, normals turn with the surface, and material libraries and textures are copied beside the files.
+
+    Args:
+        frames: Vertex positions, in the caller's coordinates. *Shape:* ``(N, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        out: Folder; it is made if missing.
+        fmt: ``"ply"``, ``"obj"``, ``"off"`` or ``"glb"``; by default the asset's, or PLY. Another format than the
+            asset's gets the bare mesh (GLB: also materials and textures), with a warning of what is lost.
+        stem: Start of the file names.
+        overwrite: Replace files that exist. Files with other numbers, of a longer sequence, stay.
+        asset: The mesh file that the frames come from, see :func:`torch_modal.open_asset`.
+
+    Returns:
+        The files, in the order of the frames.
+
+    Raises:
+        ValueError: ``frames``, ``faces``, ``fmt`` or ``stem`` cannot be used; the message says why.
+        FileExistsError: One of the files exists and ``overwrite`` is off; then none is written.
+        NotADirectoryError: ``out`` is a file.
+
+    Warns:
+        MeshWarning: The format cannot hold what the asset carries.
+    """
+    shapes, triangles = check_frames(frames, faces)
+    if asset is not None:
+        asset.check(shapes)
+    fmt = (asset.suffix.lstrip(".") if asset is not None else "ply") if fmt is None else fmt
+    if fmt not in FORMATS:
+        raise ValueError(f"fmt must be one of {', '.join(FORMATS)}, got {fmt!r}.")
+    if not stem or Path(stem).name != stem:
+        raise ValueError(f"stem must be the start of a file name, without folders, got {stem!r}.")
+    folder = Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"{folder} is a file; out must be a folder.")
+    digits = max(3, len(str(len(shapes) - 1)))
+    paths = [folder / f"{stem}-{number:0{digits}d}.{fmt}" for number in range(len(shapes))]
+    for path in paths:
+        refuse_existing(path, overwrite)
+    same = asset is not None and asset.suffix == f".{fmt}"
+    if asset is not None:
+        if same:
+            asset.write_companions(folder, overwrite)
+        asset.say_lost(paths[0], _holds(asset, fmt, same))
+    for path, vertices in zip(paths, shapes, strict=True):
+        write_file(path, _bytes(vertices, triangles, fmt, asset, same))
+    return paths
+
+
+def _holds(asset: Asset, fmt: str, same: bool) -> tuple[str, ...]:
+    if fmt == "glb":
+        return HOLDS_OF_ITS_OWN if isinstance(asset, GltfAsset) else HOLDS
+    return tuple(asset.carries) if same else ()
+
+
+def _bytes(vertices: np.ndarray, faces: np.ndarray, fmt: str, asset: Asset | None, same: bool) -> bytes:
+    if fmt == "glb":
+        return shape_bytes(vertices, faces, asset, "shape")
+    return asset.with_positions(vertices) if same and asset is not None else mesh_bytes(fmt, vertices, faces)

@@ -1,0 +1,186 @@
+"""A sequence, or one shape, as GLB."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.seams import merge_seams
+from torch_modal.io.asset import Asset, FloatArray, IntArray, Material, Part
+from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json
+from torch_modal.io.gltf_asset import GltfAsset
+from torch_modal.io.morph import Drawn, animate, place_frames
+from torch_modal.io.normals import CarriedNormals, on_frames
+from torch_modal.io.timing import Timing
+from torch_modal.io.write import write_file
+
+# Normals double the file. Beyond this size (POSITION alone) they are left out.
+LARGEST_FILE_WITH_NORMALS = 48 * 2**20
+
+HOLDS = ("texcoords", "normals", "colors", "materials")
+"""What is taken over from a file of another format; of materials, colour, roughness and the texture of the colour."""
+HOLDS_OF_ITS_OWN = ("texcoords", "normals", "colors", "materials", "groups", "polygons", "properties")
+
+
+def shape_bytes(shape: FloatArray, faces: IntArray, asset: Asset | None, name: str) -> bytes:
+    """One shape that stands still."""
+    if isinstance(asset, GltfAsset):
+        return asset.with_positions(shape)
+    document, drawn, _ = _document(shape[None], faces, asset, name)
+    place_frames(document, drawn, shape[None])
+    return document.to_glb()
+
+
+def save_glb(
+    shapes: FloatArray,
+    faces: IntArray,
+    path: Path,
+    timing: Timing,
+    keyframes: Sequence[int] = (),
+    max_targets: int = 64,
+    asset: Asset | None = None,
+) -> Path:
+    """Write frame 0 and a morph target for each further frame, with an animation of their weights.
+
+    Args:
+        shapes: *Shape:* ``(N, V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
+        path: The file, which is replaced.
+        timing: How it is played.
+        keyframes: Which frames are key-frames: kept when frames are left out, and named in the animation's extras.
+        max_targets: See :func:`torch_modal.save_animation`.
+        asset: Gives materials, textures and texture coordinates; a GLB or GLTF file, its nodes and all else.
+    """
+    if max_targets < 1:
+        raise ValueError(f"max_targets must be at least 1, got {max_targets}.")
+    kept = thinned(len(shapes), max_targets + 1, list(keyframes))
+    if len(kept) < len(shapes):
+        warnings.warn(
+            f"{path.name} holds {len(kept)} of the {len(shapes)} frames (max_targets={max_targets}); "
+            "players interpolate linearly between them.",
+            stacklevel=3,
+        )
+    move_normals = shapes[kept].size * 4 <= LARGEST_FILE_WITH_NORMALS
+    if not move_normals:
+        warnings.warn(f"{path.name} is large: its normals stay those of frame 0.", stacklevel=3)
+    if asset is not None:
+        asset.say_lost(path, HOLDS_OF_ITS_OWN if isinstance(asset, GltfAsset) else HOLDS)
+    if isinstance(asset, GltfAsset):
+        document, drawn, nodes = asset.rebuilt(shapes[kept])
+    else:
+        document, drawn, nodes = _document(shapes[kept], faces, asset, path.stem)
+    place_frames(document, drawn, shapes[kept], move_normals)
+    if len(kept) > 1:
+        times, shown = timing.knots(kept, len(shapes))
+        steps = len(shapes) if timing.cyclic else len(shapes) - 1
+        extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": list(keyframes)}
+        if timing.ping_pong:
+            extras["ping_pong"] = True
+        animate(document, nodes, kept.tolist(), times, shown, extras)
+    write_file(path, document.to_glb())
+    return path
+
+
+def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
+    """At most ``most`` frame numbers, evenly spread, with both ends and (if they fit) the wanted ones."""
+    if n_frames <= most:
+        return np.arange(n_frames)
+    fixed = sorted({0, n_frames - 1, *wanted})
+    if len(fixed) > most:
+        return np.unique(np.linspace(0, n_frames - 1, most).round().astype(np.int64))
+    gaps, pieces = np.diff(fixed), np.ones(len(fixed) - 1, dtype=np.int64)
+    for _ in range(most - len(fixed)):
+        pieces[np.argmax(gaps / pieces)] += 1  # the widest step is shortened
+    inside = [np.linspace(a, b, n + 1) for a, b, n in zip(fixed[:-1], fixed[1:], pieces, strict=True)]
+    return np.unique(np.concatenate(inside).round().astype(np.int64))
+
+
+def _document(
+    shapes: FloatArray, faces: IntArray, asset: Asset | None, name: str
+) -> tuple[Document, list[Drawn], list[int]]:
+    """A document of one node, with the parts of a file or with all faces in clay."""
+    parts = [Part(np.arange(shapes.shape[1]), faces, Material())] if asset is None else asset.parts()
+    document = Document()
+    normals = _normals(parts, shapes, faces, asset)
+    primitives, drawn = [], []
+    materials: dict[Material, int] = {}
+    for part, normal_at in zip(parts, normals, strict=True):
+        index_type = np.uint16 if len(part.vertices) <= 65535 else np.uint32  # 65535 itself is no valid uint16 index
+        if part.material not in materials:
+            materials[part.material] = document.append("materials", _material(document, part.material))
+        primitive: Json = {
+            "attributes": {},
+            "indices": document.add(part.triangles.astype(index_type).reshape(-1), "SCALAR", ELEMENT_ARRAY_BUFFER),
+            "material": materials[part.material],
+        }
+        if part.texcoords is not None:
+            primitive["attributes"]["TEXCOORD_0"] = document.add(
+                part.texcoords.astype(np.float32), "VEC2", ARRAY_BUFFER
+            )
+        if part.colors is not None:
+            primitive["attributes"]["COLOR_0"] = document.add(part.colors.astype(np.float32), "VEC4", ARRAY_BUFFER)
+        primitives.append(primitive)
+        drawn.append(Drawn(primitive, part.vertices, None, normal_at))
+    document.append("meshes", {"name": name, "primitives": primitives})
+    document.append("nodes", {"name": name, "mesh": 0})
+    document.append("scenes", {"name": "scene", "nodes": [0]})
+    document.root["scene"] = 0
+    return document, drawn, [0]
+
+
+def _normals(
+    parts: Sequence[Part], shapes: FloatArray, faces: IntArray, asset: Asset | None
+) -> list[Callable[[int], dict[str, FloatArray]]]:
+    """For each part, its normals in a frame: the file's, taken along, or smooth ones where it has none."""
+    own = [part for part in parts if part.normals is not None]
+    starts = np.cumsum([len(part.vertices) for part in own])
+    copies = merge_seams(shapes[[0, -1]], faces)
+    _, first = np.unique(copies, return_index=True)
+    smooth = on_frames(lambda x: vertex_normals(x[first], copies[faces])[copies], shapes)
+    carried = None
+    if own and asset is not None:
+        vertices = np.concatenate([part.vertices for part in own])
+        triangles = [part.triangles + end - len(part.vertices) for part, end in zip(own, starts, strict=True)]
+        from_file = CarriedNormals(
+            np.concatenate([part.normals for part in own if part.normals is not None]),
+            asset.positions[vertices],
+            np.concatenate(triangles),
+        )
+        carried = on_frames(lambda x: from_file.at(x[vertices]), shapes)
+    ends = iter(starts.tolist())
+    found: list[Callable[[int], dict[str, FloatArray]]] = []
+    for part in parts:
+        if part.normals is None or carried is None:
+            found.append(partial(_rows, smooth, part.vertices))
+        else:
+            end = next(ends)
+            found.append(partial(_rows, carried, slice(end - len(part.vertices), end)))
+    return found
+
+
+def _rows(of: Callable[[int], FloatArray], which: IntArray | slice, number: int) -> dict[str, FloatArray]:
+    return {"NORMAL": of(number)[which]}
+
+
+def _material(document: Document, material: Material) -> Json:
+    surface: Json = {
+        "baseColorFactor": list(material.color),
+        "metallicFactor": material.metallic,
+        "roughnessFactor": material.roughness,
+    }
+    if material.texture is not None:
+        view = document.add_bytes(material.texture.data)
+        image = document.append("images", {"bufferView": view, "mimeType": material.texture.mime})
+        if not document.get("samplers"):
+            document.append("samplers", {"wrapS": 10497, "wrapT": 10497})  # repeat, as OBJ does
+        texture = document.append("textures", {"source": image, "sampler": 0})
+        surface["baseColorTexture"] = {"index": texture}
+    made: Json = {"name": material.name, "doubleSided": True, "pbrMetallicRoughness": surface}
+    if material.color[3] < 1:
+        made["alphaMode"] = "BLEND"
+    return made

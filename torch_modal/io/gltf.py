@@ -1,0 +1,245 @@
+"""glTF 2.0 documents: the JSON and the binary part, read from files and written as GLB."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+Json = dict[str, Any]
+
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+LARGEST_ACCESSOR = 2**31
+"""Numbers; a damaged file may promise any count."""
+
+
+class Document:
+    """A glTF document in memory.
+
+    Args:
+        root: The JSON.
+        binary: What its first buffer holds, if that is not a file of its own.
+        folder: Where its files are.
+    """
+
+    def __init__(self, root: Json | None = None, binary: bytes = b"", folder: Path = Path()) -> None:
+        self.root: Json = {"asset": {"version": "2.0", "generator": "torch_modal"}} if root is None else root
+        self.binary = bytearray(binary)
+        self.folder = folder
+        self._buffers: dict[int, bytes] = {}
+
+    @classmethod
+    def read(cls, path: Path) -> Document:
+        """Read a GLB or GLTF file.
+
+        Raises:
+            ValueError: It is none, or of another version.
+        """
+        data = path.read_bytes()
+        binary = b""
+        if data[:4] == b"glTF":
+            text, place = b"", 12
+            while place + 8 <= len(data):
+                length, kind = struct.unpack_from("<I4s", data, place)
+                chunk = data[place + 8 : place + 8 + length]
+                if len(chunk) < length:
+                    raise ValueError("the file was cut off")
+                if kind == b"JSON":
+                    text = chunk
+                elif kind == b"BIN\0" and not binary:
+                    binary = chunk
+                place += 8 + length
+        else:
+            text = data
+        root = json.loads(text.decode("utf-8"))
+        if not isinstance(root, dict) or not str(root.get("asset", {}).get("version", "")).startswith("2"):
+            raise ValueError("not glTF 2")
+        return cls(root, binary, path.parent)
+
+    # --------------------------------------------------------------------------------------------------------- reading
+    def get(self, kind: str, index: int | None = None) -> Any:
+        """A list of the document, empty where there is none; or one of its members."""
+        items = self.root.get(kind, [])
+        return items if index is None else items[_index(index)]
+
+    def buffer(self, index: int) -> bytes:
+        """All bytes of a buffer."""
+        if index not in self._buffers:
+            uri = self.get("buffers", index).get("uri")
+            self._buffers[index] = bytes(self.binary) if uri is None else self.resource(uri)
+        return self._buffers[index]
+
+    def resource(self, uri: str) -> bytes:
+        """What a URI names: the data in it, or a file."""
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition(",")[2])
+        return (self.folder / unquote(uri)).read_bytes()
+
+    def view(self, index: int) -> bytes:
+        """The bytes of a buffer view."""
+        view = self.get("bufferViews", index)
+        start = view.get("byteOffset", 0)
+        data = self.buffer(_index(view["buffer"]))[start : start + view["byteLength"]]
+        if start < 0 or len(data) < view["byteLength"]:
+            raise ValueError("a buffer is too short")
+        return data
+
+    def accessor(self, index: int) -> NDArray[Any]:
+        """The numbers of an accessor, in its component type. *Shape:* ``(count, width)``.
+
+        Raises:
+            ValueError: It does not fit its buffer.
+        """
+        accessor = self.get("accessors", index)
+        dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+        count = accessor["count"]
+        if not 0 <= count * width < LARGEST_ACCESSOR:
+            raise ValueError(f"an accessor of {count} elements")
+        if "bufferView" in accessor:
+            view = self.get("bufferViews", accessor["bufferView"])
+            stride = view.get("byteStride") or dtype.itemsize * width
+            offset = accessor.get("byteOffset", 0)
+            array = _strided(self.view(accessor["bufferView"]), dtype, count, width, offset, stride)
+        else:
+            array = np.zeros((count, width), dtype)
+        if "sparse" in accessor:
+            sparse = accessor["sparse"]
+            rows, values = sparse["indices"], sparse["values"]
+            kind = np.dtype(COMPONENTS[rows["componentType"]])
+            n = sparse["count"]
+            at = _strided(self.view(rows["bufferView"]), kind, n, 1, rows.get("byteOffset", 0), kind.itemsize)
+            size = dtype.itemsize * width
+            new = _strided(self.view(values["bufferView"]), dtype, n, width, values.get("byteOffset", 0), size)
+            array = array.copy()
+            array[at[:, 0]] = new
+        return array
+
+    def floats(self, index: int) -> NDArray[np.float64]:
+        """The numbers of an accessor as they are meant: normalised ones divided. *Shape:* ``(count, width)``."""
+        array = self.accessor(index)
+        numbers = array.astype(np.float64)
+        if self.get("accessors", index).get("normalized") and array.dtype.kind in "iu":
+            numbers = np.maximum(numbers / np.iinfo(array.dtype).max, -1.0)
+        return numbers
+
+    # --------------------------------------------------------------------------------------------------------- writing
+    def append(self, kind: str, item: Json) -> int:
+        """Add to a list of the document; its number there."""
+        items = self.root.setdefault(kind, [])
+        items.append(item)
+        return len(items) - 1
+
+    def add_bytes(self, data: bytes, target: int | None = None) -> int:
+        """Add bytes as a buffer view; its number."""
+        self.binary += bytes(-len(self.binary) % 4)  # views start at multiples of four bytes
+        view: Json = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
+        if target is not None:
+            view["target"] = target
+        self.binary += data
+        return self.append("bufferViews", view)
+
+    def add(
+        self,
+        array: NDArray[Any],
+        kind: str,
+        target: int | None = None,
+        bounds: bool = False,
+        normalized: bool = False,
+    ) -> int:
+        """Add numbers as an accessor with a view of its own; its number.
+
+        Args:
+            array: In one of the component types. *Shape:* ``(count,)`` or ``(count, width)``.
+            kind: ``"SCALAR"``, ``"VEC3"``, ...
+            target: What the view is used for.
+            bounds: Whether least and greatest numbers are written; positions and times need them.
+            normalized: Whether integers stand for fractions.
+        """
+        rows = np.ascontiguousarray(array).reshape(len(array), -1)
+        stored = rows
+        size = rows.dtype.itemsize * rows.shape[1]
+        view_options: Json = {}
+        if target == ARRAY_BUFFER and size % 4:  # each vertex starts at a multiple of four bytes
+            stored = np.zeros((len(rows), size + -size % 4), "u1")
+            stored[:, :size] = rows.view("u1").reshape(len(rows), size)
+            view_options["byteStride"] = stored.shape[1]
+        view = self.add_bytes(stored.tobytes(), target)
+        self.root["bufferViews"][view].update(view_options)
+        code = next(code for code, name in COMPONENTS.items() if np.dtype(name) == rows.dtype)
+        accessor: Json = {"bufferView": view, "componentType": code, "count": len(rows), "type": kind}
+        if normalized:
+            accessor["normalized"] = True
+        if bounds:
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        return self.append("accessors", accessor)
+
+    def to_glb(self) -> bytes:
+        """The document as a GLB file."""
+        self.root["buffers"] = [{"byteLength": len(self.binary)}]
+        text = json.dumps(self.root, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode("utf-8")
+        text += b" " * (-len(text) % 4)
+        binary = bytes(self.binary) + bytes(-len(self.binary) % 4)
+        head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+        return b"".join(
+            [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
+        )
+
+
+def _index(number: Any) -> int:
+    """Indices of damaged files may be negative, which Python would take."""
+    if not isinstance(number, int) or number < 0:
+        raise ValueError(f"an index {number!r}")
+    return number
+
+
+def _strided(data: bytes, dtype: np.dtype, count: int, width: int, offset: int, stride: int) -> NDArray[Any]:
+    if offset < 0 or stride < dtype.itemsize * width:
+        raise ValueError("an accessor with a wrong offset or stride")
+    if count and offset + (count - 1) * stride + dtype.itemsize * width > len(data):
+        raise ValueError("a buffer view is too short")
+    return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
+
+
+def world_transforms(document: Document) -> dict[int, NDArray[np.float64]]:
+    """The nodes of the scene, parents first, and where each is. *Shape of each:* ``(4, 4)``."""
+    nodes = document.get("nodes")
+    if document.get("scenes"):
+        roots = document.get("scenes", document.root.get("scene", 0)).get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [number for number in range(len(nodes)) if number not in children]
+    found: dict[int, NDArray[np.float64]] = {}
+    waiting = [(number, np.eye(4)) for number in reversed(roots)]
+    while waiting:
+        number, parent = waiting.pop()
+        if number in found:  # a node has one parent; in a damaged file it may be its own
+            continue
+        node = document.get("nodes", number)
+        found[number] = parent @ _local_transform(node)
+        waiting += [(child, found[number]) for child in reversed(node.get("children", []))]
+    return found
+
+
+def _local_transform(node: Json) -> NDArray[np.float64]:
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix

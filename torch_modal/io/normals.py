@@ -1,0 +1,70 @@
+"""A file's own normals, taken along by the surface."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.turning import surface_frames, turn
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class CarriedNormals:
+    """Turns a file's normals as the surface turns, so that hard edges stay hard and smooth ones smooth.
+
+    Points with one place and one normal are one: seams of texture coordinates do not show in the shading.
+
+    Args:
+        normals: As the file has them. *Shape:* ``(P, 3)``.
+        positions: Of the same points, as the file has them. *Shape:* ``(P, 3)``.
+        triangles: Of points. *Shape:* ``(F, 3)``.
+    """
+
+    def __init__(self, normals: FloatArray, positions: FloatArray, triangles: IntArray) -> None:
+        self.normals = normals
+        rows = np.concatenate([positions, normals], axis=1)
+        _, self.first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        self.group = group.reshape(-1)
+        self.triangles = self.group[triangles]
+        # The other end of an edge of each point: with the normal it tells how the surface turns.
+        self.neighbour = np.arange(len(self.first))
+        for corner in (2, 1, 0):
+            self.neighbour[self.triangles[:, corner]] = self.triangles[:, (corner + 1) % 3]
+        self.before = self._surface(positions)
+
+    def _surface(self, positions: FloatArray) -> FloatArray:
+        """Frames of the surface at each point. *Shape:* ``(P, 3, 3)``."""
+        x = positions[self.first]
+        return surface_frames(vertex_normals(x, self.triangles), x[self.neighbour] - x)[self.group]
+
+    def at(self, positions: FloatArray, vectors: FloatArray | None = None) -> FloatArray:
+        """The normals, or other vectors (tangents), on the surface with other positions.
+
+        Where the surface has not moved they are those of the file, bit for bit.
+
+        Args:
+            positions: *Shape:* ``(P, 3)``.
+            vectors: *Shape:* ``(P, 3)``.
+        """
+        vectors = self.normals if vectors is None else vectors
+        return turn(vectors, self.before, self._surface(positions))
+
+
+def on_frames(at: Callable[[FloatArray], FloatArray], frames: FloatArray) -> Callable[[int], FloatArray]:
+    """Of a function of positions, one of the frame's number that computes each frame once, however many ask.
+
+    Args:
+        at: *Shape:* ``(V, 3) -> (P, 3)``.
+        frames: *Shape:* ``(N, V, 3)``.
+    """
+    known: dict[int, FloatArray] = {}
+
+    def of(number: int) -> FloatArray:
+        if number not in known:
+            known[number] = at(frames[number])
+        return known[number]
+
+    return of

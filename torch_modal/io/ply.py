@@ -1,0 +1,196 @@
+"""PLY: the bytes of the file, with other numbers where positions stand."""
+
+import re
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_modal.io.asset import Asset, FloatArray, Material, Part
+from torch_modal.io.colors import linear
+from torch_modal.io.mtl import as_image
+from torch_modal.io.normals import CarriedNormals
+from torch_modal.io.trimesh_reader import read_triangles
+
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
+_TYPES |= {"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+_TYPES |= {"float32": "f4", "float64": "f8"}
+_UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+
+
+class _Property(NamedTuple):
+    name: str
+    type: str
+    count_type: str | None = None
+    """Of a list."""
+
+
+class _Element(NamedTuple):
+    name: str
+    length: int
+    properties: list[_Property]
+
+    def row(self, order: str) -> np.dtype:
+        return np.dtype([(prop.name, order + prop.type) for prop in self.properties])
+
+
+class PlyAsset(Asset):
+    """A PLY file, kept as bytes. What is written again differs in positions and normals alone, in the file's types."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.positions, self.faces = read_triangles(path)
+        self.data = path.read_bytes()
+        self._read_header()
+        self._describe()
+
+    def _read_header(self) -> None:
+        match = re.search(rb"end_header[^\n]*\n|end_header\r", self.data)
+        if match is None:
+            raise ValueError("no end_header")
+        self._start = match.end()
+        self._format, self._order, self._textures = "ascii", "", []
+        self._elements: list[_Element] = []
+        for line in re.split(r"\r\n|\n|\r", self.data[: self._start].decode("utf-8", errors="replace")):
+            words = line.split()
+            if line.lower().startswith("comment texturefile"):
+                self._textures.append(line.split(None, 2)[2].strip())
+            elif words[:1] == ["format"]:
+                self._format = words[1]
+                self._order = ">" if words[1] == "binary_big_endian" else "<"
+            elif words[:1] == ["element"]:
+                self._elements.append(_Element(words[1], int(words[2]), []))
+            elif words[:2] == ["property", "list"]:
+                self._elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
+            elif words[:1] == ["property"]:
+                self._elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
+
+    def _describe(self) -> None:
+        names = {prop.name for prop in self._vertex.properties}
+        if len(self.faces) > self._count("face"):
+            self.carries["polygons"] = "polygons"
+        if {"nx", "ny", "nz"} <= names:
+            self.carries["normals"] = "normals"
+        if {"red", "green", "blue"} <= names:
+            self.carries["colors"] = "vertex colours"
+        face = {prop.name for element in self._elements if element.name == "face" for prop in element.properties}
+        if self._uv_names is not None:
+            self.carries["texcoords"] = "texture coordinates"
+        if self._textures:
+            self.carries["materials"] = "texture"
+        known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", *(self._uv_names or ())}
+        further = sorted((names - known) | (face - {"vertex_indices", "vertex_index"}))
+        if further or len(self._elements) > 2:
+            others = [e.name for e in self._elements if e.name not in ("vertex", "face")]
+            self.carries["properties"] = "properties " + ", ".join(further + others)
+
+    def _count(self, name: str) -> int:
+        return sum(element.length for element in self._elements if element.name == name)
+
+    @property
+    def _vertex(self) -> _Element:
+        return next(element for element in self._elements if element.name == "vertex")
+
+    @property
+    def _uv_names(self) -> tuple[str, str] | None:
+        names = {prop.name for prop in self._vertex.properties}
+        return next((pair for pair in _UV_NAMES if set(pair) <= names), None)
+
+    # ------------------------------------------------------------------------------------------------ the vertex rows
+    @cached_property
+    def _place(self) -> tuple[int, int]:
+        """Where the rows of the vertices begin: a byte, or in text a line; and how many bytes they have."""
+        before = self._elements[: self._elements.index(self._vertex)]
+        if self._format == "ascii":
+            return sum(element.length for element in before), 0
+        place = self._start
+        for element in before:
+            for _ in range(element.length):
+                for prop in element.properties:
+                    repeat = 1
+                    if prop.count_type is not None:
+                        count = np.dtype(self._order + prop.count_type)
+                        repeat = int(np.frombuffer(self.data, count, 1, place)[0])
+                        place += count.itemsize
+                    place += repeat * np.dtype(prop.type).itemsize
+        return place, self._vertex.length * self._vertex.row(self._order).itemsize
+
+    @cached_property
+    def _lines(self) -> list[bytes]:
+        return self.data[self._start :].splitlines()
+
+    @cached_property
+    def _rows(self) -> NDArray[np.void]:
+        """The vertices with all their properties. *Shape:* ``(V,)``."""
+        if any(prop.count_type for prop in self._vertex.properties):
+            raise ValueError("vertices with properties that are lists")
+        place, size = self._place
+        row = self._vertex.row(self._order)
+        if self._format != "ascii":
+            return np.frombuffer(self.data[place : place + size], row).copy()
+        lines = self._lines[place : place + self._vertex.length]
+        words = [tuple(map(float, line.split())) for line in lines]
+        return np.array(words, dtype=[(name, "f8") for name in row.names or ()])
+
+    def _columns(self, *names: str) -> FloatArray:
+        return np.stack([self._rows[name].astype(np.float64) for name in names], axis=1)
+
+    @cached_property
+    def _carried(self) -> CarriedNormals:
+        return CarriedNormals(self._columns("nx", "ny", "nz"), self.positions, self.faces)
+
+    def with_positions(self, positions: FloatArray) -> bytes:
+        """The file with other positions."""
+        new = dict(zip("xyz", positions.T, strict=True))
+        if "normals" in self.carries:
+            new |= dict(zip(("nx", "ny", "nz"), self._carried.at(positions).T, strict=True))
+        place, size = self._place
+        if self._format != "ascii":
+            rows = self._rows.copy()
+            for name, column in new.items():
+                rows[name] = column
+            return self.data[:place] + rows.tobytes() + self.data[place + size :]
+        lines = list(self._lines)
+        at = {prop.name: number for number, prop in enumerate(self._vertex.properties)}
+        single = {prop.name for prop in self._vertex.properties if prop.type == "f4"}
+        columns = {at[name]: _text(column, name in single) for name, column in new.items()}
+        for number in range(self._vertex.length):
+            words = lines[place + number].split()
+            for column, text in columns.items():
+                words[column] = text[number]
+            lines[place + number] = b" ".join(words)
+        return self.data[: self._start] + b"\n".join(lines) + b"\n"
+
+    @cached_property
+    def companions(self) -> dict[str, bytes]:
+        """Textures that the header names."""
+        paths = {name: self.path.parent / name for name in self._textures if not Path(name).is_absolute()}
+        return {name: path.read_bytes() for name, path in paths.items() if path.is_file() and ".." not in path.parts}
+
+    def parts(self) -> list[Part]:
+        """One part."""
+        material = Material()
+        if "colors" in self.carries or self._textures:
+            image = as_image(next(iter(self.companions.values()))) if self.companions else None
+            material = Material(self.path.stem, (1.0, 1.0, 1.0, 1.0), texture=image)
+        colors = None
+        if "colors" in self.carries:
+            channels = ["red", "green", "blue"]
+            types = {prop.name: prop.type for prop in self._vertex.properties}
+            channels += ["alpha"] if "alpha" in types else []
+            scale = {"f4": 1.0, "f8": 1.0}.get(types["red"]) or float(np.iinfo(types["red"]).max)
+            colors = linear(self._columns(*channels) / scale)
+        texcoords = None
+        if self._uv_names is not None:
+            texcoords = self._columns(*self._uv_names) * [1, -1] + [0, 1]
+        normals = self._columns("nx", "ny", "nz") if "normals" in self.carries else None
+        everything = np.arange(len(self.positions))
+        return [Part(everything, self.faces, material, texcoords, colors, normals)]
+
+
+def _text(column: FloatArray, single: bool) -> list[bytes]:
+    """The fewest digits that read back as the same number of the file's type."""
+    numbers = column.astype(np.float32) if single else column
+    return [str(number).encode() for number in (numbers if single else numbers.tolist())]

@@ -1,0 +1,139 @@
+"""A sequence as one file that plays; the suffix says which kind."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torch_modal.errors import MissingPackageError
+from torch_modal.io.asset import Asset
+from torch_modal.io.timing import make_timing
+from torch_modal.io.write import check_frames, check_indices, refuse_existing
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+    Array = torch.Tensor | NDArray[Any]
+
+SUFFIXES = (".glb", ".mp4", ".gif", ".usd", ".usda", ".usdc", ".mdd", ".pc2", ".npz")
+
+_USD = (("pxr",), "usd")
+# Modules that a suffix needs, and the extra that brings them.
+_NEEDS = {".mp4": (("imageio", "imageio_ffmpeg"), "video"), ".usd": _USD, ".usda": _USD, ".usdc": _USD}
+
+
+def require_packages(path: Path) -> None:
+    """Refuse a file whose format needs a package that is not installed, before any work.
+
+    Raises:
+        MissingPackageError: It says which.
+    """
+    modules, extra = _NEEDS.get(path.suffix.lower(), ((), ""))
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        raise MissingPackageError(
+            f"{path.name} needs the package {' and '.join(missing)}: pip install torch_modal[{extra}]"
+        )
+
+
+def save_animation(
+    frames: Array,
+    faces: Array,
+    out: str | Path,
+    fps: float | None = None,
+    keyframe_indices: Sequence[int] | None = None,
+    cyclic: bool = False,
+    overwrite: bool = False,
+    max_targets: int = 64,
+    *,
+    duration: float | None = None,
+    ping_pong: bool = False,
+    ease: bool = False,
+    asset: Asset | None = None,
+) -> Path:
+    """Write the sequence as one file that plays.
+
+    ``.glb`` is glTF 2.0 with a morph target for each frame after the first; viewers interpolate linearly between
+    neighbouring frames. glTF calls Y up and metres the unit; the caller's coordinates are written as they are
+    (float32), so a Z-up sequence lies on its back there. Normals move with the shape, except where that would make
+    a very large file (with a warning). ``.usd``, ``.usda`` and ``.usdc`` (extra ``usd``) hold the points over time in
+    the same manner.
+
+    ``.mp4`` (extra ``video``) and ``.gif`` are drawn. ``.mdd`` and ``.pc2`` are point caches, for a mesh that is
+    already in Blender, Maya or Houdini. ``.npz`` holds ``frames``, ``faces``, ``times`` and ``keyframes`` as arrays.
+
+    Args:
+        frames: Vertex positions, in the caller's coordinates. *Shape:* ``(N, V, 3)``. One shape gives a file that
+            stands still.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        out: File to write.
+        fps: Frames a second; with a ``duration``, pictures or samples a second of videos and point caches
+            (default: 24), while GLB and USD show every frame.
+        keyframe_indices: Which frames are key-frames. They are kept when frames are left out (unless they are
+            too many themselves), named in the GLB's ``extras``, and their number gives the default duration.
+        cyclic: Add the step from the last frame back to the first, unless the two are equal already.
+        overwrite: Replace the file if it exists.
+        max_targets: Most morph targets of a GLB. Players hold every target in memory, and the weights grow with their
+            square; a longer sequence loses frames evenly, with a warning, and players fill in linearly.
+        duration: Of the sequence once, in seconds. Default: from ``fps`` where that is given; otherwise 1 s for a
+            cycle, 2 s for two key-frames, and 1 s for each interval of more.
+        ping_pong: There and back again; the whole takes twice the duration.
+        ease: Slow at both ends, by half a period of a cosine.
+        asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
+            textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: An argument cannot be used; the message says why.
+        FileExistsError: The file exists and ``overwrite`` is off.
+        MissingPackageError: The format needs a package that is not installed; the message says which.
+
+    Warns:
+        MeshWarning: The format cannot hold what the asset carries.
+    """
+    shapes, triangles = check_frames(frames, faces)
+    path = Path(out)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"out must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}, got {path.name!r}.")
+    if asset is not None:
+        asset.check(shapes)
+    require_packages(path)
+    refuse_existing(path, overwrite)
+    keyframes = [] if keyframe_indices is None else check_indices(keyframe_indices, len(shapes), "keyframe_indices")
+    if cyclic and len(shapes) > 1 and np.array_equal(shapes[0], shapes[-1]):
+        shapes = shapes[:-1]
+        keyframes = [number for number in keyframes if number < len(shapes)]
+    timing = make_timing(
+        len(shapes),
+        max(2, len(keyframes)),
+        duration=duration,
+        fps=fps,
+        cyclic=cyclic and len(shapes) > 1,
+        ping_pong=ping_pong,
+        ease=ease,
+    )
+    if suffix == ".glb":
+        from torch_modal.io.glb import save_glb
+
+        return save_glb(shapes, triangles, path, timing, keyframes, max_targets, asset)
+    if suffix in (".mp4", ".gif"):
+        from torch_modal.view.video import save_video
+
+        return save_video(shapes, triangles, path, timing)
+    if suffix.startswith(".usd"):
+        from torch_modal.io.usd import save_usd
+
+        return save_usd(shapes, triangles, path, timing, asset)
+    from torch_modal.io.point_cache import save_mdd, save_npz, save_pc2
+
+    if suffix == ".npz":
+        return save_npz(shapes, triangles, path, timing, keyframes)
+    return (save_mdd if suffix == ".mdd" else save_pc2)(shapes, path, timing)
