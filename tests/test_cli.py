@@ -381,3 +381,20 @@ def test_cache_is_measured_and_cleared(tmp_path: Path, capsys: pytest.CaptureFix
     assert "1 entries, 2.0 MiB removed" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     assert stranger.read_text() == "mine"
+
+
+def test_times_of_keyframes_are_respected(meshes: list[str], tmp_path: Path) -> None:
+    """In the frames, and in the animation."""
+    three = [*meshes, meshes[0]]
+    argv = ["subdivide", *three, "--modes", "6", "--preset", "fast", "--frames", "9", "--times", "0,1,4", "--quiet"]
+    assert cli.main([*argv, "--out", str(tmp_path / "a.npz"), "--duration", "2"]) == 0
+    stored = np.load(tmp_path / "a.npz")
+    assert stored["keyframes"].tolist() == [0, 2, 8]
+    np.testing.assert_allclose(stored["times"], np.r_[0, 0.25, np.linspace(0.5, 2, 7)])
+    pair = [*argv[:4], *argv[4:8], "--levels", "1", "--quiet"]
+    for number, option in enumerate(([], ["--no-smooth"])):
+        assert cli.main([*pair, *option, "--out", str(tmp_path / f"{number}.npz")]) == 0
+    smooth, straight = (np.load(tmp_path / f"{number}.npz")["frames"] for number in range(2))
+    assert np.abs(smooth - straight).max() > 1e-6
+    with pytest.raises(SystemExit):
+        cli.main([*argv[:-3], "--times", "0,x", "--out", str(tmp_path / "b.npz")])

@@ -37,7 +37,9 @@ def subdivide(args: argparse.Namespace) -> None:
 
     import torch_modal as tm
 
-    places = tm.keyframe_places(len(args.meshes), args.levels, cyclic=args.cyclic, n_frames=args.frames)
+    n, spread = len(args.meshes), {"cyclic": args.cyclic, "n_frames": args.frames, "times": args.times}
+    places = tm.keyframe_places(n, args.levels, **spread)
+    when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
     keyframes, faces = tm.load_keyframes(args.meshes)
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
@@ -50,8 +52,8 @@ def subdivide(args: argparse.Namespace) -> None:
         welded.faces,
         args.levels,
         bases=bases,
-        cyclic=args.cyclic,
-        n_frames=args.frames,
+        **spread,
+        smooth=args.smooth,
         progress=progress,
         objective=objective,
         solver=replace(solver, polish=args.polish),
@@ -77,6 +79,7 @@ def subdivide(args: argparse.Namespace) -> None:
         duration=args.duration,
         ping_pong=args.ping_pong,
         ease=args.ease,
+        times=when,
         asset=asset,
     )
     report(f"animation: {animation}")

@@ -163,6 +163,14 @@ def _number(kind: Callable[[str], Any], low: float, above: bool = False) -> Call
     return convert
 
 
+def _times(text: str) -> list[float]:
+    """An argument type: numbers with commas between them."""
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM, description=DESCRIPTION, epilog=MAIN_EXAMPLES, formatter_class=_Formatter
@@ -201,6 +209,19 @@ def _parser() -> argparse.ArgumentParser:
         help="number of frames of the result, filled in linearly between the levels' shapes (default: all of those)",
     )
     sub.add_argument("--cyclic", action="store_true", help="the last key-frame leads on to the first")
+    sub.add_argument(
+        "--times",
+        type=_times,
+        metavar="T,T,...",
+        help="when the key-frames are, ascending, in any unit; of a cycle, with the time when it begins again",
+    )
+    sub.add_argument(
+        "--no-smooth",
+        dest="smooth",
+        action="store_const",
+        const=False,
+        help="treat each pair of key-frames alone, without what its neighbours in time know",
+    )
     sub.add_argument(
         "--preset",
         choices=("accurate", "fast", "paper"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ class Timing(NamedTuple):
     """There and back again."""
     ease: bool = False
     """Slow at both ends, by half a period of a cosine."""
+    parts: FloatArray | None = None
+    """Which part of the duration has passed at each frame, from 0 on; even where None. *Shape:* ``(N,)``."""
 
     def knots(self, frames: IntArray, n_frames: int) -> tuple[FloatArray, IntArray]:
         """When each frame is fully shown, for formats that interpolate linearly between such times.
@@ -42,7 +45,7 @@ class Timing(NamedTuple):
         if n_frames == 1:
             return np.zeros(1), np.zeros(1, np.int64)
         places = np.arange(len(frames))
-        parts = frames / (n_frames if self.cyclic else n_frames - 1)
+        parts = self._parts(n_frames)[frames]
         if self.ease:
             parts = np.arccos(np.clip(1 - 2 * parts, -1, 1)) / np.pi
         times = self.duration * parts
@@ -65,7 +68,14 @@ class Timing(NamedTuple):
             part = (1 - np.cos(np.pi * part)) / 2
         if self.ping_pong:
             part = np.concatenate([part, part[-2:0:-1]])
-        return part * (n_frames if self.cyclic else n_frames - 1)
+        known = self._parts(n_frames)
+        known = np.append(known, 1.0) if self.cyclic else known
+        return np.interp(part, known, np.arange(len(known)))
+
+    def _parts(self, n_frames: int) -> FloatArray:
+        if self.parts is not None:
+            return self.parts
+        return np.arange(n_frames) / (n_frames if self.cyclic else n_frames - 1)
 
 
 def make_timing(
@@ -77,6 +87,7 @@ def make_timing(
     cyclic: bool = False,
     ping_pong: bool = False,
     ease: bool = False,
+    times: Sequence[float] | FloatArray | None = None,
 ) -> Timing:
     """Settle how a sequence is played.
 
@@ -89,9 +100,10 @@ def make_timing(
         cyclic: The last frame leads on to the first.
         ping_pong: There and back again.
         ease: Slow at both ends.
+        times: When the frames are, in any unit; of a cycle, with the time when it begins again. Default: evenly.
 
     Raises:
-        ValueError: A number is not positive, or a cycle is to turn back or to slow down.
+        ValueError: A number is not positive, a cycle is to turn back or to slow down, or times do not fit.
     """
     for name, value in (("duration", duration), ("fps", fps)):
         if value is not None and not (np.isfinite(value) and value > 0):
@@ -107,7 +119,18 @@ def make_timing(
             duration = SECONDS_OF_A_CYCLE
         else:
             duration = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
-    return Timing(float(duration), float(FPS if fps is None else fps), cyclic, ping_pong, ease)
+    parts = None if times is None else _parts_of(np.asarray(times, np.float64), n_frames, cyclic)
+    return Timing(float(duration), float(FPS if fps is None else fps), cyclic, ping_pong, ease, parts)
+
+
+def _parts_of(times: FloatArray, n_frames: int, cyclic: bool) -> FloatArray:
+    wanted = n_frames + cyclic
+    if times.shape != (wanted,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        also = ", and the one when it begins again" if cyclic else ""
+        raise ValueError(f"times must be {wanted} ascending numbers, one for each frame{also}; got {times.shape}.")
+    if wanted == 1:
+        return np.zeros(1)
+    return ((times - times[0]) / (times[-1] - times[0]))[:n_frames]
 
 
 def resample(frames: FloatArray, places: FloatArray) -> FloatArray:

@@ -54,6 +54,7 @@ def save_animation(
     duration: float | None = None,
     ping_pong: bool = False,
     ease: bool = False,
+    times: Sequence[float] | None = None,
     asset: Asset | None = None,
 ) -> Path:
     """Write the sequence as one file that plays.
@@ -84,6 +85,8 @@ def save_animation(
             cycle, 2 s for two key-frames, and 1 s for each interval of more.
         ping_pong: There and back again; the whole takes twice the duration.
         ease: Slow at both ends, by half a period of a cosine.
+        times: When the frames are, in any unit (:func:`torch_modal.frame_times`); of a cycle, with the time when it
+            begins again. Default: evenly. The duration stays what it is.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
             textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
 
@@ -119,6 +122,7 @@ def save_animation(
         cyclic=cyclic and len(shapes) > 1,
         ping_pong=ping_pong,
         ease=ease,
+        times=times,
     )
     if suffix == ".glb":
         from torch_modal.io.glb import save_glb
