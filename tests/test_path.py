@@ -353,3 +353,45 @@ def test_second_differences_on_the_hand(hands: Shapes) -> None:
     elsewhere = torch.ones(len(second), dtype=torch.bool)
     elsewhere[keys] = False
     assert float(second[keys].amax() / second[elsewhere].median()) < 1.5
+
+
+# ----------------------------------------------------------------------------------------------------------- editing
+
+
+@pytest.mark.parametrize(("cyclic", "smooth", "touched"), [(False, True, 3), (True, True, 4), (False, False, 2)])
+def test_a_change_is_local(bars: Shapes, cyclic: bool, smooth: bool, touched: int) -> None:
+    own = bars.pick(0, 1, 2, 1, 0, 2)
+    path = Path(own.bases, own.faces, cyclic=cyclic, smooth=smooth)
+    editor = tm.PathEditor(path, own.keyframes, steps=3)
+    before = editor.shapes()
+    torch.testing.assert_close(before, path(own.keyframes, editor.times()), rtol=0, atol=1e-9)
+    other = own.keyframes.clone()
+    other[1] += 0.1
+    computed: list[int] = []
+    path.register_forward_pre_hook(lambda *_: computed.append(1))
+    editor.replace(1, other[1])
+    after = editor.shapes()
+    assert len(computed) == touched
+    torch.testing.assert_close(after, path(other, editor.times()), rtol=0, atol=1e-9)
+    assert torch.equal(editor.shapes(), after)
+    assert torch.equal(own.keyframes[1] + 0.1, other[1]), "the caller's key-frames stay"
+
+
+def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> None:
+    editor = tm.PathEditor(path, motion.keyframes, steps=2)
+    passing = path(motion.keyframes, 2.3)
+    assert editor.insert(2.3) == 3
+    assert editor.path.layer is path.layer
+    assert editor.path.times.tolist() == [0, 1, 2, 2.3, 3, 4]
+    torch.testing.assert_close(editor.shapes()[6], passing, rtol=0, atol=1e-12)
+    moved = passing + 0.05
+    editor.replace(3, moved)
+    assert torch.equal(editor.path(editor.keyframes, 2.3), moved)
+    with pytest.raises(ValueError, match="already"):
+        path.insert(2.0)
+    with pytest.raises(ValueError, match="between the times"):
+        editor.insert(9.0)
+    with pytest.raises(IndexError, match="6 key-frames"):
+        editor.replace(6, moved)
+    with pytest.raises(ValueError, match="holds finite numbers"):
+        editor.replace(0, moved * math.nan)

@@ -46,6 +46,7 @@ from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
 from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
+from .sequence.editor import PathEditor as PathEditor
 from .sequence.path import Path as Path
 from .sequence.subdivide import frame_times as frame_times
 from .sequence.subdivide import keyframe_places as keyframe_places

@@ -64,9 +64,40 @@ class Path(nn.Module):
         if self.layer.objective.space == "paired":
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
         self.register_buffer("times", checked_times(times, n, cyclic))
-        self.n_keyframes = n
         self.cyclic = cyclic
         self.smooth = smooth
+        #: Which pair of bases each interval has the modes of.
+        self.members = list(range(len(pairs)))
+
+    @property
+    def n_keyframes(self) -> int:
+        """Number of key-frames, K."""
+        return len(self.members) + (not self.cyclic)
+
+    def insert(self, t: float) -> "Path":
+        """The same motion with one more key-frame, which borrows the modes of those around it, as in the paper.
+
+        Args:
+            t: When it is, between the others.
+
+        Returns:
+            A path of one more key-frame, with the same layer.
+
+        Raises:
+            ValueError: The time is outside, or that of a key-frame.
+        """
+        interval, _ = self._located(self.times.new_tensor([t]))
+        i = int(interval)
+        if bool((self.times == t).any()):
+            raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
+        other = Path.__new__(Path)
+        nn.Module.__init__(other)
+        other.layer, other.cyclic, other.smooth = self.layer, self.cyclic, self.smooth
+        other.members = [*self.members[: i + 1], *self.members[i:]]
+        other.register_buffer(
+            "times", torch.cat([self.times[: i + 1], self.times.new_tensor([t]), self.times[i + 1 :]])
+        )
+        return other
 
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
@@ -145,7 +176,7 @@ class Path(nn.Module):
         forbid = layer.solver.unconverged == "raise" and torch.is_grad_enabled()
         told = partial(report, max_steps=layer.solver.max_steps, forbid=forbid)
         with full_precision(x.device.type):
-            shapes = layer.members[i](samples, exact, told).shapes.to(keyframes.dtype)
+            shapes = layer.members[self.members[i]](samples, exact, told).shapes.to(keyframes.dtype)
         for end, j in ((0, i), (1, (i + 1) % n)):
             exactly = keyframes[which, j].detach() + (shapes - shapes.detach())
             shapes = torch.where((u == end)[:, None, None], exactly, shapes)
