@@ -25,12 +25,12 @@ class Rest(NamedTuple):
 
 
 class Reference(NamedTuple):
-    r"""What shapes are compared with: :math:`\sum_m W_m (q_m - Q_m)^2 + c`."""
+    r"""What shapes are compared with: :math:`\sum_{rm} W_{rm} (q_m - Q_{rm})^2 + c`, with R of 1 or 2."""
 
     measures: tuple[Tensor, ...]
-    """``Q``. *Shape of each:* ``(..., M)``."""
+    """``Q``. *Shape of each:* ``(..., R, M)``."""
     weights: tuple[Tensor, ...]
-    """``W``, the stiffness included. *Shape of each:* ``(..., M)``."""
+    """``W``, the stiffness included. *Shape of each:* ``(..., R, M)``."""
     constant: Tensor | float
     """``c``. *Shape:* ``(...)``."""
 
@@ -43,7 +43,7 @@ class Linearised(NamedTuple):
     gradients: Tensor
     """Of the measures in the spokes, *shape* ``(n-1, 3, B, M)``; of a total in the vertices, *shape* ``(3, B, V)``."""
     difference: Tensor
-    """From the reference. *Shape:* ``(B, M)``; ``(B, 1)`` of a total, as the next two."""
+    """From the reference. *Shape:* ``(B, R, M)``; M is 1 of a total, here and below."""
     slope: Tensor
     """First derivative of the energy in each measure. *Shape:* ``(B, M)``."""
     curvature: Tensor
@@ -169,9 +169,9 @@ class Energy(nn.Module):
         return Rest(tuple(measures), tuple(weights))
 
     def between(self, first: Rest, second: Rest, t: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
-        r"""Both as one reference: :math:`(1-t) \sum w_a (q - q_a)^2 + t \sum w_b (q - q_b)^2` up to squares.
+        r"""Both as the reference: :math:`(1-t) \sum w_a (q - q_a)^2 + t \sum w_b (q - q_b)^2`.
 
-        Angles lie between those of the two the short way.
+        The sum of two squares of the same measure is one square and a constant, except where measures come round.
 
         Args:
             first: Rest shapes of the weight ``1 - t``.
@@ -183,27 +183,31 @@ class Energy(nn.Module):
         measures, weights, constant = [], [], torch.zeros_like(t[..., 0])
         for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
             pull_a, pull_b = (1 - t) * first.weights[i], t * second.weights[i]
+            if part.term.periodic:
+                measures.append(torch.stack([x.expand_as(pull_a) for x in (first.measures[i], second.measures[i])], -2))
+                weights.append(torch.stack([factor * pull_a, factor * pull_b], -2))
+                continue
             whole = pull_a + pull_b
             share = pull_b * inverse(whole, whole <= 0)
             apart = part.term.difference(second.measures[i], first.measures[i])
-            measures.append(first.measures[i] + share * apart)
-            weights.append(factor * whole)
+            measures.append((first.measures[i] + share * apart)[..., None, :])
+            weights.append((factor * whole)[..., None, :])
             constant = constant + (factor * pull_a * share * apart**2).sum(-1)
         return Reference(tuple(measures), tuple(weights), constant)
 
     @staticmethod
     def against(rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
-        weights = tuple(factor * weight for factor, weight in zip(stiffness, rest.weights, strict=True))
-        return Reference(rest.measures, weights, 0.0)
+        weights = tuple((k * weight)[..., None, :] for k, weight in zip(stiffness, rest.weights, strict=True))
+        return Reference(tuple(measures[..., None, :] for measures in rest.measures), weights, 0.0)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
         """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
         total: Any = reference.constant
         for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
-            difference = part.term.difference(part.measures(part.spokes(extended)), rest)
-            total = total + (weight * difference**2).sum(-1)
+            difference = part.term.difference(part.measures(part.spokes(extended))[..., None, :], rest)
+            total = total + (weight * difference**2).sum((-1, -2))
         return total
 
     # ---------------------------------------------------------------------------------------------------- derivatives
@@ -217,16 +221,17 @@ class Energy(nn.Module):
             if part.term.total:
                 corners = part.to_corners(gradients)
                 gradients = torch.zeros_like(extended).index_add(-1, part.corners.flatten(), corners)
-            difference = part.term.difference(measures, rest)
-            curvature = (2 * weight).expand_as(difference)
-            found.append(Linearised(spokes, gradients, difference, curvature * difference, curvature))
+            difference = part.term.difference(measures[..., None, :], rest)
+            slope, curvature = 2 * (weight * difference).sum(-2), 2 * weight.sum(-2)
+            found.append(Linearised(spokes, gradients, difference, slope, curvature.expand_as(slope)))
         return found
 
     @staticmethod
     def value_at(at: Sequence[Linearised], reference: Reference) -> Tensor:
         """The energy of shapes that were linearised. *Shape:* ``(B,)``."""
         found: Any = reference.constant
-        return found + sum((0.5 * one.slope * one.difference).sum(-1) for one in at)
+        parts = zip(reference.weights, at, strict=True)
+        return found + sum((weight * one.difference**2).sum((-1, -2)) for weight, one in parts)
 
     def rates(self, at: Sequence[Linearised], field: Tensor) -> list[Tensor]:
         """First change of the measures with a displacement. *Shape:* ``(3, B, V)``, extended; ``(B, M)`` of each."""

@@ -94,7 +94,7 @@ class ShellEnergy(nn.Module):
         rows = self._rows(x)
         reference = self.against(x_rest)
         parts = [
-            weight.sqrt() * part.term.difference(part.measures(part.spokes(rows)), rest)
+            (weight.sqrt() * part.term.difference(part.measures(part.spokes(rows))[..., None, :], rest)).squeeze(-2)
             for part, rest, weight in zip(self.energy.parts, reference.measures, reference.weights, strict=True)
         ]
         lead = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))

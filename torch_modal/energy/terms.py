@@ -105,6 +105,8 @@ class Term(nn.Module):
 
     total = False
     """Whether the measures of all elements add up to one, such as a volume."""
+    periodic = False
+    """Whether measures come round, such as angles."""
     sampled = False
     """Whether elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
     stiffness: Any
@@ -232,6 +234,8 @@ class Stretch(Term):
 
 class Bend(Term):
     r"""Dihedral angles: :math:`\beta \sum_h (\theta_h - \bar\theta_h)^2 \bar l_h^2 / \bar A_h`, the second of Eq. 5."""
+
+    periodic = True
 
     def elements(self, mesh: Mesh) -> Tensor:
         """All hinges."""

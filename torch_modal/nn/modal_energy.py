@@ -151,7 +151,8 @@ class ModalEnergy(nn.Module):
         if placement.extra is not None:
             own = energy.gradient(at).transpose(0, 1)
             to_extra = a[:, n, None, None] * to_base + direction[:, n, None, None] * own
-        to_measures = [-one.curvature * rate for one, rate in zip(at, rates, strict=True)]
+        rates = [rate[:, None] for rate in rates]
+        to_measures = [-2 * weight * rate for weight, rate in zip(placement.reference.weights, rates, strict=True)]
         to_weights = [2 * rate * one.difference for one, rate in zip(at, rates, strict=True)]
         constant = placement.reference.constant
         to_constant = torch.zeros_like(constant) if isinstance(constant, Tensor) else constant
