@@ -11,6 +11,7 @@ import json
 import os
 import re
 import shutil
+import stat
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -160,10 +161,22 @@ def write_set(
 
 def why_not_replaceable(folder: Path) -> str:
     """What is at the place of a set and cannot be replaced; empty if a set can be written there."""
-    if not os.path.lexists(folder):
-        return ""
-    if not folder.is_dir():
-        return f"{folder} exists and is no folder"
+    while os.path.lexists(folder):
+        if folder.is_symlink() and not folder.exists():
+            return f"{folder} is a link to nothing"
+        try:
+            found = folder.stat()
+            if not stat.S_ISDIR(found.st_mode):
+                return f"{folder} exists and is no folder"
+            obstacle = _obstacle(folder)
+            if not obstacle or folder.stat().st_ino == found.st_ino:
+                return obstacle
+        except FileNotFoundError:
+            pass  # another process is replacing it at this moment: look again
+    return ""
+
+
+def _obstacle(folder: Path) -> str:
     there = sorted(folder.iterdir())
     if below := [path.name for path in there if path.is_dir()]:
         return f"{folder} holds the folder {below[0]}, which is no part of a stored key-frame set"

@@ -22,6 +22,8 @@ class Minimisation(NamedTuple):
     max_steps: int
     tolerance: float
     least_gain: float
+    guessed: bool
+    """Whether the start is a guess, which may be worse than zeros."""
     require: Callable[[Tensor], None]
     """Raises where there is no minimum at some of the times."""
     report: Callable[[Solution], None] | None
@@ -43,9 +45,10 @@ class _ArgMin(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         minimisation.require(times)
         placement = trees.filled(tree, tensors)
-        # Never a start that is worse than linear interpolation: what comes out must not be, either.
-        zeros = torch.zeros_like(start)
-        start, _ = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
+        if minimisation.guessed:
+            # Never a start that is worse than linear interpolation: what comes out must not be, either.
+            zeros = torch.zeros_like(start)
+            start, _ = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
         limits = minimisation.max_steps, minimisation.tolerance, minimisation.least_gain
         solution = minimise(minimisation.step, start, placement, *limits)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))

@@ -139,9 +139,11 @@ class Between(nn.Module):
         anchors = self._anchors(placed, t)
         problem = self.problem(pair, samples, anchors)
         least_gain = 0.0 if exact or isinstance(space, PairedSpace) else solver.least_gain
-        minimisation = Minimisation(self.step, solver.max_steps, solver.tolerance, least_gain, space.require, report)
+        limits = solver.max_steps, solver.tolerance, least_gain
+        minimisation = Minimisation(self.step, *limits, problem.start is not None, space.require, report)
         solve = solve_implicit if solver.gradient == "implicit" else solve_unrolled
-        solution = solve(minimisation, problem.placement, problem.start, usable, t)
+        start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
+        solution = solve(minimisation, problem.placement, start, usable, t)
         x = space.lift(solution.amplitudes, problem)
         if len(x) and (solver.local_steps or solver.polish):
             x = self._refine(x, problem.base, pair, samples, anchors)

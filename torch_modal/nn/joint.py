@@ -21,8 +21,8 @@ class JointProblem(NamedTuple):
 
     placement: tuple[Placement, ...]
     """What the minimiser depends on."""
-    start: Tensor
-    """Where the minimisation may start. *Shape:* ``(B, n)``."""
+    start: Tensor | None
+    """Where the minimisation may start; None: at zeros. *Shape:* ``(B, n)``."""
     base: Tensor
     """The fine shape that the modes are added to. *Shape:* ``(B, V, 3)``."""
     difference: Tensor
@@ -78,7 +78,7 @@ class JointSpace(nn.Module):
         difference = self._difference(pair)
         extras = levels.seen(difference, self.frame.coarsen(difference))
         difference, extras = trees.picked((difference, extras), index)
-        start = t.new_zeros(len(t), self.n_unknowns)
+        start = None
         if pair.around is not None:
             base = self.on_course(pair, index, t)
             coarse = self.frame.coarsen(base)
@@ -104,7 +104,7 @@ class JointSpace(nn.Module):
             seen = levels.seen(blend, self.frame.coarsen(blend))
             turned = levels.place(self.energy, seen, references, extras, anchors)
             with torch.no_grad():
-                better = self.energy.value(start, turned) < self.energy.value(start, placement)
+                better = levels.value(turned) < levels.value(placement)
             base = torch.where(better[:, None, None], blend, base)
             placement = tuple(
                 straight._replace(base=torch.where(better[:, None, None], bent.base, straight.base))

@@ -1,6 +1,7 @@
 """Where the terms of an in-between's energy are evaluated: on the coarse mesh, or at the vertices that they name."""
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -71,6 +72,11 @@ class Levels(nn.Module):
         """Shapes as what others are compared with. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
         parts = zip(self.rests(self.seen(x, coarse)), stiffness.levels, strict=True)
         return [Energy.against(rest, own) for rest, own in parts]
+
+    def value(self, placement: Sequence[Placement]) -> Tensor:
+        """The energy at amplitudes of zero. *Shape:* ``(B,)``."""
+        parts = zip(self.energies, placement, strict=True)
+        return reduce(torch.add, [energy.value(own.base.transpose(0, 1), own.reference) for energy, own in parts])
 
     def place(
         self,

@@ -30,8 +30,8 @@ class PairedProblem(NamedTuple):
 
     placement: PairedPlacement
     """What the minimiser depends on."""
-    start: Tensor
-    """Zeros, which are the key-frames, as in the paper. *Shape:* ``(B, n)``."""
+    start: None
+    """At zeros, which are the key-frames, as in the paper."""
     first: Tensor
     """*Shape:* ``(B, V, 3)``."""
     second: Tensor
@@ -138,7 +138,7 @@ class PairedSpace(nn.Module):
         places = place(first, self.energy.first), place(second, self.energy.second)
         apart = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)
         placement = PairedPlacement(places[0], places[1], apart @ self.energy.gap.mT, (apart**2).sum(-1), mu)
-        return PairedProblem(placement, t.new_zeros(len(t), self.n_unknowns), first, second)
+        return PairedProblem(placement, None, first, second)
 
     @staticmethod
     def require(t: Tensor) -> None:
