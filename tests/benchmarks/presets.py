@@ -23,6 +23,7 @@ from cases import Case
 from measures import Yardstick
 from methods import linear
 from tables import geometric_mean, number, percent
+from threads import limit_threads
 from timing import timed
 from torch import Tensor
 
@@ -149,7 +150,7 @@ def main() -> None:
     parser.add_argument("--terms", action="store_true", help="closed forms against torch.func instead")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    limit_threads()
     (terms if arguments.terms else presets)(arguments.only)
 
 
