@@ -78,6 +78,7 @@ def subdivide(args: argparse.Namespace) -> None:
         ping_pong=args.ping_pong,
         ease=args.ease,
         asset=asset,
+        progress=progress,
     )
     report(f"animation: {animation}")
     if args.picture:
