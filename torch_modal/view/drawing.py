@@ -195,7 +195,9 @@ def draw(scene: Scene, renderer: str) -> ByteArray:
         return _draw_matplotlib(scene)
     if importlib.util.find_spec("pyvista") is None:
         if renderer == "pyvista":
-            raise RuntimeError("pyvista is not installed: pip install torch_modal[pictures]; matplotlib draws without it.")
+            raise RuntimeError(
+                "pyvista is not installed: pip install torch_modal[pictures]; matplotlib draws without it."
+            )
         logger.debug("matplotlib draws; pyvista draws better: pip install torch_modal[pictures]")
         return _draw_matplotlib(scene)
     try:
