@@ -63,5 +63,5 @@ class Curvature(PairBlocks):
 
     def of(self, energy: Energy, at: Sequence[Linearised]) -> Tensor:
         """The blocks at given shapes. *Shape:* ``(3, 3, B, P)``."""
-        terms = (part.term.blocks(one.spokes, one.slope) for part, one in zip(energy.parts, at, strict=True))
-        return self(torch.cat(list(terms), -1))
+        parts = zip(energy.parts, at, strict=True)
+        return self(torch.cat([block for part, one in parts for block in part.term.blocks(one.spokes, one.slope)], -1))

@@ -6,6 +6,7 @@ which elements it sees and what it measures on one of them: derivatives then com
 of Eq. 5 write theirs out, because they are what all the time goes into.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -166,7 +167,7 @@ class Term(nn.Module):
         n = len(corners)
         return torch.cat([torch.stack([corners[s], corners[t]], 1) for s in range(n) for t in range(s + 1, n)])
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
         r"""The blocks of :math:`\sum_m s_m \nabla^2 q_m` between the two vertices of each of :meth:`pairs`.
 
         Args:
@@ -174,14 +175,14 @@ class Term(nn.Module):
             slope: ``s``. *Shape:* ``(B, M)``, or ``(B, 1)``.
 
         Returns:
-            By row and column. *Shape:* ``(3, 3, B, N)``.
+            By row and column, in parts that together have all pairs in their order. *Shape of each:* ``(3, 3, B, ·)``.
         """
         hessian = slope * self._each(jacrev(jacrev(self.measure)), spokes)
         # Translations change nothing: the first vertex has what is left.
         first = -hessian.sum(0).movedim(1, 0)
         n = len(spokes)
         others = [hessian[s, :, t] for s in range(n) for t in range(s + 1, n)]
-        return torch.cat([*first, *others], -1)
+        return [*first, *others]
 
     def tension(self, spokes: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
         """Stiffness that stretched elements of two vertices have across; None for elements of more.
@@ -221,9 +222,9 @@ class Stretch(Term):
         """Unit vectors."""
         return length_gradient(spokes[0])[None]
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
         """The length's Hessian with the other sign, between both ends."""
-        return -slope * length_hessian(spokes[0])
+        return [-slope * length_hessian(spokes[0])]
 
     def tension(self, spokes: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """What a stretched string has; nearly none where compressed, without a kink in between."""
@@ -268,9 +269,9 @@ class Bend(Term):
         i, j, k, m = mesh.hinges.unbind(1)
         return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
         """In closed form."""
-        return torch.cat((slope * dihedral_hessian(spokes)).unbind(), -1)
+        return (slope * dihedral_hessian(spokes)).unbind()
 
 
 class Volume(Term):
@@ -311,9 +312,9 @@ class Volume(Term):
         i, j, k = self.elements(mesh)[:, 1:].unbind(1)
         return torch.cat([torch.stack(side, 1) for side in ((i, j), (j, k), (k, i))])
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Tensor:
+    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
         """``p.(q x r)`` has the block ``-[r]`` between ``p`` and ``q``."""
         p, q, r = spokes
         x, y, z = torch.cat([r, p, q], -1) * (slope / 6)
         zero = torch.zeros_like(x)
-        return torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3))
+        return [torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3))]

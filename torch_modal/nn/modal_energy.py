@@ -91,7 +91,7 @@ class ModalEnergy(nn.Module):
         x = placement.base + (a[..., :n] @ self.columns.flatten(1)).unflatten(-1, (3, -1))
         if placement.extra is not None:
             x = x + a[..., n, None, None] * placement.extra
-        return x.movedim(-2, 0)
+        return x.movedim(-2, 0).contiguous()
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
