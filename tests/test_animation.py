@@ -13,7 +13,7 @@ from textured import bend, textured_obj, triangles_of_tube
 import torch_modal as tm
 from torch_modal.errors import MeshWarning, MissingPackageError
 from torch_modal.io.timing import make_timing, resample
-from torch_modal.view import animation
+from torch_modal.view import animation, video
 
 X, FACES = triangles_of_tube()
 FRAMES = np.stack([bend(X, turn) for turn in (0.01, 0.3, 0.6, 0.9)])
@@ -149,11 +149,16 @@ def test_usd_read_back(tmp_path, suffix):
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
-def test_gif_read_back(tmp_path):
-    path = tm.save_animation(FRAMES[:2], FACES, tmp_path / "a.gif", duration=0.4, fps=10, ping_pong=True)
+def test_gif_read_back(tmp_path, small_pictures):
+    said = []
+    path = tm.save_animation(
+        *(FRAMES[:2], FACES, tmp_path / "a.gif"),
+        **{"duration": 0.4, "fps": 10, "ping_pong": True, "progress": lambda *now: said.append(now)},
+    )
+    assert said == [(5, 5, "pictures")]  # those of the way back are the same
     image = Image.open(path)
     assert image.n_frames == 8 and image.info["loop"] == 0 and image.info["duration"] == 100
-    assert max(image.size) == 640
+    assert max(image.size) == 160
     pictures = []
     for number in range(8):
         image.seek(number)
@@ -163,7 +168,7 @@ def test_gif_read_back(tmp_path):
     assert (pictures[0] < 250).any(axis=2).mean() > 0.1  # there is something to see
 
 
-def test_mp4_read_back(tmp_path):
+def test_mp4_read_back(tmp_path, small_pictures):
     pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
     import imageio.v2 as imageio
 
@@ -172,8 +177,13 @@ def test_mp4_read_back(tmp_path):
         meta = reader.get_meta_data()
         pictures = [np.asarray(picture, dtype=float) for picture in reader]
     assert meta["codec"] == "h264" and meta["fps"] == 8 and len(pictures) == 9
-    assert max(meta["size"]) == 640 and not any(side % 2 for side in meta["size"])
+    assert max(meta["size"]) == 160 and not any(side % 2 for side in meta["size"])
     assert np.abs(pictures[0] - pictures[-1]).mean() > 1
+
+
+@pytest.fixture
+def small_pictures(monkeypatch):
+    monkeypatch.setattr(video, "PIXELS", 160)
 
 
 @pytest.mark.parametrize(("suffix", "extra"), [("mp4", "video"), ("usdc", "usd")])
@@ -187,7 +197,7 @@ def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffi
 
 
 @pytest.mark.parametrize("suffix", ["mdd", "pc2", "npz", "usda", "gif"])
-def test_one_frame_and_nothing_overwritten(tmp_path, suffix):
+def test_one_frame_and_nothing_overwritten(tmp_path, suffix, small_pictures):
     if suffix == "usda":
         pytest.importorskip("pxr")
     path = tm.save_animation(FRAMES[:1], FACES, tmp_path / "new" / f"a.{suffix}")

@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import gltf_validator
 import numpy as np
 import pygltflib
 import pytest
@@ -347,6 +348,7 @@ def test_demo_on_the_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     out = tmp_path / "demo"
     assert cli.main(["demo", "--sample", "hand", "--levels", "2", "--out", str(out)]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["hand.glb", "hand.png"]
+    assert not gltf_validator.issues(out / "hand.glb")
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == f"written to {out}: hand.glb, hand.png"
     mean = next(line for line in lines if line.startswith("hand, mean")).split()

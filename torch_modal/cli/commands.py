@@ -81,6 +81,7 @@ def subdivide(args: argparse.Namespace) -> None:
         ease=args.ease,
         times=when,
         asset=asset,
+        progress=progress,
     )
     report(f"animation: {animation}")
     if args.picture:

@@ -40,6 +40,7 @@ class ObjAsset(Asset):
         texcoords: list[list[float]] = []
         normals: list[list[float]] = []
         corners: list[tuple[int, int, int]] = []  # vertex, texture coordinate, normal; -1 where there is none
+        known: dict[str, tuple[int, int, int]] = {}
         sizes: list[int] = []
         self._materials: list[str] = []
         material_of: list[int] = []
@@ -66,7 +67,12 @@ class ObjAsset(Asset):
                     raise self._bad_face(line)
                 counts = (len(vertices), len(texcoords), len(normals))
                 for word in words[1:]:
-                    corners.append(self._corner(word, counts, line))
+                    corner = known.get(word)
+                    if corner is None:
+                        corner = self._corner(word, counts, line)
+                        if "-" not in word:  # counted from the start, so the same wherever it stands
+                            known[word] = corner
+                    corners.append(corner)
                 sizes.append(len(words) - 1)
                 material_of.append(material)
                 self._f_lines.append(number)

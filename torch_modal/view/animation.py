@@ -13,6 +13,7 @@ from torch_modal.errors import MissingPackageError
 from torch_modal.io.asset import Asset
 from torch_modal.io.timing import make_timing
 from torch_modal.io.write import check_frames, check_indices, refuse_existing
+from torch_modal.progress import Progress
 
 if TYPE_CHECKING:
     import torch
@@ -56,6 +57,7 @@ def save_animation(
     ease: bool = False,
     times: Sequence[float] | None = None,
     asset: Asset | None = None,
+    progress: Progress = None,
 ) -> Path:
     """Write the sequence as one file that plays.
 
@@ -89,6 +91,8 @@ def save_animation(
             begins again. Default: evenly. The duration stays what it is.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
             textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
+        progress: Of drawing a video: whether a bar shows it; by default on terminals, with lines of the log elsewhere.
+            Or a function ``(done, total, what)``.
 
     Returns:
         The file.
@@ -131,7 +135,7 @@ def save_animation(
     if suffix in (".mp4", ".gif"):
         from torch_modal.view.video import save_video
 
-        return save_video(shapes, triangles, path, timing)
+        return save_video(shapes, triangles, path, timing, progress=progress)
     if suffix.startswith(".usd"):
         from torch_modal.io.usd import save_usd
 

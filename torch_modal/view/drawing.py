@@ -198,7 +198,7 @@ def draw(scene: Scene, renderer: str) -> ByteArray:
             raise RuntimeError(
                 "pyvista is not installed: pip install torch_modal[pictures]; matplotlib draws without it."
             )
-        logger.info("matplotlib draws; pyvista draws better: pip install torch_modal[pictures]")
+        logger.debug("matplotlib draws; pyvista draws better: pip install torch_modal[pictures]")
         return _draw_matplotlib(scene)
     try:
         return _draw_in_child(scene)

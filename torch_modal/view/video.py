@@ -9,11 +9,15 @@ import numpy as np
 
 from torch_modal.io.files import temporary_beside
 from torch_modal.io.timing import Timing, resample
+from torch_modal.progress import Progress, ProgressReport
 from torch_modal.view.drawing import ByteArray, Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, centred, view_rotation
 
 PIXELS = 640
 """The longer side of a picture."""
+
+PICTURES_AT_ONCE = 24
+"""That a process of the renderer draws."""
 
 
 def save_video(
@@ -23,6 +27,7 @@ def save_video(
     timing: Timing,
     view: tuple[float, float] | None = None,
     renderer: str = "auto",
+    progress: Progress = None,
 ) -> Path:
     """Draw the sequence from one place and write it as H.264 in MP4, or as a GIF that goes on for ever.
 
@@ -33,6 +38,7 @@ def save_video(
         timing: Pictures are taken at its rate.
         view: Azimuth and elevation of the camera, as for :func:`torch_modal.render_sequence`.
         renderer: ``"auto"``, ``"pyvista"`` or ``"matplotlib"``.
+        progress: How the drawing shows its progress.
     """
     places = timing.samples(len(shapes))
     # A frame that is shown twice, as on the way back, is drawn once.
@@ -42,7 +48,12 @@ def save_video(
     # H.264 stores colour for blocks of two by two.
     size = np.maximum((PIXELS * half / half.max() / 2).round() * 2, 2).astype(np.int64)
     paint = np.broadcast_to((np.array(BETWEEN_COLOR) * 255).round().astype(np.uint8), points[0].shape)
-    images = draw(Scene(points[0], paint.copy(), faces, half, size), renderer)
+    images: list[ByteArray] = []
+    with ProgressReport(len(unique), "pictures", progress, unit="picture") as report:
+        for start in range(0, len(unique), PICTURES_AT_ONCE):
+            part = slice(start, start + PICTURES_AT_ONCE)
+            images += list(draw(Scene(points[0, part], paint[part].copy(), faces, half, size), renderer))
+            report.update(len(images) - start)
     path.parent.mkdir(parents=True, exist_ok=True)
     with temporary_beside(path, path.suffix.lower()) as temporary:
         write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
