@@ -497,7 +497,9 @@ def test_seams_are_named():
     vertices = np.concatenate([CUBE, CUBE[[1, 7, 3]]])[None]
     faces = CUBE_FACES.copy()
     faces[-1] = [8, 9, 10]  # was [1, 7, 3]
-    with pytest.warns(MeshWarning, match=r"open: 6 edges .* 6 of its vertices lie exactly on each other.*weld_seams joins them"):
+    with pytest.warns(
+        MeshWarning, match=r"open: 6 edges .* 6 of its vertices lie exactly on each other.*weld_seams joins them"
+    ):
         check_keyframes(vertices, faces)
 
 

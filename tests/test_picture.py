@@ -176,7 +176,7 @@ def test_without_pyvista_matplotlib_draws_and_says_nothing(tmp_path, monkeypatch
     rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
     path = render_sequence(rows, faces, tmp_path / "auto.png")
     assert path.read_bytes() == render_sequence(rows, faces, tmp_path / "m.png", renderer="matplotlib").read_bytes()
-    with pytest.raises(RuntimeError, match=r"pip install torch_modal\[view\]"):
+    with pytest.raises(RuntimeError, match=r"pip install torch_modal\[pictures\]"):
         render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
 
 

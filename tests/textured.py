@@ -90,7 +90,7 @@ def textured_obj(folder: Path, name: str, shape: np.ndarray | None = None, blank
         path.write_text(path.read_text().replace("my bar.mtl", "bar.mtl"))
         text = (folder / "my bar.mtl").read_text().replace("-s 1 1 1 textures/red skin", "red")
         (folder / "bar.mtl").write_text(text)
-        (folder / "textures" / "red skin.png").rename(folder / "red.png")
+        (folder / "textures" / "red skin.png").replace(folder / "red.png")
     return path
 
 
