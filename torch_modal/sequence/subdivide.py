@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import blend
@@ -15,6 +14,7 @@ from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import extract_bases
+from torch_modal.progress import Progress, ProgressReport
 from torch_modal.sequence.path import Path, checked_times
 
 MAX_LEVELS = 12
@@ -34,7 +34,7 @@ def subdivide(
     preset: Preset = "accurate",
     objective: Objective | None = None,
     solver: Solver | None = None,
-    progress: bool | None = None,
+    progress: Progress = None,
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
 
@@ -59,7 +59,7 @@ def subdivide(
         preset: As for :class:`torch_modal.InBetween`.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
-        progress: Whether to show progress bars. Default: on a terminal only.
+        progress: What is said while it goes on: see :data:`torch_modal.progress.Progress`.
 
     Returns:
         The sequence in the caller's coordinates, dtype and device, the key-frames bit for bit at their places. *Shape:*
@@ -81,10 +81,8 @@ def subdivide(
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
-    hidden = None if progress is None else not progress
     total = len(places) - 1 if smooth else (len(places) - 1) * levels
-    bar = tqdm(total=total, desc="in-between shapes", unit="step", leave=False, disable=hidden)
-    with bar, torch.no_grad():
+    with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
         if smooth:
             parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, chosen)
         else:
@@ -122,7 +120,7 @@ def _by_recursion(
     levels: int,
     n_frames: int | None,
     chosen: Settings,
-    bar: Any,
+    bar: ProgressReport,
 ) -> Iterator[Tensor]:
     """Shapes of each interval, of the pair alone."""
     weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
