@@ -226,6 +226,23 @@ def test_changed_files_and_options_are_done_again_and_said(bench: Bench) -> None
     assert bench.run("--modes", "40", "--timeout", "5", "--workers", "1") == 0 and bench.computed() == []
 
 
+def test_sequences_are_made_when_asked_and_again_when_their_times_change(bench: Bench) -> None:
+    bench.add("a")
+    times = bench.root / "a" / "times.txt"
+    times.write_text("0 1")
+    assert bench.run() == 0 and bench.computed() == ["a"]
+    times.write_text("0 2")
+    assert bench.run() == 0 and bench.computed() == []  # nobody asked for them
+    assert bench.run("--sequence") == 0 and bench.computed() == ["a"]
+    assert bench.report()["a"]["reason"].endswith("sequence changed from None to True")
+    assert bench.run("--sequence") == 0 and bench.computed() == []
+    times.write_text("0 3")
+    assert bench.run("--sequence") == 0 and bench.computed() == ["a"]
+    assert bench.report()["a"]["reason"] == "its files changed"
+    assert bench.run() == 0 and bench.computed() == ["a"]
+    assert bench.report()["a"]["reason"].endswith("sequence changed from True to None")
+
+
 def test_damaged_or_missing_bases_are_made_again(bench: Bench) -> None:
     bench.add("a", "b", "c")
     assert bench.run() == 0 and len(bench.computed()) == 3
@@ -372,3 +389,46 @@ def test_worker_says_what_is_wrong(
     assert (bug.status, bug.reason) == ("failed", "KeyError: 'k'") and "Traceback" in bug.log
     files[0].write_text(files[0].read_text() + "# more")
     assert "were written to while they were read" in _set_worker.compute(job).reason
+
+
+def test_times_of_a_sequence(
+    tmp_path: Path, capsule: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even ones, those of the file, a cycle's, and what is wrong with others; without bases, which have no part."""
+
+    def extract(keyframes: torch.Tensor, *_: object, **__: object) -> list[tm.ModalBasis]:
+        some = torch.ones(1, dtype=torch.float64)
+        return [tm.ModalBasis(x, some, torch.ones_like(x)[None], some.expand(6)) for x in keyframes]
+
+    monkeypatch.setattr(_set_worker, "extract_bases", extract)
+    files = save_frames(np.stack([capsule[0] * s for s in (1, 1.1, 1.2)]), capsule[1], tmp_path / "a", fmt="obj")
+    job = {"options": {"sequence": True}, "source": str(tmp_path / "a"), "target": str(tmp_path / "out" / "a")}
+
+    def outcome(times: str | None) -> Record:
+        beside = [] if times is None else [tmp_path / "a" / "times.txt"]
+        for file in beside:
+            file.write_text(times or "")
+        record = {"set": "a", "files": [file.name for file in files], "inputs": inputs_key([*files, *beside])}
+        return _set_worker.compute({**job, "record": record})
+
+    for text, expected, cyclic in (
+        (None, (0, 1, 2), False),
+        ("0 0.25\n1e1\n", (0, 0.25, 10), False),
+        ("0\n1\n2\n2.5", (0, 1, 2, 2.5), True),
+    ):
+        made = outcome(text)
+        assert made.status == "done", made.reason
+        stored = open_set(tmp_path / "out" / "a")
+        assert (stored.times, stored.cyclic) == (expected, cyclic)
+    for text in ("0 1", "0 1 1", "0 one 2", "0 1 nan", ""):
+        wrong = outcome(text)
+        assert wrong.status == "refused"
+        assert "times.txt needs one number for each of the 3 key-frames, ascending" in wrong.reason
+    job["options"] = {}
+    assert (
+        _set_worker.compute(
+            {**job, "record": {"set": "a", "files": [f.name for f in files], "inputs": inputs_key(files)}}
+        ).status
+        == "done"
+    )
+    assert open_set(tmp_path / "out" / "a").times is None

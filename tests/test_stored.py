@@ -11,6 +11,7 @@ from conftest import Shapes
 from safetensors.torch import save_file
 
 from torch_modal.data.dataset import stored_labels
+from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import (
     BASES_FILE,
     KEYFRAMES_FILE,
@@ -47,6 +48,26 @@ def test_reads_what_was_written(small_bars: Shapes, folder: Path) -> None:
     assert found.faces.dtype == torch.int64
     for mine, its in zip(found.bases, small_bars.bases, strict=True):
         assert_equal_bases(mine, its)
+
+
+def test_times_of_a_motion(small_bars: Shapes, folder: Path) -> None:
+    assert (open_set(folder).times, open_set(folder).cyclic) == (None, False)
+    for times, cyclic in (((0.0, 0.1, 2.5), False), ((-1.0, 0.1, 2.5, 2.75), True)):
+        write_set(folder, *small_bars, NAMES, times=torch.tensor(times, dtype=torch.float64), cyclic=cyclic)
+        found = pickle.loads(pickle.dumps(open_set(folder)))
+        assert (found.times, found.cyclic) == (times, cyclic)
+        space = ShapeSpace.open(found)
+        assert space.motion is not None and space.motion.times.tolist() == list(times)
+        assert space.motion.cyclic == cyclic
+    for wrong, message in (
+        ({"times": (0, 1)}, r"needs one time for each key-frame: \(3,\)"),
+        ({"times": (0, 1, 2), "cyclic": True}, r"\(4,\)"),
+        ({"times": (0, 1, 1)}, "must ascend"),
+        ({"cyclic": True}, r"need their times: range\(4\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_set(folder, *small_bars, NAMES, **wrong)
+    assert open_set(folder).cyclic  # the last that was right
 
 
 def test_numbers_of_modes_may_differ(small_bars: Shapes, tmp_path: Path) -> None:

@@ -65,6 +65,12 @@ def add_arguments(sub: argparse.ArgumentParser, number: Callable[..., Callable[[
         default=600.0,
         help="seconds for a set, half of which the mesher may take (default: 600)",
     )
+    sub.add_argument(
+        "--sequence",
+        action="store_true",
+        help="the meshes of a folder are a motion, in natural order of their names; its file times.txt, if there is "
+        "one, says when each is, and when the first comes again if it is a cycle (default: even times)",
+    )
     sub.add_argument("--retry", action="store_true", help="try sets again that failed before")
 
 
@@ -110,6 +116,7 @@ def run(args: argparse.Namespace) -> int:
         timeout=args.timeout,
         retry=args.retry,
         overwrite=args.overwrite,
+        sequence=args.sequence,
     )
     bar = not args.quiet and sys.stderr.isatty()
     with dask_cluster(args.scheduler) if args.scheduler else local_processes(args.workers) as engine:

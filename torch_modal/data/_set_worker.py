@@ -19,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torch_modal.data.motion import Motion
 from torch_modal.data.record import DONE, FAILED, REFUSED, Record, inputs_key
 from torch_modal.data.set_task import Options
 from torch_modal.data.stored import RECORD_FILE, write_set
@@ -61,8 +62,10 @@ def compute(job: dict[str, Any]) -> Record:
                 raise MeshError(
                     f"{n_files} files have the name {stem}; one shape in several formats is to be there once"
                 )
+            beside = options.beside(Path(job["source"]))
             keyframes, faces = load_keyframes(files)
-            if inputs_key(files) != record.inputs:
+            motion = _motion(beside, len(files)) if options.sequence else None
+            if inputs_key([*files, *beside]) != record.inputs:
                 raise RuntimeError("its files were written to while they were read; start again")
             record = replace(record, keyframes=keyframes.shape[0], vertices=keyframes.shape[1])
             bases = extract_bases(
@@ -77,12 +80,37 @@ def compute(job: dict[str, Any]) -> Record:
                 progress=False,
             )
             done = ended(DONE)
-            write_set(job["target"], keyframes, faces, bases, record.files, beside={RECORD_FILE: done.line()})
+            write_set(
+                job["target"],
+                keyframes,
+                faces,
+                bases,
+                record.files,
+                times=None if motion is None else motion.times,
+                cyclic=motion is not None and motion.cyclic,
+                beside={RECORD_FILE: done.line()},
+            )
             return done
         except (ValueError, RuntimeError) as error:
             return ended(REFUSED if isinstance(error, ValueError) else FAILED, " ".join(str(error).split()))
         except Exception as error:  # the machine, or a bug, which should not take the other sets' time
             return ended(FAILED, f"{type(error).__name__}: {error}", traceback.format_exc()[-2000:])
+
+
+def _motion(beside: list[Path], n_keyframes: int) -> Motion:
+    """The motion of key-frames, at the times in their file or at even ones.
+
+    Raises:
+        ValueError: The file does not hold such times.
+    """
+    if not beside:
+        return Motion(range(n_keyframes), n_keyframes)
+    wanted = f"one number for each of the {n_keyframes} key-frames, ascending, and one more if they are a cycle"
+    try:
+        times = [float(word) for word in beside[0].read_text().split()]
+        return Motion(times, n_keyframes, cyclic=len(times) == n_keyframes + 1)
+    except ValueError as error:
+        raise ValueError(f"{beside[0].name} needs {wanted}: {error}") from error
 
 
 def _end_with_parent() -> None:

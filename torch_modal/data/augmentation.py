@@ -70,6 +70,8 @@ class Pool(NamedTuple):
     """Located."""
     own: Tensor | None
     """Which of them each shape is itself, or is nearest to. On the CPU. *Shape:* ``(B,)``."""
+    neighbours: Tensor | None = None
+    """Those before and after each in time, if the pool is a motion. *Shape:* ``(K, 2)``."""
 
 
 class ShapeAugmentation(nn.Module):
@@ -209,7 +211,7 @@ class ShapeAugmentation(nn.Module):
         if pool is None:
             others = Pool(batch, chosen)
         elif len(pool.shapes) == len(space):
-            others = Pool(pool, mine.nearest)
+            others = Pool(pool, mine.nearest, None if space.motion is None else space.motion.neighbours)
         else:
             raise ValueError(f"a pool holds the {len(space)} key-frames of the space; got {len(pool.shapes)} shapes")
         return batch.put(chosen, self.apply_transform(mine, own, space, others))

@@ -13,8 +13,9 @@ from torch.utils.data import Dataset, Sampler
 
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch
 from torch_modal.data.random_in_between import RandomInBetween
+from torch_modal.data.recent import Recent
 from torch_modal.data.sequential import AugmentationSequential
-from torch_modal.data.space import Recent, ShapeSpace
+from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets, open_set
 from torch_modal.geometry.normals import vertex_normals
 

@@ -30,7 +30,10 @@ class _Pairwise(ShapeAugmentation):
         raise NotImplementedError
 
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
-        """``partner``, in [0, 1): how far along the others of the pool the partner stands; and the times ``t``."""
+        """``partner``, in [0, 1): how far along the others of the pool the partner stands; and the times ``t``.
+
+        The others are two if the pool is a motion: the key-frame before in time, below a half, and the one after.
+        """
         return {"partner": uniform(n, generator), "t": self.draw_times(n, generator)}
 
     def apply_transform(
@@ -42,8 +45,12 @@ class _Pairwise(ShapeAugmentation):
         if size < 2:
             return batch
         assert pool.own is not None
-        offset = (params["partner"].cpu() * (size - 1)).long().clamp(0, size - 2) + 1
-        other = pool.batch.rows((pool.own + offset) % size)
+        along = params["partner"].cpu()
+        if pool.neighbours is None:
+            partner = (pool.own + (along * (size - 1)).long().clamp(0, size - 2) + 1) % size
+        else:
+            partner = pool.neighbours[pool.own, (along >= 0.5).long()]
+        other = pool.batch.rows(partner)
         t = params["t"]
         assert batch.nearest is not None and batch.given is not None
         assert other.nearest is not None and other.given is not None
@@ -108,6 +115,10 @@ class RandomInBetween(_Pairwise):
     """Replaces a shape by one between it and a partner, of least elastic energy (:class:`torch_modal.InBetween`).
 
     Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames, if a call names a pool.
+
+    Where the key-frames are a motion (``keyframe_times`` of the :class:`ShapeSpace`), the partner from a pool is the
+    key-frame before or after in time, each as likely, and the shape between is that of :class:`torch_modal.Path`. This
+    is for key-frames as they stand: any other shape has its partner likewise, but is solved with it alone.
 
     Args:
         t: Range of times, drawn uniformly: 0 is the shape itself, 1 its partner.

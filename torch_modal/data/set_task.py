@@ -37,6 +37,7 @@ main(sys.argv[1])
 COMMAND = [sys.executable, "-c", BOOT, str(Path(__file__).resolve().parents[2])]
 """What is started, with the path of the result after it."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+TIMES_FILE = "times.txt"
 POLL = 0.5
 GRACE = 5.0
 """Seconds between asking a process to end and killing it."""
@@ -55,11 +56,18 @@ class Options:
     """Seconds for a set; the mesher may take half of them."""
     retry: bool = False
     overwrite: bool = False
+    sequence: bool = False
+    """Whether the key-frames of a set are a motion, in the order of their files."""
 
     def parameters(self) -> dict[str, Any]:
-        """What the bases depend on besides the files."""
+        """What the result depends on besides the files."""
         settings = asdict(QUALITIES[self.quality])
-        return {"n_modes": self.n_modes, "mesher": self.mesher, "settings": settings, "algorithm": CACHE_VERSION}
+        made = {"n_modes": self.n_modes, "mesher": self.mesher, "settings": settings, "algorithm": CACHE_VERSION}
+        return {**made, "sequence": self.sequence or None}  # as in records from before there was this option
+
+    def beside(self, source: Path) -> list[Path]:
+        """Files of a set besides its meshes: the times of a motion, if there are any."""
+        return [file for file in [source / TIMES_FILE] if self.sequence and file.is_file()]
 
 
 class SetTask(NamedTuple):
@@ -103,7 +111,8 @@ def run_set(task: SetTask, stop: threading.Event | None = None) -> Outcome:
         raise RuntimeError(f"{new.host} has {why}; all machines need the same package and the same folders")
     try:
         files = mesh_files(task.source)
-        new = replace(new, files=[file.name for file in files], inputs=inputs_key(files))
+        inputs = inputs_key([*files, *task.options.beside(task.source)])
+        new = replace(new, files=[file.name for file in files], inputs=inputs)
     except OSError as error:
         return Outcome(new.ended(FAILED, f"its files cannot be read: {error}"), True)
     before = read_record(target / RECORD_FILE)

@@ -3,14 +3,16 @@
 import hashlib
 import os
 import warnings
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_modal.data.motion import Motion, Span
+from torch_modal.data.recent import Recent
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
 from torch_modal.geometry.connectivity import Connectivity
@@ -25,6 +27,7 @@ from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Status
 from torch_modal.precompute.basis import ModalBasis
+from torch_modal.sequence.path import Path as MotionPath
 from torch_modal.version import __version__
 
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
@@ -33,26 +36,6 @@ _NOT_ELASTIC = 1e-8
 # What one space keeps of each kind; the rest is made again when it is needed. Fewer than a batch needs would make all
 # of them again for each batch.
 _N_LAYERS, _N_TABLES, _N_REFERENCES = 32, 64, 16
-
-
-class Recent:
-    """The few most recently used of what is expensive to make."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
-
-    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The thing of this key, made where it is not kept."""
-        if key not in self._kept:
-            while len(self._kept) >= self.limit:  # before making, so that there are never more
-                self._kept.popitem(last=False)
-            self._kept[key] = make()
-        self._kept.move_to_end(key)
-        return self._kept[key]
-
-    def __len__(self) -> int:
-        return len(self._kept)
 
 
 class Reference(NamedTuple):
@@ -83,9 +66,13 @@ class ShapeSpace:
             cubics; None solves each anew. At least 4.
         dtype: What tables are kept in.
         folder: Where tables are kept between runs; by default nowhere.
+        keyframe_times: When the key-frames are, if they are a motion, as for :class:`torch_modal.Path`. Partners of
+            key-frames are then those before and after them in time, and what is between is that path's.
+        cyclic: Whether the last key-frame of the motion leads on to the first.
 
     Raises:
-        ValueError: The bases do not fit each other or the faces, or ``times`` is below 4.
+        ValueError: The bases do not fit each other or the faces, ``times`` is below 4, or ``keyframe_times`` are not
+            those of a motion.
     """
 
     def __init__(
@@ -99,6 +86,8 @@ class ShapeSpace:
         times: int | None = 17,
         dtype: torch.dtype = torch.float32,
         folder: str | os.PathLike[str] | None = None,
+        keyframe_times: Tensor | Sequence[float] | None = None,
+        cyclic: bool = False,
     ) -> None:
         self.bases = [basis.to("cpu") for basis in ([bases] if isinstance(bases, ModalBasis) else bases)]
         if not self.bases:
@@ -114,12 +103,17 @@ class ShapeSpace:
         self.times = times
         self.dtype = dtype
         self.folder = None if folder is None else Path(folder)
+        self.motion = Motion.of(keyframe_times, len(self.bases), cyclic)
         self._forget()
 
     @classmethod
     def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
-        """The space of a stored key-frame set; tables are kept in its folder. Options as for the constructor."""
-        return cls(stored.bases, stored.faces, **{"folder": stored.folder, **options})
+        """The space of a stored key-frame set, a motion if that is one; tables are kept in its folder.
+
+        Options as for the constructor.
+        """
+        own = {"folder": stored.folder, "keyframe_times": stored.times, "cyclic": stored.cyclic}
+        return cls(stored.bases, stored.faces, **{**own, **options})
 
     def _forget(self) -> None:
         self._layers, self._tables, self._references = Recent(_N_LAYERS), Recent(_N_TABLES), Recent(_N_REFERENCES)
@@ -220,6 +214,20 @@ class ShapeSpace:
         objective, solver = self.settings
         return InBetween([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver)
 
+    def _span(self, i: int, j: int) -> Span | None:
+        return None if self.motion is None else self.motion.span(i, j)
+
+    def _between(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
+        """Between two key-frames themselves: along the motion if they follow each other in it, else of the pair."""
+        span = self._span(i, j)
+        if span is None:
+            return partial(self._layer(i, j).to(like).solve, *self.keyframes(like)[[i, j]])
+        objective, solver = self.settings
+        bases = [self.bases[key] for key in span.keyframes]
+        # The neighbours are all that it depends on; a path of all key-frames would be made anew for each table.
+        course = MotionPath(bases, self.faces, span.times, objective=objective, solver=solver).to(like)
+        return partial(course.solve, self.keyframes(like)[span.keyframes])
+
     def table(self, i: int, j: int) -> Tensor:
         """In-betweens of two key-frames at even times, from disk where they are. *Shape:* ``(T, V, 3)``."""
         assert self.times is not None
@@ -230,9 +238,9 @@ class ShapeSpace:
             kept = None if path is None else read_table(path, key)
             if kept is not None:
                 return kept
-            x_i, x_j = (self.bases[key].reference.double() for key in (i, j))
+            t = torch.linspace(0, 1, self.times, dtype=torch.float64)
             with torch.no_grad():
-                result = self._layer(i, j).solve(x_i, x_j, torch.linspace(0, 1, self.times, dtype=torch.float64))
+                result = self._between(i, j, t)(t)
             table = _shapes(result, i, j).to(self.dtype)
             # What did not converge is warned of by every run: it is not kept.
             if path is not None and bool(result.solution.usable.all()):
@@ -242,11 +250,12 @@ class ShapeSpace:
         return self._tables.get((i, j), make)
 
     def _content(self, i: int, j: int) -> str:
-        """A hash of all that a table follows from: bases, faces, settings, and what made it."""
+        """A hash of all that a table follows from: bases, times, faces, settings, and what made it."""
         digest = hashlib.sha256(f"{__version__} {torch.__version__}".encode())
-        bases = (self.bases[i], self.bases[j])
+        span = self._span(i, j)
+        bases = [self.bases[key] for key in (span.keyframes if span else (i, j))]
         tensors = [part for basis in bases for part in (basis.reference, basis.eigenvalues, basis.modes)]
-        values = [self.faces, *tensors]
+        values = [self.faces, *tensors, *([span.times] if span else [])]
         for name, value in sorted({**vars(self.settings.objective), **vars(self.settings.solver)}.items()):
             if isinstance(value, tuple):
                 for term in value:
@@ -263,12 +272,15 @@ class ShapeSpace:
 
     # -------------------------------------------------------------------------------------------------- in-betweens
     def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:
-        """Between two key-frames themselves, from the table. *Shape:* ``(B,) -> (B, V, 3)``, in the dtype of ``t``."""
+        """Between two key-frames themselves, from the table; along the motion if they follow each other in it.
+
+        *Shape:* ``(B,) -> (B, V, 3)``, in the dtype of ``t``.
+        """
         if i > j:
             return self.keyframe_in_between(j, i, 1 - t)  # one table serves both ways
         if self.times is None:
-            x_i, x_j = self.keyframes(t)[[i, j]]
-            return _shapes(self.layer(i, j, t).solve(x_i, x_j, t), i, j)
+            between = self._layers.get(("keyframes", i, j, t.dtype, t.device), lambda: self._between(i, j, t))
+            return _shapes(between(t), i, j)
         table = self._tables.get((i, j, t.device), lambda: self.table(i, j).to(t.device))
         return interpolate(table, t.to(table.dtype)).to(t.dtype)
 

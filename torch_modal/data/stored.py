@@ -1,8 +1,9 @@
 """Key-frame sets with their bases on disk: one folder each, written whole, read by memory mapping.
 
-A folder holds ``keyframes.safetensors`` (``keyframes``, ``faces``; names of the source files in its metadata) and
-``bases.safetensors``, where the tensors of each :class:`~torch_modal.ModalBasis` have the number of the key-frame and a
-dot before their names. Other files in it, ``labels.safetensors`` for example, are the user's.
+A folder holds ``keyframes.safetensors`` (``keyframes``, ``faces``; in its metadata the names of the source files, and
+the times if the key-frames are a motion) and ``bases.safetensors``, where the tensors of each
+:class:`~torch_modal.ModalBasis` have the number of the key-frame and a dot before their names. Other files in it,
+``labels.safetensors`` for example, are the user's.
 """
 
 import contextlib
@@ -25,6 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from torch_modal.data.motion import Motion
 from torch_modal.precompute.basis import FORMAT as BASIS_FORMAT
 from torch_modal.precompute.basis import VERSION as BASIS_VERSION
 from torch_modal.precompute.basis import ModalBasis
@@ -66,6 +68,9 @@ class StoredSet:
             raise ValueError(f"{self.folder / KEYFRAMES_FILE} needs keyframes (K, V, 3) and faces (F, 3); has {shapes}")
         #: Names of the source files, one for each key-frame.
         self.names: tuple[str, ...] = tuple(json.loads(meta.get("names", "[]")))
+        times = json.loads(meta.get("times", "null"))
+        #: When the key-frames are, if they are a motion; if cyclic, with the time when the first comes again.
+        self.times: tuple[float, ...] | None = times and tuple(times)
         wanted = [f"{i}.{part}" for i in range(len(self)) for part in _PARTS]
         _read_header(self.folder / BASES_FILE, BASIS_FORMAT, BASIS_VERSION, wanted)
 
@@ -77,6 +82,11 @@ class StoredSet:
     def n_vertices(self) -> int:
         """Number of vertices, V."""
         return self._shape[1]
+
+    @property
+    def cyclic(self) -> bool:
+        """Whether the key-frames are a motion whose last leads on to the first."""
+        return self.times is not None and len(self.times) == len(self) + 1
 
     @cached_property
     def keyframes(self) -> Tensor:
@@ -95,7 +105,7 @@ class StoredSet:
         return [ModalBasis(**{part: next(tensors) for part in _PARTS}) for _ in range(len(self))]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in ("folder", "names", "_shape")}
+        return {name: self.__dict__[name] for name in ("folder", "names", "times", "_shape")}
 
     def __repr__(self) -> str:
         return f"StoredSet({str(self.folder)!r}, {len(self)} key-frames, {self.n_vertices} vertices)"
@@ -113,6 +123,8 @@ def write_set(
     bases: Sequence[ModalBasis],
     names: Sequence[str],
     *,
+    times: Tensor | Sequence[float] | None = None,
+    cyclic: bool = False,
     beside: Mapping[str, bytes] | None = None,
 ) -> None:
     """Write a key-frame set; its folder is whole or absent.
@@ -127,6 +139,9 @@ def write_set(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         bases: The basis of each key-frame.
         names: Name of each key-frame, for example its file's.
+        times: When the key-frames are, ascending, if they are a motion; if cyclic, one more, when the first comes
+            again. *Shape:* ``(K,)``, or ``(K + 1,)`` if cyclic.
+        cyclic: Whether the last key-frame of the motion leads on to the first.
         beside: Name and content of files that are to appear in the folder at the same moment.
 
     Raises:
@@ -136,6 +151,7 @@ def write_set(
     """
     folder = Path(folder)
     _check_parts(keyframes, faces, bases, names)
+    motion = Motion.of(times, len(keyframes), cyclic)
     if obstacle := why_not_replaceable(folder):
         raise FileExistsError(f"{obstacle}; move it away or write elsewhere")
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -147,6 +163,8 @@ def write_set(
         shapes = {"keyframes": _plain(keyframes, torch.float64), "faces": _plain(faces, torch.int64)}
         names_json = json.dumps([str(name) for name in names])
         metadata = {"format": FORMAT, "version": VERSION, "names": names_json}
+        if motion is not None:
+            metadata["times"] = json.dumps(motion.times.tolist())
         # Not safetensors' own save_file: its files are for the owner's eyes alone, whatever the umask says.
         (fresh / KEYFRAMES_FILE).write_bytes(save_tensors(shapes, metadata))
         parts = {f"{i}.{part}": _plain(getattr(basis, part)) for i, basis in enumerate(bases) for part in _PARTS}
@@ -242,7 +260,8 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
 
 
 def _plain(x: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    return x.detach().to("cpu", dtype).contiguous()
+    # A copy: safetensors refuses tensors that share memory, as those of a basis that serves two key-frames do.
+    return x.detach().to("cpu", dtype, copy=True).contiguous()
 
 
 def _check_parts(keyframes: Tensor, faces: Tensor, bases: Sequence[ModalBasis], names: Sequence[str]) -> None:

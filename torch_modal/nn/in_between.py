@@ -203,14 +203,7 @@ class InBetween(nn.Module):
             parts.append(member(picked, exact, report))
         if not parts:
             return self.members[0](samples, exact, report)  # of nothing, nothing
-        back = torch.argsort(torch.cat(order))
-        widest = max(part.solution.amplitudes.shape[-1] for part in parts)
-        amplitudes = torch.cat(
-            [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]
-        )
-        others = [torch.cat(values)[back] for values in zip(*(part.solution[1:] for part in parts), strict=True)]
-        shapes = torch.cat([part.shapes for part in parts])
-        return InBetweenResult(shapes[back], Solution(amplitudes[back], *others))
+        return joined(parts, order)
 
     # ------------------------------------------------------------------------------------------------------ the border
     def _chosen(self, pair: Tensor | int) -> Tensor | None:
@@ -293,6 +286,23 @@ class _Basis(nn.Module):
 def _rebuild(layer: InBetween, *_: Any) -> None:
     """After other bases were loaded, what follows from them is made anew."""
     layer._build()
+
+
+def joined(parts: Sequence[InBetweenResult], order: Sequence[Tensor]) -> InBetweenResult:
+    """Flat batches as one.
+
+    Args:
+        parts: One or more. Where numbers of modes differ, zeros follow the amplitudes.
+        order: Where the samples of each part stand in the whole. *Shape of each:* ``(B,)``.
+    """
+    back = torch.argsort(torch.cat(list(order)))
+    widest = max(part.solution.amplitudes.shape[-1] for part in parts)
+    amplitudes = torch.cat(
+        [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]
+    )
+    others = [torch.cat(values)[back] for values in zip(*(part.solution[1:] for part in parts), strict=True)]
+    shapes = torch.cat([part.shapes for part in parts])
+    return InBetweenResult(shapes[back], Solution(amplitudes[back], *others))
 
 
 @contextmanager

@@ -6,7 +6,7 @@ compares with, the rigid motion) follows a cubic through four key-frames (:mod:`
 place of a straight line through two. The minimisation is the same.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -14,10 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.hermite import Spacing
-from torch_modal.nn.between import Samples, report
-from torch_modal.nn.in_between import InBetween, full_precision
+from torch_modal.nn.between import InBetweenResult, Samples, report
+from torch_modal.nn.in_between import InBetween, full_precision, joined
 from torch_modal.nn.settings import Objective, Preset, Solver
+from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
+from torch_modal.sequence.times import checked_times
 
 
 class Path(nn.Module):
@@ -99,6 +101,10 @@ class Path(nn.Module):
         )
         return other
 
+    def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
+        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
+        return self._batched(keyframes, t, None)
+
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
 
@@ -113,6 +119,13 @@ class Path(nn.Module):
             ValueError: Shapes that do not fit, or a time before the first or after the last key-frame.
             ConvergenceError: As for :class:`torch_modal.InBetween`.
         """
+        solver = self.layer.solver
+        forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
+        return self._batched(keyframes, t, partial(report, max_steps=solver.max_steps, forbid=forbid)).shapes
+
+    def _batched(
+        self, keyframes: Tensor, t: Tensor | float, report: Callable[[Solution], None] | None
+    ) -> InBetweenResult:
         layer = self.layer
         if keyframes.dim() < 3 or keyframes.shape[-3] != self.n_keyframes:
             raise ValueError(
@@ -132,15 +145,15 @@ class Path(nn.Module):
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = self._located(t.expand(lead).reshape(-1))
         exact = torch.is_grad_enabled() and (keyframes.requires_grad or t.requires_grad or _any_recorded(layer))
-        order, shapes = [], []
-        for i in segment.unique().tolist():
+        order, parts = [], []
+        for i in segment.unique().tolist() or [0]:  # of nothing, nothing
             mine = torch.nonzero(segment == i).flatten()
             order.append(mine)
-            shapes.append(self._between(flat, i, which[mine], u[mine], exact))
-        if not shapes:
-            return keyframes.new_zeros(*lead, *item)
-        back = torch.argsort(torch.cat(order))
-        return torch.cat(shapes)[back].reshape(*lead, *item)
+            parts.append(self._between(flat, i, which[mine], u[mine], exact, report))
+        shapes, solution = joined(parts, order)
+        return InBetweenResult(
+            shapes.reshape(*lead, *item), Solution(*(value.reshape(lead + value.shape[1:]) for value in solution))
+        )
 
     def _located(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
@@ -157,7 +170,15 @@ class Path(nn.Module):
         segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
         return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
 
-    def _between(self, keyframes: Tensor, i: int, which: Tensor, u: Tensor, exact: bool) -> Tensor:
+    def _between(
+        self,
+        keyframes: Tensor,
+        i: int,
+        which: Tensor,
+        u: Tensor,
+        exact: bool,
+        report: Callable[[Solution], None] | None,
+    ) -> InBetweenResult:
         """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
         layer, n = self.layer, self.n_keyframes
         x = keyframes.to(layer.dtype)
@@ -173,34 +194,13 @@ class Path(nn.Module):
         samples = Samples(
             x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), layer.stiffness_of(u, u.shape), **around
         )
-        forbid = layer.solver.unconverged == "raise" and torch.is_grad_enabled()
-        told = partial(report, max_steps=layer.solver.max_steps, forbid=forbid)
         with full_precision(x.device.type):
-            shapes = layer.members[self.members[i]](samples, exact, told).shapes.to(keyframes.dtype)
+            result = layer.members[self.members[i]](samples, exact, report)
+        shapes = result.shapes.to(keyframes.dtype)
         for end, j in ((0, i), (1, (i + 1) % n)):
             exactly = keyframes[which, j].detach() + (shapes - shapes.detach())
             shapes = torch.where((u == end)[:, None, None], exactly, shapes)
-        return shapes
-
-
-def checked_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor:
-    """The times of key-frames; if cyclic, with the time when the first comes again. *Shape:* ``(K,)`` or ``(K + 1,)``.
-
-    Raises:
-        ValueError: Another number of times, or times that do not ascend.
-    """
-    n = n_keyframes + cyclic
-    if times is None:
-        return torch.arange(n, dtype=torch.float64)
-    found = torch.as_tensor(times).detach().to("cpu", torch.float64)
-    if found.shape != (n,):
-        also = ", and one when the first comes again" if cyclic else ""
-        raise ValueError(
-            f"times has the shape {tuple(found.shape)}; it needs one time for each key-frame{also}: ({n},)"
-        )
-    if not bool(found.isfinite().all()) or bool((found.diff() <= 0).any()):
-        raise ValueError(f"times must ascend from key-frame to key-frame; got {found.tolist()}")
-    return found
+        return InBetweenResult(shapes, result.solution)
 
 
 def _any_recorded(layer: InBetween) -> bool:

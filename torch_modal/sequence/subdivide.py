@@ -15,7 +15,8 @@ from torch_modal.nn.settings import Objective, Preset, Settings, Solver, setting
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import extract_bases
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.sequence.path import Path, checked_times
+from torch_modal.sequence.path import Path
+from torch_modal.sequence.times import checked_times
 
 MAX_LEVELS = 12
 

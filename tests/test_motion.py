@@ -1,0 +1,174 @@
+"""Key-frames that are a motion: who follows whom, and what random in-betweens of them are."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import Shapes
+
+import torch_modal as tm
+from torch_modal.data.motion import Motion
+
+F64 = torch.float64
+TIMES = (0.0, 0.5, 2.0, 3.0, 4.5)
+
+
+@pytest.fixture(scope="module")
+def bar_motion(bars: Shapes) -> Shapes:
+    """Five poses of a bar: straight, bent, twisted, bent, straight."""
+    return bars.pick(0, 1, 2, 1, 0)
+
+
+def space_of(shapes: Shapes, **options: Any) -> tm.ShapeSpace:
+    return tm.ShapeSpace(shapes.bases, shapes.faces, **{"dtype": F64, "keyframe_times": TIMES, **options})
+
+
+def largest(x: torch.Tensor) -> float:
+    return float(x.abs().max())
+
+
+# ------------------------------------------------------------------------------------------------------------ times
+def test_neighbours_in_time() -> None:
+    assert Motion(range(4), 4).neighbours.tolist() == [[1, 1], [0, 2], [1, 3], [2, 2]]
+    assert Motion(range(5), 4, cyclic=True).neighbours.tolist() == [[3, 1], [0, 2], [1, 3], [2, 0]]
+    assert Motion(range(2), 2).neighbours.tolist() == [[1, 1], [0, 0]]
+
+
+def test_ways_between_neighbours() -> None:
+    motion = Motion((0, 1, 3, 4), 4)
+    for (i, j), keyframes, times in (
+        ((0, 1), [0, 1, 2], [0, 1, 3]),
+        ((1, 2), [0, 1, 2, 3], [-0.5, 0, 1, 1.5]),
+        ((2, 1), [3, 2, 1, 0], [-0.5, 0, 1, 1.5]),
+        ((2, 3), [1, 2, 3], [-2, 0, 1]),
+    ):
+        span = motion.span(i, j)
+        assert span is not None and span.keyframes == keyframes and span.times.tolist() == times
+    assert motion.span(0, 2) is None and motion.span(0, 3) is None and motion.span(1, 1) is None
+    cycle = Motion((0, 1, 3, 5), 3, cyclic=True)
+    for (i, j), keyframes, times in (
+        ((2, 0), [1, 2, 0, 1], [-1, 0, 1, 1.5]),
+        ((0, 2), [1, 0, 2, 1], [-0.5, 0, 1, 2]),
+        ((0, 1), [2, 0, 1, 2], [-2, 0, 1, 3]),
+    ):
+        span = cycle.span(i, j)
+        assert span is not None and span.keyframes == keyframes and span.times.tolist() == times
+    # Two have nobody to be smooth with, whichever way they go round.
+    assert Motion(range(2), 2).span(0, 1) is None and Motion(range(3), 2, cyclic=True).span(0, 1) is None
+
+
+def test_times_are_those_that_are_given() -> None:
+    assert Motion((0, 0.1, 0.7), 3).times.tolist() == [0, 0.1, 0.7]  # not rounded to float32 on the way
+
+
+def test_times_that_are_none(bar_motion: Shapes) -> None:
+    with pytest.raises(ValueError, match=r"one time for each key-frame: \(5,\)"):
+        space_of(bar_motion, keyframe_times=(0, 1))
+    with pytest.raises(ValueError, match="must ascend"):
+        space_of(bar_motion, keyframe_times=(0, 1, 1, 2, 3))
+    with pytest.raises(ValueError, match=r"need their times: range\(6\)"):
+        space_of(bar_motion, keyframe_times=None, cyclic=True)
+
+
+# ----------------------------------------------------------------------------------------------------------- shapes
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Shapes, cyclic: bool) -> None:
+    when = (*TIMES, 6.0) if cyclic else TIMES
+    shapes = bar_motion if not cyclic else bar_motion.pick(0, 1, 2, 1, 2)  # the last is not the first
+    space = space_of(shapes, times=None, keyframe_times=when, cyclic=cyclic)
+    pairs = space_of(shapes, times=None, keyframe_times=None)
+    path = tm.Path(shapes.bases, shapes.faces, when, cyclic, preset="fast")
+    u = torch.tensor([0.0, 0.2, 0.5, 0.9, 1.0], dtype=F64)
+    for i in range(len(when) - 1):
+        j = (i + 1) % 5
+        with torch.no_grad():
+            expected = path(shapes.keyframes, torch.lerp(*torch.tensor(when[i : i + 2], dtype=F64), u))
+        found = space.keyframe_in_between(i, j, u)
+        # Weights of vertices are means over the neighbours here, over all key-frames there.
+        assert largest(found - expected) < 2e-3
+        assert largest(pairs.keyframe_in_between(i, j, u) - expected) > 2e-2
+        assert torch.equal(found[[0, -1]], shapes.keyframes[[i, j]])
+        torch.testing.assert_close(space.keyframe_in_between(j, i, 1 - u), found, rtol=0, atol=1e-6)
+    assert torch.equal(space.keyframe_in_between(0, 2, u), pairs.keyframe_in_between(0, 2, u))
+    x = shapes.keyframes[:2] + 0.01 * torch.sin(shapes.keyframes[:2])
+    half = u[2:3]
+    found = space.in_between(x[:1], x[1:], half, 0, 1)
+    assert torch.equal(found, pairs.in_between(x[:1], x[1:], half, 0, 1))
+
+
+def test_tables_hold_the_path_and_follow_from_times_and_neighbours(bar_motion: Shapes, tmp_path: Path) -> None:
+    t = torch.linspace(0, 1, 23, dtype=F64)
+    solved = space_of(bar_motion, times=None).keyframe_in_between(1, 2, t)
+    read = space_of(bar_motion, folder=tmp_path).keyframe_in_between(1, 2, t)
+    assert largest(read - solved) < 0.05 * largest(
+        space_of(bar_motion, keyframe_times=None).table(1, 2)[8] - solved[11]
+    )
+    file = tmp_path / "between-1-2.safetensors"
+    kept, when = tmp_path / "kept", file.stat().st_mtime_ns
+    shutil.copy2(file, kept)
+    # Twice as slow is the same way, and what is beyond the neighbours has no say.
+    space_of(bar_motion, folder=tmp_path, keyframe_times=[2 * t for t in TIMES[:4]] + [20.0]).table(1, 2)
+    assert file.stat().st_mtime_ns == when
+    first = bar_motion.bases[0]
+    modes = first.modes + 0.1 * torch.sin(first.reference)
+    other = tm.ModalBasis(first.reference, first.eigenvalues, modes, first.rigid_eigenvalues)
+    changed = bar_motion._replace(bases=[other, *bar_motion.bases[1:]])
+    for shapes, times in ((bar_motion, None), (bar_motion, (0.0, 0.6, 2.0, 3.0, 4.5)), (changed, TIMES)):
+        shutil.copy2(kept, file)
+        space_of(shapes, folder=tmp_path, keyframe_times=times).table(1, 2)
+        assert file.stat().st_mtime_ns != when
+
+
+# ------------------------------------------------------------------------------------------------------ transforms
+def test_partners_of_key_frames_are_their_neighbours(bar_motion: Shapes) -> None:
+    space = space_of(bar_motion)
+    pool = tm.ShapeBatch.of_keyframes(space, bar_motion.keyframes, shape_labels=torch.arange(5))
+    augment = tm.RandomInBetween(t=(0.6, 0.9), p=1.0, space=space)
+    start = torch.arange(5).repeat(40)
+    params = augment.forward_parameters(200, generator=torch.Generator().manual_seed(0))
+    out = augment.transform(pool.rows(start), params, None, pool)
+    partner = out.shape_labels  # these are nearer to it
+    assert partner is not None
+    assert bool(((partner - start).abs() == 1).all())
+    inner = (start > 0) & (start < 4)
+    assert 0.35 < float((partner > start)[inner].double().mean()) < 0.65
+    for row in range(10):
+        i, j = int(start[row]), int(partner[row])
+        expected = space.keyframe_in_between(i, j, params["t"][row : row + 1])[0]
+        torch.testing.assert_close(out.shapes[row], expected, rtol=0, atol=1e-12)
+
+
+def test_other_shapes_are_solved_with_their_partner_alone(bar_motion: Shapes) -> None:
+    space, pairs = space_of(bar_motion), space_of(bar_motion, keyframe_times=None)
+    x = bar_motion.keyframes[1:3] + 0.02 * torch.sin(bar_motion.keyframes[1:3])
+    params = {name: torch.tensor([value] * 2) for name, value in (("batch_prob", True), ("partner", 0.7), ("t", 0.4))}
+    augment = tm.RandomInBetween(p=1.0)
+    # Of a batch: as without times.
+    assert torch.equal(augment(x, params, space=space), augment(x, params, space=pairs))
+    # Of the key-frames: the one after the nearest.
+    pool = tm.ShapeBatch.of_keyframes(space, x)
+    found = augment(x, params, space=space, pool=pool)
+    nearest = space.nearest(x)
+    for row, i in enumerate(nearest.tolist()):
+        expected = pairs.in_between(x[row : row + 1], bar_motion.keyframes[i + 1 : i + 2], params["t"][:1], i, i + 1)
+        torch.testing.assert_close(found[row : row + 1], expected, rtol=0, atol=1e-6)
+
+
+def test_a_dataset_draws_from_the_path_of_a_stored_motion(bar_motion: Shapes, tmp_path: Path) -> None:
+    tm.write_set(tmp_path / "set", *bar_motion, [*"01234"], times=TIMES)
+    half = tm.RandomInBetween(t=(0.5, 0.5), p=1.0)
+    path = tm.Path(bar_motion.bases, bar_motion.faces, TIMES, preset="fast")
+    with torch.no_grad():
+        middles = path(bar_motion.keyframes, torch.tensor(TIMES, dtype=F64).unfold(0, 2, 1).mean(1))
+
+    def distances(**options: Any) -> torch.Tensor:
+        data = tm.ShapeDataset(tmp_path, half, samples_per_set=20, dtype=F64, **options)
+        samples = torch.stack([data[i]["vertices"] for i in range(20)])
+        return (samples[:, None] - middles).flatten(2).abs().amax(2)
+
+    found = distances()
+    assert largest(found.amin(1)) < 2e-3
+    assert set(found.argmin(1).tolist()) == {0, 1, 2, 3}
+    assert float(distances(keyframe_times=None).amin(1).min()) > 2e-2
