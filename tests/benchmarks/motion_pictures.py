@@ -6,7 +6,7 @@ from pathlib import Path
 
 import matplotlib
 import torch
-from motion import Measured
+from motion_measures import Measured
 from motions import Motion, fractions, gallop, grip
 from torch import Tensor
 
