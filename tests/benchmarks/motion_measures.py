@@ -38,7 +38,9 @@ class Found:
     """Hinges that are more than a right angle from the truth's."""
     turned: int = 0
     collapsed: int = 0
-    corner: float = 0.0
+    corner: float = NAN
+    """The mean of all key-frames."""
+    worst_corner: float = NAN
     overshoot: float = NAN
     """In % of the diagonal."""
 
@@ -75,10 +77,22 @@ class Measured:
             i, u = motion.located(t)
             truth = None if self.truths is None else self.truths[n]
             self._shape(found, self.yards[i], u, x, truth)
-        found.corner = self.corner(smooth, knots)
-        if motion.stop is not None:
-            found.overshoot = self.overshoot(lambda times: self.at(times, smooth, knots))
+        self.in_time(found, lambda times: self.at(times, smooth, knots), DENSE if smooth else 4)
         return found
+
+    def of_truth(self) -> Found:
+        """What can be measured of a truth without a truth; empty where it is known at some times only."""
+        found, truth = Found(), self.motion.truth
+        if truth is not None and self.motion.known_anywhere:
+            self.in_time(found, lambda times: torch.stack([truth(float(t)) for t in times]), DENSE)
+        return found
+
+    def in_time(self, found: Found, at: Callable[[Any], Tensor], places: int) -> None:
+        """Second differences, at so many places of each interval, and overshoot."""
+        ratio = self.corner(at, places)
+        found.corner, found.worst_corner = float(ratio.mean()), float(ratio.amax())
+        if self.motion.stop is not None:
+            found.overshoot = self.overshoot(at)
 
     def _shape(self, found: Found, yard: Yardstick, u: float, x: Tensor, truth: Tensor | None) -> None:
         ends = yard.case.x_a, yard.case.x_b
@@ -99,21 +113,25 @@ class Measured:
             agree = (yard.normals(yard.laid(x, truth)) * yard.normals(truth)).sum(1)
             found.turned += int((agree < 0).sum())
 
-    def corner(self, smooth: bool, knots: Tensor | None = None) -> float:
-        """The largest second difference at a key-frame over the median elsewhere, means over the vertices."""
+    def corner(self, at: Callable[[Any], Tensor], places: int) -> Tensor:
+        """Second differences at key-frames over their median elsewhere, means over the vertices. *Shape:* ``(K,)``."""
         motion, own = self.motion, self.motion.times
         h = [(b - a) / DENSE for a, b in pairwise(own)]
         keys = [(own[i], h[i - 1], h[i]) for i in range(0 if motion.cyclic else 1, len(h))]
-        rest = [(t, h[i], h[i]) for t in fractions(own, 0.25, 0.5, 0.75) for i in [motion.located(t)[0]]]
+        rest = [
+            (t, h[i], h[i])
+            for t in fractions(own, *(k / places for k in range(1, places)))
+            for i in [motion.located(t)[0]]
+        ]
         t, before, after = torch.tensor(keys + rest, dtype=torch.float64).T
         if motion.cyclic:
             t = t + own[-1] - own[0]  # one period on: there is a time before the first
-        x = self.at(torch.stack([t - before, t, t + after]), smooth, knots)
+        x = at(torch.cat([t - before, t, t + after])).unflatten(0, (3, -1))
         slope_before, slope_after = (x[1] - x[0]) / before[:, None, None], (x[2] - x[1]) / after[:, None, None]
         second = ((slope_after - slope_before) / (0.5 * (before + after))[:, None, None]).norm(dim=-1).mean(-1)
-        return float(second[: len(keys)].amax() / second[len(keys) :].median())
+        return second[: len(keys)] / second[len(keys) :].median()
 
-    def overshoot(self, at: Callable[[list[float]], Tensor]) -> float:
+    def overshoot(self, at: Callable[[Any], Tensor]) -> float:
         """How far vertices leave a stop, or go beyond it just before and after: the farthest, in % of the diagonal."""
         motion = self.motion
         assert motion.stop is not None

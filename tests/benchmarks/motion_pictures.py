@@ -13,7 +13,7 @@ from torch import Tensor
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-DENSE = 24  # shapes to each interval
+DENSE = 16  # shapes to each interval
 LOOKS = {
     "truth": {"color": "0.55", "lw": 3.5, "alpha": 0.6},
     "each pair alone": {"color": "tab:red", "lw": 1.1},
