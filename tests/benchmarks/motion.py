@@ -4,267 +4,59 @@
 
 Distances are means over the vertices, in % of the diagonal, without any alignment; edge errors are means of
 ``|l - l_true| / l_true``, or, without a truth, of the strain against lengths that change evenly between key-frames.
-"Corner" is the second difference in time at the key-frames (the largest), over its median at the quarters of the
-intervals, at 1/32 of an interval. Times are of the processor, of all threads, the best of several.
+"Corner" is the second difference in time at a key-frame over its median elsewhere, at 1/32 of an interval (of the pair,
+elsewhere is at the quarters of the intervals). Overshoot is how far a vertex leaves a stop, or passes it. Times are of
+the processor, of all threads, the best of several.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from itertools import pairwise
-from pathlib import Path as File
+from pathlib import Path
 from statistics import fmean
-from typing import Any
-from unittest import mock
 
-import torch
-from cases import Case
-from measures import Yardstick, mean_ratio
-from motions import MOTIONS, Motion, fractions
-from timing import timed
-from torch import Tensor
-
-from torch_modal.energy.measures import wrap_angle
-from torch_modal.geometry import hermite
-from torch_modal.geometry.rigid import best_fit
-from torch_modal.sequence.path import Path
-
-COLLAPSED = 0.05  # of the smaller area in both key-frames
-MOVES = 1e-3  # of the diagonal: vertices that move less have no direction
-DENSE = 32  # steps to each interval, for second differences and at a stop
-SEQUENCE = 8  # shapes to each interval, for the cost of a sequence
-USERS = ("torch_modal.geometry.local_rotations", "torch_modal.nn.frame", "torch_modal.nn.joint")
-
-
-@dataclass
-class Found:
-    """What is measured of one way through one motion: lists have a value for each time."""
-
-    distance: list[float] = field(default_factory=list)
-    edges: list[float] = field(default_factory=list)
-    volume: list[float] = field(default_factory=list)
-    energy: list[float] = field(default_factory=list)
-    folds: int = 0
-    true_folds: int = 0
-    """What the truth has of them, at the same times."""
-    unlike: int = 0
-    """Hinges that are more than a right angle from the truth's."""
-    turned: int = 0
-    collapsed: int = 0
-    corner: float = 0.0
-    overshoot: float = float("nan")
-    """In % of the diagonal."""
-
-
-class Measured:
-    """A motion with its path."""
-
-    def __init__(self, motion: Motion) -> None:
-        self.motion, shapes = motion, motion.shapes
-        self.path = Path(shapes.bases(30), shapes.faces, motion.times, motion.cyclic)
-        n = len(shapes.keyframes)
-        self.yards = [Yardstick(Case(motion.name, shapes, i, (i + 1) % n, {})) for i in range(len(motion.times) - 1)]
-        self.truths = None if motion.truth is None else [motion.truth(t) for t in motion.measured]
-
-    def at(self, times: Any, smooth: bool = True, knots: Tensor | None = None) -> Tensor:
-        """Shapes; of a path whose key-frames are at other times, each at the same part of its interval."""
-        path, t = self.path, torch.as_tensor(times, dtype=torch.float64)
-        own = path.times
-        if knots is not None:
-            t = own[0] + (t - own[0]) % (own[-1] - own[0]) if self.motion.cyclic else t
-            i = (torch.searchsorted(own, t, right=True) - 1).clamp(0, len(own) - 2)
-            t = knots[i] + (t - own[i]) / own.diff()[i] * knots.diff()[i]
-        path.smooth, path.times = smooth, own if knots is None else knots
-        try:
-            with torch.no_grad():
-                return path(self.motion.shapes.keyframes, t)
-        finally:
-            path.smooth, path.times = True, own
-
-    def measure(self, smooth: bool = True, knots: Tensor | None = None) -> Found:
-        """All that can be measured on shapes."""
-        motion, found = self.motion, Found()
-        for n, (t, x) in enumerate(zip(motion.measured, self.at(motion.measured, smooth, knots), strict=True)):
-            i, u = motion.located(t)
-            truth = None if self.truths is None else self.truths[n]
-            self._shape(found, self.yards[i], u, x, truth)
-        found.corner = self.corner(smooth, knots)
-        if motion.stop is not None:
-            found.overshoot = self.overshoot(lambda times: self.at(times, smooth, knots))
-        return found
-
-    def _shape(self, found: Found, yard: Yardstick, u: float, x: Tensor, truth: Tensor | None) -> None:
-        ends = yard.case.x_a, yard.case.x_b
-        lengths = torch.lerp(*map(yard.lengths, ends), u) if truth is None else yard.lengths(truth)
-        found.edges.append(100 * mean_ratio(yard.lengths(x), lengths))
-        found.volume.append(yard.volume(x))
-        found.folds += int(yard.folded(x).sum())
-        areas = torch.minimum(*(yard.normals(y).norm(dim=1) for y in ends))
-        found.collapsed += int((yard.normals(x).norm(dim=1) < COLLAPSED * areas).sum())
-        if truth is None:
-            energies = yard.shell(x * yard.scale, torch.stack(ends) * yard.scale)
-            found.energy.append(float((1 - u) * energies[0] + u * energies[1]))
-        else:
-            found.distance.append(100 * float((x - truth).norm(dim=-1).mean()) / self.motion.diagonal)
-            found.true_folds += int(yard.folded(truth).sum())
-            apart = wrap_angle(yard.shell.measure(x).angle - yard.shell.measure(truth).angle).abs()
-            found.unlike += int((apart > torch.pi / 2).sum())
-            agree = (yard.normals(yard.laid(x, truth)) * yard.normals(truth)).sum(1)
-            found.turned += int((agree < 0).sum())
-
-    def corner(self, smooth: bool, knots: Tensor | None = None) -> float:
-        """The largest second difference at a key-frame over the median elsewhere, means over the vertices."""
-        motion, own = self.motion, self.motion.times
-        h = [(b - a) / DENSE for a, b in pairwise(own)]
-        keys = [(own[i], h[i - 1], h[i]) for i in range(0 if motion.cyclic else 1, len(h))]
-        rest = [(t, h[i], h[i]) for t in fractions(own, 0.25, 0.5, 0.75) for i in [motion.located(t)[0]]]
-        t, before, after = torch.tensor(keys + rest, dtype=torch.float64).T
-        if motion.cyclic:
-            t = t + own[-1] - own[0]  # one period on: there is a time before the first
-        x = self.at(torch.stack([t - before, t, t + after]), smooth, knots)
-        slope_before, slope_after = (x[1] - x[0]) / before[:, None, None], (x[2] - x[1]) / after[:, None, None]
-        second = ((slope_after - slope_before) / (0.5 * (before + after))[:, None, None]).norm(dim=-1).mean(-1)
-        return float(second[: len(keys)].amax() / second[len(keys) :].median())
-
-    def overshoot(self, at: Callable[[list[float]], Tensor]) -> float:
-        """How far vertices leave a stop, or go beyond it just before and after: the farthest, in % of the diagonal."""
-        motion = self.motion
-        assert motion.stop is not None
-        keys = [motion.times.index(t) for t in motion.stop]
-        worst = 0.0
-        for rest, other in ((keys[0], keys[0] - 1), (keys[1], keys[1] + 1)):
-            still, beside = motion.shapes.keyframes[rest], motion.shapes.keyframes[other]
-            a, b = motion.times[rest], motion.times[other]
-            beyond = at([a + (b - a) * i / DENSE for i in range(1, DENSE)]) - still
-            away = still - beside
-            lengths = away.norm(dim=-1)
-            moving = lengths > MOVES * motion.diagonal
-            along = (beyond * away).sum(-1)[:, moving] / lengths[moving]
-            worst = max(worst, float(along.amax()))
-        start, end = motion.stop
-        held = at([start + (end - start) * i / DENSE for i in range(1, DENSE)])
-        worst = max(worst, float((held - motion.shapes.keyframes[keys[0]]).norm(dim=-1).amax()))
-        return 100 * worst / motion.diagonal
-
-    def costs(self) -> tuple[float, float]:
-        """One shape at a random time, and a sequence, over the same of the pairs."""
-        first, last = self.motion.times[0], self.motion.times[-1]
-        generator = torch.Generator().manual_seed(0)
-        random = first + (last - first) * torch.rand(8, dtype=torch.float64, generator=generator)
-        whole = fractions(self.motion.times, *(i / SEQUENCE for i in range(SEQUENCE)))
-
-        def one_by_one(smooth: bool) -> None:
-            for t in random:
-                self.at(t, smooth)
-
-        single = [timed(lambda smooth=smooth: one_by_one(smooth))[1] for smooth in (True, False)]
-        sequence = [timed(lambda smooth=smooth: self.at(whole, smooth))[1] for smooth in (True, False)]
-        return single[0] / single[1], sequence[0] / sequence[1]
-
-
-# ------------------------------------------------------------------------------------------------------- choices
-
-
-@contextmanager
-def without_limit() -> Iterator[None]:
-    """Velocities as the parabola wants them."""
-
-    def velocity(before: Tensor, after: Tensor, h_before: Tensor, h_after: Tensor, squared: object) -> Tensor:
-        return (h_after * before + h_before * after) / (h_before + h_after)
-
-    with mock.patch.object(hermite, "_velocity", velocity):
-        yield
-
-
-@contextmanager
-def ends(part: float) -> Iterator[None]:
-    """The excess at an end is this part of the other: -1/2 is natural, -1 is a parabola, 0 the speed of the step."""
-
-    def excess(step: Tensor, before: Tensor | None, after: Tensor | None, *rest: Any) -> hermite.Excess:
-        found = hermite.excess(step, before, after, *rest)
-        if before is None and after is not None:
-            return hermite.Excess(part * found.last, found.last)
-        if after is None and before is not None:
-            return hermite.Excess(found.first, part * found.first)
-        return found
-
-    with ExitStack() as stack:
-        for user in USERS:
-            stack.enter_context(mock.patch(f"{user}.excess", excess))
-        yield
-
-
-def by_distance(motion: Motion, power: float) -> Tensor:
-    """Times of key-frames by the distance between them: 1 is chordal, 1/2 centripetal."""
-    x = motion.shapes.keyframes
-    x = torch.cat([x, x[:1]]) if motion.cyclic else x
-    weights = torch.ones(x.shape[1], dtype=x.dtype)
-    laid = [best_fit(b, a, weights).apply(b) for a, b in pairwise(x)]
-    steps = torch.stack([(b - a).norm(dim=-1).mean() for a, b in zip(x[:-1], laid, strict=True)])
-    return torch.cat([steps.new_zeros(1), steps.clamp_min(1e-3 * steps.amax()).pow(power).cumsum(0)])
-
-
-def print_choices(measured: Measured) -> None:
-    """What other ways of choosing velocities do, over the default."""
-    motion = measured.motion
-    base = measured.measure()
-
-    def row(name: str, found: Found) -> None:
-        near = fmean(found.distance) / fmean(base.distance) if base.distance else float("nan")
-        edges = fmean(found.edges) / fmean(base.edges)
-        print(
-            f"| {motion.name} | {name} | {near:.3f} | {edges:.3f} | {found.corner:.2f} | {found.folds} | "
-            f"{found.overshoot:.2f} |",
-            flush=True,
-        )
-
-    row("as it is", base)
-    with without_limit():
-        row("velocities without a limit", measured.measure())
-    if not motion.cyclic:
-        for name, part in (("ends: parabola", -1.0), ("ends: speed of the step", 0.0)):
-            with ends(part):
-                row(name, measured.measure())
-    for name, power in (("chordal times", 1.0), ("centripetal times", 0.5)):
-        row(name, measured.measure(knots=by_distance(motion, power)))
-
-
-# --------------------------------------------------------------------------------------------------------- table
+from measures import NAN
+from motion_measures import Measured
+from motions import MOTIONS
+from tables import number
 
 
 def print_motion(measured: Measured) -> None:
-    """A row of the table for the path, and one for the pair."""
+    """A row of the table for each thing that is measured."""
+    motion = measured.motion
     smooth, pair = (measured.measure(way) for way in (True, False))
     single, sequence = measured.costs()
-    volumes = [abs(a / b - 1) for a, b in zip(smooth.volume, pair.volume, strict=True)]
-    motion = measured.motion
+    apart = [100 * abs(a / b - 1) for a, b in zip(smooth.volume, pair.volume, strict=True)]
 
-    def cell(own: list[float], other: list[float]) -> str:
-        if not own:
-            return "-"
-        a, b = fmean(own), fmean(other)
-        return f"{a:.3f} / {b:.3f} = {a / b:.2f}"
+    def row(what: str, own: float, other: float = NAN, truth: float = NAN) -> None:
+        over = own / other if other else NAN
+        cells = (number(x, ".3g") for x in (own, other, over, truth))
+        print(f"| {motion.name} | {what} | {' | '.join(cells)} |", flush=True)
 
-    print(
-        f"| {motion.name} | {cell(smooth.distance, pair.distance)} | {cell(smooth.edges, pair.edges)} | "
-        f"{cell(smooth.energy, pair.energy)} | {100 * max(volumes):.2f} | {smooth.folds} / {pair.folds} / {smooth.true_folds} | "
-        f"{smooth.unlike} / {pair.unlike} | "
-        f"{smooth.turned} / {pair.turned} | {smooth.collapsed} / {pair.collapsed} | "
-        f"{smooth.corner:.2f} / {pair.corner:.1f} | {smooth.overshoot:.2f} / {pair.overshoot:.2f} | "
-        f"{single:.2f} | {sequence:.2f} |",
-        flush=True,
-    )
     parts = [round(motion.located(t)[1], 3) for t in motion.measured]
-    if smooth.distance and len(set(parts)) > 1:
-        for part in sorted(set(parts)):
-            own, other = (
-                [[value for value, u in zip(row, parts, strict=True) if u == part] for row in (way.distance, way.edges)]
-                for way in (smooth, pair)
-            )
-            print(f"| - at {part} | {cell(own[0], other[0])} | {cell(own[1], other[1])} |" + "|" * 10, flush=True)
+    for name, own, others in (
+        ("distance, %", smooth.distance, pair.distance),
+        ("edge error, %", smooth.edges, pair.edges),
+        ("energy", smooth.energy, pair.energy),
+    ):
+        if own:
+            row(name, fmean(own), fmean(others))
+            for part in sorted(set(parts)):
+                here = [i for i, u in enumerate(parts) if u == part]
+                row(f"{name}, at {part:g}", fmean(own[i] for i in here), fmean(others[i] for i in here))
+    row("volume apart, worst, %", max(apart))
+    row("folds", smooth.folds, pair.folds, smooth.true_folds if smooth.distance else NAN)
+    if smooth.distance:
+        row("hinges unlike the truth", smooth.unlike, pair.unlike, 0)
+        row("turned faces", smooth.turned, pair.turned, 0)
+    row("collapsed faces", smooth.collapsed, pair.collapsed)
+    truth = measured.of_truth()
+    row("corner, mean", smooth.corner, pair.corner, truth.corner)
+    row("corner, worst", smooth.worst_corner, pair.worst_corner, truth.worst_corner)
+    if motion.stop is not None:
+        row("overshoot, %", smooth.overshoot, pair.overshoot, truth.overshoot)
+    row("time of one shape, over the pair's", single)
+    row("time of a sequence, over the pair's", sequence)
 
 
 def print_costs(measured: Measured) -> None:
@@ -274,11 +66,7 @@ def print_costs(measured: Measured) -> None:
 
 
 COSTS = "| motion | one shape, over the pair's | sequence |"
-TABLE = (
-    "| motion | distance %, smooth / pair | edge error % | energy | volume apart, worst % | folds, and the truth's | unlike the truth | turned | collapsed "
-    "| corner | overshoot % | one shape | sequence |"
-)
-CHOICES = "| motion | choice | distance over ours | edge error over ours | corner | folds | overshoot % |"
+TABLE = "| motion | measure | smooth | pair | smooth over pair | truth |"
 
 
 def main() -> None:
@@ -287,16 +75,20 @@ def main() -> None:
     parser.add_argument("motions", nargs="*", help=f"of {', '.join(MOTIONS)}; default: all")
     parser.add_argument("--choices", action="store_true", help="compare limits, ends and times instead")
     parser.add_argument("--costs", action="store_true", help="costs alone")
-    parser.add_argument("--pictures", type=File, metavar="FOLDER", help="draw trails and speeds there instead")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw trails and speeds there instead")
     args = parser.parse_args()
     if args.pictures:
         from motion_pictures import draw
 
         draw(args.pictures)
         return
-    head, row = (
-        (CHOICES, print_choices) if args.choices else (COSTS, print_costs) if args.costs else (TABLE, print_motion)
-    )
+    head, row = TABLE, print_motion
+    if args.choices:
+        from motion_choices import CHOICES, print_choices
+
+        head, row = CHOICES, print_choices
+    elif args.costs:
+        head, row = COSTS, print_costs
     print(head)
     print("|---" * (head.count("|") - 1) + "|")
     for name in args.motions or MOTIONS:

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import matplotlib
 import torch
-from motion import Measured
+from motion_measures import Measured
 from motions import Motion, fractions, gallop, grip
 from torch import Tensor
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-DENSE = 24  # shapes to each interval
+DENSE = 16  # shapes to each interval
 LOOKS = {
     "truth": {"color": "0.55", "lw": 3.5, "alpha": 0.6},
     "each pair alone": {"color": "tab:red", "lw": 1.1},

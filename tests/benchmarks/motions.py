@@ -38,8 +38,10 @@ class Motion:
     measured: tuple[float, ...]
     """When shapes are measured."""
     truth: Truth | None
-    """The true shape at a time that is measured, or at any if the motion is our own. *Shape:* ``(V, 3)``."""
+    """The true shape at a time that is measured. *Shape:* ``(V, 3)``."""
     cyclic: bool = False
+    known_anywhere: bool = False
+    """Whether the truth is known at any time."""
     stop: tuple[float, float] | None = None
     """Two times of key-frames between which nothing moves."""
 
@@ -90,7 +92,7 @@ def gallop() -> Iterator[Motion]:
     faces, posed = sculpted("creature")
     times = tuple(float(i) for i in range(7))
     shapes = KeyframeSet(torch.stack([posed(t) for t in times[:-1]]), faces)
-    yield Motion("creature", shapes, times, fractions(times, 0.25, 0.5, 0.75), posed, cyclic=True)
+    yield Motion("creature", shapes, times, fractions(times, 0.25, 0.5, 0.75), posed, cyclic=True, known_anywhere=True)
 
 
 def grip() -> Iterator[Motion]:
@@ -102,7 +104,7 @@ def grip() -> Iterator[Motion]:
 
     shapes = KeyframeSet(torch.stack([posed(t) for t in STOP_TIMES]), faces)
     measured = fractions(STOP_TIMES, 0.25, 0.5, 0.75)
-    yield Motion("hand with a stop", shapes, STOP_TIMES, measured, posed, stop=(CLOSED, LETS_GO))
+    yield Motion("hand with a stop", shapes, STOP_TIMES, measured, posed, known_anywhere=True, stop=(CLOSED, LETS_GO))
 
 
 def hand_path() -> Iterator[Motion]:
