@@ -8,6 +8,9 @@ from setuptools import find_packages, setup
 ROOT = Path(__file__).parent
 VERSION = re.search(r'^__version__ = "(.+)"', (ROOT / "torch_modal/version.py").read_text(), re.M).group(1)
 
+# libigl's AABB tree came to Python with 2.6.
+REGISTER = ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6", "threadpoolctl>=3.1"]
+
 setup(
     name="torch_modal",
     version=VERSION,
@@ -37,7 +40,8 @@ setup(
     ],
     extras_require={
         "pyg": ["torch_geometric>=2.4"],
-        "test": ["pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4"],
+        "register": REGISTER,
+        "test": [*REGISTER, "pytest>=8", "ruff>=0.6", "mypy>=1.11", "torch_geometric>=2.4"],
     },
     entry_points={"console_scripts": ["torch-modal = torch_modal.cli.main:main"]},
 )

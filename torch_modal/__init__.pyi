@@ -24,6 +24,9 @@ from .io.write import save_animation as save_animation
 from .io.write import save_frames as save_frames
 from .keyframes.check import check_keyframes as check_keyframes
 from .keyframes.load import load_keyframes as load_keyframes
+from .keyframes.registration.landmarks import suggest_landmarks as suggest_landmarks
+from .keyframes.registration.register import register as register
+from .keyframes.registration.report import Registration as Registration
 from .nn.between import ConvergenceError as ConvergenceError
 from .nn.between import ConvergenceWarning as ConvergenceWarning
 from .nn.in_between import InBetween as InBetween
