@@ -20,6 +20,8 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("subdivide needs two key-frames or more")
     if args.mu is not None and args.space != "paired":
         args.fail("--mu is the similarity weight of --space paired; the joint space has none")
+    if (args.landmarks or args.across) and not args.register:
+        args.fail("--landmarks and --across are for --register")
     if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
         args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
     single = _is_file(args, ".glb")
@@ -31,8 +33,8 @@ def subdivide(args: argparse.Namespace) -> None:
     import torch_modal as tm
 
     places = tm.keyframe_places(len(args.meshes), args.levels, cyclic=args.cyclic, n_frames=args.frames)
-    keyframes, faces = tm.load_keyframes(args.meshes)
     progress = False if args.quiet else None
+    keyframes, faces = tm.load_keyframes(args.meshes, **_registration(args))
     bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
     options = {} if args.mu is None else {"mu": args.mu}
     frames = tm.subdivide(
@@ -128,6 +130,21 @@ def cache(args: argparse.Namespace) -> None:
     n_entries, n_bytes = (clear_cache if args.clear else cache_content)(args.cache_dir)
     there = "removed from" if args.clear else "in"
     print(f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB {there} {args.cache_dir or default_cache_dir()}")
+
+
+def _registration(args: argparse.Namespace) -> dict[str, Any]:
+    """What `load_keyframes` is told of meshes of different connectivity."""
+    if not args.register:
+        return {}
+    from torch_modal.cli.register import registrar
+
+    return {
+        "register": registrar(args),
+        "landmarks": args.landmarks,
+        "same_subject": not args.across,
+        "progress": False if args.quiet else None,
+        "report": _reporter(args),
+    }
 
 
 def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``demo`` and ``cache``.
+"""The command line: ``torch-modal subdivide``, ``register``, ``modes``, ``precompute``, ``demo`` and ``cache``.
 
 Nothing heavy is imported before the arguments are known to make sense.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from torch_modal.bulk import command as bulk
-from torch_modal.cli import commands
+from torch_modal.cli import commands, register
 from torch_modal.version import __version__
 
 PROGRAM = "torch-modal"
@@ -28,6 +28,7 @@ MAIN_EXAMPLES = """\
 start here:
   torch-modal demo                                        try it on the samples that come with it
   torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
+  torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
   torch-modal subdivide --help                            all that can be set"""
 
 SUBDIVIDE = """\
@@ -116,7 +117,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def _expected_errors() -> tuple[type[Exception], ...]:
     """What input, files and machine can cause; anything else is a bug and shows its traceback."""
-    expected: list[type[Exception]] = [ValueError, OSError, MemoryError]
+    expected: list[type[Exception]] = [ValueError, OSError, MemoryError, ImportError]
     # Their modules are heavy: if one was never imported, it raised nothing.
     for module, name in (
         ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
@@ -263,7 +264,15 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="also draw the sequence beside linear interpolation, as .png or .pdf",
     )
+    sub.add_argument(
+        "--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others"
+    )
+    register.add_options(sub)
     _add_modes(sub)
+    _add_common(sub)
+
+    sub = command("register", register.run, register.SUMMARY, register.DESCRIPTION, register.EXAMPLES)
+    register.add_arguments(sub)
     _add_common(sub)
 
     sub = command("modes", commands.modes, "vibration modes of key-frames, as safetensors", MODES, MODES_EXAMPLES)

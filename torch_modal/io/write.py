@@ -196,6 +196,23 @@ def save_frames(
     return paths
 
 
+def save_mesh(vertices: Array, faces: Array, out: str | Path, overwrite: bool = False) -> Path:
+    """Write one shape; the file's extension says the format, as for `save_frames`.
+
+    Raises:
+        ValueError: The arrays or the extension cannot be used.
+        FileExistsError: The file exists and ``overwrite`` is off.
+    """
+    path = Path(out)
+    shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
+    fmt = path.suffix.lower().lstrip(".")
+    if fmt not in _WRITERS:
+        raise ValueError(f"{path.name!r} must end in one of {', '.join('.' + name for name in _WRITERS)}.")
+    refuse_existing(path, overwrite)
+    write_file(path, _WRITERS[fmt](shapes[0], triangles))
+    return path
+
+
 def _thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
     """At most ``most`` frame numbers, evenly spread, with both ends and (if they fit) the wanted ones."""
     if n_frames <= most:
