@@ -10,7 +10,7 @@ import numpy as np
 from torch_modal.io.asset import Asset
 from torch_modal.io.glb import HOLDS, HOLDS_OF_ITS_OWN, shape_bytes
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.write import MESH_FORMATS, check_frames, mesh_bytes, refuse_existing, write_file
+from torch_modal.io.write import MESH_FORMATS, check_frames, mesh_bytes, refuse_existing, to_numpy, write_file
 
 if TYPE_CHECKING:
     import torch
@@ -83,6 +83,23 @@ def save_frames(
     for path, vertices in zip(paths, shapes, strict=True):
         write_file(path, _bytes(vertices, triangles, fmt, asset, same))
     return paths
+
+
+def save_mesh(vertices: Array, faces: Array, out: str | Path, overwrite: bool = False) -> Path:
+    """Write one shape; the file's extension says the format, as for :func:`save_frames`.
+
+    Raises:
+        ValueError: The arrays or the extension cannot be used.
+        FileExistsError: The file exists and ``overwrite`` is off.
+    """
+    path = Path(out)
+    shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
+    fmt = path.suffix.lower().lstrip(".")
+    if fmt not in MESH_FORMATS:
+        raise ValueError(f"{path.name!r} must end in one of {', '.join('.' + name for name in MESH_FORMATS)}.")
+    refuse_existing(path, overwrite)
+    write_file(path, mesh_bytes(fmt, shapes[0], triangles))
+    return path
 
 
 def _holds(asset: Asset, fmt: str, same: bool) -> tuple[str, ...]:
