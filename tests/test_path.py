@@ -190,6 +190,26 @@ def test_what_rests_between_equal_keyframes_does_not_move(bars: Shapes) -> None:
     assert largest(found - still.keyframes[1]) < 1e-9
 
 
+def test_a_stop_is_not_passed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar bends, stops, and goes back at uneven times; without the limit it would run on."""
+    own = bars.pick(0, 2, 1, 1, 0)
+    path = Path(own.bases, own.faces, [0.0, 0.9, 1.2, 2.0, 2.3])
+    stop = own.keyframes[2]
+
+    def overshoot() -> float:
+        worst = largest(path(own.keyframes, torch.linspace(1.2, 2.0, 17, dtype=DOUBLE)) - stop)
+        for other, start, end in ((1, 0.9, 1.2), (4, 2.0, 2.3)):
+            away = stop - own.keyframes[other]
+            beyond = path(own.keyframes, torch.linspace(start, end, 17, dtype=DOUBLE)[1:-1]) - stop
+            moving = away.norm(dim=-1) > 1e-3 * diagonal(stop)
+            worst = max(worst, float(((beyond * away).sum(-1) / away.norm(dim=-1))[:, moving].amax()))
+        return worst / diagonal(stop)
+
+    assert overshoot() < 5e-3
+    monkeypatch.setattr(hermite, "_velocity", lambda v, w, h, k, _: (k * v + h * w) / (h + k))
+    assert overshoot() > 5e-3
+
+
 def test_times_scale(motion: Shapes) -> None:
     when = times(0.0, 1.0, 1.5, 3.0, 4.0)
     own, slow = Path(motion.bases, motion.faces, when), Path(motion.bases, motion.faces, 10 * when - 3)

@@ -1,9 +1,8 @@
 r"""Motion through many key-frames: smooth in time, at any time, differentiable.
 
-Between two key-frames a path is the in-between of :class:`torch_modal.InBetween`, with what the neighbours in time know
-beyond the pair: everything that moves (rotations and sizes of triangles, lengths, angles and the volume that the energy
-compares with, the rigid motion) follows a cubic through four key-frames (:mod:`torch_modal.geometry.hermite`) in the
-place of a straight line through two. The minimisation is the same.
+Between two key-frames of a path, the rotations and sizes of triangles and the rigid motion follow a cubic through four
+key-frames (:mod:`torch_modal.geometry.hermite`) in the place of a straight step between two, and a Poisson system makes
+a shape of it. Nothing is minimised unless there are terms beyond Eq. 5, which then compares with that shape.
 """
 
 from collections.abc import Callable, Sequence
