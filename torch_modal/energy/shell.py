@@ -26,6 +26,18 @@ class Measures(NamedTuple):
     """Signed volume enclosed with the centroid. *Shape:* ``(...,)``."""
 
 
+def _stiffness(number: int, doc: str) -> Any:
+    """The stiffness of one of the terms, as an attribute of their energy."""
+
+    def get(energy: "ShellEnergy") -> Any:
+        return energy.terms[number].stiffness
+
+    def put(energy: "ShellEnergy", value: float | Tensor) -> None:
+        energy.terms[number].stiffness = value
+
+    return property(get, put, doc=doc)
+
+
 class ShellEnergy(nn.Module):
     r"""Discrete-shell energy between a shape and a rest shape (Eq. 5 of the paper).
 
@@ -117,29 +129,6 @@ class ShellEnergy(nn.Module):
         """Of each term."""
         return [term.stiffness for term in self.terms]
 
-    @property
-    def alpha(self) -> Any:
-        """Stretching stiffness; it may be replaced."""
-        return self.terms[0].stiffness
-
-    @alpha.setter
-    def alpha(self, value: float | Tensor) -> None:
-        self.terms[0].stiffness = value
-
-    @property
-    def beta(self) -> Any:
-        """Bending stiffness; it may be replaced."""
-        return self.terms[1].stiffness
-
-    @beta.setter
-    def beta(self, value: float | Tensor) -> None:
-        self.terms[1].stiffness = value
-
-    @property
-    def gamma(self) -> Any:
-        """Volume stiffness; it may be replaced."""
-        return self.terms[2].stiffness
-
-    @gamma.setter
-    def gamma(self, value: float | Tensor) -> None:
-        self.terms[2].stiffness = value
+    alpha = _stiffness(0, "Stretching stiffness; it may be replaced.")
+    beta = _stiffness(1, "Bending stiffness; it may be replaced.")
+    gamma = _stiffness(2, "Volume stiffness; it may be replaced.")
