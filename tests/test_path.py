@@ -415,3 +415,23 @@ def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> N
         editor.replace(6, moved)
     with pytest.raises(ValueError, match="holds finite numbers"):
         editor.replace(0, moved * math.nan)
+
+
+def test_solve_tells_how_it_went(motion: Shapes, path: Path) -> None:
+    t = times(0.0, 3.5, 1.2, 0.4)
+    with torch.no_grad():
+        result = path.solve(motion.keyframes, t)
+        assert torch.equal(result.shapes, path(motion.keyframes, t))
+        alone = path.solve(motion.keyframes, 1.2)
+        nothing = path.solve(motion.keyframes, t[:0])
+    assert result.solution.status.shape == (4,)
+    assert bool(result.solution.usable.all())
+    torch.testing.assert_close(result.solution.energy[2], alone.solution.energy)
+    assert nothing.shapes.shape == (0, *motion.keyframes.shape[1:]) and nothing.solution.status.shape == (0,)
+
+
+def test_times_in_a_list_reach_the_key_frames(motion: Shapes) -> None:
+    """0.1 is no number of float32."""
+    path = Path(motion.bases[:3], motion.faces, [0.1, 0.3, 0.7])
+    with torch.no_grad():
+        assert torch.equal(path(motion.keyframes[:3], times(0.1, 0.3, 0.7)), motion.keyframes[:3])

@@ -60,14 +60,20 @@ class Motion:
         Returns:
             None where they do not follow each other, or have no neighbours.
         """
-        n, cyclic = self.n_keyframes, self.cyclic
-        ahead = (j - i) % n if cyclic else j - i
-        if n < 3 or ahead not in (1, -1, n - 1):
+        n, ahead, back = self.n_keyframes, j - i, i - j
+        if self.cyclic:
+            ahead, back = ahead % n, back % n
+        if n < 3 or 1 not in (ahead, back):
             return None
-        if ahead != 1:
-            back = self.span(j, i)
-            return back and Span(back.keyframes[::-1], 1 - back.times.flip(0))
-        places = [place for place in range(i - 1, i + 3) if cyclic or 0 <= place < n]
+        if ahead == 1:
+            return self._onwards(i)
+        keyframes, times = self._onwards(j)
+        return Span(keyframes[::-1], 1 - times.flip(0))
+
+    def _onwards(self, i: int) -> Span:
+        """The way from a key-frame to the next."""
+        n = self.n_keyframes
+        places = [place for place in range(i - 1, i + 3) if self.cyclic or 0 <= place < n]
         period = self.times[-1] - self.times[0]
         when = torch.stack([self.times[place % n] + place // n * period for place in (i, i + 1, *places)])
         return Span([place % n for place in places], (when[2:] - when[0]) / (when[1] - when[0]))
