@@ -27,6 +27,9 @@ from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
 from .keyframes.check import check_keyframes as check_keyframes
 from .keyframes.load import load_keyframes as load_keyframes
+from .keyframes.registration.landmarks import suggest_landmarks as suggest_landmarks
+from .keyframes.registration.register import register as register
+from .keyframes.registration.report import Registration as Registration
 from .keyframes.seams import weld_seams as weld_seams
 from .nn.adjoint import ConvergenceWarning as ConvergenceWarning
 from .nn.between import ConvergenceError as ConvergenceError

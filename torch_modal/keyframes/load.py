@@ -1,7 +1,8 @@
 """Key-frames from files."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,29 +11,59 @@ from torch_modal.errors import MeshError
 from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 
+Registrar = Callable[..., Any]
+"""Takes and returns what `register` does."""
 
-def load_keyframes(paths: Sequence[str | os.PathLike[str]]) -> Keyframes:
+
+def load_keyframes(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    register: bool | Registrar = False,
+    landmarks: Any = None,
+    same_subject: bool = True,
+    progress: bool | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Keyframes:
     """Read key-frames from OBJ, PLY, OFF, GLB or GLTF files.
 
     Vertices keep the order and number in which they stand in the files. Faces may differ between the files in
     their order, first corner and winding; those of the first file are used. What may be wrong with the
     meshes themselves is said by `check_keyframes`, which everything that takes key-frames calls.
 
+    With ``register``, the meshes may have any connectivity: the first one's is laid onto each, from the one before it.
+    A mesh with the vertices and faces of the first is taken as it is.
+
     Args:
         paths: One file per key-frame, in the order of the sequence.
+        register: Whether to register meshes of another connectivity; or a function like
+            :func:`torch_modal.register` that does it, for example one that keeps its results.
+        landmarks: For the registration: a landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``, a column for
+            each of the K meshes.
+        same_subject: Whether all are poses of one body; if not, five landmarks or more are needed.
+        progress: Show bars of the registration; by default on a terminal only.
+        report: Takes a line about each registration.
 
     Returns:
         Positions, float64, *shape* ``(K, V, 3)``, in the files' units; faces, int64, *shape* ``(F, 3)``.
 
     Raises:
         FileNotFoundError: A file does not exist.
-        MeshError: A file cannot be read, or differs from the first in its number of vertices or in its faces.
+        MeshError: A file cannot be read, or differs from the first in its number of vertices or in its faces; or,
+            with ``register``, a registration is doubtful.
+        ImportError: With ``register``, the extra of that name is not installed.
     """
     if isinstance(paths, (str, bytes, os.PathLike)):
         raise MeshError(f"paths is one path, {os.fspath(paths)!r}; pass a list with one file per key-frame")
     paths = list(paths)
     if not paths:
         raise MeshError("paths is empty; pass one file per key-frame")
+    if register:
+        from torch_modal.keyframes.registration.sequence import register_files
+
+        options = {"landmarks": landmarks, "same_subject": same_subject, "progress": progress, "report": report}
+        return register_files(paths, None if register is True else register, **options)
+    if landmarks is not None:
+        raise MeshError("landmarks are for registration; pass register=True too")
     vertices, faces = read_mesh(paths[0])
     shapes = [vertices]
     for path in paths[1:]:

@@ -1,0 +1,276 @@
+"""How well meshes are registered whose truth is known: the table of docs/registration.md.
+
+    python tests/benchmarks/registration.py [--parts poses pairs marked across middle time] [--rows FILE] [--n-pairs 50]
+
+The template is a pose decimated to 60 % of its vertices and shuffled; the target is another pose, turned, scaled and
+moved, and often damaged. The truth of a template vertex is the point of the other pose with the same place in the same
+face. Lengths are in percent of the target's bounding-box diagonal. Times are processor seconds of one thread.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import fast_simplification
+import numpy as np
+from animals import animal, held_out, tips
+from scipy.spatial.transform import Rotation
+
+import torch_modal as tm
+from torch_modal.data.samples import sample_files
+from torch_modal.io.read import read_mesh
+from torch_modal.keyframes.registration.consistency import farthest_points
+from torch_modal.keyframes.registration.spectrum import SpectralShape
+from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Surface, referenced
+
+SHARED = Path(__file__).parents[2].parent / "shared" / "data"
+BODIES = {
+    "mh-hand": [SHARED / "mh-hand" / f"{n}.obj" for n in ("00-open", "01-half", "02-fist", "03-point", "04-spread")],
+    "mh-woman": [SHARED / "mh-woman" / f"{n}.obj" for n in ("00-rest", "02-walk-a", "03-walk-b")],
+    "creature": sample_files("creature"),
+}
+DAMAGES = ("none", "hole", "noise", "cut off", "slit", "non-manifold")
+KEPT = 0.6
+WRONG = 3.0  # percent
+
+
+@cache
+def poses(name: str) -> tuple[FloatArray, IntArray]:
+    """All poses of a body. *Shape:* ``(K, V, 3), (F, 3)``."""
+    meshes = [read_mesh(path) for path in BODIES[name]]
+    return np.stack([vertices for vertices, _ in meshes]), meshes[0][1]
+
+
+def remeshed(vertices: FloatArray, faces: IntArray, random: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """Decimated, with vertices and faces in random order."""
+    unit = 100 / np.linalg.norm(np.ptp(vertices, axis=0))
+    points, triangles = fast_simplification.simplify(vertices * unit, faces.astype(np.int32), target_reduction=1 - KEPT)
+    order = random.permutation(len(points))
+    number = np.argsort(order)
+    return points[order] / unit, number[triangles.astype(np.int64)][random.permutation(len(triangles))]
+
+
+def transported(points: FloatArray, source: FloatArray, target: FloatArray, faces: IntArray) -> FloatArray:
+    """The points of another pose at the same places."""
+    surface = Surface(source, faces)
+    return surface.rows(surface.closest(points)) @ target
+
+
+def damaged(
+    vertices: FloatArray, faces: IntArray, how: str, random: np.random.Generator
+) -> tuple[FloatArray, IntArray]:
+    """A target with a flaw."""
+    size = np.linalg.norm(np.ptp(vertices, axis=0))
+    centres = vertices[faces].mean(1)
+    if how == "noise":
+        return vertices + 0.003 * size * random.normal(size=vertices.shape), faces
+    if how == "hole":
+        at = centres[random.integers(len(faces))]
+        faces = faces[np.linalg.norm(centres - at, axis=1) > 0.06 * size]
+    elif how == "cut off":
+        along = centres @ (lambda d: d / np.linalg.norm(d))(random.normal(size=3))
+        faces = faces[along > np.quantile(along, 0.12)]
+    elif how == "slit":
+        at, axis = centres[random.integers(len(faces))], random.normal(size=3)
+        near = np.linalg.norm(centres - at, axis=1) < 0.15 * size
+        faces = faces[~(near & (np.abs((centres - at) @ axis / np.linalg.norm(axis)) < 0.01 * size))]
+    elif how == "non-manifold":
+        fins = faces[random.permutation(len(faces))[:20]]
+        tops = vertices[fins].mean(1) + 0.02 * size * random.normal(size=(20, 3))
+        new = np.column_stack([fins[:, :2], len(vertices) + np.arange(20)])
+        vertices, faces = np.concatenate([vertices, tops]), np.concatenate([faces, new])
+    surface, _ = referenced(vertices, faces)
+    return surface.vertices, surface.faces
+
+
+def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Five points spread over the template, and where they belong: what a person would pick."""
+    surface = Surface(rest, faces)
+    shape = SpectralShape(surface)
+    chosen = surface.nearest_alike(shape.positions, shape.coarse.vertex_normals)[farthest_points(shape, 5)[0]]
+    return rest[chosen], truth[chosen]
+
+
+def one(name: str, i: int, j: int, how: str, seed: int, marked: bool) -> dict[str, Any]:
+    """One registration against its truth."""
+    random = np.random.default_rng(seed)
+    shapes, faces = poses(name)
+    rest, triangles = remeshed(shapes[i], faces, random)
+    truth = transported(rest, shapes[i], shapes[j], faces)
+    there, there_faces = damaged(shapes[j], faces, how, random)
+    rotation, scale = Rotation.random(rng=random).as_matrix(), random.uniform(0.3, 3)
+    shift = scale * random.normal(size=3)
+    there, truth = (scale * p @ rotation.T + shift for p in (there, truth))
+    marks = five_marks(rest, triangles, truth) if marked else None
+    row: dict[str, Any] = {"case": f"{name} {i}-{j}", "how": how, "marked": marked, "vertices": len(rest)}
+    started = time.process_time()
+    try:
+        found = tm.register(rest, triangles, there, there_faces, landmarks=marks, progress=False)
+    except tm.MeshError as error:
+        return row | {"error": str(error)}
+    seconds = time.process_time() - started
+    size = np.linalg.norm(np.ptp(scale * shapes[j], axis=0))
+    errors = 100 / size * np.linalg.norm(found.positions.numpy() - truth, axis=1)
+    return row | {
+        "mean": errors.mean(),
+        "p95": np.percentile(errors, 95),
+        "confidence": found.confidence,
+        "score": found.map_score,
+        "distortion": found.distortion,
+        "stretch": found.stretch,
+        "to": found.to_target.mean,
+        "from": found.from_target.mean,
+        "flipped": found.flipped_area,
+        "seconds": seconds,
+    }
+
+
+def pose_cases() -> Iterator[tuple[str, int, int, str, int, bool]]:
+    """Whole bodies, without landmarks."""
+    for name, pairs in (
+        ("mh-hand", [(0, 1), (0, 2), (2, 0), (0, 3), (3, 4), (1, 2)]),
+        ("mh-woman", [(0, 1), (1, 2), (2, 0)]),
+        ("creature", [(0, 1), (1, 2), (2, 5), (4, 2), (5, 1), (3, 0)]),
+    ):
+        for i, j in pairs:
+            yield name, i, j, "none", 10 * i + j, False
+
+
+def random_cases(n: int, marked: bool) -> Iterator[tuple[str, int, int, str, int, bool]]:
+    """Random pairs of poses, with each flaw in turn."""
+    random = np.random.default_rng(7)
+    for k in range(n):
+        name = list(BODIES)[random.integers(len(BODIES))]
+        i, j = random.permutation(len(BODIES[name]))[:2]
+        yield name, int(i), int(j), DAMAGES[k % len(DAMAGES)], 1000 + k, marked
+
+
+def across() -> dict[str, Any]:
+    """Two animals of other proportions and tessellation, eight landmarks."""
+    (first, first_faces, first_cones), (second, second_faces, second_cones) = animal("slender"), animal("stout")
+    marks = [surface.closest(tips(cones)).points for surface, cones in (
+        (Surface(first, first_faces), first_cones), (Surface(second, second_faces), second_cones))]  # fmt: skip
+    started = time.process_time()
+    found = tm.register(
+        first, first_faces, second, second_faces, landmarks=tuple(marks), same_subject=False, progress=False
+    )
+    seconds = time.process_time() - started
+    here = Surface(first, first_faces)
+    others = [
+        surface.closest(held_out(cones))
+        for surface, cones in ((here, first_cones), (Surface(second, second_faces), second_cones))
+    ]
+    size = np.linalg.norm(np.ptp(second, axis=0))
+    off = 100 / size * np.linalg.norm(here.rows(others[0]) @ found.positions.numpy() - others[1].points, axis=1)
+    return {
+        "case": "slender animal on stout animal",
+        "vertices": len(first),
+        "to": found.to_target,
+        "from": found.from_target,
+        "flipped": found.flipped_area,
+        "folds": found.folds,
+        "held out": off.tolist(),
+        "landmarks": found.landmark_errors.tolist(),
+        "confidence": found.confidence,
+        "seconds": seconds,
+    }
+
+
+def middle(name: str, i: int, j: int) -> dict[str, Any]:
+    """The in-between of a registered pair against that of the true connectivity."""
+    shapes, faces = poses(name)
+    rest, triangles = remeshed(shapes[i], faces, np.random.default_rng(0))
+    found = tm.register(rest, triangles, shapes[j], faces, progress=False)
+    halves = [
+        tm.subdivide(np.stack(pair), f, 1, progress=False)[1].numpy()
+        for pair, f in (((rest, found.positions.numpy()), triangles), ((shapes[i], shapes[j]), faces))
+    ]
+    mine, true = Surface(halves[0], triangles), Surface(halves[1], faces)
+    size = 100 / true.diagonal
+    apart = [size * a.closest(b.vertices).distances for a, b in ((true, mine), (mine, true))]
+    return {"case": f"{name} {i}-{j}", "mean": [a.mean() for a in apart], "max": [a.max() for a in apart],
+            "confidence": found.confidence}  # fmt: skip
+
+
+def timed(n_rounds: int) -> dict[str, Any]:
+    """The woman, in faces cut into four as often as told and then decimated to 60 %."""
+    import trimesh
+
+    shapes, faces = poses("mh-woman")
+    both, triangles = np.concatenate([shapes[0], shapes[1]], axis=1), faces
+    for _ in range(n_rounds):
+        cut, triangles, new = trimesh.remesh.subdivide(both[:, :3], triangles, vertex_attributes={"o": both[:, 3:]})
+        both = np.hstack([cut, new["o"]])
+    rest, template = remeshed(both[:, :3], triangles, np.random.default_rng(0))
+    started = time.process_time()
+    tm.register(rest, template, both[:, 3:], triangles, progress=False)
+    return {"case": f"{len(rest)} on {len(both)} vertices", "seconds": time.process_time() - started}
+
+
+def tasks(part: str, n_pairs: int) -> list[Callable[[], dict[str, Any]]]:
+    """What a part of the table is made of."""
+    if part in ("poses", "pairs", "marked"):
+        cases = pose_cases() if part == "poses" else random_cases(n_pairs, part == "marked")
+        return [lambda case=case: one(*case) for case in cases]  # type: ignore[misc]
+    if part == "across":
+        return [across]
+    if part == "middle":
+        pairs = (("mh-hand", 0, 1), ("mh-woman", 1, 2), ("creature", 1, 5))
+        return [lambda pair=pair: middle(*pair) for pair in pairs]  # type: ignore[misc]
+    return [lambda: timed(0), lambda: timed(1)]
+
+
+def main() -> None:
+    """Run parts and print their rows; rows are kept, and the table at the end is made of all that are kept."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", default=["poses", "pairs", "marked", "across", "middle", "time"])
+    parser.add_argument("--n-pairs", type=int, default=50)
+    parser.add_argument("--rows", type=Path, help="a file of rows from earlier runs, which is added to")
+    args = parser.parse_args()
+    rows = [json.loads(line) for line in args.rows.read_text().splitlines()] if args.rows and args.rows.exists() else []
+    done = [row["part"] for row in rows]
+    for part in args.parts:
+        for task in tasks(part, args.n_pairs)[done.count(part) :]:
+            row = {"part": part, **task()}
+            rows.append(row)
+            print(json.dumps(row, default=float), flush=True)
+            if args.rows:
+                with args.rows.open("a") as file:
+                    file.write(json.dumps(row, default=float) + "\n")
+    print("\n".join(table(rows)))
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """The lines of the summary."""
+    lines = []
+    for part in ("poses", "pairs", "marked"):
+        own = [row for row in rows if row["part"] == part]
+        if not own:
+            continue
+        results = [row for row in own if "error" not in row]
+        trusted = [row for row in results if row["confidence"] >= 0.5]
+        whole = [row for row in trusted if row["how"] != "cut off"]
+        lines.append(
+            f"{part}: {len(own)} pairs, {len(own) - len(results)} errors, {len(results) - len(trusted)} doubtful, "
+            f"{sum(row['mean'] > WRONG for row in results)} beyond {WRONG:g} %, of these trusted "
+            f"{sum(row['mean'] > WRONG for row in trusted)}"
+        )
+        if trusted:
+            means, tails = ([row[key] for row in whole] for key in ("mean", "p95"))
+            lines.append(
+                f"  trusted whole ones: mean {np.mean(means):.2f} %, worst {max(means):.2f} %; 95th percentile "
+                f"{np.mean(tails):.2f} %, worst {max(tails):.2f} %; {sum(m > 1.3 for m in means)} of {len(whole)} "
+                "above 1.3 %"
+            )
+    for row in rows:
+        if row["part"] in ("across", "middle", "time"):
+            lines.append(f"{row['part']}: {json.dumps(row, default=float)}")
+    return lines
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""Laying a template onto a target, from a rough map to the surface itself."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from torch_modal.keyframes.registration.elastic import ElasticSurface, Pull
+from torch_modal.keyframes.registration.spectrum import SpectralShape
+from torch_modal.keyframes.registration.surface import BoolArray, Closest, FloatArray, IntArray, Surface
+
+WORKING_DIAGONAL = 100.0
+"""Of the target's bounding box: reaches below are in percent of it."""
+
+
+class Stage(NamedTuple):
+    """Some steps with the same weight."""
+
+    weight: float
+    """Of closest points against stiffness."""
+    reach: float
+    """Closest points further away do not count, in percent of the diagonal."""
+    steps: int
+
+
+COARSE_STAGES = (Stage(0.05, 6, 4), Stage(0.2, 5, 6), Stage(0.5, 4, 6), Stage(2.0, 3, 4))
+FINE_STAGES = (Stage(0.3, 4, 3), Stage(1.0, 3, 3), Stage(3.0, 3, 3))
+
+_ALIKE = 0.4  # cosine between the normals of closest points
+_LANDMARK_WEIGHT = 5.0
+MAP_WEIGHTS = (0.02, 0.1)
+_MAP_ROUNDS = 40
+_MAP_SHARE = 0.05  # of the weight of closest points, while a map is followed
+_RELEASED, _CAUGHT = Stage(0.3, 5, 4), Stage(0.5, 5, 3)  # without what is turned, then with it
+_REST = 1e-5  # holds what nothing else does: a piece without a counterpart
+_ON_EDGE = 1e-6
+
+
+class Gate:
+    """Keeps closest points near the image of a map: two fingers that touch are far apart along the surface.
+
+    Args:
+        target: The target's coarse shape.
+        radius: Of a surface of area one.
+    """
+
+    def __init__(self, target: SpectralShape, radius: float = 0.12) -> None:
+        self._near = target.neighbourhoods(radius)
+        self._tree = cKDTree(target.positions)
+
+    def coarse(self, points: FloatArray) -> IntArray:
+        """The coarse vertex next to points on the target. *Shape:* ``(n, 3) -> (n,)``."""
+        return self._tree.query(points)[1].astype(np.int64)
+
+    def open(self, images: IntArray, coarse: IntArray) -> BoolArray:
+        """Whether coarse vertices are neighbours. *Shape:* ``(n,), (n,) -> (n,)``."""
+        return self._near[images, coarse]
+
+
+class Fit:
+    """A template on its way to a target.
+
+    Args:
+        template: The rest shape, in the target's scale.
+        target: With a diagonal of 100.
+        back: Some form of the target whose vertices look for closest points on the template.
+        gate: Says which points may meet.
+        images: Coarse vertex of the target for each template vertex. *Shape:* ``(V,)``.
+        landmarks: Points of the template and where they belong.
+        stretchable: Whether parts may grow and shrink.
+        tick: Called after each step.
+    """
+
+    def __init__(
+        self,
+        template: Surface,
+        target: Surface,
+        back: Surface,
+        gate: Gate,
+        images: IntArray,
+        landmarks: tuple[sparse.csr_matrix, FloatArray] | None = None,
+        *,
+        stretchable: bool = False,
+        tick: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.template, self.target, self.back, self.tick = template, target, back, tick
+        self.elastic = ElasticSurface(template, stretchable=stretchable)
+        self._gate, self._images = gate, images
+        self._share = template.vertex_areas / template.vertex_areas.mean()
+        self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
+        self._back_coarse = gate.coarse(back.vertices)
+        self._fixed: list[Pull] = []
+        self._map: list[Pull] = []
+        if landmarks is not None:
+            self._fixed = [self._pull(*landmarks, np.full(len(landmarks[1]), _LANDMARK_WEIGHT))]
+
+    def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray) -> Pull:
+        return Pull(points, places, self.elastic.stiffness * weights)
+
+    def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
+        """Towards the places that a map gives, softly; and from then on a little. *Shape:* ``(V, 3), (V, 3)``."""
+        everywhere, ones = sparse.identity(len(x), format="csr"), np.ones(len(x))
+        for weight in MAP_WEIGHTS:
+            x = self.elastic.follow(x, [self._pull(everywhere, places, weight * ones), *self._fixed], _MAP_ROUNDS)
+            self.tick()
+        self._map = [self._pull(everywhere, places, _MAP_SHARE * ones)]
+        return x
+
+    def run(self, x: FloatArray, stages: Sequence[Stage], releases: int) -> FloatArray:
+        """All stages, then some releases of what lies the wrong way round. *Shape:* ``(V, 3)``."""
+        for stage in stages:
+            x = self._steps(x, stage)
+        self._map = []
+        for _ in range(releases):
+            turned = self._turned(x)
+            if turned.any():
+                x = self._steps(self._steps(x, _RELEASED, turned), _CAUGHT)
+        return x
+
+    def _steps(self, x: FloatArray, stage: Stage, released: BoolArray | None = None) -> FloatArray:
+        everywhere = sparse.identity(len(x), format="csr")
+        for _ in range(stage.steps):
+            shape = self.template.moved(x)
+            pulls = [self._forth(shape, stage, released), self._and_back(shape, stage, released), *self._fixed]
+            pulls += [pull._replace(weights=pull.weights * stage.weight) for pull in self._map]
+            pulls.append(self._pull(everywhere, x, np.full(len(x), _REST)))
+            x = self.elastic.follow(x, pulls)
+            self.tick()
+        return x
+
+    def _forth(self, shape: Surface, stage: Stage, released: BoolArray | None) -> Pull:
+        """Template vertices to their closest points on the target."""
+        closest = self.target.closest(shape.vertices)
+        places, normals = closest.points.copy(), self.target.face_normals[closest.faces]
+        used = np.einsum("vi,vi->v", shape.vertex_normals, normals) > _ALIKE
+        used &= self._gate.open(self._images, self._gate.coarse(places))
+        # Where another sheet lies in the way, a vertex of the right one will do.
+        hidden = np.flatnonzero(~used)
+        beside = self.target.nearest_alike(shape.vertices[hidden], shape.vertex_normals[hidden])
+        places[hidden] = self.target.vertices[beside]
+        used[hidden] = np.einsum("vi,vi->v", shape.vertex_normals[hidden], self.target.vertex_normals[beside]) > _ALIKE
+        used[hidden] &= self._gate.open(self._images[hidden], self._gate.coarse(places[hidden]))
+        used &= np.linalg.norm(places - shape.vertices, axis=1) < stage.reach
+        used &= shape.on_boundary | ~on_open_edge(self.target, closest)
+        if released is not None:
+            used &= ~released
+        kept = np.flatnonzero(used)
+        points = sparse.identity(len(used), format="csr")[kept]
+        return self._pull(points, places[kept], stage.weight * self._share[kept])
+
+    def _and_back(self, shape: Surface, stage: Stage, released: BoolArray | None) -> Pull:
+        """The template's points next to the target's vertices, pulled to these."""
+        closest = shape.closest(self.back.vertices)
+        corners = shape.faces[closest.faces]
+        used = np.einsum("vi,vi->v", self.back.vertex_normals, shape.face_normals[closest.faces]) > _ALIKE
+        used &= closest.distances < stage.reach
+        used &= self.back.on_boundary | ~on_open_edge(shape, closest)
+        used &= self._gate.open(self._images[corners[:, 0]], self._back_coarse)
+        if released is not None:
+            used &= ~released[corners].any(1)
+        kept = np.flatnonzero(used)
+        points = shape.rows(closest)[kept]
+        return self._pull(points, self.back.vertices[kept], stage.weight * self._back_share[kept])
+
+    def _turned(self, x: FloatArray) -> BoolArray:
+        """Vertices of faces that look against the target, and their neighbours."""
+        shape = self.template.moved(x)
+        bad = np.zeros(len(x), dtype=bool)
+        bad[shape.faces[self.target.looks_away(x[shape.faces].mean(1), shape.face_normals)]] = True
+        spread = bad.copy()
+        i, j = shape.edges.T
+        spread[i[bad[j]]] = spread[j[bad[i]]] = True
+        return spread
+
+
+def on_open_edge(surface: Surface, closest: Closest) -> BoolArray:
+    """Closest points on the boundary: what is really next to them may be missing. *Shape:* ``(n,)``."""
+    if not surface.open_sides.any():
+        return np.zeros(len(closest.faces), dtype=bool)
+    return np.logical_or.reduce((surface.barycentric(closest) < _ON_EDGE) & surface.open_sides[closest.faces], axis=1)

@@ -1,0 +1,146 @@
+"""Landmarks: points that belong together; their files, and suggestions where to put them."""
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torch_modal.errors import MeshError
+from torch_modal.keyframes.check import check_keyframes
+from torch_modal.keyframes.registration.consistency import farthest_points
+from torch_modal.keyframes.registration.spectrum import SpectralShape
+from torch_modal.keyframes.registration.surface import FloatArray, IntArray, referenced
+
+N_SUGGESTED = 14
+# A tip is a vertex that is farther from the rest, in the mean, than all within this distance; of a surface of area one.
+_TIP_RADIUS = 0.25
+
+
+class LandmarkPoints(NamedTuple):
+    """Places on both meshes, each in its own coordinates. *Shape of each:* ``(n, 3)``."""
+
+    template: FloatArray
+    target: FloatArray
+
+
+def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) -> LandmarkPoints:
+    """What `register` is given, as points.
+
+    Args:
+        landmarks: None, pairs of vertex indices ``(n, 2)``, or two arrays of points ``(n, 3)``.
+        template: *Shape:* ``(V, 3)``.
+        target: *Shape:* ``(V_target, 3)``.
+
+    Raises:
+        MeshError: The shapes are wrong, or a vertex does not exist.
+    """
+    if landmarks is None:
+        return LandmarkPoints(np.zeros((0, 3)), np.zeros((0, 3)))
+    if isinstance(landmarks, (tuple, list)) and len(landmarks) == 2 and all(np.ndim(part) == 2 for part in landmarks):
+        here, there = (_array(part).astype(np.float64) for part in landmarks)
+        if here.shape != there.shape or here.shape[1] != 3 or not np.isfinite([here, there]).all():
+            raise MeshError(
+                f"landmarks are arrays of shapes {here.shape} and {there.shape}; two arrays of finite points (n, 3) "
+                "are needed, the template's and the target's"
+            )
+        return LandmarkPoints(here, there)
+    pairs = _array(landmarks)
+    if pairs.size == 0:
+        return LandmarkPoints(np.zeros((0, 3)), np.zeros((0, 3)))
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
+        raise MeshError(
+            f"landmarks have shape {pairs.shape} and dtype {pairs.dtype}; pairs of vertex indices (n, 2) are needed, "
+            "template first, or two arrays of points (n, 3)"
+        )
+    for column, (name, mesh) in enumerate((("template", template), ("target", target))):
+        wrong = np.flatnonzero((pairs[:, column] < 0) | (pairs[:, column] >= len(mesh)))
+        if len(wrong):
+            raise MeshError(
+                f"landmark {wrong[0]} names vertex {pairs[wrong[0], column]} of the {name}, which has {len(mesh)} "
+                "vertices, counted from 0"
+            )
+    return LandmarkPoints(template[pairs[:, 0]], target[pairs[:, 1]])
+
+
+def _array(values: Any) -> Any:
+    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+
+
+def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | FloatArray:
+    """Read a landmark file: a line for each landmark, a column for each mesh; ``#`` begins a comment.
+
+    Args:
+        path: A text file. Each line names one vertex of each mesh, counted from 0, or gives three coordinates for each.
+        n_meshes: How many meshes the landmarks are for.
+
+    Returns:
+        Vertices, int64, *shape* ``(n, n_meshes)``, or points, float64, *shape* ``(n, n_meshes, 3)``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        MeshError: A line cannot be used.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    rows: list[list[float]] = []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if (
+            not np.isfinite(row).all()
+            or len(row) not in (n_meshes, 3 * n_meshes)
+            or (rows and len(row) != len(rows[0]))
+        ):
+            raise MeshError(
+                f"{path}, line {number}: {line.strip()[:60]!r} is no landmark for {n_meshes} meshes; each line holds "
+                f"{n_meshes} vertex numbers, counted from 0, or {3 * n_meshes} coordinates, all lines alike"
+            )
+        if len(row) == n_meshes and any(value != int(value) or value < 0 for value in row):
+            raise MeshError(
+                f"{path}, line {number}: vertex numbers are whole and count from 0, got {line.strip()[:60]!r}"
+            )
+        rows.append(row)
+    if not rows:
+        raise MeshError(f"{path}: no landmarks in this file; write a line for each, with a vertex number for each mesh")
+    table = np.array(rows)
+    return table.astype(np.int64) if table.shape[1] == n_meshes else table.reshape(-1, n_meshes, 3)
+
+
+def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArray:
+    """Vertices that are easily found again on another mesh of the same kind: tips first, then points spread between.
+
+    Tips are local maxima of the mean geodesic distance to everything else: the ends of limbs, ears, noses.
+
+    Args:
+        vertices: Vertex positions. *Shape:* ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n: How many.
+
+    Returns:
+        Vertex indices. *Shape:* ``(n,)``, fewer on a mesh with fewer vertices.
+
+    Raises:
+        MeshError: The mesh cannot work.
+        ImportError: The extra ``register`` is not installed.
+    """
+    checked = check_keyframes([vertices], faces, warn=False)
+    points = checked.keyframes[0].detach().cpu().double().numpy()
+    surface, used = referenced(points, checked.faces.cpu().numpy())
+    shape = SpectralShape(surface)
+    _, to_samples = farthest_points(shape, 4 * n)
+    eccentricity = to_samples.mean(1)
+    near = shape.neighbourhoods(_TIP_RADIUS)
+    highest = np.where(near, eccentricity, -np.inf).max(1)
+    tips = np.flatnonzero(eccentricity >= highest)
+    tips = tips[np.argsort(-eccentricity[tips])][:n]
+    chosen, _ = farthest_points(shape, n, start=tips)
+    fine = surface.nearest_alike(shape.positions[chosen], shape.coarse.vertex_normals[chosen])
+    return used[fine]

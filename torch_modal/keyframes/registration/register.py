@@ -1,0 +1,304 @@
+"""One mesh laid onto another: the whole path, from two meshes to a report."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy import sparse
+from tqdm import tqdm
+
+from torch_modal.errors import MeshError
+from torch_modal.keyframes.check import check_keyframes
+from torch_modal.keyframes.registration.consistency import Consistency
+from torch_modal.keyframes.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Fit, Gate
+from torch_modal.keyframes.registration.landmarks import LandmarkPoints, landmark_points
+from torch_modal.keyframes.registration.libraries import require
+from torch_modal.keyframes.registration.maps import (
+    FINE_FUNCTIONS,
+    N_OTHER_STARTS,
+    Map,
+    landmark_map,
+    rate,
+    spectral_maps,
+)
+from torch_modal.keyframes.registration.report import Quality, Registration, judge, measure
+from torch_modal.keyframes.registration.spectrum import SpectralShape
+from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Surface, outward, referenced
+
+FEWEST_ACROSS = 5
+"""Landmarks that two different subjects need: their spectra do not tell which map is right."""
+_SURE_SCORE = 0.40  # of a spectral map; below it, more starts are tried
+_SIGNS, _MORE_SIGNS = 4, 6
+_SCORE_SHARE = 0.5  # of a map's score against the stretch of its fit
+_RIVALS = 3  # maps that are fitted before one is chosen
+_RIVAL_SCORE = 0.15  # behind the best, in score minus distortion
+_SAME = 0.1  # maps that differ by less at all but 2 % of the vertices, of a surface of area one, count as one
+_RESCALED = 0.02  # change of scale of the whole, as a logarithm, that is worth another fit
+
+
+class _Candidate(NamedTuple):
+    found: Map
+    distortion: float
+    scale: float
+    x: FloatArray
+    fit: Fit
+    quality: Quality
+
+    @property
+    def cost(self) -> float:
+        """What candidates are compared by: a good map, laid on without stretch."""
+        return self.quality.cost + self.distortion - _SCORE_SHARE * self.found.score
+
+
+class _Progress:
+    """A bar whose length is learnt on the way."""
+
+    def __init__(self, show: bool | None) -> None:
+        # None: on a terminal only.
+        self._bar = tqdm(total=0, desc="register", disable=None if show is None else not show, leave=False)
+
+    def expect(self, steps: int) -> None:
+        if not self._bar.disable:
+            self._bar.total += steps
+            self._bar.refresh()
+
+    def tick(self) -> None:
+        self._bar.update()
+
+    def close(self) -> None:
+        self._bar.close()
+
+
+def register(
+    template: Any,
+    template_faces: Any,
+    target: Any,
+    target_faces: Any,
+    *,
+    landmarks: Any = None,
+    same_subject: bool = True,
+    progress: bool | None = None,
+) -> Registration:
+    """Lay a template onto a target of any other connectivity.
+
+    Both are decimated and compared by their Laplacian spectra, or by geodesic distances to the landmarks; the map is
+    refined, and an elastic copy of the template follows it onto the target.
+
+    Args:
+        template: Vertex positions, float32 or float64, in any units and any place. *Shape:* ``(V, 3)``.
+        template_faces: Vertex indices. *Shape:* ``(F, 3)``.
+        target: Vertex positions. *Shape:* ``(V_target, 3)``.
+        target_faces: Vertex indices. *Shape:* ``(F_target, 3)``.
+        landmarks: Pairs of vertices, template first, *shape* ``(n, 2)``; or two arrays of points ``(n, 3)``, in the
+            coordinates of the template and of the target.
+        same_subject: Whether both are poses of one body, nearly without stretch. Two different bodies need five
+            landmarks or more.
+        progress: Show a bar; by default on a terminal only.
+
+    Returns:
+        Places of the template's vertices on the target, and a report. A doubtful result is returned too, with a
+        confidence below 0.5 and warnings.
+
+    Raises:
+        MeshError: A mesh or the landmarks cannot work.
+        ImportError: The extra ``register`` is not installed.
+    """
+    checked = check_keyframes([template], template_faces, warn=False)
+    goal = check_keyframes([target], target_faces, warn=False)
+    rest, faces = checked.keyframes[0].detach().cpu().double().numpy(), checked.faces.cpu().numpy()
+    there, there_faces = goal.keyframes[0].detach().cpu().double().numpy(), goal.faces.cpu().numpy()
+    points = landmark_points(landmarks, rest, there)
+    if not same_subject and len(points.template) < FEWEST_ACROSS:
+        raise MeshError(
+            f"two different subjects need {FEWEST_ACROSS} landmarks or more, got {len(points.template)}: without them "
+            "nothing tells which map is right; give pairs of vertices, template first"
+        )
+    bar = _Progress(progress)
+    try:
+        # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
+        with require("threadpoolctl").threadpool_limits(1):
+            return _Problem(rest, faces, there, there_faces, points, same_subject, bar).solve(checked.keyframes[0])
+    finally:
+        bar.close()
+
+
+class _Problem:
+    """Two meshes in working units: the target around the origin with a diagonal of 100, the template of its area."""
+
+    def __init__(
+        self,
+        rest: FloatArray,
+        faces: IntArray,
+        there: FloatArray,
+        there_faces: IntArray,
+        points: LandmarkPoints,
+        same_subject: bool,
+        progress: _Progress,
+    ) -> None:
+        self.same_subject, self.progress = same_subject, progress
+        goal, self.target_vertices = referenced(there, outward(there, there_faces))
+        self.unit, self.origin = goal.diagonal / WORKING_DIAGONAL, goal.vertices.mean(0)
+        self.target = goal.moved((goal.vertices - self.origin) / self.unit)
+        own, self.used = referenced(rest, outward(rest, faces))
+        self.size = np.sqrt(self.target.area / own.area)
+        self.rest = rest * self.size
+        self.template = own.moved(own.vertices * self.size)
+        self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
+        self.gate = Gate(self.second)
+        self.consistency = Consistency(self.first, self.second)
+        self.marks = points.template * self.size
+        self.mark_places = (points.target - self.origin) / self.unit
+
+    def solve(self, like: torch.Tensor) -> Registration:
+        rivals = self._rivals(self._maps())
+        candidates = [self._coarse(found, distortion) for found, distortion in rivals]
+        best = self._rescaled(min(candidates, key=lambda one: one.cost))
+        x, everything = self._fine(best)
+        return self._report(x, everything, best, like)
+
+    # ------------------------------------------------------------------------------------------------------- maps
+    def _maps(self) -> list[Map]:
+        if len(self.marks):
+            pairs = [
+                shape.nearest(places, _normals(surface, places))
+                for shape, surface, places in (
+                    (self.first, self.template, self.marks),
+                    (self.second, self.target, self.mark_places),
+                )
+            ]
+            return [landmark_map(self.first, self.second, np.stack(pairs, axis=1))]
+        self.progress.expect(2**_SIGNS + N_OTHER_STARTS)
+        maps = spectral_maps(self.first, self.second, _SIGNS, tick=self.progress.tick)
+        if maps[0].score < _SURE_SCORE:
+            self.progress.expect(2**_MORE_SIGNS + N_OTHER_STARTS)
+            maps += spectral_maps(self.first, self.second, _MORE_SIGNS, tick=self.progress.tick)
+        return maps
+
+    def _rivals(self, maps: list[Map]) -> list[tuple[Map, float]]:
+        """The maps that are worth a fit, and their distortions: those found, and those mended, which differ."""
+        mended = [self.consistency.mended(found) for found in maps] if self.same_subject else []
+        everything = [*maps, *(found for found in mended if found is not None)]
+        rated = [(found, self.consistency.distortion(found.vertices)) for found in everything]
+        rated.sort(key=lambda pair: pair[1] - pair[0].score)
+        places = self.second.coarse.vertices
+        kept = rated[:1]
+        for found, distortion in rated[1:]:
+            apart = min(_apart(places[found.vertices], places[one.vertices]) for one, _ in kept)
+            lead = (found.score - distortion) - (rated[0][0].score - rated[0][1])
+            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and apart > _SAME:
+                kept.append((found, distortion))
+        return kept
+
+    # ------------------------------------------------------------------------------------------------------- fits
+    def _coarse(self, found: Map, distortion: float, scale: float = 1.0, x: FloatArray | None = None) -> _Candidate:
+        template = self.first.placed.moved(scale * self.first.positions)
+        back = self.second.placed
+        fit = self._fit(template, back, found.vertices, scale)
+        self.progress.expect(len(MAP_WEIGHTS) + sum(stage.steps for stage in COARSE_STAGES))
+        places = self.second.positions[found.vertices]
+        if x is None:
+            x = fit.follow_map(_placed(template.vertices, places, template.vertex_areas), places)
+        x = fit.run(x, COARSE_STAGES, releases=2)
+        return _Candidate(found, distortion, scale, x, fit, measure(template, x, back))
+
+    def _fit(self, template: Surface, back: Surface, images: IntArray, scale: float) -> Fit:
+        landmarks = None
+        if len(self.marks):
+            rows = template.rows(template.closest(self.marks * scale))
+            landmarks = (rows, self.mark_places)
+        return Fit(
+            template,
+            self.target,
+            back,
+            self.gate,
+            images,
+            landmarks,
+            stretchable=not self.same_subject,
+            tick=self.progress.tick,
+        )
+
+    def _rescaled(self, candidate: _Candidate) -> _Candidate:
+        """Fitted again with the scale that it has on the target: areas mislead where parts are missing."""
+        template = candidate.fit.template
+        i, j = template.edges.T
+        now, rest = (np.linalg.norm(p[i] - p[j], axis=1) for p in (candidate.x, template.vertices))
+        change = float(np.median(np.log(np.maximum(now, 1e-12) / np.maximum(rest, 1e-12))))
+        if not self.same_subject or abs(change) < _RESCALED:
+            return candidate
+        again = self._coarse(candidate.found, candidate.distortion, float(np.exp(change)), candidate.x)
+        return again if again.quality.cost <= candidate.quality.cost else candidate
+
+    def _fine(self, candidate: _Candidate) -> tuple[FloatArray, FloatArray]:
+        """Of the used vertices after the last stages; and of all, so that vertices of no face come along."""
+        coarse, x = candidate.fit.template, candidate.x
+        template = self.template.moved(self.template.vertices * candidate.scale)
+        frames = candidate.fit.elastic.local_frames(x)
+        start = _carried(template.vertices, coarse, x, frames)
+        images = self.second.nearest(start, template.moved(start).vertex_normals)
+        fit = self._fit(template, self.target, images, candidate.scale)
+        self.progress.expect(sum(stage.steps for stage in FINE_STAGES))
+        found = fit.run(start, FINE_STAGES, releases=1)
+        everything = _carried(self.rest * candidate.scale, coarse, x, frames)
+        everything[self.used] = found
+        return found, everything
+
+    # ----------------------------------------------------------------------------------------------------- report
+    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate, like: torch.Tensor) -> Registration:
+        quality = measure(self.template, x, self.target)
+        coarse = best.fit.template.moved(best.x)
+        images = self.second.nearest(coarse.vertices, coarse.vertex_normals)
+        score = rate(self.first, self.second, images, FINE_FUNCTIONS)
+        # Where sheets touch, the image of a sample may fall on the wrong one; the map itself has no such places.
+        distortion = min(best.distortion, self.consistency.distortion(images))
+        errors = np.zeros(0)
+        if len(self.marks):
+            rows = self.template.rows(self.template.closest(self.marks))
+            errors = np.linalg.norm(rows @ x - self.mark_places, axis=1) * (100 / WORKING_DIAGONAL)
+        confidence, said = judge(
+            quality, score, distortion, errors, same_subject=self.same_subject, landmarks=bool(len(self.marks))
+        )
+        closest = self.target.closest(everything)
+        corners = self.target_vertices[self.target.faces[closest.faces]]
+        tensor = torch.from_numpy(everything * self.unit + self.origin).to(like)
+        return Registration(
+            positions=tensor,
+            confidence=confidence,
+            map_score=score,
+            distortion=distortion,
+            to_target=quality.to_target,
+            from_target=quality.from_target,
+            stretch=quality.stretch,
+            flipped_area=quality.flipped_area,
+            folds=quality.folds,
+            landmark_errors=torch.from_numpy(errors),
+            target_faces=torch.from_numpy(closest.faces),
+            barycentric=torch.from_numpy(self.target.barycentric(closest)),
+            target_corners=torch.from_numpy(corners),
+            warnings=said,
+        )
+
+
+def _apart(places: FloatArray, others: FloatArray) -> float:
+    return float(np.percentile(np.linalg.norm(places - others, axis=1), 98))
+
+
+def _normals(surface: Surface, points: FloatArray) -> FloatArray:
+    return surface.face_normals[surface.closest(points).faces]
+
+
+def _placed(x: FloatArray, places: FloatArray, weights: FloatArray) -> FloatArray:
+    """Moved rigidly onto places, as well as it goes (Kabsch). *Shape:* ``(n, 3), (n, 3), (n,)``."""
+    weights = weights / weights.sum()
+    source, target = weights @ x, weights @ places
+    u, _, vh = np.linalg.svd(((places - target) * weights[:, None]).T @ (x - source))
+    u[:, 2] *= np.linalg.det(u @ vh)
+    return (x - source) @ (u @ vh).T + target
+
+
+def _carried(points: FloatArray, coarse: Surface, x: FloatArray, frames: FloatArray) -> FloatArray:
+    """Points beside a coarse surface at rest, moved along with it. *Shape:* ``(n, 3)``."""
+    rows: sparse.csr_matrix = coarse.rows(coarse.closest(points))
+    # Each corner carries the point as its own frame says; the mean by barycentric weights.
+    offsets = np.einsum("vij,vj->vi", frames, coarse.vertices)
+    turn = (rows @ frames.reshape(len(frames), 9)).reshape(-1, 3, 3)
+    return rows @ (x - offsets) + np.einsum("nij,nj->ni", turn, points)

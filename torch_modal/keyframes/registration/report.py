@@ -1,0 +1,188 @@
+"""What came out of a registration, and how far it can be trusted."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torch_modal.errors import MeshError
+from torch_modal.geometry import connectivity
+from torch_modal.keyframes.registration.surface import FloatArray, Surface
+
+TRUSTED = 0.5
+"""Confidence below which a result is doubtful."""
+
+
+class Distances(NamedTuple):
+    """From the vertices of one surface to the other, in percent of the target's bounding-box diagonal."""
+
+    mean: float
+    """By area."""
+    percentile_95: float
+    """Of the vertices."""
+    max: float
+    """Of the vertices."""
+
+    @classmethod
+    def between(cls, surface: Surface, other: Surface, diagonal: float) -> "Distances":
+        """From ``surface`` to ``other``."""
+        distances = 100 / diagonal * other.closest(surface.vertices).distances
+        weights = surface.vertex_areas / surface.vertex_areas.sum()
+        return cls(float(weights @ distances), float(np.percentile(distances, 95)), float(distances.max()))
+
+
+class Quality(NamedTuple):
+    """How a laid-on template looks; nothing here knows the truth."""
+
+    to_target: Distances
+    from_target: Distances
+    stretch: float
+    """Root mean square of ``log(length / length at rest)`` over the edges, after the best scale of the whole."""
+    flipped_area: float
+    """Part of the template's area that looks against the target."""
+    folds: int
+    """Edges at which two faces that were at most at right angles now lie nearly back to back."""
+
+    @property
+    def cost(self) -> float:
+        """What candidates are compared by: lower is better."""
+        return self.stretch + 0.1 * (self.to_target.mean + self.from_target.mean) + self.flipped_area
+
+
+def measure(template: Surface, x: FloatArray, target: Surface) -> Quality:
+    """The quality of a shape of the template against the target."""
+    shape = template.moved(x)
+    i, j = shape.edges.T
+    now, rest = (np.linalg.norm(p[i] - p[j], axis=1) for p in (x, template.vertices))
+    usable = (now > 0) & (rest > 0)
+    logs = np.log(now[usable] / rest[usable])
+    against = target.looks_away(x[shape.faces].mean(1), shape.face_normals)
+    pairs = connectivity.face_neighbours(shape.faces)
+    cosines = [
+        np.einsum("ni,ni->n", n[pairs[:, 0]], n[pairs[:, 1]]) for n in (template.face_normals, shape.face_normals)
+    ]
+    return Quality(
+        Distances.between(shape, target, target.diagonal),
+        Distances.between(target, shape, target.diagonal),
+        float(np.sqrt(np.mean((logs - np.median(logs)) ** 2))) if len(logs) else 0.0,
+        float(template.face_areas[against].sum() / template.area),
+        int(((cosines[0] > 0) & (cosines[1] < -0.5)).sum()),
+    )
+
+
+class Registration(NamedTuple):
+    """A template laid onto a target. Lengths are in percent of the target's bounding-box diagonal."""
+
+    positions: torch.Tensor
+    """Places of the template's vertices on the target, in its coordinates and the template's dtype.
+
+    *Shape:* ``(V, 3)``.
+    """
+    confidence: float
+    """From 0 to 1; below 0.5 the result is doubtful, and ``warnings`` says why."""
+    map_score: float
+    """Area that keeps its orientation minus thrice the round-trip error, of the coarse map; 1 is perfect."""
+    distortion: float
+    """Error of distances along the surface, of each vertex to its worst sample, in roots of the area."""
+    to_target: Distances
+    """From the template's vertices to the target."""
+    from_target: Distances
+    """From the target's vertices to the template."""
+    stretch: float
+    """Root mean square of the edges' logarithmic change of length, after the best scale of the whole."""
+    flipped_area: float
+    """Part of the template's area that looks against the target."""
+    folds: int
+    """Edges at which the template is folded over itself."""
+    landmark_errors: torch.Tensor
+    """From each landmark to its place. *Shape:* ``(n,)``."""
+    target_faces: torch.Tensor
+    """The face of the target below each vertex. *Shape:* ``(V,)``."""
+    barycentric: torch.Tensor
+    """Weights of that face's corners. *Shape:* ``(V, 3)``."""
+    target_corners: torch.Tensor
+    """Vertices of the target at those corners. *Shape:* ``(V, 3)``."""
+    warnings: tuple[str, ...]
+    """What makes the result doubtful, and what to do."""
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the result should not be used without a look at it."""
+        return self.confidence < TRUSTED
+
+    def sample(self, values: Any) -> torch.Tensor:
+        """Attributes of the target's vertices, at the template's vertices.
+
+        Floats (colours, texture coordinates) are interpolated in the face below each vertex; whole numbers and
+        booleans (labels) are taken from the nearest of its corners.
+
+        Args:
+            values: One row for each vertex of the target. *Shape:* ``(V_target, ...)``.
+
+        Returns:
+            *Shape:* ``(V, ...)``, same dtype.
+
+        Raises:
+            MeshError: There are fewer rows than vertices.
+        """
+        rows = torch.as_tensor(values)
+        if rows.ndim == 0 or len(rows) <= int(self.target_corners.max()):
+            raise MeshError(
+                f"values have shape {tuple(rows.shape)}; one row for each vertex of the target is needed, at least "
+                f"{int(self.target_corners.max()) + 1}"
+            )
+        corners = self.target_corners.to(rows.device)
+        if not (rows.is_floating_point() or rows.is_complex()):
+            nearest = self.barycentric.to(rows.device).argmax(1, keepdim=True)
+            return rows[corners.gather(1, nearest)[:, 0]]
+        weights = self.barycentric.to(rows).reshape(*corners.shape, *[1] * (rows.ndim - 1))
+        return (weights * rows[corners]).sum(1)
+
+    def summary(self) -> str:
+        """The report in one line."""
+        marks = f", landmarks within {float(self.landmark_errors.max()):.2f} %" if len(self.landmark_errors) else ""
+        return (
+            f"confidence {self.confidence:.2f}, distance {self.to_target.mean:.3f} % there and "
+            f"{self.from_target.mean:.3f} % back (at most {max(self.to_target.max, self.from_target.max):.1f} %), "
+            f"stretch {100 * self.stretch:.0f} %, flipped area {100 * self.flipped_area:.1f} %, "
+            f"{self.folds} folds{marks}"
+        )
+
+
+def _ramp(value: float, bad: float, good: float) -> float:
+    """0 at ``bad``, 1 at ``good``, linear between."""
+    return float(np.clip((value - bad) / (good - bad), 0, 1))
+
+
+def judge(
+    quality: Quality,
+    map_score: float,
+    distortion: float,
+    landmark_errors: FloatArray,
+    *,
+    same_subject: bool,
+    landmarks: bool,
+) -> tuple[float, tuple[str, ...]]:
+    """Confidence, the least of several signs, and a sentence for each that is bad."""
+    advice = "look at the result, and give landmarks (five or more) on both meshes" + (
+        ", or more of them" if landmarks else ""
+    )
+    distance = max(quality.to_target.mean, quality.from_target.mean)
+    signs = [
+        (_ramp(distance, 1.0, 0.3), f"the surfaces are {distance:.2f} % of the diagonal apart in the mean"),
+        (_ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
+    ]
+    if same_subject:
+        said_of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.5 and 0.1"
+        signs.append((_ramp(map_score - distortion, 0.1, 0.5), said_of_map))
+        signs.append((_ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"))
+    if len(landmark_errors):
+        worst = int(landmark_errors.argmax())
+        signs.append(
+            (
+                _ramp(landmark_errors[worst], 8.0, 2.0),
+                f"landmark {worst} is {landmark_errors[worst]:.1f} % off its place",
+            )
+        )
+    said = tuple(f"{what}; {advice}" for value, what in signs if value < TRUSTED)
+    return min(value for value, _ in signs), said

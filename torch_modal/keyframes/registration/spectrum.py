@@ -1,0 +1,131 @@
+"""A coarse copy of a surface with its Laplacian eigenfunctions and geodesic distances: what maps are made from."""
+
+import threading
+from functools import cached_property
+from typing import Any
+
+import fast_simplification
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.sparse.linalg import eigsh
+
+from torch_modal.geometry import inspect
+from torch_modal.keyframes.registration.libraries import require
+from torch_modal.keyframes.registration.surface import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Surface,
+    largest_piece,
+    referenced,
+)
+
+N_COARSE = 2000
+"""Vertices of the coarse copies."""
+N_FUNCTIONS = 60
+"""Eigenfunctions, the constant one among them."""
+
+_WORKING_DIAGONAL = 100.0  # fast-simplification has absolute thresholds
+_NOT_THREAD_SAFE = threading.Lock()  # it keeps its mesh in static memory
+
+
+class SpectralShape:
+    """The largest piece of a surface, decimated and scaled to area one.
+
+    Args:
+        surface: The fine surface.
+        n_vertices: About as many are kept.
+    """
+
+    def __init__(self, surface: Surface, n_vertices: int = N_COARSE) -> None:
+        self.fine = surface
+        coarse = decimated(surface, n_vertices)
+        self.scale = np.sqrt(coarse.area)
+        """Length of the fine surface's units that is one here."""
+        self.coarse = Surface(coarse.vertices / self.scale, coarse.faces)
+
+    def __len__(self) -> int:
+        """Number of coarse vertices."""
+        return len(self.coarse.vertices)
+
+    @property
+    def positions(self) -> FloatArray:
+        """Coarse vertices in the units of the fine surface. *Shape:* ``(n, 3)``."""
+        return self.coarse.vertices * self.scale
+
+    @cached_property
+    def _spectrum(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        laplacian, mass = require("robust_laplacian").mesh_laplacian(self.coarse.vertices, self.coarse.faces)
+        n = len(self)
+        count = min(N_FUNCTIONS, n - 2)
+        # Shifted by a little: the constant function makes the matrix singular.
+        values, functions = eigsh(laplacian.tocsc(), count, mass.tocsc(), sigma=-0.01, v0=np.ones(n) + np.arange(n) / n)
+        return values, functions, mass.diagonal()
+
+    @property
+    def eigenvalues(self) -> FloatArray:
+        """*Shape:* ``(k,)``."""
+        return self._spectrum[0]
+
+    @property
+    def functions(self) -> FloatArray:
+        """Orthonormal in the mass. *Shape:* ``(n, k)``."""
+        return self._spectrum[1]
+
+    @property
+    def mass(self) -> FloatArray:
+        """Area of each vertex, as the Laplacian has it. *Shape:* ``(n,)``."""
+        return self._spectrum[2]
+
+    def wave_kernel_signatures(self, n_energies: int = 40) -> FloatArray:
+        """Aubry, Schlickewei and Cremers 2011. *Shape:* ``(n, n_energies)``, columns of length one."""
+        logs = np.log(np.maximum(self.eigenvalues[1:], 1e-9))
+        energies = np.linspace(logs[0], logs[-1] / 1.02, n_energies)
+        width = max(7 * (logs[-1] - logs[0]) / n_energies, 1e-9)
+        weights = np.exp(-((energies[:, None] - logs) ** 2) / (2 * width**2))
+        signatures = self.functions[:, 1:] ** 2 @ (weights / weights.sum(1, keepdims=True)).T
+        return signatures / np.linalg.norm(signatures, axis=0)
+
+    @cached_property
+    def _heat_solver(self) -> Any:
+        return require("potpourri3d").MeshHeatMethodDistanceSolver(self.coarse.vertices, self.coarse.faces)
+
+    def geodesics_from(self, sources: IntArray) -> FloatArray:
+        """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
+        return np.stack([self._heat_solver.compute_distance(int(source)) for source in sources], axis=1)
+
+    def neighbourhoods(self, radius: float) -> BoolArray:
+        """Where two vertices lie within a distance along edges. *Shape:* ``(n, n)``."""
+        i, j = self.coarse.edges.T
+        lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
+        graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
+        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=radius) <= radius
+        return near
+
+    def nearest(self, points: FloatArray, normals: FloatArray) -> IntArray:
+        """The coarse vertex next to points of the fine surface, on the same side of thin parts. *Shape:* ``(m,)``."""
+        return self.placed.nearest_alike(points, normals)
+
+    @cached_property
+    def placed(self) -> Surface:
+        """The coarse copy in the units of the fine surface."""
+        return Surface(self.positions, self.coarse.faces)
+
+
+def decimated(surface: Surface, n_vertices: int) -> Surface:
+    """The largest piece with fewer vertices; as it is if it has no more than a fifth above."""
+    surface = largest_piece(surface)
+    if len(surface.vertices) <= 1.2 * n_vertices:
+        return surface
+    centre, factor = surface.vertices.mean(0), _WORKING_DIAGONAL / surface.diagonal
+    with _NOT_THREAD_SAFE:
+        vertices, faces = fast_simplification.simplify(
+            (surface.vertices - centre) * factor,
+            surface.faces.astype(np.int32),
+            target_reduction=1 - n_vertices / len(surface.vertices),
+        )
+    faces = faces.astype(np.int64)
+    faces = faces[~inspect.degenerate_faces(faces)]
+    faces = faces[~inspect.repeated_faces(faces)]
+    return largest_piece(referenced(vertices.astype(np.float64) / factor + centre, faces)[0])

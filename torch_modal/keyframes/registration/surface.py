@@ -1,0 +1,198 @@
+"""A surface that is asked for its closest points."""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.inspect import signed_volume
+from torch_modal.keyframes.registration.libraries import require
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+LEAN = 0.01
+"""What a normal counts for beside a position, in diagonals: sheets closer than twice that are told apart."""
+
+
+class Closest(NamedTuple):
+    """The point of a surface next to each query."""
+
+    distances: FloatArray
+    """*Shape:* ``(n,)``."""
+    faces: IntArray
+    """The face that it lies on. *Shape:* ``(n,)``."""
+    points: FloatArray
+    """*Shape:* ``(n, 3)``."""
+
+
+class Surface:
+    """A triangle mesh with what is derived from it once.
+
+    Args:
+        vertices: *Shape:* ``(V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
+    """
+
+    def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
+        self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+
+    @cached_property
+    def area_vectors(self) -> FloatArray:
+        """Normals as long as the faces are large. *Shape:* ``(F, 3)``."""
+        a, b, c = (self.vertices[corner] for corner in self.faces.T)
+        return 0.5 * np.cross(b - a, c - a)
+
+    @cached_property
+    def face_areas(self) -> FloatArray:
+        """*Shape:* ``(F,)``."""
+        return np.linalg.norm(self.area_vectors, axis=1)
+
+    @cached_property
+    def face_normals(self) -> FloatArray:
+        """Unit vectors; zero where a face has no area. *Shape:* ``(F, 3)``."""
+        return unit(self.area_vectors)
+
+    @cached_property
+    def vertex_normals(self) -> FloatArray:
+        """Means over the faces around a vertex, by area. *Shape:* ``(V, 3)``."""
+        summed = np.zeros_like(self.vertices)
+        np.add.at(summed, self.faces.reshape(-1), np.repeat(self.area_vectors, 3, axis=0))
+        return unit(summed)
+
+    @cached_property
+    def vertex_areas(self) -> FloatArray:
+        """A third of the faces around each vertex. *Shape:* ``(V,)``."""
+        return connectivity.vertex_areas(self.vertices, self.faces)
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """*Shape:* ``(E, 2)``."""
+        return connectivity.unique_edges(self.faces)[0]
+
+    @cached_property
+    def open_sides(self) -> BoolArray:
+        """Whether the side opposite to each corner belongs to one face only. *Shape:* ``(F, 3)``."""
+        sides = np.sort(self.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
+        _, index, counts = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+        return (counts == 1)[index.reshape(-1)].reshape(-1, 3)
+
+    @cached_property
+    def on_boundary(self) -> BoolArray:
+        """Vertices of such sides. *Shape:* ``(V,)``."""
+        found = np.zeros(len(self.vertices), dtype=bool)
+        for corner in range(3):
+            found[np.delete(self.faces, corner, axis=1)[self.open_sides[:, corner]]] = True
+        return found
+
+    @property
+    def diagonal(self) -> float:
+        """Of the bounding box."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    @property
+    def area(self) -> float:
+        """Of all faces."""
+        return float(self.face_areas.sum())
+
+    @cached_property
+    def _tree(self) -> Any:
+        tree = require("igl").AABB()
+        tree.init(self.vertices, self.faces)
+        return tree
+
+    def closest(self, points: FloatArray) -> Closest:
+        """The closest point on the surface to each query. *Shape:* ``(n, 3)``."""
+        squared, faces, found = self._tree.squared_distance(
+            self.vertices, self.faces, np.ascontiguousarray(points, dtype=np.float64)
+        )
+        distances = np.sqrt(np.maximum(np.asarray(squared).reshape(-1), 0))
+        return Closest(distances, np.asarray(faces).reshape(-1).astype(np.int64), np.asarray(found).reshape(-1, 3))
+
+    @cached_property
+    def _sides_tree(self) -> cKDTree:
+        return cKDTree(np.hstack([self.vertices, LEAN * self.diagonal * self.vertex_normals]))
+
+    def nearest_alike(self, points: FloatArray, normals: FloatArray) -> IntArray:
+        """The vertex next to each query whose normal is not far off: of two sheets that touch, the right one.
+
+        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
+        """
+        return self._sides_tree.query(np.hstack([points, LEAN * self.diagonal * normals]))[1].astype(np.int64)
+
+    def looks_away(self, points: FloatArray, normals: FloatArray) -> BoolArray:
+        """Whether surface elements look against the closest point, and no sheet beside it looks their way.
+
+        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
+        """
+        away = np.einsum("ni,ni->n", normals, self.face_normals[self.closest(points).faces]) < 0
+        some = np.flatnonzero(away)
+        there = self.vertex_normals[self.nearest_alike(points[some], normals[some])]
+        away[some] = np.einsum("ni,ni->n", normals[some], there) < 0
+        return away
+
+    def barycentric(self, closest: Closest) -> FloatArray:
+        """Weights of the corners of each closest point's face, none negative. *Shape:* ``(n, 3)``."""
+        a, b, c = (self.vertices[self.faces[closest.faces, corner]] for corner in range(3))
+        normal = np.cross(b - a, c - a)
+        squared = np.einsum("ni,ni->n", normal, normal)
+        p = closest.points
+        weights = np.stack(
+            [
+                np.einsum("ni,ni->n", np.cross(c - b, p - b), normal),
+                np.einsum("ni,ni->n", np.cross(a - c, p - c), normal),
+            ]
+        )
+        weights = weights / np.where(squared > 0, squared, 1)
+        weights = np.concatenate([weights, 1 - weights.sum(0, keepdims=True)]).T
+        weights[squared <= 0] = 1 / 3
+        weights = np.clip(weights, 0, 1)
+        return weights / weights.sum(1, keepdims=True)
+
+    def rows(self, closest: Closest) -> sparse.csr_matrix:
+        """Closest points as combinations of the vertices. *Shape:* ``(n, V)``."""
+        n = len(closest.faces)
+        where = (np.repeat(np.arange(n), 3), self.faces[closest.faces].reshape(-1))
+        return sparse.csr_matrix((self.barycentric(closest).reshape(-1), where), shape=(n, len(self.vertices)))
+
+    def moved(self, vertices: FloatArray) -> "Surface":
+        """The same connectivity in another shape."""
+        shape = Surface(vertices, self.faces)
+        for name in ("edges", "open_sides", "on_boundary"):  # of the connectivity alone
+            shape.__dict__[name] = getattr(self, name)
+        return shape
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Vectors of length one; zero stays zero. *Shape:* ``(n, 3)``."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)
+
+
+def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
+    """Faces wound outwards if the surface is closed, else as they are. *Shape:* ``(F, 3)``."""
+    closed = not len(connectivity.boundary_edges(faces))
+    centred = vertices - vertices[faces].mean((0, 1))
+    return faces[:, ::-1].copy() if closed and signed_volume(centred, faces) < 0 else faces
+
+
+def referenced(vertices: FloatArray, faces: IntArray) -> tuple[Surface, IntArray]:
+    """Without the vertices of no face; and which vertices are left. *Shape of the second:* ``(V',)``."""
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return Surface(vertices[used], renumbered.reshape(-1, 3)), used
+
+
+def largest_piece(surface: Surface) -> Surface:
+    """The connected piece with the largest area."""
+    pieces = connectivity.vertex_pieces(surface.edges, len(surface.vertices))
+    if pieces.max() == 0:
+        return surface
+    of_faces = pieces[surface.faces[:, 0]]
+    kept = of_faces == np.bincount(of_faces, surface.face_areas).argmax()
+    return referenced(surface.vertices, surface.faces[kept])[0]
