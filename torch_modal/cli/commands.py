@@ -19,6 +19,8 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("subdivide needs two key-frames or more")
     if args.mu is not None and args.preset != "paper":
         args.fail("--mu is the similarity weight of --preset paper; the others have none")
+    if (args.landmarks or args.across) and not args.register:
+        args.fail("--landmarks and --across are for --register")
     if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
         args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
     if args.cyclic and (args.ping_pong or args.ease):
@@ -40,7 +42,7 @@ def subdivide(args: argparse.Namespace) -> None:
     n, spread = len(args.meshes), {"cyclic": args.cyclic, "n_frames": args.frames, "times": args.times}
     places = tm.keyframe_places(n, args.levels, **spread)
     when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
-    keyframes, faces = tm.load_keyframes(args.meshes)
+    keyframes, faces = tm.load_keyframes(args.meshes, **_registration(args))
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
@@ -166,6 +168,21 @@ def cache(args: argparse.Namespace) -> None:
     n_entries, n_bytes = cache_content(folder) if removed is None else removed
     size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
     print(f"{size} removed from {folder}" if removed else f"{size} in {folder} (limit: {size_limit() / 2**20:g} MiB)")
+
+
+def _registration(args: argparse.Namespace) -> dict[str, Any]:
+    """What `load_keyframes` is told of meshes of different connectivity."""
+    if not args.register:
+        return {}
+    from torch_modal.cli.register import registrar
+
+    return {
+        "register": registrar(args),
+        "landmarks": args.landmarks,
+        "same_subject": not args.across,
+        "progress": False if args.quiet else None,
+        "report": _reporter(args),
+    }
 
 
 def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:

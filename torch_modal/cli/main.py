@@ -1,4 +1,4 @@
-"""The command line: ``torch-modal subdivide``, ``modes``, ``precompute``, ``view``, ``demo`` and ``cache``.
+"""The command line: ``torch-modal subdivide``, ``register``, ``modes`` and the others.
 
 Nothing heavy is imported before the arguments are known to make sense.
 """
@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli import commands, precompute, view
+from torch_modal.cli import commands, precompute, register, view
 from torch_modal.cli.messages import PROGRAM, log_as_lines, say, warnings_as_lines
 from torch_modal.version import __version__
 
@@ -25,6 +25,7 @@ MAIN_EXAMPLES = """\
 start here:
   torch-modal demo                                        try it on the samples that come with it
   torch-modal subdivide a.obj b.obj --out between.glb     from your meshes to an animation
+  torch-modal subdivide a.obj scan.ply --register --out between.glb   of different connectivity
   torch-modal subdivide --help                            all that can be set"""
 
 SUBDIVIDE = """\
@@ -121,7 +122,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def _expected_errors() -> tuple[type[Exception], ...]:
     """What input, files and machine can cause; anything else is a bug and shows its traceback."""
-    expected: list[type[Exception]] = [ValueError, OSError, MemoryError]
+    expected: list[type[Exception]] = [ValueError, OSError, MemoryError, ImportError]
     # Their modules are heavy: if one was never imported, it raised nothing.
     for module, name in (
         ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
@@ -267,7 +268,15 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="also draw the sequence beside linear interpolation, as .png or .pdf",
     )
+    sub.add_argument(
+        "--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others"
+    )
+    register.add_options(sub)
     _add_modes(sub)
+    _add_common(sub)
+
+    sub = command("register", register.run, register.SUMMARY, register.DESCRIPTION, register.EXAMPLES)
+    register.add_arguments(sub)
     _add_common(sub)
 
     sub = command("modes", commands.modes, "vibration modes of key-frames, as safetensors", MODES, MODES_EXAMPLES)

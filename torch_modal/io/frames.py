@@ -10,7 +10,7 @@ import numpy as np
 from torch_modal.io.asset import Asset
 from torch_modal.io.glb import HOLDS, HOLDS_OF_ITS_OWN, shape_bytes
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.write import MESH_FORMATS, check_frames, mesh_bytes, refuse_existing, write_file
+from torch_modal.io.write import MESH_FORMATS, check_frames, mesh_bytes, refuse_existing, to_numpy, write_file
 
 if TYPE_CHECKING:
     import torch
@@ -83,6 +83,37 @@ def save_frames(
     for path, vertices in zip(paths, shapes, strict=True):
         write_file(path, _bytes(vertices, triangles, fmt, asset, same))
     return paths
+
+
+def save_mesh(
+    vertices: Array, faces: Array, out: str | Path, overwrite: bool = False, asset: Asset | None = None
+) -> Path:
+    """Write one shape; the file's extension says the format. All else is as for `save_frames`.
+
+    Args:
+        vertices: Vertex positions. *Shape:* ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        out: The file.
+        overwrite: Replace the file if it exists.
+        asset: The mesh file whose materials, texture coordinates and all else the shape keeps.
+
+    Raises:
+        ValueError: The arrays or the extension cannot be used.
+        FileExistsError: The file exists and ``overwrite`` is off.
+    """
+    path = Path(out)
+    shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
+    fmt = path.suffix.lower().lstrip(".")
+    if fmt not in FORMATS:
+        raise ValueError(f"{path.name!r} must end in one of {', '.join('.' + name for name in FORMATS)}.")
+    refuse_existing(path, overwrite)
+    same = asset is not None and asset.suffix == f".{fmt}"
+    if asset is not None:
+        if same:
+            asset.write_companions(path.parent, overwrite)
+        asset.say_lost(path, _holds(asset, fmt, same))
+    write_file(path, _bytes(shapes[0], triangles, fmt, asset, same))
+    return path
 
 
 def _holds(asset: Asset, fmt: str, same: bool) -> tuple[str, ...]:

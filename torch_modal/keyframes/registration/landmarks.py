@@ -15,7 +15,7 @@ from torch_modal.keyframes.registration.surface import FloatArray, IntArray, ref
 
 N_SUGGESTED = 14
 # A tip is a vertex that is farther from the rest, in the mean, than all within this distance; of a surface of area one.
-_TIP_RADIUS = 0.25
+_TIP_RADIUS = 0.12
 
 
 class LandmarkPoints(NamedTuple):
