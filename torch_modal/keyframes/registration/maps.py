@@ -23,6 +23,8 @@ _STEP = 3
 _ROUND_TRIP = 3.0
 # A triangle whose image is longer than so many times its own length, and a bit, is torn.
 _TORN = (2.5, 0.03)
+# At least so much of the area counts, even if more than the rest of it falls together.
+_LEAST_COUNTED = 0.3
 
 
 class Map(NamedTuple):
@@ -31,7 +33,7 @@ class Map(NamedTuple):
     vertices: IntArray
     """*Shape:* ``(n_first,)``."""
     score: float
-    """Right maps of one subject reach 0.4 and more, wrong ones hardly; see `rate`."""
+    """Right maps of one subject reach 0.7 and more, wrong ones hardly; see `rate`."""
 
 
 def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
@@ -88,7 +90,10 @@ def _oriented_area(first: SpectralShape, second: SpectralShape, vertices: IntArr
     before, after = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1) for x in (own, image))
     whole = after < _TORN[0] * before + _TORN[1]
     sign = np.sign(np.einsum("fi,fi->f", area_vectors, normals))
-    return float((first.coarse.face_areas * whole * sign).sum() / first.coarse.area)
+    # Where the other mesh is coarser, faces fall together into points and edges, which says nothing.
+    counted = first.coarse.face_areas[sign != 0].sum()
+    total = max(counted, _LEAST_COUNTED * first.coarse.area)
+    return float((first.coarse.face_areas * whole * sign).sum() / total)
 
 
 def landmark_map(first: SpectralShape, second: SpectralShape, pairs: IntArray) -> Map:

@@ -27,7 +27,7 @@ from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Sur
 
 FEWEST_ACROSS = 5
 """Landmarks that two different subjects need: their spectra do not tell which map is right."""
-_SURE_SCORE = 0.40  # of a spectral map; below it, more starts are tried
+_SURE_SCORE = 0.62  # of a spectral map; below it, more starts are tried
 _SIGNS, _MORE_SIGNS = 4, 6
 _SCORE_SHARE = 0.5  # of a map's score against the stretch of its fit
 _RIVALS = 3  # maps that are fitted before one is chosen

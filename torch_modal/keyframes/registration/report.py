@@ -173,8 +173,8 @@ def judge(
         (_ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
     ]
     if same_subject:
-        said_of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.5 and 0.1"
-        signs.append((_ramp(map_score - distortion, 0.1, 0.5), said_of_map))
+        said_of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
+        signs.append((_ramp(map_score - distortion, 0.32, 0.70), said_of_map))
         signs.append((_ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"))
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
