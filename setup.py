@@ -28,9 +28,9 @@ EXTRAS = {
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],
     "pyg": ["torch_geometric>=2.4"],
-    "dask": ["distributed>=2024.5"],
-    # libigl's AABB tree came to Python with 2.6.
+    # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
+    "dask": ["distributed>=2024.5"],
 }
 
 setup(

@@ -1,4 +1,4 @@
-"""The command line: ``torch-modal subdivide``, ``register``, ``modes``, ``precompute``, ``view``, ``demo``, ``cache``.
+"""The command line: ``torch-modal subdivide``, ``register``, ``modes`` and the others.
 
 Nothing heavy is imported before the arguments are known to make sense.
 """

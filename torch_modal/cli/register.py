@@ -20,7 +20,7 @@ examples:
     torch-modal register cat.obj dog.obj --suggest numbers.png
   and with the pairs that were typed from it, one a line:
     torch-modal register cat.obj dog.obj --across --landmarks pairs.txt --out wrapped.obj"""
-FORMATS = (".obj", ".ply", ".off")
+FORMATS = (".obj", ".ply", ".off", ".glb")
 VERSION = 1
 """Part of the key of kept results: raise it when the algorithm changes."""
 
@@ -28,7 +28,9 @@ VERSION = 1
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``register`` besides the common ones."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
-    sub.add_argument("--out", type=Path, metavar="FILE", help="the template laid onto the target, .obj, .ply or .off")
+    sub.add_argument(
+        "--out", type=Path, metavar="FILE", help="the template laid onto the target: .obj, .ply, .off, .glb"
+    )
     sub.add_argument(
         "--suggest",
         type=Path,
@@ -93,7 +95,7 @@ def _register(args: argparse.Namespace) -> None:
     import warnings
 
     from torch_modal.io.frames import save_mesh
-    from torch_modal.io.read import read_mesh
+    from torch_modal.io.read import open_asset, read_mesh
     from torch_modal.keyframes.registration.sequence import ADVICE, landmark_table
 
     (vertices, faces), (there, there_faces) = (read_mesh(mesh) for mesh in args.meshes)
@@ -114,7 +116,7 @@ def _register(args: argparse.Namespace) -> None:
         if not args.keep_doubtful:
             raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
         warnings.warn(why, stacklevel=2)
-    save_mesh(found.positions, faces, args.out, overwrite=args.overwrite)
+    save_mesh(found.positions, faces, args.out, args.overwrite, open_asset(args.meshes[0]))
     if not args.quiet:
         print(f"written: {args.out}")
 

@@ -73,20 +73,21 @@ def save_frames(
         raise NotADirectoryError(f"{folder} is a file; out must be a folder.")
     digits = max(3, len(str(len(shapes) - 1)))
     paths = [folder / f"{stem}-{number:0{digits}d}.{fmt}" for number in range(len(shapes))]
-    for path in paths:
-        refuse_existing(path, overwrite)
-    same = asset is not None and asset.suffix == f".{fmt}"
-    if asset is not None:
-        if same:
-            asset.write_companions(folder, overwrite)
-        asset.say_lost(paths[0], _holds(asset, fmt, same))
-    for path, vertices in zip(paths, shapes, strict=True):
-        write_file(path, _bytes(vertices, triangles, fmt, asset, same))
+    _write(shapes, triangles, paths, fmt, asset, overwrite)
     return paths
 
 
-def save_mesh(vertices: Array, faces: Array, out: str | Path, overwrite: bool = False) -> Path:
-    """Write one shape; the file's extension says the format, as for :func:`save_frames`.
+def save_mesh(
+    vertices: Array, faces: Array, out: str | Path, overwrite: bool = False, asset: Asset | None = None
+) -> Path:
+    """Write one shape; the file's extension says the format. All else is as for `save_frames`.
+
+    Args:
+        vertices: Vertex positions. *Shape:* ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        out: The file.
+        overwrite: Replace the file if it exists.
+        asset: The mesh file whose materials, texture coordinates and all else the shape keeps.
 
     Raises:
         ValueError: The arrays or the extension cannot be used.
@@ -95,11 +96,25 @@ def save_mesh(vertices: Array, faces: Array, out: str | Path, overwrite: bool = 
     path = Path(out)
     shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
     fmt = path.suffix.lower().lstrip(".")
-    if fmt not in MESH_FORMATS:
-        raise ValueError(f"{path.name!r} must end in one of {', '.join('.' + name for name in MESH_FORMATS)}.")
-    refuse_existing(path, overwrite)
-    write_file(path, mesh_bytes(fmt, shapes[0], triangles))
+    if fmt not in FORMATS:
+        raise ValueError(f"{path.name!r} must end in one of {', '.join('.' + name for name in FORMATS)}.")
+    _write(shapes, triangles, [path], fmt, asset, overwrite)
     return path
+
+
+def _write(
+    shapes: np.ndarray, faces: np.ndarray, paths: list[Path], fmt: str, asset: Asset | None, overwrite: bool
+) -> None:
+    """Each shape to its file, all in one folder and of one format; none if one of them may not be written."""
+    for path in paths:
+        refuse_existing(path, overwrite)
+    same = asset is not None and asset.suffix == f".{fmt}"
+    if asset is not None:
+        if same:
+            asset.write_companions(paths[0].parent, overwrite)
+        asset.say_lost(paths[0], _holds(asset, fmt, same))
+    for path, vertices in zip(paths, shapes, strict=True):
+        write_file(path, _bytes(vertices, faces, fmt, asset, same))
 
 
 def _holds(asset: Asset, fmt: str, same: bool) -> tuple[str, ...]:
