@@ -29,7 +29,7 @@ EXTRAS = {
     "usd": ["usd-core>=24.5"],
     "pyg": ["torch_geometric>=2.4"],
     # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
-    "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6", "threadpoolctl>=3.1"],
+    "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
     "dask": ["distributed>=2024.5"],
 }
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from torch_modal.io.write import FloatArray, IntArray, refuse_existing, write_file
 from torch_modal.view.drawing import ByteArray, Scene, draw
-from torch_modal.view.picture import BETWEEN_COLOR, KEYFRAME_COLOR, _view_rotation
+from torch_modal.view.picture import BETWEEN_COLOR, KEYFRAME_COLOR, view_rotation
 
 PIXELS = 700  # the longer side of a view
 MARKER = (0.85, 0.0, 0.35)
@@ -61,7 +61,7 @@ def render_landmarks(
 
 def _views(mesh: MarkedMesh, renderer: str) -> list[tuple[ByteArray, IntArray, FloatArray]]:
     """For each side: the image, the vertices that are seen, and their pixels."""
-    rotation = _view_rotation(mesh.vertices, None, None)
+    rotation = view_rotation(mesh.vertices, None, None)
     turned = []
     for degrees in _SIDES:
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))

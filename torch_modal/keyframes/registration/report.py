@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from torch_modal.errors import MeshError
-from torch_modal.geometry import connectivity
 from torch_modal.keyframes.registration.surface import FloatArray, Surface
 
 TRUSTED = 0.5
@@ -57,7 +56,7 @@ def measure(template: Surface, x: FloatArray, target: Surface) -> Quality:
     usable = (now > 0) & (rest > 0)
     logs = np.log(now[usable] / rest[usable])
     against = target.looks_away(x[shape.faces].mean(1), shape.face_normals)
-    pairs = connectivity.face_neighbours(shape.faces)
+    pairs = shape.connectivity.face_neighbours
     cosines = [
         np.einsum("ni,ni->n", n[pairs[:, 0]], n[pairs[:, 1]]) for n in (template.face_normals, shape.face_normals)
     ]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry import connectivity
+from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.keyframes.registration.libraries import require
 
@@ -36,12 +36,13 @@ class Surface:
 
     Args:
         vertices: *Shape:* ``(V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
+        faces: *Shape:* ``(F, 3)``, or what was made from them for another shape.
     """
 
-    def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
+    def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
         self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        self.connectivity = faces if isinstance(faces, Connectivity) else Connectivity(faces, len(self.vertices))
+        self.faces = self.connectivity.faces
 
     @cached_property
     def area_vectors(self) -> FloatArray:
@@ -69,26 +70,24 @@ class Surface:
     @cached_property
     def vertex_areas(self) -> FloatArray:
         """A third of the faces around each vertex. *Shape:* ``(V,)``."""
-        return connectivity.vertex_areas(self.vertices, self.faces)
+        return vertex_areas(self.vertices, self.faces)
 
-    @cached_property
+    @property
     def edges(self) -> IntArray:
         """*Shape:* ``(E, 2)``."""
-        return connectivity.unique_edges(self.faces)[0]
+        return self.connectivity.edges
 
     @cached_property
     def open_sides(self) -> BoolArray:
         """Whether the side opposite to each corner belongs to one face only. *Shape:* ``(F, 3)``."""
-        sides = np.sort(self.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
-        _, index, counts = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-        return (counts == 1)[index.reshape(-1)].reshape(-1, 3)
+        is_open = (self.connectivity.counts == 1)[self.connectivity.sides].reshape(3, -1).T
+        return np.roll(is_open, -1, axis=1)  # the side opposite to a corner starts at the next one
 
     @cached_property
     def on_boundary(self) -> BoolArray:
         """Vertices of such sides. *Shape:* ``(V,)``."""
         found = np.zeros(len(self.vertices), dtype=bool)
-        for corner in range(3):
-            found[np.delete(self.faces, corner, axis=1)[self.open_sides[:, corner]]] = True
+        found[self.connectivity.boundary_edges] = True
         return found
 
     @property
@@ -163,10 +162,7 @@ class Surface:
 
     def moved(self, vertices: FloatArray) -> "Surface":
         """The same connectivity in another shape."""
-        shape = Surface(vertices, self.faces)
-        for name in ("edges", "open_sides", "on_boundary"):  # of the connectivity alone
-            shape.__dict__[name] = getattr(self, name)
-        return shape
+        return Surface(vertices, self.connectivity)
 
 
 def unit(vectors: FloatArray) -> FloatArray:
@@ -177,7 +173,7 @@ def unit(vectors: FloatArray) -> FloatArray:
 
 def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     """Faces wound outwards if the surface is closed, else as they are. *Shape:* ``(F, 3)``."""
-    closed = not len(connectivity.boundary_edges(faces))
+    closed = not len(Connectivity(faces).boundary_edges)
     centred = vertices - vertices[faces].mean((0, 1))
     return faces[:, ::-1].copy() if closed and signed_volume(centred, faces) < 0 else faces
 
@@ -190,7 +186,7 @@ def referenced(vertices: FloatArray, faces: IntArray) -> tuple[Surface, IntArray
 
 def largest_piece(surface: Surface) -> Surface:
     """The connected piece with the largest area."""
-    pieces = connectivity.vertex_pieces(surface.edges, len(surface.vertices))
+    pieces = surface.connectivity.vertex_pieces
     if pieces.max() == 0:
         return surface
     of_faces = pieces[surface.faces[:, 0]]
