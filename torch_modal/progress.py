@@ -38,6 +38,14 @@ class ProgressReport:
         self._said = time.monotonic()
         self._lock = threading.Lock()
 
+    def expect(self, steps: int) -> None:
+        """There are more steps than was known."""
+        with self._lock:
+            self.total += steps
+            if self._bar is not None:
+                self._bar.total = self.total
+                self._bar.refresh()
+
     def describe(self, what: str) -> None:
         """Say what goes on now."""
         with self._lock:

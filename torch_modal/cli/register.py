@@ -29,7 +29,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``register`` besides the common ones."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
     sub.add_argument(
-        "--out", type=Path, metavar="FILE", help="the template laid onto the target: .obj, .ply, .off, .glb"
+        "--out", type=Path, metavar="FILE", help="the template laid onto the target, .obj, .ply, .off or .glb"
     )
     sub.add_argument(
         "--suggest",

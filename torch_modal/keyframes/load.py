@@ -10,6 +10,7 @@ import torch
 from torch_modal.errors import MeshError
 from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
+from torch_modal.progress import Progress
 
 Registrar = Callable[..., Any]
 """Takes and returns what `register` does."""
@@ -21,7 +22,7 @@ def load_keyframes(
     register: bool | Registrar = False,
     landmarks: Any = None,
     same_subject: bool = True,
-    progress: bool | None = None,
+    progress: Progress = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Keyframes:
     """Read key-frames from OBJ, PLY, OFF, GLB or GLTF files.
@@ -40,7 +41,7 @@ def load_keyframes(
         landmarks: For the registration: a landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``, a column for
             each of the K meshes.
         same_subject: Whether all are poses of one body; if not, five landmarks or more are needed.
-        progress: Show bars of the registration; by default on a terminal only.
+        progress: Of the registration, see :data:`torch_modal.progress.Progress`.
         report: Takes a line about each registration.
 
     Returns:
@@ -50,7 +51,7 @@ def load_keyframes(
         FileNotFoundError: A file does not exist.
         MeshError: A file cannot be read, or differs from the first in its number of vertices or in its faces; or,
             with ``register``, a registration is doubtful.
-        ImportError: With ``register``, the extra of that name is not installed.
+        MissingPackageError: With ``register``, the extra of that name is not installed.
     """
     if isinstance(paths, (str, bytes, os.PathLike)):
         raise MeshError(f"paths is one path, {os.fspath(paths)!r}; pass a list with one file per key-frame")

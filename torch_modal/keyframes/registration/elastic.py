@@ -93,13 +93,9 @@ class ElasticSurface:
 
 def _cotangent_weights(surface: Surface) -> FloatArray:
     """Half the cotangents opposite to each edge, summed, within bounds. *Shape:* ``(E,)``."""
-    n = len(surface.vertices)
-    weights = np.zeros(len(surface.edges))
-    keys = surface.edges[:, 0] * n + surface.edges[:, 1]
-    for corner in range(3):
-        i, j, k = (surface.faces[:, (corner + shift) % 3] for shift in range(3))
-        u, v = surface.vertices[i] - surface.vertices[k], surface.vertices[j] - surface.vertices[k]
-        sine = np.linalg.norm(np.cross(u, v), axis=1)
-        cotangent = np.einsum("fi,fi->f", u, v) / np.maximum(sine, 1e-12 * (u * u).sum(1) + 1e-300)
-        np.add.at(weights, np.searchsorted(keys, np.minimum(i, j) * n + np.maximum(i, j)), 0.5 * cotangent)
-    return np.clip(weights, *_WEIGHTS)
+    mesh = surface.connectivity
+    start, end, opposite = (surface.vertices[at] for at in (mesh.start, mesh.end, mesh.opposite))
+    u, v = start - opposite, end - opposite
+    sine = np.linalg.norm(np.cross(u, v), axis=1)
+    cotangent = np.einsum("si,si->s", u, v) / np.maximum(sine, 1e-12 * (u * u).sum(1) + 1e-300)
+    return np.clip(np.bincount(mesh.sides, 0.5 * cotangent, minlength=len(mesh.edges)), *_WEIGHTS)

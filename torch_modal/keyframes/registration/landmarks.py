@@ -129,7 +129,7 @@ def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArr
 
     Raises:
         MeshError: The mesh cannot work.
-        ImportError: The extra ``register`` is not installed.
+        MissingPackageError: The extra ``register`` is not installed.
     """
     checked = check_keyframes([vertices], faces, warn=False)
     points = checked.keyframes[0].detach().cpu().double().numpy()

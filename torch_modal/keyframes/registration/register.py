@@ -5,14 +5,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy import sparse
-from tqdm import tqdm
+from threadpoolctl import threadpool_limits
 
 from torch_modal.errors import MeshError
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.keyframes.registration.consistency import Consistency
 from torch_modal.keyframes.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Fit, Gate
 from torch_modal.keyframes.registration.landmarks import LandmarkPoints, landmark_points
-from torch_modal.keyframes.registration.libraries import require
 from torch_modal.keyframes.registration.maps import (
     FINE_FUNCTIONS,
     N_OTHER_STARTS,
@@ -24,6 +23,8 @@ from torch_modal.keyframes.registration.maps import (
 from torch_modal.keyframes.registration.report import Quality, Registration, judge, measure
 from torch_modal.keyframes.registration.spectrum import SpectralShape
 from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Surface, outward, referenced
+from torch_modal.keyframes.seams import weld_seams
+from torch_modal.progress import Progress, ProgressReport
 
 FEWEST_ACROSS = 5
 """Landmarks that two different subjects need: their spectra do not tell which map is right."""
@@ -50,25 +51,6 @@ class _Candidate(NamedTuple):
         return self.quality.cost + self.distortion - _SCORE_SHARE * self.found.score
 
 
-class _Progress:
-    """A bar whose length is learnt on the way."""
-
-    def __init__(self, show: bool | None) -> None:
-        # None: on a terminal only.
-        self._bar = tqdm(total=0, desc="register", disable=None if show is None else not show, leave=False)
-
-    def expect(self, steps: int) -> None:
-        if not self._bar.disable:
-            self._bar.total += steps
-            self._bar.refresh()
-
-    def tick(self) -> None:
-        self._bar.update()
-
-    def close(self) -> None:
-        self._bar.close()
-
-
 def register(
     template: Any,
     template_faces: Any,
@@ -77,7 +59,7 @@ def register(
     *,
     landmarks: Any = None,
     same_subject: bool = True,
-    progress: bool | None = None,
+    progress: Progress = None,
 ) -> Registration:
     """Lay a template onto a target of any other connectivity.
 
@@ -93,7 +75,7 @@ def register(
             coordinates of the template and of the target.
         same_subject: Whether both are poses of one body, nearly without stretch. Two different bodies need five
             landmarks or more.
-        progress: Show a bar; by default on a terminal only.
+        progress: See :data:`torch_modal.progress.Progress`; the total grows as it is learnt.
 
     Returns:
         Places of the template's vertices on the target, and a report. A doubtful result is returned too, with a
@@ -101,25 +83,32 @@ def register(
 
     Raises:
         MeshError: A mesh or the landmarks cannot work.
-        ImportError: The extra ``register`` is not installed.
+        MissingPackageError: The extra ``register`` is not installed.
     """
     checked = check_keyframes([template], template_faces, warn=False)
     goal = check_keyframes([target], target_faces, warn=False)
-    rest, faces = checked.keyframes[0].detach().cpu().double().numpy(), checked.faces.cpu().numpy()
-    there, there_faces = goal.keyframes[0].detach().cpu().double().numpy(), goal.faces.cpu().numpy()
-    points = landmark_points(landmarks, rest, there)
+    shapes = [mesh.keyframes[0].detach().cpu().double().numpy() for mesh in (checked, goal)]
+    points = landmark_points(landmarks, *shapes)
+    # Along seams of texture coordinates, the surface is not cut open.
+    welded, welded_goal = (
+        weld_seams(x[None], mesh.faces.cpu()) for x, mesh in zip(shapes, (checked, goal), strict=True)
+    )
     if not same_subject and len(points.template) < FEWEST_ACROSS:
         raise MeshError(
             f"two different subjects need {FEWEST_ACROSS} landmarks or more, got {len(points.template)}: without them "
             "nothing tells which map is right; give pairs of vertices, template first"
         )
-    bar = _Progress(progress)
-    try:
-        # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
-        with require("threadpoolctl").threadpool_limits(1):
-            return _Problem(rest, faces, there, there_faces, points, same_subject, bar).solve(checked.keyframes[0])
-    finally:
-        bar.close()
+    meshes = [(one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal)]
+    # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
+    with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
+        found = _Problem(*meshes, points, same_subject, report).solve()
+    corners = torch.from_numpy(np.unique(welded_goal.vertex_of.numpy(), return_index=True)[1])[found.target_corners]
+    return found._replace(
+        positions=welded.scatter(found.positions).to(checked.keyframes),
+        target_faces=found.target_faces[welded.vertex_of],
+        barycentric=found.barycentric[welded.vertex_of],
+        target_corners=corners[welded.vertex_of],
+    )
 
 
 class _Problem:
@@ -127,19 +116,18 @@ class _Problem:
 
     def __init__(
         self,
-        rest: FloatArray,
-        faces: IntArray,
-        there: FloatArray,
-        there_faces: IntArray,
+        template: tuple[FloatArray, IntArray],
+        target: tuple[FloatArray, IntArray],
         points: LandmarkPoints,
         same_subject: bool,
-        progress: _Progress,
+        progress: ProgressReport,
     ) -> None:
         self.same_subject, self.progress = same_subject, progress
-        goal, self.target_vertices = referenced(there, outward(there, there_faces))
+        rest = template[0]
+        goal, self.target_vertices = referenced(target[0], outward(*target))
         self.unit, self.origin = goal.diagonal / WORKING_DIAGONAL, goal.vertices.mean(0)
         self.target = goal.moved((goal.vertices - self.origin) / self.unit)
-        own, self.used = referenced(rest, outward(rest, faces))
+        own, self.used = referenced(rest, outward(*template))
         self.size = np.sqrt(self.target.area / own.area)
         self.rest = rest * self.size
         self.template = own.moved(own.vertices * self.size)
@@ -149,12 +137,12 @@ class _Problem:
         self.marks = points.template * self.size
         self.mark_places = (points.target - self.origin) / self.unit
 
-    def solve(self, like: torch.Tensor) -> Registration:
+    def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
         candidates = [self._coarse(found, distortion) for found, distortion in rivals]
         best = self._rescaled(min(candidates, key=lambda one: one.cost))
         x, everything = self._fine(best)
-        return self._report(x, everything, best, like)
+        return self._report(x, everything, best)
 
     # ------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
@@ -168,10 +156,10 @@ class _Problem:
             ]
             return [landmark_map(self.first, self.second, np.stack(pairs, axis=1))]
         self.progress.expect(2**_SIGNS + N_OTHER_STARTS)
-        maps = spectral_maps(self.first, self.second, _SIGNS, tick=self.progress.tick)
+        maps = spectral_maps(self.first, self.second, _SIGNS, tick=self.progress.update)
         if maps[0].score < _SURE_SCORE:
             self.progress.expect(2**_MORE_SIGNS + N_OTHER_STARTS)
-            maps += spectral_maps(self.first, self.second, _MORE_SIGNS, tick=self.progress.tick)
+            maps += spectral_maps(self.first, self.second, _MORE_SIGNS, tick=self.progress.update)
         return maps
 
     def _rivals(self, maps: list[Map]) -> list[tuple[Map, float]]:
@@ -214,7 +202,7 @@ class _Problem:
             images,
             landmarks,
             stretchable=not self.same_subject,
-            tick=self.progress.tick,
+            tick=self.progress.update,
         )
 
     def _rescaled(self, candidate: _Candidate) -> _Candidate:
@@ -243,7 +231,7 @@ class _Problem:
         return found, everything
 
     # ----------------------------------------------------------------------------------------------------- report
-    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate, like: torch.Tensor) -> Registration:
+    def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate) -> Registration:
         quality = measure(self.template, x, self.target)
         coarse = best.fit.template.moved(best.x)
         images = self.second.nearest(coarse.vertices, coarse.vertex_normals)
@@ -259,9 +247,8 @@ class _Problem:
         )
         closest = self.target.closest(everything)
         corners = self.target_vertices[self.target.faces[closest.faces]]
-        tensor = torch.from_numpy(everything * self.unit + self.origin).to(like)
         return Registration(
-            positions=tensor,
+            positions=torch.from_numpy(everything * self.unit + self.origin),
             confidence=confidence,
             map_score=score,
             distortion=distortion,

@@ -56,7 +56,7 @@ def measure(template: Surface, x: FloatArray, target: Surface) -> Quality:
     usable = (now > 0) & (rest > 0)
     logs = np.log(now[usable] / rest[usable])
     against = target.looks_away(x[shape.faces].mean(1), shape.face_normals)
-    pairs = shape.mesh.face_neighbours
+    pairs = shape.connectivity.face_neighbours
     cosines = [
         np.einsum("ni,ni->n", n[pairs[:, 0]], n[pairs[:, 1]]) for n in (template.face_normals, shape.face_normals)
     ]

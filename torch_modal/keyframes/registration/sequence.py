@@ -14,6 +14,7 @@ from torch_modal.keyframes.registration.landmarks import read_landmarks
 from torch_modal.keyframes.registration.register import register
 from torch_modal.keyframes.registration.report import Registration
 from torch_modal.keyframes.registration.surface import FloatArray, IntArray
+from torch_modal.progress import Progress
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
@@ -27,7 +28,7 @@ def register_files(
     *,
     landmarks: Any = None,
     same_subject: bool = True,
-    progress: bool | None = None,
+    progress: Progress = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Keyframes:
     """Read meshes and lay the first one's connectivity onto the others; see `load_keyframes`.

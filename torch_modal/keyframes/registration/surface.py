@@ -36,12 +36,13 @@ class Surface:
 
     Args:
         vertices: *Shape:* ``(V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
+        faces: *Shape:* ``(F, 3)``, or what was made from them for another shape.
     """
 
-    def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
+    def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
         self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        self.connectivity = faces if isinstance(faces, Connectivity) else Connectivity(faces, len(self.vertices))
+        self.faces = self.connectivity.faces
 
     @cached_property
     def area_vectors(self) -> FloatArray:
@@ -71,29 +72,22 @@ class Surface:
         """A third of the faces around each vertex. *Shape:* ``(V,)``."""
         return vertex_areas(self.vertices, self.faces)
 
-    @cached_property
+    @property
     def edges(self) -> IntArray:
         """*Shape:* ``(E, 2)``."""
-        return self.mesh.edges
-
-    @cached_property
-    def mesh(self) -> Connectivity:
-        """What neighbours what."""
-        return Connectivity(self.faces, len(self.vertices))
+        return self.connectivity.edges
 
     @cached_property
     def open_sides(self) -> BoolArray:
         """Whether the side opposite to each corner belongs to one face only. *Shape:* ``(F, 3)``."""
-        # The mesh has the side from each corner to the next; the one across follows it.
-        single = (self.mesh.counts == 1)[self.mesh.sides].reshape(3, -1).T
-        return np.roll(single, -1, axis=1)
+        is_open = (self.connectivity.counts == 1)[self.connectivity.sides].reshape(3, -1).T
+        return np.roll(is_open, -1, axis=1)  # the side opposite to a corner starts at the next one
 
     @cached_property
     def on_boundary(self) -> BoolArray:
         """Vertices of such sides. *Shape:* ``(V,)``."""
         found = np.zeros(len(self.vertices), dtype=bool)
-        for corner in range(3):
-            found[np.delete(self.faces, corner, axis=1)[self.open_sides[:, corner]]] = True
+        found[self.connectivity.boundary_edges] = True
         return found
 
     @property
@@ -168,10 +162,7 @@ class Surface:
 
     def moved(self, vertices: FloatArray) -> "Surface":
         """The same connectivity in another shape."""
-        shape = Surface(vertices, self.faces)
-        for name in ("mesh", "edges", "open_sides", "on_boundary"):  # of the connectivity alone
-            shape.__dict__[name] = getattr(self, name)
-        return shape
+        return Surface(vertices, self.connectivity)
 
 
 def unit(vectors: FloatArray) -> FloatArray:
@@ -195,7 +186,7 @@ def referenced(vertices: FloatArray, faces: IntArray) -> tuple[Surface, IntArray
 
 def largest_piece(surface: Surface) -> Surface:
     """The connected piece with the largest area."""
-    pieces = surface.mesh.vertex_pieces
+    pieces = surface.connectivity.vertex_pieces
     if pieces.max() == 0:
         return surface
     of_faces = pieces[surface.faces[:, 0]]
