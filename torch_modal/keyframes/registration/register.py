@@ -98,10 +98,10 @@ def register(
             f"two different subjects need {FEWEST_ACROSS} landmarks or more, got {len(points.template)}: without them "
             "nothing tells which map is right; give pairs of vertices, template first"
         )
-    meshes = [(one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal)]
+    own, other = ((one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal))
     # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
     with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
-        found = _Problem(*meshes, points, same_subject, report).solve()
+        found = _Problem(own, other, points, same_subject, report).solve()
     corners = torch.from_numpy(np.unique(welded_goal.vertex_of.numpy(), return_index=True)[1])[found.target_corners]
     return found._replace(
         positions=welded.scatter(found.positions).to(checked.keyframes),
