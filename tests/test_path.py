@@ -430,6 +430,19 @@ def test_solve_tells_how_it_went(motion: Shapes, path: Path) -> None:
     assert nothing.shapes.shape == (0, *motion.keyframes.shape[1:]) and nothing.solution.status.shape == (0,)
 
 
+def test_times_in_float32_reach_the_key_frames(motion: Shapes) -> None:
+    at = [2.0, 2.3, 2.7, 3.1, 3.3]
+    t = torch.tensor(at).requires_grad_()
+    for cyclic in (False, True):
+        layer = Path(motion.bases, motion.faces, times=[*at, 3.9] if cyclic else at, cyclic=cyclic)
+        shapes = layer(motion.keyframes, t)
+        assert torch.equal(shapes, motion.keyframes)
+        assert torch.autograd.grad(shapes[1:4].square().sum(), t)[0][1:4].abs().min() > 0
+        assert layer(motion.keyframes, torch.linspace(2.0, 3.3, 17)).isfinite().all()
+    with pytest.raises(ValueError, match="lies between"):
+        Path(motion.bases, motion.faces, times=at)(motion.keyframes, 3.3 + 1e-5)
+
+
 def test_times_in_a_list_reach_the_key_frames(motion: Shapes) -> None:
     """0.1 is no number of float32."""
     path = Path(motion.bases[:3], motion.faces, [0.1, 0.3, 0.7])

@@ -131,6 +131,7 @@ class Path(nn.Module):
                 f"keyframes of this path have the shape (..., {self.n_keyframes}, V, 3); got {tuple(keyframes.shape)}"
             )
         layer.check(keyframes[..., 0, :, :], keyframes[..., -1, :, :], 0.0)
+        rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         own, item = keyframes.shape[:-3], keyframes.shape[-2:]
         try:
@@ -142,7 +143,7 @@ class Path(nn.Module):
             ) from None
         flat = keyframes.reshape(-1, *keyframes.shape[-3:])
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
-        segment, u = self._located(t.expand(lead).reshape(-1))
+        segment, u = self._located(t.expand(lead).reshape(-1), rounding)
         exact = torch.is_grad_enabled() and (keyframes.requires_grad or t.requires_grad or _any_recorded(layer))
         order, parts = [], []
         for i in segment.unique().tolist() or [0]:  # of nothing, nothing
@@ -154,12 +155,17 @@ class Path(nn.Module):
             shapes.reshape(*lead, *item), Solution(*(value.reshape(lead + value.shape[1:]) for value in solution))
         )
 
-    def _located(self, t: Tensor) -> tuple[Tensor, Tensor]:
+    def _located(self, t: Tensor, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
         times = self.times
+        # 0.3 in float32 is beside 0.3 in float64, and would miss the key-frame, or lie after the last.
+        scale = torch.maximum(t.detach().abs(), times.abs().amax())
         if self.cyclic:
             period = times[-1] - times[0]
             t = t - period * torch.floor((t.detach() - times[0]) / period)
+        differences = times - t.detach()[:, None]
+        to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
+        t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
         outside = ~((t >= times[0]) & (t <= times[-1]))
         if bool(outside.any()):
             raise ValueError(
