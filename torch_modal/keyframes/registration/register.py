@@ -31,6 +31,7 @@ FEWEST_ACROSS = 5
 _SURE_SCORE = 0.62  # of a spectral map; below it, more starts are tried
 _SIGNS, _MORE_SIGNS = 4, 6
 _SCORE_SHARE = 0.5  # of a map's score against the stretch of its fit
+_NEAR_LANDMARK = 0.1  # of a surface of area one: spectral maps further off are left out
 _RIVALS = 3  # maps that are fitted before one is chosen
 _RIVAL_SCORE = 0.15  # behind the best, in score minus distortion
 _SAME = 0.1  # maps that differ by less at all but 2 % of the vertices, of a surface of area one, count as one
@@ -147,20 +148,31 @@ class _Problem:
     # ------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
         if len(self.marks):
-            pairs = [
+            marks = [
                 shape.nearest(places, _normals(surface, places))
                 for shape, surface, places in (
                     (self.first, self.template, self.marks),
                     (self.second, self.target, self.mark_places),
                 )
             ]
-            return [landmark_map(self.first, self.second, np.stack(pairs, axis=1))]
-        self.progress.expect(2**_SIGNS + N_OTHER_STARTS)
-        maps = spectral_maps(self.first, self.second, _SIGNS, tick=self.progress.update)
+            pairs = np.stack(marks, axis=1)
+            maps = [landmark_map(self.first, self.second, pairs)]
+            return maps + [one for one in self._spectral() if self._agrees(one, pairs)] if self.same_subject else maps
+        maps = self._spectral()
         if maps[0].score < _SURE_SCORE:
             self.progress.expect(2**_MORE_SIGNS + N_OTHER_STARTS)
             maps += spectral_maps(self.first, self.second, _MORE_SIGNS, tick=self.progress.update)
         return maps
+
+    def _spectral(self) -> list[Map]:
+        self.progress.expect(2**_SIGNS + N_OTHER_STARTS)
+        return spectral_maps(self.first, self.second, _SIGNS, tick=self.progress.update)
+
+    def _agrees(self, found: Map, pairs: IntArray) -> bool:
+        """Whether a map sends all landmarks near their places."""
+        places = self.second.coarse.vertices
+        apart = np.linalg.norm(places[found.vertices[pairs[:, 0]]] - places[pairs[:, 1]], axis=1)
+        return bool((apart < _NEAR_LANDMARK).all())
 
     def _rivals(self, maps: list[Map]) -> list[tuple[Map, float]]:
         """The maps that are worth a fit, and their distortions: those found, and those mended, which differ."""
