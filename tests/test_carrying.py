@@ -8,10 +8,11 @@ from solids import box, surface
 
 from torch_modal.precompute import filling, modes
 from torch_modal.precompute.cache import Cache
-from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, self_proximity
+from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, nearest_rotations
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import embed_surface
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
+from torch_modal.precompute.proximity import self_proximity, thin_part
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tet_volumes
@@ -87,9 +88,31 @@ def test_local_rotations_of_a_turn() -> None:
     np.testing.assert_allclose(turns, np.broadcast_to(TURN, turns.shape), atol=1e-12)
 
 
+def test_nearest_rotations_against_singular_values() -> None:
+    random = np.random.default_rng(0)
+    matrices = random.normal(size=(3000, 3, 3)) * random.uniform(1e-9, 1e9, (3000, 1, 1))
+    matrices[:10], matrices[10:20, :, 0] = 0.0, 0.0  # of no and of two dimensions
+    matrices[20:30] = np.eye(3)
+    found = nearest_rotations(matrices)
+    u, _, vt = np.linalg.svd(matrices)
+    flip = np.ones((len(u), 3))
+    flip[:, 2] = np.sign(np.linalg.det(u @ vt))
+    np.testing.assert_allclose(found, (u * flip[:, None]) @ vt, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(found), 1.0, atol=1e-12)
+
+
 def test_a_degenerate_face_does_no_harm() -> None:
     faces = np.concatenate([COMPACT, [[COMPACT[0, 0], COMPACT[0, 1], COMPACT[0, 1]]]])
     assert np.isfinite(local_rotations(POINTS, POINTS @ TURN.T, faces)).all()
+
+
+def test_thin_parts() -> None:
+    """A plate of 8 by 4 by 0.4, a diagonal of 9: all of its area but that of the rims has 0.4 under it."""
+    plate = box((40, 20, 2), (8.0, 4.0, 0.4))
+    used, compact = np.unique(surface(plate), return_inverse=True)
+    whole = Surface.of(plate.vertices[used], compact.reshape(-1, 3))
+    assert thin_part(whole, 0.03) == 0
+    assert thin_part(whole, 0.1) > 0.8
 
 
 def horseshoe(angle: float) -> np.ndarray:
@@ -121,6 +144,7 @@ def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
 
     monkeypatch.setattr(filling, "tetrahedralize", fill)
+    monkeypatch.setattr(filling, "MOST_THIN", -1.0)  # no body is left to the lattice
     return asked
 
 

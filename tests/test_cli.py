@@ -60,6 +60,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("the mesher was started")
 
     monkeypatch.setattr(filling, "tetrahedralize", started)
+    monkeypatch.setattr(filling, "lattice", started)
 
 
 def fails(capsys: pytest.CaptureFixture[str], *argv: str) -> str:

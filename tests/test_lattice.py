@@ -1,6 +1,10 @@
 """The lattice fills what is inside, the same way each time, whatever the surface is like."""
 
+import os
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +13,7 @@ from solids import box, surface
 
 from torch_modal.errors import MeshWarning
 from torch_modal.precompute import filling
+from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.lattice import lattice
 from torch_modal.precompute.modes import extract_bases, extract_modes
@@ -25,12 +30,79 @@ def test_volume_and_place(capsule: Mesh, cell: float) -> None:
     filled = lattice(whole, cell)
     assert (tet_volumes(filled) > 0).all()
     exact = trimesh.Trimesh(whole.points, whole.faces)
-    assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=0.02)
+    assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=cell)
     mass = lumped_mass(filled)
     center = (mass[:, None] * filled.vertices).sum(axis=0) / mass.sum()
     np.testing.assert_allclose(center, exact.center_mass, atol=0.3)  # of a diagonal of 100
     low, high = filled.vertices.min(axis=0), filled.vertices.max(axis=0)
-    assert (low <= whole.points.min(axis=0)).all() and (high >= whole.points.max(axis=0)).all()
+    np.testing.assert_allclose(low, whole.points.min(axis=0), atol=50 * cell)
+    np.testing.assert_allclose(high, whole.points.max(axis=0), atol=50 * cell)
+
+
+def test_outer_vertices_lie_on_the_surface(capsule: Mesh) -> None:
+    whole = Surface.of(*capsule)
+    filled = lattice(whole, 0.05)
+    outer = filled.vertices[np.unique(surface(filled))]
+    corners = whole.points[whole.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    # Of a convex body: the distance to the plane that a point is most outside of.
+    distance = np.abs(((outer[:, None] - corners[:, 0]) * normals).sum(axis=2).max(axis=1))
+    assert np.median(distance) < 1e-6  # some would make a tetrahedron flat, and stay away
+    assert distance.max() < 5.0  # a cube
+
+
+def test_what_is_thinner_than_a_cube_stays_in_one_piece() -> None:
+    solid = box((30, 20, 1), (10.0, 6.0, 0.12))
+    used, compact = np.unique(surface(solid), return_inverse=True)
+    turn = np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0]
+    sheet = Surface.of(solid.vertices[used] @ turn, compact.reshape(-1, 3))
+    filled = lattice(sheet, 0.03)
+    assert lowest_modes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).n_zero == 6
+    assert solid_volumes(filled).sum() == pytest.approx(10 * 6 * 0.12 * sheet.scale**3, rel=0.2)
+
+
+THREADS = """
+import hashlib, sys
+import numpy as np
+import trimesh
+from torch_modal.precompute.modes import extract_bases
+mesh = trimesh.creation.capsule(height=3.0, radius=0.6, count=(24, 24))
+keyframes = np.stack([mesh.vertices, mesh.vertices * [1.0, 1.1, 1.0]])
+total = hashlib.sha256()
+for basis in extract_bases(keyframes, mesh.faces, 12, mesher="lattice", cache=False):
+    total.update(basis.modes.numpy().tobytes() + basis.eigenvalues.numpy().tobytes())
+print(total.hexdigest())
+"""
+
+
+def test_the_same_in_every_process_with_any_threads() -> None:
+    """Bit by bit; the capsule's modes come in pairs of nearly equal eigenvalues, which rounding would turn."""
+    root = str(Path(lattice_module.__file__).parents[2])
+    found = set()
+    for threads in ("1", "2", "4"):
+        variables = {**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads, "PYTHONPATH": root}
+        run = subprocess.run([sys.executable, "-c", THREADS], check=True, capture_output=True, text=True, env=variables)
+        found.add(run.stdout.strip())
+    assert len(found) == 1
+
+
+def test_auto_takes_it_for_bodies_without_thin_parts(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def fail(*args: object, **kwargs: object) -> None:
+        asked.append(args)
+        raise TetrahedralizationError("none here")
+
+    monkeypatch.setattr(filling, "tetrahedralize", fail)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        extract_modes(*capsule, 6, cache=False)
+    assert not asked
+    vertices, faces = capsule
+    with pytest.warns(MeshWarning, match="lattice of cubes takes its place"):
+        extract_modes(vertices * (1.0, 0.02, 1.0), faces, 6, cache=False)
+    assert asked
 
 
 def test_each_side_is_shared_alike(capsule: Mesh) -> None:
@@ -85,6 +157,7 @@ def test_it_takes_over_with_a_warning(capsule: Mesh, monkeypatch: pytest.MonkeyP
         raise TetrahedralizationError("signal SIGSEGV")
 
     monkeypatch.setattr(filling, "tetrahedralize", fail)
+    monkeypatch.setattr(filling, "MOST_THIN", -1.0)  # as if the capsule had thin parts
     with pytest.warns(MeshWarning, match="lattice of cubes takes its place: signal SIGSEGV"):
         basis = extract_modes(*capsule, 6, cache=False)
     with warnings.catch_warnings():
@@ -110,4 +183,4 @@ def test_settings_reach_the_mesher(capsule: Mesh, monkeypatch: pytest.MonkeyPatc
     for settings in ("fast", "fine", TetrahedraSettings(edge_length_fac=0.07)):
         extract_modes(*capsule, 5, settings=settings, mesher="lattice", cache=False)
     assert seen[0] > seen[1]
-    assert seen[2] == 0.07
+    assert seen[2] == filling.CUBE * 0.07

@@ -192,6 +192,12 @@ def test_untrustworthy_problems_are_refused() -> None:
 # -------------------------------------------------------------------------------- from key-frames to bases
 
 
+@pytest.fixture(autouse=True)
+def _nothing_for_the_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The box has no thin parts, and would not come to the mesher that is replaced below."""
+    monkeypatch.setattr(filling, "MOST_THIN", -1.0)
+
+
 @pytest.fixture
 def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
     """A box as a surface, and a mesher that fills it (the surface comes centred, with a diagonal of 100)."""

@@ -352,7 +352,7 @@ def _add_modes(sub: argparse.ArgumentParser) -> None:
         choices=("auto", "tetwild", "lattice"),
         default="auto",
         help="what fills the surfaces: fTetWild, a lattice of cubes (deterministic, takes open surfaces), or auto: the "
-        "second where the first fails (default: %(default)s)",
+        "second for bodies without thin parts and where the first fails (default: %(default)s)",
     )
     sub.add_argument(
         "--quality",

@@ -21,7 +21,7 @@ from safetensors.numpy import save as save_arrays
 
 from torch_modal.io.files import write_atomically
 
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 """Part of every key: raise it when an algorithm of the pre-computation changes, and old entries are left."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"

@@ -19,10 +19,12 @@ RINGS = 2
 MAX_RINGS = 6
 PUSH = 0.005
 """How far points are moved inward for the search of the closest tetrahedron, in bounding-box diagonals: more
-than the tolerance of the mesher (0.002), less than the thickness of a limb."""
+than the tolerance of the mesher (0.004), less than the thickness of a limb."""
 MAX_AMPLIFICATION = 4.0
 """Largest sum of the magnitudes of a point's weights; 1 inside, larger where it extrapolates."""
-_CANDIDATES = 32
+FLAT = 1e-7
+"""Determinant of the covariance of a point's neighbours, over its cubed trace, below which they lie in a plane."""
+_CANDIDATES = (6, 32)
 _CHUNK = 4096
 
 
@@ -119,21 +121,26 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
 def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
     """The tetrahedron around each point, or about the closest one where there is none. *Shape:* ``(V,)``.
 
-    Among the tetrahedra with the nearest centroids, the one whose faces the point is least far outside of.
+    Among the tetrahedra with the nearest centroids, the one whose faces the point is least far outside of. A few are
+    enough for points that one of those few holds.
     """
-    corners = tetrahedra.vertices[tetrahedra.tets]
-    centroids = corners.mean(axis=1)
+    centroids = tetrahedra.vertices[tetrahedra.tets].mean(axis=1)
     gradients = hat_gradients(tetrahedra)
     heights = 1 / np.linalg.norm(gradients, axis=2)
-    n_candidates = min(_CANDIDATES, len(centroids))
-    candidates = cKDTree(centroids).query(points, k=n_candidates)[1].reshape(len(points), n_candidates)
+    tree = cKDTree(centroids)
     closest = np.empty(len(points), dtype=np.int64)
-    for chunk in _chunks(np.arange(len(points))):
-        tets = candidates[chunk]
-        offset = points[chunk, None] - centroids[tets]
-        barycentric = 0.25 + np.einsum("vci,vcai->vca", offset, gradients[tets])
-        inside = (barycentric * heights[tets]).min(axis=2)  # signed distance to the face it is most outside of
-        closest[chunk] = np.take_along_axis(tets, inside.argmax(axis=1)[:, None], axis=1)[:, 0]
+    left = np.arange(len(points))
+    for n_candidates in _CANDIDATES:
+        n_candidates = min(n_candidates, len(centroids))
+        outside = []
+        for chunk in _chunks(left):
+            tets = tree.query(points[chunk], k=n_candidates)[1].reshape(len(chunk), n_candidates)
+            offset = points[chunk, None] - centroids[tets]
+            barycentric = 0.25 + (gradients[tets] @ offset[..., None])[..., 0]
+            inside = (barycentric * heights[tets]).min(axis=2)  # signed distance to the face it is most outside of
+            closest[chunk] = np.take_along_axis(tets, inside.argmax(axis=1)[:, None], axis=1)[:, 0]
+            outside.append(chunk[inside.max(axis=1) < 0])
+        left = np.concatenate(outside)
     return closest
 
 
@@ -192,16 +199,32 @@ def _nearest_reached(
 def _moving_least_squares(points: FloatArray, vertices: FloatArray, nearest: Neighbours) -> FloatArray:
     """Weights ``θ_j p_jᵀ (Σ θ p pᵀ)⁻¹ p(x)`` with ``p = (1, (x_j - x) / r)``. *Shape:* ``(·, 12)``."""
     offset = vertices[nearest.vertex] - points[:, None]
-    used = nearest.kernel > 0
-    radius = np.sqrt(((offset**2).sum(axis=2) * used).max(axis=1))
-    basis = np.concatenate([np.ones((*offset.shape[:2], 1)), offset / radius[:, None, None]], axis=2)
+    squared = (offset**2).sum(axis=2)
+    radius = np.sqrt((squared * (nearest.kernel > 0)).max(axis=1))
+    offset /= radius[:, None, None]
     theta = nearest.kernel / nearest.kernel.sum(axis=1, keepdims=True)
-    moments = np.einsum("vj,vja,vjb->vab", theta, basis, basis)
-    # The pseudo-inverse, since neighbours in one plane fix no slope across it: none is taken then.
-    solve = np.linalg.pinv(moments, rcond=1e-9, hermitian=True)
+    mean = (theta[:, None] @ offset)[:, 0]
+    centered = offset - mean[:, None]
+    covariance = (theta[..., None] * centered).transpose(0, 2, 1) @ centered
+    inverse = _inverses(covariance)
+    # Eliminating the constant leaves 3 x 3: the weights are θ (a + s · (d - mean)) with a sum a and a moment C s.
     weights = np.zeros_like(theta)
-    target = np.array([1.0, 0.0, 0.0, 0.0])
     for _ in range(2):  # the second pass takes out the rounding of the first
-        missing = target - np.einsum("vj,vja->va", weights, basis)
-        weights = weights + theta * np.einsum("vja,vab,vb->vj", basis, solve, missing)
+        sum_missing = 1 - weights.sum(axis=1)
+        moment_missing = -(weights[:, None] @ offset)[:, 0]
+        slope = (inverse @ (moment_missing - sum_missing[:, None] * mean)[..., None])[..., 0]
+        weights = weights + theta * (sum_missing[:, None] + (centered @ slope[..., None])[..., 0])
     return weights
+
+
+def _inverses(covariance: FloatArray) -> FloatArray:
+    """Inverses of symmetric positive semi-definite matrices. *Shape:* ``(·, 3, 3)``.
+
+    The pseudo-inverse of those that are nearly singular: neighbours in one plane fix no slope across it, and none is
+    taken then.
+    """
+    flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
+    inverse = np.empty_like(covariance)
+    inverse[~flat] = np.linalg.inv(covariance[~flat])
+    inverse[flat] = np.linalg.pinv(covariance[flat], rcond=1e-9, hermitian=True)
+    return inverse

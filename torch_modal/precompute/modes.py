@@ -47,7 +47,8 @@ def extract_modes(
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
         mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
-            than one cell; ``"auto"`` takes the first, and the second where the first fails.
+            than one cell; ``"auto"`` takes the second for bodies without thin parts, the first for others, and the
+            second again where the first fails.
         timeout: Seconds that the child process of fTetWild may take.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
@@ -103,7 +104,8 @@ def extract_bases(
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
         mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
-            than one cell; ``"auto"`` takes the first, and the second where the first fails.
+            than one cell; ``"auto"`` takes the second for bodies without thin parts, the first for others, and the
+            second again where the first fails.
         carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each has its own.
         timeout: Seconds that the child process of fTetWild may take for a key-frame.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.

@@ -68,4 +68,5 @@ def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
 
     fTetWild keeps what the faces wind around, which is nothing for a mesh that is inside out.
     """
-    return faces[:, ::-1] if signed_volume(vertices - vertices.mean(axis=0), faces) < 0 else faces
+    inside_out = signed_volume(vertices - vertices.mean(axis=0), faces) < 0
+    return np.ascontiguousarray(faces[:, ::-1]) if inside_out else faces
