@@ -279,7 +279,7 @@ def test_interrupt_says_one_line_and_leaves_with_130(meshes: list[str], tmp_path
     out, scratch = tmp_path / "out", tmp_path / "scratch"
     scratch.mkdir()
     process = subprocess.Popen(
-        [sys.executable, "-m", "torch_modal", "modes", *meshes, "--no-cache", "--out", str(out)],
+        [sys.executable, "-m", "torch_modal", "modes", *meshes, "--no-cache", "--mesher", "tetwild", "--out", str(out)],
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "TMPDIR": str(scratch)},
