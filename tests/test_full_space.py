@@ -102,8 +102,8 @@ def test_gap_closed_on_the_hand(hands: Shapes, pair: tuple[int, int]) -> None:
     x_a, x_b = hands.keyframes[i], hands.keyframes[j]
     bases = [hands.bases[i], hands.bases[j]]
     modal, local, polished = (
-        tm.MidShape(bases, hands.faces, local=local, polish=polish)(x_a, x_b)
-        for local, polish in ((False, 0), (True, 0), (True, 2))
+        tm.MidShape(bases, hands.faces, solver=tm.Solver(local_steps=local_steps, polish=polish))(x_a, x_b)
+        for local_steps, polish in ((0, 0), (2, 0), (2, 2))
     )
     optimum = full_space(x_a, x_b, hands.faces, start=modal).shape
     gaps = [gap_closed(x, optimum, x_a, x_b, hands.faces) for x in (modal, local, polished)]

@@ -81,6 +81,11 @@ class TestValues:
         mid = MidShape(bars.bases[:2], bars.faces, **modal(coarse_faces=200))
         assert torch.equal(layer(*bars.keyframes[:2], 0.5), mid(*bars.keyframes[:2]))
 
+    def test_faces_may_be_a_reversed_view_of_an_array(self, bars: Shapes) -> None:
+        x, turned = bars.keyframes, bars.faces.numpy()[:, ::-1]  # torch.from_numpy refuses negative strides
+        assert InBetween(bars.bases[:2], turned)(x[0], x[1], 0.5).isfinite().all()
+        assert ShellEnergy(turned)(x[0], x[1]) > 0
+
     def test_near_the_ends_it_is_near_the_key_frames(self, layer: InBetween, bars: Shapes) -> None:
         x = layer(*bars.keyframes[:2], times(1e-6, 1 - 1e-6))
         assert float((x - bars.keyframes[:2]).abs().max()) < 1e-4 * diagonal(bars.keyframes[0])

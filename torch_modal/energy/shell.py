@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Term, Volume
+from torch_modal.keyframes.arrays import as_faces
 
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
 """The paper's stiffnesses, for shapes of a bounding-box diagonal of 100."""
@@ -70,8 +71,7 @@ class ShellEnergy(nn.Module):
         terms: tuple[Term, ...] = (),
     ) -> None:
         super().__init__()
-        faces = torch.as_tensor(faces)
-        self.register_buffer("faces", faces.detach().cpu().long().clone(), persistent=False)
+        self.register_buffer("faces", torch.from_numpy(as_faces(faces)), persistent=False)
         self.terms: Any = nn.ModuleList([Stretch(alpha), Bend(beta), Volume(gamma), *terms])
         self.energy = Energy(Mesh.of(self.faces, int(self.faces.max()) + 1), [*self.terms])
 

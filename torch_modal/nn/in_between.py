@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
+from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.between import Between, InBetweenResult, Samples, report
 from torch_modal.nn.frame import mean_areas
@@ -74,7 +75,7 @@ class InBetween(nn.Module):
         else:
             self.mu = mu
         self.bases = nn.ModuleList(_Basis(basis) for basis in bases)
-        self.faces = torch.as_tensor(faces)
+        self.faces = torch.from_numpy(as_faces(faces))
         self._build()
         self.register_load_state_dict_post_hook(_rebuild)
 
