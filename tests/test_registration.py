@@ -19,6 +19,7 @@ from torch_modal.keyframes.registration.report import measure
 from torch_modal.keyframes.registration.sequence import landmark_table
 from torch_modal.keyframes.registration.spectrum import SpectralShape
 from torch_modal.keyframes.registration.surface import Surface, largest_piece, outward, referenced
+from torch_modal.view import drawing, landmarks
 
 for library in ("robust_laplacian", "potpourri3d", "igl"):
     pytest.importorskip(library, reason=f"{library} is not installed; it is part of the extra 'register'")
@@ -374,7 +375,10 @@ def test_command(files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixtur
         cli.main(["subdivide", *map(str, files[:2]), "--across", "--out", str(tmp_path / "x.glb")])
 
 
-def test_suggestion_picture(files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_suggestion_picture(
+    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(landmarks, "draw", lambda scene, renderer: drawing.draw(scene, "matplotlib"))  # the faster one
     picture = tmp_path / "numbers.png"
     assert cli.main(["register", *map(str, files[:2]), "--suggest", str(picture)]) == 0
     assert picture.stat().st_size > 10_000

@@ -227,7 +227,7 @@ def tasks(part: str, n_pairs: int) -> list[Callable[[], dict[str, Any]]]:
 def main() -> None:
     """Run parts and print their rows; rows are kept, and the table at the end is made of all that are kept."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", default=["poses", "pairs", "marked", "across", "middle", "time"])
+    parser.add_argument("--parts", nargs="*", default=["poses", "pairs", "marked", "across", "middle", "time"])
     parser.add_argument("--n-pairs", type=int, default=50)
     parser.add_argument("--rows", type=Path, help="a file of rows from earlier runs, which is added to")
     args = parser.parse_args()
