@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import Shapes, processes
+from conftest import Shapes, processes, wait_until
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
@@ -138,7 +138,8 @@ def test_bad_sets_are_reported_and_do_not_stop_the_others(bench: Bench, monkeypa
     assert summary[-1] == f"report: {bench.out / REPORT}" and len(summary) == 9
     scratch = bench.root.parent / "scratch"
     assert list(scratch.iterdir()) == [], "temporary files are left"
-    assert processes(str(scratch)) == [], "what a process has started is ended with it"
+    # What a process has started is killed with it, which takes a moment where the machine is busy.
+    wait_until(lambda: not processes(str(scratch)), 10)
 
 
 def test_names_that_are_no_text(bench: Bench) -> None:
