@@ -97,8 +97,7 @@ class LocalRotations(nn.Module):
         areas, t = a.doubled_areas + b.doubled_areas, t[:, None]
         length, along, height = (torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))
         turn = power(self._sensed(a, b), t)
-        wanted = Sides(rotate(turn, length * a.e1), rotate(turn, a.world(along, height)))
-        return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, len(self.per_length))
+        return self._edges(Sides(rotate(turn, length * a.e1), rotate(turn, a.world(along, height))), areas)
 
     def course(
         self, before: Tensor | None, first: Tensor, second: Tensor, after: Tensor | None, spacing: Spacing
@@ -143,7 +142,10 @@ class LocalRotations(nn.Module):
 
         end = course.size + course.unit * course.step[3:]
         areas = course.size[0] * course.size[2] + end[0] * end[2]
-        wanted = Sides(placed(length, flat), placed(along, height))
+        return self._edges(Sides(placed(length, flat), placed(along, height)), areas)
+
+    def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
+        """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""
         return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, len(self.per_length))
 
     def _sensed(self, a: Frames, b: Frames) -> Tensor:

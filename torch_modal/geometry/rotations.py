@@ -65,9 +65,7 @@ def power(q: Tensor, t: Tensor) -> Tensor:
     The sign of a quaternion tells the way round: with a real part below zero it is the long one.
     *Shape:* ``(4, ...), (...) -> (4, ...)``.
     """
-    half = t * _arc(q)
-    cosine, sinc = _cos_and_sinc((half * half).sum(0))
-    return torch.cat([cosine[None], sinc * half])
+    return _about(t * _arc(q))
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
@@ -78,9 +76,7 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 
 def turned(turn: Tensor, v: Tensor) -> Tensor:
     """Vectors turned about axes by their lengths. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
-    half = 0.5 * turn
-    cosine, sinc = _cos_and_sinc((half * half).sum(0))
-    return rotate(torch.cat([cosine[None], sinc * half]), v)
+    return rotate(_about(0.5 * turn), v)
 
 
 def turn_of(q: Tensor) -> Tensor:
@@ -100,6 +96,12 @@ def _arc(q: Tensor) -> Tensor:
     tangent = torch.where(small, imaginary, 0) / torch.where(small, real, 1)
     near = _series(_ARC, (tangent * tangent).sum(0)) * tangent
     return torch.where(small, near, torch.atan2(sine, real) / sine * imaginary)
+
+
+def _about(half: Tensor) -> Tensor:
+    """The quaternion of axis times half the angle: the inverse of :func:`_arc`. *Shape:* ``(3, ...) -> (4, ...)``."""
+    cosine, sinc = _cos_and_sinc((half * half).sum(0))
+    return torch.cat([cosine[None], sinc * half])
 
 
 def _cos_and_sinc(squared: Tensor) -> tuple[Tensor, Tensor]:

@@ -136,9 +136,7 @@ class InBetween(nn.Module):
             ValueError: Shapes, dtypes, devices or times that do not fit.
             ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
         """
-        forbid = self.solver.unconverged == "raise" and torch.is_grad_enabled()
-        told = partial(report, max_steps=self.solver.max_steps, forbid=forbid)
-        return self._batched(x_a, x_b, t, pair, told).shapes
+        return self._batched(x_a, x_b, t, pair, self.report()).shapes
 
     @property
     def dtype(self) -> torch.dtype:
@@ -165,20 +163,14 @@ class InBetween(nn.Module):
             self.mu_of(times, lead),
             self.stiffness_of(times, lead),
         )
-        recorded = (x_a, x_b, times, samples.mu, *samples.stiffness)
-        exact = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in recorded)
+        exact = self.records(x_a, x_b, times)
         with full_precision(times.device.type):
             if chosen is None:
                 result = self.members[0 if isinstance(pair, Tensor) else pair](samples, exact, report)
             else:
                 result = self._of_several(samples, chosen.expand(own).reshape(-1), exact, report)
-        result_type = torch.promote_types(x_a.dtype, x_b.dtype)
-        shapes = result.shapes.to(result_type).reshape(*lead, *item)
-        # The ends are the key-frames to the last bit; their gradients are those of the in-between there.
-        for end, x in ((0, x_a), (1, x_b)):
-            exactly = x.to(result_type).detach() + (shapes - shapes.detach())
-            shapes = torch.where((times == end)[..., None, None], exactly, shapes)
-        return InBetweenResult(shapes, Solution(*(value.reshape(lead + value.shape[1:]) for value in result.solution)))
+        shapes, solution = unflattened(result, lead)
+        return InBetweenResult(with_exact_ends(shapes, x_a, x_b, times), solution)
 
     def _of_several(
         self, samples: Samples, chosen: Tensor, exact: bool, report: Callable[[Solution], None] | None
@@ -205,6 +197,16 @@ class InBetween(nn.Module):
         if not parts:
             return self.members[0](samples, exact, report)  # of nothing, nothing
         return joined(parts, order)
+
+    def report(self) -> Callable[[Solution], None]:
+        """What ``forward`` says of samples that did not converge."""
+        forbid = self.solver.unconverged == "raise" and torch.is_grad_enabled()
+        return partial(report, max_steps=self.solver.max_steps, forbid=forbid)
+
+    def records(self, *given: Tensor) -> bool:
+        """Whether gradients of these, or of what is minimised, are recorded."""
+        own = [self.mu, *(term.stiffness for term in self.terms)]
+        return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in [*given, *own])
 
     # ------------------------------------------------------------------------------------------------------ the border
     def _chosen(self, pair: Tensor | int) -> Tensor | None:
@@ -304,6 +306,28 @@ def joined(parts: Sequence[InBetweenResult], order: Sequence[Tensor]) -> InBetwe
     others = [torch.cat(values)[back] for values in zip(*(part.solution[1:] for part in parts), strict=True)]
     shapes = torch.cat([part.shapes for part in parts])
     return InBetweenResult(shapes[back], Solution(amplitudes[back], *others))
+
+
+def unflattened(result: InBetweenResult, lead: torch.Size) -> InBetweenResult:
+    """A flat batch with these leading dimensions."""
+    solution = Solution(*(value.reshape(lead + value.shape[1:]) for value in result.solution))
+    return InBetweenResult(result.shapes.reshape(*lead, *result.shapes.shape[1:]), solution)
+
+
+def with_exact_ends(shapes: Tensor, x_a: Tensor, x_b: Tensor, t: Tensor) -> Tensor:
+    """In-betweens, at 0 and 1 the key-frames to the last bit; gradients stay those of the in-between there.
+
+    Args:
+        shapes: *Shape:* ``(..., V, 3)``.
+        x_a: Key-frames at 0, whose dtype the result has. *Shape:* ``(..., V, 3)``.
+        x_b: Key-frames at 1, likewise. *Shape:* ``(..., V, 3)``.
+        t: *Shape:* ``(...)``.
+    """
+    shapes = shapes.to(torch.promote_types(x_a.dtype, x_b.dtype))
+    for end, x in ((0, x_a), (1, x_b)):
+        exactly = x.to(shapes).detach() + (shapes - shapes.detach())
+        shapes = torch.where((t == end)[..., None, None], exactly, shapes)
+    return shapes
 
 
 @contextmanager

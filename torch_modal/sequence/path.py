@@ -6,16 +6,15 @@ a shape of it. Nothing is minimised unless there are terms beyond Eq. 5, which t
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.hermite import Spacing
-from torch_modal.nn.between import InBetweenResult, Samples, report
-from torch_modal.nn.in_between import InBetween, full_precision, joined
-from torch_modal.nn.settings import Objective, Preset, Solver
+from torch_modal.nn.between import InBetweenResult, Samples
+from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
+from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.sequence.times import checked_times
@@ -60,11 +59,12 @@ class Path(nn.Module):
         n = len(bases)
         if n < 2:
             raise ValueError(f"a path needs two key-frames or more, got {n} bases")
-        pairs = [(i, (i + 1) % n) for i in range(n if cyclic else n - 1)]
-        self.layer = InBetween(list(bases), faces, preset, objective=objective, solver=solver, pairs=pairs)
-        if self.layer.objective.space == "paired":
+        objective, solver = settings(preset, objective, solver)
+        if objective.space == "paired":
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
         self.register_buffer("times", checked_times(times, n, cyclic))
+        pairs = [(i, (i + 1) % n) for i in range(n if cyclic else n - 1)]
+        self.layer = InBetween(list(bases), faces, objective=objective, solver=solver, pairs=pairs)
         self.cyclic = cyclic
         self.smooth = smooth
         #: Which pair of bases each interval has the modes of.
@@ -118,9 +118,7 @@ class Path(nn.Module):
             ValueError: Shapes that do not fit, or a time before the first or after the last key-frame.
             ConvergenceError: As for :class:`torch_modal.InBetween`.
         """
-        solver = self.layer.solver
-        forbid = solver.unconverged == "raise" and torch.is_grad_enabled()
-        return self._batched(keyframes, t, partial(report, max_steps=solver.max_steps, forbid=forbid)).shapes
+        return self._batched(keyframes, t, self.layer.report()).shapes
 
     def _batched(
         self, keyframes: Tensor, t: Tensor | float, report: Callable[[Solution], None] | None
@@ -133,7 +131,7 @@ class Path(nn.Module):
         layer.check(keyframes[..., 0, :, :], keyframes[..., -1, :, :], 0.0)
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
-        own, item = keyframes.shape[:-3], keyframes.shape[-2:]
+        own = keyframes.shape[:-3]
         try:
             lead = torch.broadcast_shapes(own, t.shape)
         except RuntimeError:
@@ -144,16 +142,13 @@ class Path(nn.Module):
         flat = keyframes.reshape(-1, *keyframes.shape[-3:])
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = self._located(t.expand(lead).reshape(-1), rounding)
-        exact = torch.is_grad_enabled() and (keyframes.requires_grad or t.requires_grad or _any_recorded(layer))
+        exact = layer.records(keyframes, t)
         order, parts = [], []
         for i in segment.unique().tolist() or [0]:  # of nothing, nothing
             mine = torch.nonzero(segment == i).flatten()
             order.append(mine)
             parts.append(self._between(flat, i, which[mine], u[mine], exact, report))
-        shapes, solution = joined(parts, order)
-        return InBetweenResult(
-            shapes.reshape(*lead, *item), Solution(*(value.reshape(lead + value.shape[1:]) for value in solution))
-        )
+        return unflattened(joined(parts, order), lead)
 
     def _located(self, t: Tensor, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
@@ -201,13 +196,5 @@ class Path(nn.Module):
         )
         with full_precision(x.device.type):
             result = layer.members[self.members[i]](samples, exact, report)
-        shapes = result.shapes.to(keyframes.dtype)
-        for end, j in ((0, i), (1, (i + 1) % n)):
-            exactly = keyframes[which, j].detach() + (shapes - shapes.detach())
-            shapes = torch.where((u == end)[:, None, None], exactly, shapes)
-        return InBetweenResult(shapes, result.solution)
-
-
-def _any_recorded(layer: InBetween) -> bool:
-    stiffness = [layer.mu, *(term.stiffness for term in layer.terms)]
-    return any(isinstance(value, Tensor) and value.requires_grad for value in stiffness)
+        ends = keyframes[which, i], keyframes[which, (i + 1) % n]
+        return InBetweenResult(with_exact_ends(result.shapes, *ends, u), result.solution)

@@ -107,10 +107,9 @@ def _along_path(
     """Shapes of each interval, smooth in time."""
     path = Path(bases, faces.cpu(), times, cyclic, objective=chosen.objective, solver=chosen.solver)
     path.to(keyframes.device)
-    for (start, end), n in zip(pairwise(path.times.tolist()), (b - a for a, b in pairwise(places)), strict=True):
-        inner = torch.linspace(start, end, n + 1, dtype=torch.float64, device=keyframes.device)[1:-1]
+    for when in _times_of_intervals(path.times, places):
         ends = keyframes[:1]  # the key-frames are put there by the caller
-        yield torch.cat([ends, path(keyframes, inner), ends])
+        yield torch.cat([ends, path(keyframes, when[1:-1]), ends])
 
 
 def _by_recursion(
@@ -187,11 +186,14 @@ def frame_times(
     """
     when = checked_times(times, n_keyframes, cyclic)
     places = keyframe_places(n_keyframes, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    parts = [
-        torch.linspace(float(a), float(b), n + 1, dtype=torch.float64)[:-1]
-        for (a, b), n in zip(pairwise(when.tolist()), (b - a for a, b in pairwise(places)), strict=True)
-    ]
+    parts = [times[:-1] for times in _times_of_intervals(when, places)]
     return torch.cat(parts if cyclic else [*parts, when[-1:]])
+
+
+def _times_of_intervals(when: Tensor, places: Sequence[int]) -> Iterator[Tensor]:
+    """Even times of each interval, both ends among them. *Shape:* ``(K,) -> (n + 1,)``."""
+    for (start, end), (a, b) in zip(pairwise(when.tolist()), pairwise(places), strict=True):
+        yield torch.linspace(start, end, b - a + 1, dtype=torch.float64, device=when.device)
 
 
 def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
@@ -221,6 +223,7 @@ class _Segment:
     ) -> None:
         self.bases, self.faces, self.chosen, self.device = bases, faces.cpu(), chosen, device
         self.layers: dict[tuple[int, int], MidShape] = {}
+        self.edges = torch.tensor(Connectivity(self.faces.numpy()).edges, device=device)
 
     def mid_shapes(self, shapes: Tensor) -> Tensor:
         """Between each shape and the next. *Shape:* ``(n + 1, V, 3) -> (n, V, 3)``."""
@@ -242,8 +245,7 @@ class _Segment:
 
     def _nearest(self, shapes: Tensor) -> list[int]:
         """Which key-frame, 0 or 1, each shape is nearer to in its edge lengths, which no rigid motion changes."""
-        edges = torch.tensor(Connectivity(self.faces.numpy()).edges, device=shapes.device)
-        lengths = torch.linalg.norm(shapes[:, edges[:, 0]] - shapes[:, edges[:, 1]], dim=-1)
+        lengths = torch.linalg.norm(shapes[:, self.edges[:, 0]] - shapes[:, self.edges[:, 1]], dim=-1)
         to_first, to_last = ((lengths - lengths[end]).norm(dim=-1) for end in (0, -1))
         return (to_last < to_first).long().tolist()
 
