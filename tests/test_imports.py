@@ -85,6 +85,12 @@ def test_layers_are_torch_only(module: str) -> None:
     assert {name for name in own(module) if name.startswith("precompute")} <= allowed
 
 
+def test_one_lock_guards_the_decimation() -> None:
+    """fast-simplification is not thread-safe; the worker is a process of its own."""
+    users = [name for name in MODULES if "fast_simplification" in imported(name)]
+    assert users == ["geometry.decimation", "precompute._tetwild_worker"]
+
+
 def test_import_loads_nothing_heavy() -> None:
     heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch_geometric"]
     code = f"import sys, torch_modal; print([name for name in {heavy} if name in sys.modules])"

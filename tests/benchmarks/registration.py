@@ -15,13 +15,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import fast_simplification
 import numpy as np
 from animals import animal, held_out, tips
 from scipy.spatial.transform import Rotation
 
 import torch_modal as tm
 from torch_modal.data.samples import sample_files
+from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import read_mesh
 from torch_modal.keyframes.registration.consistency import farthest_points
 from torch_modal.keyframes.registration.spectrum import SpectralShape
@@ -47,11 +47,10 @@ def poses(name: str) -> tuple[FloatArray, IntArray]:
 
 def remeshed(vertices: FloatArray, faces: IntArray, random: np.random.Generator) -> tuple[FloatArray, IntArray]:
     """Decimated, with vertices and faces in random order."""
-    unit = 100 / np.linalg.norm(np.ptp(vertices, axis=0))
-    points, triangles = fast_simplification.simplify(vertices * unit, faces.astype(np.int32), target_reduction=1 - KEPT)
+    points, triangles, _ = decimate(vertices, faces, int(KEPT * len(faces)))
     order = random.permutation(len(points))
     number = np.argsort(order)
-    return points[order] / unit, number[triangles.astype(np.int64)][random.permutation(len(triangles))]
+    return points[order], number[triangles][random.permutation(len(triangles))]
 
 
 def transported(points: FloatArray, source: FloatArray, target: FloatArray, faces: IntArray) -> FloatArray:

@@ -201,6 +201,16 @@ def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tupl
     return parents.astype(np.int64), piece
 
 
+def half_cotangents(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
+    """Half the cotangent of the angle across each side, finite on slivers too. *Shape:* ``(3F,)``."""
+    tip = vertices[mesh.opposite]
+    u, v = vertices[mesh.start] - tip, vertices[mesh.end] - tip
+    twice_area = np.linalg.norm(np.cross(u, v), axis=1)
+    least = 1e-12 * (u * u).sum(1) + np.finfo(np.float64).tiny
+    halves: NDArray[np.float64] = 0.5 * (u * v).sum(1) / np.maximum(twice_area, least)
+    return halves
+
+
 def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
     """A third of the area of the faces around each vertex. *Shape:* ``(V,)``."""
     corners = vertices[faces]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from torch_modal.geometry.connectivity import Connectivity, IntArray, vertex_areas
+from torch_modal.geometry.connectivity import Connectivity, IntArray, half_cotangents, vertex_areas
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import Sides, edge_means
@@ -153,12 +153,8 @@ def _equal(a: Tensor, b: Tensor) -> bool:
 
 
 def _side_weights(shape: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
-    """Half the cotangent of the angle across each side. *Shape:* ``(3F,)``."""
-    tip = shape[mesh.opposite]
-    u, v = shape[mesh.start] - tip, shape[mesh.end] - tip
-    twice_area = np.linalg.norm(np.cross(u, v), axis=-1)
-    tiny = np.finfo(np.float64).tiny
-    return np.clip(0.5 * (u * v).sum(-1) / np.maximum(twice_area, tiny), *_WEIGHT_RANGE)
+    """Half the cotangent of the angle across each side, within bounds. *Shape:* ``(3F,)``."""
+    return np.clip(half_cotangents(shape, mesh), *_WEIGHT_RANGE)
 
 
 def _nearest(points: NDArray[np.float64], piece: NDArray[np.float64]) -> IntArray:

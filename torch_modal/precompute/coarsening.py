@@ -1,22 +1,16 @@
 """One edge-collapse rule for all key-frames, and the cluster averages that it gives (section 3.2 of the paper)."""
 
-import threading
 from dataclasses import dataclass
 
-import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from torch_modal.geometry.connectivity import IntArray
+from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
 
 FloatArray = NDArray[np.float64]
-
-# fast-simplification keeps its mesh in static memory and has absolute thresholds.
-_NOT_THREAD_SAFE = threading.Lock()
-_WORKING_DIAGONAL = 100.0
-_AGGRESSIVENESS = 7.0
 
 # A triangle of less area than this part of its longest edge squared is a needle; an equilateral one has 0.43. If there
 # is one, other numbers of faces are tried.
@@ -61,16 +55,7 @@ class Coarsening:
 
 def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
     """Partition by the edge collapses of one pose."""
-    extent = np.ptp(points[np.unique(faces)], axis=0)
-    working = np.ascontiguousarray((points - points.mean(0)) * (_WORKING_DIAGONAL / np.linalg.norm(extent)))
-    with _NOT_THREAD_SAFE:
-        _, _, collapses = fast_simplification.simplify(
-            working,
-            np.ascontiguousarray(faces, dtype=np.int32),
-            target_count=n_faces,
-            agg=_AGGRESSIVENESS,
-            return_collapses=True,
-        )
+    collapses = decimate(points, faces, n_faces).collapses
     root = np.arange(len(points))
     root[collapses[:, 1]] = collapses[:, 0]
     while not np.array_equal(root[root], root):

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from torch_modal.geometry.connectivity import half_cotangents
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
 from torch_modal.keyframes.registration.surface import FloatArray, Surface
 
@@ -94,8 +95,6 @@ class ElasticSurface:
 def _cotangent_weights(surface: Surface) -> FloatArray:
     """Half the cotangents opposite to each edge, summed, within bounds. *Shape:* ``(E,)``."""
     mesh = surface.connectivity
-    start, end, opposite = (surface.vertices[at] for at in (mesh.start, mesh.end, mesh.opposite))
-    u, v = start - opposite, end - opposite
-    sine = np.linalg.norm(np.cross(u, v), axis=1)
-    cotangent = np.einsum("si,si->s", u, v) / np.maximum(sine, 1e-12 * (u * u).sum(1) + 1e-300)
-    return np.clip(np.bincount(mesh.sides, 0.5 * cotangent, minlength=len(mesh.edges)), *_WEIGHTS)
+    return np.clip(
+        np.bincount(mesh.sides, half_cotangents(surface.vertices, mesh), minlength=len(mesh.edges)), *_WEIGHTS
+    )

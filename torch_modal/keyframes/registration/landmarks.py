@@ -54,14 +54,24 @@ def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) ->
             f"landmarks have shape {pairs.shape} and dtype {pairs.dtype}; pairs of vertex indices (n, 2) are needed, "
             "template first, or two arrays of points (n, 3)"
         )
-    for column, (name, mesh) in enumerate((("template", template), ("target", target))):
-        wrong = np.flatnonzero((pairs[:, column] < 0) | (pairs[:, column] >= len(mesh)))
-        if len(wrong):
-            raise MeshError(
-                f"landmark {wrong[0]} names vertex {pairs[wrong[0], column]} of the {name}, which has {len(mesh)} "
-                "vertices, counted from 0"
-            )
-    return LandmarkPoints(template[pairs[:, 0]], target[pairs[:, 1]])
+    return LandmarkPoints(
+        vertices_named(pairs[:, 0], template, "the template"), vertices_named(pairs[:, 1], target, "the target")
+    )
+
+
+def vertices_named(numbers: IntArray, vertices: FloatArray, mesh: str) -> FloatArray:
+    """The vertices of these numbers. *Shape:* ``(n,), (V, 3) -> (n, 3)``.
+
+    Raises:
+        MeshError: ``mesh``, as the message calls it, has no such vertex.
+    """
+    wrong = np.flatnonzero((numbers < 0) | (numbers >= len(vertices)))
+    if len(wrong):
+        raise MeshError(
+            f"landmark {wrong[0]} names vertex {numbers[wrong[0]]} of {mesh}, which has {len(vertices)} vertices, "
+            "counted from 0"
+        )
+    return vertices[numbers]
 
 
 def _array(values: Any) -> Any:

@@ -8,6 +8,7 @@ from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from torch_modal.errors import MeshError
+from torch_modal.geometry.rigid import best_fit
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.keyframes.registration.consistency import Consistency
 from torch_modal.keyframes.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Fit, Gate
@@ -286,12 +287,10 @@ def _normals(surface: Surface, points: FloatArray) -> FloatArray:
 
 
 def _placed(x: FloatArray, places: FloatArray, weights: FloatArray) -> FloatArray:
-    """Moved rigidly onto places, as well as it goes (Kabsch). *Shape:* ``(n, 3), (n, 3), (n,)``."""
-    weights = weights / weights.sum()
-    source, target = weights @ x, weights @ places
-    u, _, vh = np.linalg.svd(((places - target) * weights[:, None]).T @ (x - source))
-    u[:, 2] *= np.linalg.det(u @ vh)
-    return (x - source) @ (u @ vh).T + target
+    """Moved rigidly onto places, as well as it goes. *Shape:* ``(n, 3), (n, 3), (n,)``."""
+    here, there, shares = (torch.from_numpy(array) for array in (x, places, weights))
+    with torch.no_grad():
+        return best_fit(here, there, shares).apply(here).numpy()
 
 
 def _carried(points: FloatArray, coarse: Surface, x: FloatArray, frames: FloatArray) -> FloatArray:

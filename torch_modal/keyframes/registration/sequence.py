@@ -10,7 +10,7 @@ import torch
 from torch_modal.errors import MeshError
 from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.keyframes.registration.landmarks import read_landmarks
+from torch_modal.keyframes.registration.landmarks import read_landmarks, vertices_named
 from torch_modal.keyframes.registration.register import register
 from torch_modal.keyframes.registration.report import Registration
 from torch_modal.keyframes.registration.surface import FloatArray, IntArray
@@ -81,17 +81,7 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray |
             f"landmarks have shape {table.shape} and dtype {table.dtype}; for {len(shapes)} meshes they are vertex "
             f"numbers (n, {len(shapes)}) or points (n, {len(shapes)}, 3)"
         )
-    return np.stack([_picked(table[:, k], k, shape) for k, shape in enumerate(shapes)], axis=1)
-
-
-def _picked(numbers: IntArray, k: int, shape: FloatArray) -> FloatArray:
-    wrong = np.flatnonzero((numbers < 0) | (numbers >= len(shape)))
-    if len(wrong):
-        raise MeshError(
-            f"landmark {wrong[0]} names vertex {numbers[wrong[0]]} of mesh {k}, which has {len(shape)} vertices, "
-            "counted from 0"
-        )
-    return shape[numbers]
+    return np.stack([vertices_named(table[:, k], shape, f"mesh {k}") for k, shape in enumerate(shapes)], axis=1)
 
 
 def is_same_mesh(vertices: FloatArray, faces: IntArray, others: FloatArray, other_faces: IntArray) -> bool:

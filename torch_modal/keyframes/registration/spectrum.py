@@ -1,16 +1,15 @@
 """A coarse copy of a surface with its Laplacian eigenfunctions and geodesic distances: what maps are made from."""
 
-import threading
 from functools import cached_property
 from typing import Any
 
-import fast_simplification
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
 
 from torch_modal.geometry import inspect
+from torch_modal.geometry.decimation import decimate
 from torch_modal.keyframes.registration.libraries import require
 from torch_modal.keyframes.registration.surface import (
     BoolArray,
@@ -25,9 +24,6 @@ N_COARSE = 2000
 """Vertices of the coarse copies."""
 N_FUNCTIONS = 60
 """Eigenfunctions, the constant one among them."""
-
-_WORKING_DIAGONAL = 100.0  # fast-simplification has absolute thresholds
-_NOT_THREAD_SAFE = threading.Lock()  # it keeps its mesh in static memory
 
 
 class SpectralShape:
@@ -118,14 +114,8 @@ def decimated(surface: Surface, n_vertices: int) -> Surface:
     surface = largest_piece(surface)
     if len(surface.vertices) <= 1.2 * n_vertices:
         return surface
-    centre, factor = surface.vertices.mean(0), _WORKING_DIAGONAL / surface.diagonal
-    with _NOT_THREAD_SAFE:
-        vertices, faces = fast_simplification.simplify(
-            (surface.vertices - centre) * factor,
-            surface.faces.astype(np.int32),
-            target_reduction=1 - n_vertices / len(surface.vertices),
-        )
-    faces = faces.astype(np.int64)
+    wanted = int(n_vertices / len(surface.vertices) * len(surface.faces))
+    vertices, faces, _ = decimate(surface.vertices, surface.faces, wanted)
     faces = faces[~inspect.degenerate_faces(faces)]
     faces = faces[~inspect.repeated_faces(faces)]
-    return largest_piece(referenced(vertices.astype(np.float64) / factor + centre, faces)[0])
+    return largest_piece(referenced(vertices, faces)[0])

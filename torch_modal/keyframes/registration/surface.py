@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.normals import vertex_normals
 from torch_modal.keyframes.registration.libraries import require
 
 FloatArray = NDArray[np.float64]
@@ -63,9 +64,7 @@ class Surface:
     @cached_property
     def vertex_normals(self) -> FloatArray:
         """Means over the faces around a vertex, by area. *Shape:* ``(V, 3)``."""
-        summed = np.zeros_like(self.vertices)
-        np.add.at(summed, self.faces.reshape(-1), np.repeat(self.area_vectors, 3, axis=0))
-        return unit(summed)
+        return vertex_normals(self.vertices, self.faces)
 
     @cached_property
     def vertex_areas(self) -> FloatArray:
