@@ -189,7 +189,7 @@ def small_pictures(monkeypatch):
 @pytest.mark.parametrize(("suffix", "extra"), [("mp4", "video"), ("usdc", "usd")])
 def test_missing_packages_are_named_before_the_work(tmp_path, monkeypatch, suffix, extra):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingPackageError, match=rf"pip install torch_modal\[{extra}\]"):
+    with pytest.raises(MissingPackageError, match=rf"pip install 'torch_modal\[{extra}\]'"):
         animation.require_packages(Path(f"a.{suffix}"))
     with pytest.raises(MissingPackageError):
         tm.save_animation(FRAMES, FACES, tmp_path / f"a.{suffix}")

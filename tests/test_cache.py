@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_modal.io.files import write_atomically
-from torch_modal.precompute import cache as cache_module
-from torch_modal.precompute.cache import (
+from torch_modal.io import cache as cache_module
+from torch_modal.io.cache import (
     Cache,
     CacheContent,
     CacheWarning,
@@ -24,6 +23,7 @@ from torch_modal.precompute.cache import (
     shrink_cache,
     size_limit,
 )
+from torch_modal.io.files import write_atomically
 
 POINTS = np.arange(6.0).reshape(2, 3)
 RESULT = {"values": np.linspace(0, 1, 50), "index": np.arange(8).reshape(2, 4)}
@@ -235,7 +235,7 @@ WRITER = """
 import sys, warnings
 import numpy as np
 from pathlib import Path
-from torch_modal.precompute.cache import Cache
+from torch_modal.io.cache import Cache
 warnings.simplefilter("error")
 cache = Cache(Path(sys.argv[1]), limit=5 * 2**17)
 for i in range(60):

@@ -6,8 +6,8 @@ import torch
 from bodies import bend
 from solids import box, surface
 
+from torch_modal.io.cache import Cache
 from torch_modal.precompute import filling, modes
-from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, nearest_rotations
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import embed_surface

@@ -19,10 +19,10 @@ from torch_modal import progress
 from torch_modal.cli import demo
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
+from torch_modal.io.cache import Cache
 from torch_modal.io.frames import save_frames
 from torch_modal.precompute import filling
 from torch_modal.precompute import modes as modes_module
-from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
 
 FAST = ["--modes", "6", "--levels", "1", "--preset", "fast"]
@@ -185,7 +185,7 @@ def test_key_frames_are_never_overwritten(
 ) -> None:
     files = [str(file) for file in save_frames(np.stack([capsule[0]] * 2), capsule[1], tmp_path)]
     message = fails(capsys, "subdivide", *files, "--out", str(tmp_path), "--overwrite", "--no-cache")
-    assert "frame-000.ply is one of the key-frames" in message
+    assert "frame-000.ply is one of the meshes" in message
 
 
 def test_output_that_cannot_be_written_is_refused_before_the_work(

@@ -17,7 +17,7 @@ from hostile_inputs import CASES, EITHER, ERROR
 from torch.utils.data import DataLoader, Dataset
 
 import torch_modal as tm
-from torch_modal.precompute.cache import cache_content
+from torch_modal.io.cache import cache_content
 from torch_modal.precompute.parallel import n_cpus
 
 ROOT = Path(tm.__file__).parents[1]

@@ -11,7 +11,19 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "torch_modal"
 
 # From the ground up: a module imports from its own floor and lower ones, at the top of the file or inside functions.
-FLOORS = ["version", "errors", "progress", "geometry", "io", "keyframes", "precompute", "energy", "nn", "sequence"]
+FLOORS = [
+    "version",
+    "errors",
+    "extras",
+    "progress",
+    "geometry",
+    "io",
+    "keyframes",
+    "precompute",
+    "energy",
+    "nn",
+    "sequence",
+]
 FLOORS += ["data", "view", "", "cli", "__main__"]
 MODULES = sorted(
     str(path.relative_to(PACKAGE).with_suffix("")).replace("/", ".").removesuffix("__init__").removesuffix(".")

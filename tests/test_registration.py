@@ -8,11 +8,13 @@ import torch
 import trimesh
 
 import torch_modal as tm
+from torch_modal import extras
 from torch_modal.cli import main as cli
 from torch_modal.io.frames import save_mesh
-from torch_modal.keyframes.registration import libraries
+from torch_modal.keyframes.registration import register as register_module
 from torch_modal.keyframes.registration.elastic import ElasticSurface, Pull
 from torch_modal.keyframes.registration.landmarks import read_landmarks
+from torch_modal.keyframes.registration.libraries import require
 from torch_modal.keyframes.registration.maps import FINE_FUNCTIONS, nearest_rows, rate, zoom_out
 from torch_modal.keyframes.registration.register import register
 from torch_modal.keyframes.registration.report import measure
@@ -112,6 +114,40 @@ def test_dtype_and_units_follow_the_inputs(pair: tuple[Mesh, Mesh, np.ndarray]) 
 def test_results_are_repeatable(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
     again = register(*pair[0], *pair[1], progress=False)
     assert torch.equal(again.positions, found.positions) and again.confidence == found.confidence
+
+
+def test_the_second_time_is_from_the_cache(
+    pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the content of both meshes and of the landmarks, which are vertices or points; in any dtype."""
+    (rest, faces), (there, there_faces), _ = pair
+    calls: list[int] = []
+
+    def solved(problem: object) -> tm.Registration:
+        calls.append(len(calls))
+        return found._replace(confidence=0.25, warnings=("one, with a comma", "two"), folds=3)
+
+    monkeypatch.setattr(register_module._Problem, "solve", solved)
+
+    def again(target: np.ndarray, marks: object = None, dtype: type = np.float64) -> tm.Registration:
+        own = rest.astype(np.float32).astype(dtype)
+        options = {"landmarks": marks, "cache_dir": tmp_path, "progress": False}
+        return register(own, faces, target, there_faces, **options)
+
+    first = again(there)
+    second = again(there, dtype=np.float32)
+    assert calls == [0] and second.positions.dtype == torch.float32 and first.positions.dtype == torch.float64
+    assert second.warnings == ("one, with a comma", "two") and second.doubtful and second.folds == 3
+    assert second.to_target == found.to_target and isinstance(second.to_target, type(found.to_target))
+    for name in ("target_faces", "barycentric", "target_corners", "landmark_errors"):
+        assert torch.equal(getattr(second, name), getattr(found, name)), name
+    assert len(again(there + 1e-9).positions) == len(rest) and calls == [0, 1]
+    marks = np.array([[3, 5], [40, 70]])
+    again(there, marks)
+    again(there, (rest.astype(np.float32)[marks[:, 0]].astype(np.float64), there[marks[:, 1]]))
+    assert calls == [0, 1, 2]
+    register(rest, faces, there, there_faces, cache=False, progress=False)
+    assert calls == [0, 1, 2, 3]
 
 
 def test_vertices_of_no_face_come_along(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:
@@ -216,9 +252,9 @@ def test_bad_input_is_refused(pair: tuple[Mesh, Mesh, np.ndarray], monkeypatch: 
         register(rest, faces, *target, same_subject=False, progress=False)
     with pytest.raises(tm.MeshError, match="NaN"):
         register(np.full_like(rest, np.nan), faces, *target, progress=False)
-    monkeypatch.setattr(libraries.importlib, "import_module", lambda name: (_ for _ in ()).throw(ImportError(name)))
+    monkeypatch.setattr(extras.importlib, "import_module", lambda name: (_ for _ in ()).throw(ImportError(name)))
     with pytest.raises(ImportError, match=r"torch_modal\[register\]"):
-        libraries.require("igl")
+        require("igl")
 
 
 # ------------------------------------------------------------------------------------------------------------- parts

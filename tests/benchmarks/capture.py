@@ -13,7 +13,7 @@ from quadratic import at_points, quadratic_modes
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import vertex_areas
-from torch_modal.precompute.cache import Arrays, Cache
+from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
 from torch_modal.precompute.lattice import lattice

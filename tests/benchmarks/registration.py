@@ -108,7 +108,7 @@ def one(name: str, i: int, j: int, how: str, seed: int, marked: bool) -> dict[st
     row: dict[str, Any] = {"case": f"{name} {i}-{j}", "how": how, "marked": marked, "vertices": len(rest)}
     started = time.process_time()
     try:
-        found = tm.register(rest, triangles, there, there_faces, landmarks=marks, progress=False)
+        found = tm.register(rest, triangles, there, there_faces, landmarks=marks, cache=False, progress=False)
     except tm.MeshError as error:
         return row | {"error": str(error)}
     seconds = time.process_time() - started
@@ -155,7 +155,14 @@ def across() -> dict[str, Any]:
         (Surface(first, first_faces), first_cones), (Surface(second, second_faces), second_cones))]  # fmt: skip
     started = time.process_time()
     found = tm.register(
-        first, first_faces, second, second_faces, landmarks=tuple(marks), same_subject=False, progress=False
+        first,
+        first_faces,
+        second,
+        second_faces,
+        landmarks=tuple(marks),
+        same_subject=False,
+        cache=False,
+        progress=False,
     )
     seconds = time.process_time() - started
     here = Surface(first, first_faces)
@@ -183,7 +190,7 @@ def middle(name: str, i: int, j: int) -> dict[str, Any]:
     """The in-between of a registered pair against that of the true connectivity."""
     shapes, faces = poses(name)
     rest, triangles = remeshed(shapes[i], faces, np.random.default_rng(0))
-    found = tm.register(rest, triangles, shapes[j], faces, progress=False)
+    found = tm.register(rest, triangles, shapes[j], faces, cache=False, progress=False)
     halves = [
         tm.subdivide(np.stack(pair), f, 1, progress=False)[1].numpy()
         for pair, f in (((rest, found.positions.numpy()), triangles), ((shapes[i], shapes[j]), faces))
@@ -206,7 +213,7 @@ def timed(n_rounds: int) -> dict[str, Any]:
         both = np.hstack([cut, new["o"]])
     rest, template = remeshed(both[:, :3], triangles, np.random.default_rng(0))
     started = time.process_time()
-    tm.register(rest, template, both[:, 3:], triangles, progress=False)
+    tm.register(rest, template, both[:, 3:], triangles, cache=False, progress=False)
     return {"case": f"{len(rest)} on {len(both)} vertices", "seconds": time.process_time() - started}
 
 

@@ -4,13 +4,14 @@ Each refuses what it could not write before it imports anything heavy, and befor
 """
 
 import argparse
-import os
 import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
+
+from torch_modal.cli.output import check_output, check_picture
 
 
 def subdivide(args: argparse.Namespace) -> None:
@@ -21,8 +22,7 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
-    if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
-        args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
+    check_picture(args, "--picture", args.picture)
     if args.cyclic and (args.ping_pong or args.ease):
         args.fail(
             f"--{'ping-pong' if args.ping_pong else 'ease'} is for sequences that begin and end; a cycle does not"
@@ -34,7 +34,7 @@ def subdivide(args: argparse.Namespace) -> None:
     files = [animation, *([args.picture] if args.picture else [])]
     fmt = args.format or {".gltf": "glb"}.get(args.meshes[0].suffix.lower(), args.meshes[0].suffix.lower()[1:])
     pattern = None if single else f"frame-*.{fmt}"
-    _check_output(args, files, pattern)
+    check_output(files, args.meshes, args.overwrite, folder=args.out, pattern=pattern)
     require_packages(animation)
 
     import torch_modal as tm
@@ -102,7 +102,7 @@ def modes(args: argparse.Namespace) -> None:
         files = [args.out / f"{mesh.stem}.safetensors" for mesh in args.meshes]
         if len(set(files)) < len(files):
             args.fail("two meshes have the same file name, so their bases would too; take them one by one")
-    _check_output(args, files)
+    check_output(files, args.meshes, args.overwrite)
 
     import torch_modal as tm
 
@@ -133,7 +133,7 @@ def demo(args: argparse.Namespace) -> None:
     names = [args.sample] if args.sample else ["creature", "hand"]
     if _looks_like_file(args.out):
         args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
-    _check_output(args, [args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")])
+    check_output([args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")], (), args.overwrite)
 
     from torch_modal.cli.demo import run_demo
 
@@ -149,7 +149,7 @@ def demo(args: argparse.Namespace) -> None:
 
 def cache(args: argparse.Namespace) -> None:
     """Run ``torch-modal cache``."""
-    from torch_modal.precompute.cache import (
+    from torch_modal.io.cache import (
         cache_content,
         clear_cache,
         default_cache_dir,
@@ -174,12 +174,12 @@ def _registration(args: argparse.Namespace) -> dict[str, Any]:
     """What `load_keyframes` is told of meshes of different connectivity."""
     if not args.register:
         return {}
-    from torch_modal.cli.register import registrar
-
     return {
-        "register": registrar(args),
+        "register": True,
         "landmarks": args.landmarks,
         "same_subject": not args.across,
+        "cache_dir": args.cache_dir,
+        "cache": not args.no_cache,
         "progress": False if args.quiet else None,
         "report": _reporter(args),
     }
@@ -217,37 +217,6 @@ def _is_file(args: argparse.Namespace, *suffixes: str) -> bool:
 def _looks_like_file(out: Path) -> bool:
     """Whether a name has an ending: letters, not the number of a version, and no folder has it already."""
     return re.fullmatch(r"\.\w*[A-Za-z]\w*", out.suffix) is not None and not out.is_dir()
-
-
-def _check_output(args: argparse.Namespace, files: list[Path], pattern: str | None = None) -> None:
-    """Refuse, before any work, what could not or must not be written at the end.
-
-    Args:
-        args: Their ``out``, ``overwrite`` and, where there are any, ``meshes``.
-        files: Files that will be written.
-        pattern: Names of further files in the folder ``out``.
-    """
-    inputs = {mesh.resolve() for mesh in getattr(args, "meshes", [])}
-    existing = [file for file in files if file.exists() or file.resolve() in inputs]
-    if pattern is not None and args.out.is_dir():
-        existing += sorted(args.out.glob(pattern))
-    for file in existing:
-        if file.resolve() in inputs:
-            _refuse(f"{file} is one of the key-frames; choose another --out")
-        if file.is_dir():
-            _refuse(f"{file} is a folder; a file is to be written there")
-        if not args.overwrite:
-            _refuse(f"{file} exists; --overwrite replaces it")
-    for folder in dict.fromkeys(file.parent for file in files):
-        there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-        if not there.is_dir():
-            _refuse(f"{there} is a file, so nothing can be written below it; choose another --out")
-        if not os.access(there, os.W_OK):
-            _refuse(f"the folder {there} cannot be written; choose another --out")
-
-
-def _refuse(reason: str) -> NoReturn:
-    raise ValueError(reason)
 
 
 def _warn_of_leftovers(folder: Path, pattern: str | None, written: list[Path]) -> None:

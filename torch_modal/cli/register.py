@@ -1,9 +1,9 @@
-"""``torch-modal register``, and the registration that other commands do on the way, kept in the cache."""
+"""``torch-modal register``: one mesh laid onto another, or numbered suggestions for landmarks."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+from torch_modal.cli.output import check_name, check_output, check_picture
 
 SUMMARY = "one mesh's connectivity laid onto others"
 DESCRIPTION = """\
@@ -20,9 +20,6 @@ examples:
     torch-modal register cat.obj dog.obj --suggest numbers.png
   and with the pairs that were typed from it, one a line:
     torch-modal register cat.obj dog.obj --across --landmarks pairs.txt --out wrapped.obj"""
-FORMATS = (".obj", ".ply", ".off", ".glb")
-VERSION = 1
-"""Part of the key of kept results: raise it when the algorithm changes."""
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -58,17 +55,14 @@ def run(args: argparse.Namespace) -> None:
     """Run ``torch-modal register``."""
     if (args.out is None) == (args.suggest is None):
         args.fail("register needs either --out FILE or --suggest PICTURE")
-    if args.out and args.out.suffix.lower() not in FORMATS:
-        args.fail(f"--out must end in {', '.join(FORMATS)}, got {args.out.name!r}")
-    if args.suggest and args.suggest.suffix.lower() not in (".png", ".pdf"):
-        args.fail(f"--suggest must end in .png or .pdf, got {args.suggest.name!r}")
-    file = args.out or args.suggest
-    if file.resolve() in {mesh.resolve() for mesh in args.meshes}:
-        raise ValueError(f"{file} is one of the meshes; choose another file")
+    file, option = (args.out, "--out") if args.out else (args.suggest, "--suggest")
+    if args.suggest:
+        check_picture(args, option, file)
+    else:
+        from torch_modal.io.frames import SUFFIXES
 
-    from torch_modal.io.write import refuse_existing
-
-    refuse_existing(file, args.overwrite)
+        check_name(args, option, file, SUFFIXES)
+    check_output([file], args.meshes, args.overwrite, option=option)
     if args.suggest:
         _suggest(args)
     else:
@@ -96,17 +90,22 @@ def _register(args: argparse.Namespace) -> None:
 
     from torch_modal.io.frames import save_mesh
     from torch_modal.io.read import open_asset, read_mesh
+    from torch_modal.keyframes.registration.register import register
     from torch_modal.keyframes.registration.sequence import ADVICE, landmark_table
 
-    (vertices, faces), (there, there_faces) = (read_mesh(mesh) for mesh in args.meshes)
+    asset = open_asset(args.meshes[0])
+    vertices, faces = asset.positions, asset.faces
+    there, there_faces = read_mesh(args.meshes[1])
     marks = landmark_table(args.landmarks, [vertices, there])
-    found = registrar(args)(
+    found = register(
         vertices,
         faces,
         there,
         there_faces,
         landmarks=None if marks is None else (marks[:, 0], marks[:, 1]),
         same_subject=not args.across,
+        cache_dir=args.cache_dir,
+        cache=not args.no_cache,
         progress=False if args.quiet else None,
     )
     if not args.quiet:
@@ -116,45 +115,6 @@ def _register(args: argparse.Namespace) -> None:
         if not args.keep_doubtful:
             raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
         warnings.warn(why, stacklevel=2)
-    save_mesh(found.positions, faces, args.out, args.overwrite, open_asset(args.meshes[0]))
+    save_mesh(found.positions, faces, args.out, args.overwrite, asset)
     if not args.quiet:
         print(f"written: {args.out}")
-
-
-def registrar(args: argparse.Namespace) -> Callable[..., Any]:
-    """A `register` that keeps its results in the cache, by the content of meshes and landmarks."""
-    import numpy as np
-    import torch
-
-    from torch_modal.keyframes.registration.register import register
-    from torch_modal.keyframes.registration.report import Distances, Registration
-    from torch_modal.precompute.cache import Cache
-
-    cache = Cache.at(args.cache_dir, enabled=not args.no_cache)
-
-    def kept(template: Any, faces: Any, target: Any, target_faces: Any, **options: Any) -> Registration:
-        marks = options.get("landmarks")
-        inputs = {"template": template, "faces": faces, "target": target, "target_faces": target_faces}
-        if marks is not None:
-            inputs |= {"here": marks[0], "there": marks[1]}
-
-        def compute() -> dict[str, Any]:
-            found = register(template, faces, target, target_faces, **options)
-            arrays = {name: np.array(value) for name, value in found._asdict().items() if name != "warnings"}
-            return arrays | {"warnings": np.frombuffer("\n".join(found.warnings).encode(), dtype=np.uint8)}
-
-        parameters = {"same_subject": options["same_subject"], "version": VERSION}
-        stored = cache.get("registration", inputs, parameters, compute)
-        fields: dict[str, Any] = {}
-        for name, array in stored.items():
-            if name == "warnings":
-                fields[name] = tuple(line for line in array.tobytes().decode().split("\n") if line)
-            elif name in ("to_target", "from_target"):
-                fields[name] = Distances(*array.tolist())
-            elif Registration.__annotations__[name] in (float, int):
-                fields[name] = array.reshape(-1)[0].item()
-            else:
-                fields[name] = torch.from_numpy(array)
-        return Registration(**fields)
-
-    return kept

@@ -6,8 +6,11 @@ import argparse
 import tempfile
 import webbrowser
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
+
+from torch_modal.cli.output import check_output, check_page
 
 SUMMARY = "look at sequences of shapes, in a page for the browser"
 
@@ -83,14 +86,13 @@ def run(args: argparse.Namespace) -> None:
     if args.live:
         _live(args)
         return
-    if args.page and args.page.suffix.lower() not in (".html", ".htm"):
-        args.fail(f"--page must end in .html, got {args.page.name!r}")
+    check_page(args, "--page", args.page)
     given = [args.meshes, *args.compare]
     n_sequences = len(given) + args.linear
     if args.names and len(args.names) != n_sequences:
         args.fail(f"--names names {len(args.names)} sequences, but there are {n_sequences}")
-    if args.page and args.page.exists() and not args.overwrite:
-        raise FileExistsError(f"{args.page} exists; --overwrite replaces it")
+    if args.page:
+        check_output([args.page], chain(*given), args.overwrite, option="--page")
 
     import torch_modal as tm
 
@@ -126,10 +128,7 @@ def _live(args: argparse.Namespace) -> None:
     import torch_modal as tm
     from torch_modal.view.live import require_viser
 
-    try:
-        require_viser()
-    except ImportError as error:
-        raise ValueError(str(error)) from None
+    require_viser()
     session = tm.live(*tm.load_keyframes(args.meshes), port=args.port)
     print(f"open {session.url} in a browser; Ctrl-C ends the session", flush=True)
     webbrowser.open(session.url)

@@ -10,6 +10,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+from torch_modal.extras import require
 from torch_modal.precompute.parallel import n_cpus
 
 RETRIES = 2
@@ -54,15 +55,12 @@ def dask_cluster(address: str) -> Iterator[Engine]:
         address: Of the scheduler, ``tcp://HOST:8786`` for example.
 
     Raises:
-        ValueError: dask.distributed is not installed.
+        MissingPackageError: dask.distributed is not installed.
         OSError: There is no scheduler.
     """
-    try:
-        from distributed import Client, Event
-    except ImportError as error:
-        raise ValueError("a Dask cluster needs dask.distributed: pip install 'torch_modal[dask]'") from error
-    with Client(address, set_as_default=False) as client:
+    distributed = require("distributed", "dask", "a Dask cluster")
+    with distributed.Client(address, set_as_default=False) as client:
         n_threads = sum(client.nthreads().values())
         there = f"{n_threads} sets at a time" if n_threads else "which has no workers yet: sets wait for one"
         executor = client.get_executor(pure=False, retries=RETRIES)
-        yield Engine(executor, Event(client=client), f"Dask cluster at {address}, {there}")
+        yield Engine(executor, distributed.Event(client=client), f"Dask cluster at {address}, {there}")

@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 from torch_modal.data.record import CRASHED, DONE, FAILED, REFUSED, TIMEOUT, Record, inputs_key, read_record
 from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, RECORD_FILE, open_set, why_not_replaceable
 from torch_modal.data.tree import mesh_files
+from torch_modal.io.cache import CACHE_VERSION
 from torch_modal.io.files import write_atomically
 from torch_modal.io.processes import describe_exit, end_process, last_line
-from torch_modal.precompute.cache import CACHE_VERSION
 from torch_modal.precompute.modes import QUALITIES
 
 BOOT = """\

@@ -10,7 +10,15 @@ import numpy as np
 from torch_modal.io.asset import Asset
 from torch_modal.io.glb import HOLDS, HOLDS_OF_ITS_OWN, shape_bytes
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.write import MESH_FORMATS, check_frames, mesh_bytes, refuse_existing, to_numpy, write_file
+from torch_modal.io.write import (
+    MESH_FORMATS,
+    check_frames,
+    check_suffix,
+    mesh_bytes,
+    refuse_existing,
+    to_numpy,
+    write_file,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -19,6 +27,7 @@ if TYPE_CHECKING:
     Array = torch.Tensor | NDArray[Any]
 
 FORMATS = (*MESH_FORMATS, "glb")
+SUFFIXES = tuple(f".{name}" for name in FORMATS)
 
 
 def save_frames(
@@ -95,9 +104,7 @@ def save_mesh(
     """
     path = Path(out)
     shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
-    fmt = path.suffix.lower().lstrip(".")
-    if fmt not in FORMATS:
-        raise ValueError(f"{path.name!r} must end in one of {', '.join('.' + name for name in FORMATS)}.")
+    fmt = check_suffix(path, SUFFIXES)
     _write(shapes, triangles, [path], fmt, asset, overwrite)
     return path
 

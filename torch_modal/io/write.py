@@ -22,6 +22,11 @@ if TYPE_CHECKING:  # at run time these stay out: a reader of PLY files needs nei
 
 logger = logging.getLogger("torch_modal")
 
+PICTURES = (".png", ".pdf")
+"""What pictures are written as."""
+PAGES = (".html", ".htm")
+"""What pages are written as."""
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -81,6 +86,28 @@ def check_indices(indices: Sequence[int], n_frames: int, name: str) -> list[int]
             f"{name} must be numbers of frames, from 0 to {n_frames - 1}, at least one; got {list(indices)}."
         )
     return numbers
+
+
+def check_suffix(path: Path, suffixes: Sequence[str], name: str = "out") -> str:
+    """The format that a file's name asks for.
+
+    Args:
+        path: The file.
+        suffixes: Those that there are, in small letters, with their dots.
+        name: What the message calls the file.
+
+    Returns:
+        The suffix in small letters, without its dot.
+
+    Raises:
+        ValueError: It is none of those.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in suffixes:
+        *others, last = suffixes
+        wanted = f"{', '.join(others)} or {last}" if others else last
+        raise ValueError(f"{name} must end in {wanted}, got {path.name!r}.")
+    return suffix[1:]
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:

@@ -12,16 +12,15 @@ from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.progress import Progress
 
-Registrar = Callable[..., Any]
-"""Takes and returns what `register` does."""
-
 
 def load_keyframes(
     paths: Sequence[str | os.PathLike[str]],
     *,
-    register: bool | Registrar = False,
+    register: bool = False,
     landmarks: Any = None,
     same_subject: bool = True,
+    cache_dir: str | os.PathLike[str] | None = None,
+    cache: bool = True,
     progress: Progress = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Keyframes:
@@ -36,11 +35,12 @@ def load_keyframes(
 
     Args:
         paths: One file per key-frame, in the order of the sequence.
-        register: Whether to register meshes of another connectivity; or a function like
-            :func:`torch_modal.register` that does it, for example one that keeps its results.
+        register: Whether to register meshes of another connectivity, see :func:`torch_modal.register`.
         landmarks: For the registration: a landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``, a column for
             each of the K meshes.
         same_subject: Whether all are poses of one body; if not, five landmarks or more are needed.
+        cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
+        cache: Whether registrations are kept on disk and found there.
         progress: Of the registration, see :data:`torch_modal.progress.Progress`.
         report: Takes a line about each registration.
 
@@ -61,8 +61,15 @@ def load_keyframes(
     if register:
         from torch_modal.keyframes.registration.sequence import register_files
 
-        options = {"landmarks": landmarks, "same_subject": same_subject, "progress": progress, "report": report}
-        return register_files(paths, None if register is True else register, **options)
+        return register_files(
+            paths,
+            landmarks=landmarks,
+            same_subject=same_subject,
+            cache_dir=cache_dir,
+            cache=cache,
+            progress=progress,
+            report=report,
+        )
     if landmarks is not None:
         raise MeshError("landmarks are for registration; pass register=True too")
     vertices, faces = read_mesh(paths[0])

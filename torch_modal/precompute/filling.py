@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from torch_modal.precompute.cache import Arrays, Cache
+from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
 from torch_modal.precompute.lattice import is_too_fine, lattice

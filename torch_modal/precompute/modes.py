@@ -7,9 +7,9 @@ import numpy as np
 import torch
 
 from torch_modal.geometry.connectivity import connected_pieces
+from torch_modal.io.cache import Cache
 from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.cache import Cache
 from torch_modal.precompute.eigen import N_RIGID
 from torch_modal.precompute.filling import MESHERS, Filler, Mesher
 from torch_modal.precompute.parallel import StoppedError

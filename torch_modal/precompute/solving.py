@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
-from torch_modal.precompute.cache import Cache
+from torch_modal.io.cache import Cache
 from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.filling import Filler, Filling, meshing_order
 from torch_modal.precompute.parallel import Budget, run_all

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torch_modal.errors import MissingPackageError
+from torch_modal.extras import require_installed
 from torch_modal.io.asset import Asset
 from torch_modal.io.timing import make_timing
-from torch_modal.io.write import check_frames, check_indices, refuse_existing
+from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.progress import Progress
 
 if TYPE_CHECKING:
@@ -35,11 +34,7 @@ def require_packages(path: Path) -> None:
         MissingPackageError: It says which.
     """
     modules, extra = _NEEDS.get(path.suffix.lower(), ((), ""))
-    missing = [name for name in modules if importlib.util.find_spec(name) is None]
-    if missing:
-        raise MissingPackageError(
-            f"{path.name} needs the package {' and '.join(missing)}: pip install torch_modal[{extra}]"
-        )
+    require_installed(modules, extra, path.name)
 
 
 def save_animation(
@@ -107,9 +102,7 @@ def save_animation(
     """
     shapes, triangles = check_frames(frames, faces)
     path = Path(out)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"out must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}, got {path.name!r}.")
+    suffix = f".{check_suffix(path, SUFFIXES)}"
     if asset is not None:
         asset.check(shapes)
     require_packages(path)

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from torch_modal.io.write import FloatArray, IntArray, refuse_existing, write_file
+from torch_modal.io.write import PICTURES, FloatArray, IntArray, check_suffix, refuse_existing, write_file
 from torch_modal.view.drawing import ByteArray, Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, KEYFRAME_COLOR, view_rotation
 
@@ -51,9 +51,7 @@ def render_landmarks(
         FileExistsError: The file exists and ``overwrite`` is off.
     """
     path = Path(out)
-    fmt = path.suffix.lower().lstrip(".")
-    if fmt not in ("png", "pdf"):
-        raise ValueError(f"out must end in .png or .pdf, got {path.name!r}.")
+    fmt = check_suffix(path, PICTURES)
     refuse_existing(path, overwrite)
     write_file(path, _sheet([(mesh, _views(mesh, renderer)) for mesh in meshes], fmt))
     return path

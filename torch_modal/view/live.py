@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from torch_modal.extras import require
 from torch_modal.io.write import FloatArray, IntArray, to_numpy
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.precompute.modes import extract_bases
@@ -52,7 +53,7 @@ def live(
         The session, which runs in threads of its own until ``stop()``.
 
     Raises:
-        ImportError: viser is not installed.
+        MissingPackageError: viser is not installed.
         MeshError: The key-frames cannot be used; the message says why.
     """
     require_viser()
@@ -62,12 +63,12 @@ def live(
 
 
 def require_viser() -> Any:
-    """The module, or an ImportError that says how to come by it."""
-    try:
-        import viser
-    except ImportError:
-        raise ImportError("a live session is shown by viser: pip install 'torch_modal[view]'") from None
-    return viser
+    """The module.
+
+    Raises:
+        MissingPackageError: It is not installed.
+    """
+    return require("viser", "view", "a live session")
 
 
 class LiveSession:

@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from torch_modal.io.write import (
+    PAGES,
     FloatArray,
     IntArray,
     check_frames,
     check_indices,
+    check_suffix,
     refuse_existing,
     to_numpy,
     write_file,
@@ -205,8 +207,7 @@ def write_page(
 
 def _checked_path(out: str | Path, overwrite: bool) -> Path:
     path = Path(out)
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise ValueError(f"out must end in .html, got {path.name!r}.")
+    check_suffix(path, PAGES)
     refuse_existing(path, overwrite)
     return path
 

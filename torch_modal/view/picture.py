@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from torch_modal.io.write import FloatArray, check_frames, check_indices, refuse_existing, to_numpy, write_file
+from torch_modal.io.write import (
+    PICTURES,
+    FloatArray,
+    check_frames,
+    check_indices,
+    check_suffix,
+    refuse_existing,
+    to_numpy,
+    write_file,
+)
 from torch_modal.view.drawing import ByteArray, Scene, draw
 
 if TYPE_CHECKING:
@@ -185,9 +194,7 @@ def render_sequence(
     if not frames_by_row:
         raise ValueError("frames_by_row is empty; it needs at least one row of shapes.")
     path = Path(out)
-    fmt = path.suffix.lower().lstrip(".")
-    if fmt not in ("png", "pdf"):
-        raise ValueError(f"out must end in .png or .pdf, got {path.name!r}.")
+    fmt = check_suffix(path, PICTURES)
     if renderer not in ("auto", "pyvista", "matplotlib"):
         raise ValueError(f"renderer must be auto, pyvista or matplotlib, got {renderer!r}.")
     check_view(view, up)

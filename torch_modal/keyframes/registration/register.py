@@ -1,5 +1,6 @@
 """One mesh laid onto another: the whole path, from two meshes to a report."""
 
+import os
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
+from torch_modal.io.cache import Cache
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.keyframes.registration.consistency import Consistency
 from torch_modal.keyframes.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Fit, Gate
@@ -27,6 +29,8 @@ from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Sur
 from torch_modal.keyframes.seams import weld_seams
 from torch_modal.progress import Progress, ProgressReport
 
+VERSION = 2
+"""Part of the key of kept results: raise it when the algorithm changes."""
 FEWEST_ACROSS = 5
 """Landmarks that two different subjects need: their spectra do not tell which map is right."""
 _SURE_SCORE = 0.62  # of a spectral map; below it, more starts are tried
@@ -61,6 +65,8 @@ def register(
     *,
     landmarks: Any = None,
     same_subject: bool = True,
+    cache_dir: str | os.PathLike[str] | None = None,
+    cache: bool = True,
     progress: Progress = None,
 ) -> Registration:
     """Lay a template onto a target of any other connectivity.
@@ -77,6 +83,8 @@ def register(
             coordinates of the template and of the target.
         same_subject: Whether both are poses of one body, nearly without stretch. Two different bodies need five
             landmarks or more.
+        cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
+        cache: Whether the result is kept on disk, by the content of meshes and landmarks, and found there.
         progress: See :data:`torch_modal.progress.Progress`; the total grows as it is learnt.
 
     Returns:
@@ -101,9 +109,17 @@ def register(
             "nothing tells which map is right; give pairs of vertices, template first"
         )
     own, other = ((one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal))
-    # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
-    with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
-        found = _Problem(own, other, points, same_subject, report).solve()
+
+    def compute() -> dict[str, Any]:
+        # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
+        with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
+            return _Problem(own, other, points, same_subject, report).solve().arrays()
+
+    inputs = {"template": own[0], "faces": own[1], "target": other[0], "target_faces": other[1]}
+    marks = {"here": points.template, "there": points.target}
+    parameters = {"same_subject": same_subject, "version": VERSION}
+    kept = Cache.at(cache_dir, enabled=cache).get("registration", {**inputs, **marks}, parameters, compute)
+    found = Registration.from_arrays(kept)
     corners = torch.from_numpy(np.unique(welded_goal.vertex_of.numpy(), return_index=True)[1])[found.target_corners]
     return found._replace(
         positions=welded.scatter(found.positions).to(checked.keyframes),

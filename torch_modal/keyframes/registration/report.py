@@ -1,11 +1,14 @@
 """What came out of a registration, and how far it can be trusted."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
+from torch_modal.io.write import to_numpy
 from torch_modal.keyframes.registration.surface import FloatArray, Surface
 
 TRUSTED = 0.5
@@ -108,6 +111,26 @@ class Registration(NamedTuple):
     def doubtful(self) -> bool:
         """Whether the result should not be used without a look at it."""
         return self.confidence < TRUSTED
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The same as arrays, which a file can hold."""
+        arrays = {name: to_numpy(value) for name, value in self._asdict().items() if name != "warnings"}
+        return arrays | {"warnings": np.frombuffer("\n".join(self.warnings).encode(), dtype=np.uint8)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Registration":
+        """What `arrays` was made from."""
+        fields: dict[str, Any] = {}
+        for name, array in arrays.items():
+            if name == "warnings":
+                fields[name] = tuple(line for line in array.tobytes().decode().split("\n") if line)
+            elif name in ("to_target", "from_target"):
+                fields[name] = Distances(*array.tolist())
+            elif cls.__annotations__[name] in (float, int):
+                fields[name] = array.reshape(-1)[0].item()
+            else:
+                fields[name] = torch.from_numpy(array)
+        return cls(**fields)
 
     def sample(self, values: Any) -> torch.Tensor:
         """Attributes of the target's vertices, at the template's vertices.

@@ -12,9 +12,7 @@ from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.keyframes.registration.landmarks import read_landmarks, vertices_named
 from torch_modal.keyframes.registration.register import register
-from torch_modal.keyframes.registration.report import Registration
 from torch_modal.keyframes.registration.surface import FloatArray, IntArray
-from torch_modal.progress import Progress
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
@@ -24,14 +22,18 @@ ADVICE = (
 
 def register_files(
     paths: Sequence[str | os.PathLike[str]],
-    registrar: Callable[..., Registration] | None = None,
     *,
     landmarks: Any = None,
-    same_subject: bool = True,
-    progress: Progress = None,
     report: Callable[[str], None] = lambda line: None,
+    **options: Any,
 ) -> Keyframes:
     """Read meshes and lay the first one's connectivity onto the others; see `load_keyframes`.
+
+    Args:
+        paths: A file for each mesh.
+        landmarks: As `landmark_table` takes them.
+        report: Takes a line about each registration.
+        **options: What `register` takes besides.
 
     Raises:
         MeshError: A file cannot be read, landmarks do not fit the meshes, or a registration is doubtful.
@@ -46,9 +48,7 @@ def register_files(
             shapes.append(there)
             continue
         pair = None if marks is None else (marks[:, k - 1], marks[:, k])
-        found = (registrar or register)(
-            shapes[-1], faces, there, there_faces, landmarks=pair, same_subject=same_subject, progress=progress
-        )
+        found = register(shapes[-1], faces, there, there_faces, landmarks=pair, **options)
         report(f"{os.fspath(paths[k])} registered from {os.fspath(paths[k - 1])}: {found.summary()}")
         if found.doubtful:
             raise MeshError(

@@ -1,4 +1,4 @@
-"""Results of the pre-computation, kept on disk under the hash of what they were computed from."""
+"""Results that take long, kept on disk under the hash of what they were computed from."""
 
 import contextlib
 import hashlib
@@ -22,7 +22,7 @@ from safetensors.numpy import save as save_arrays
 from torch_modal.io.files import write_atomically
 
 CACHE_VERSION = 4
-"""Part of every key: raise it when an algorithm of the pre-computation changes, and old entries are left."""
+"""Part of every key: raise it when an algorithm changes whose results are kept, and old entries are left."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
 DEFAULT_LIMIT = 4 * 2**30

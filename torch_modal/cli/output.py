@@ -1,0 +1,77 @@
+"""What the commands may write: refused before any work, and before anything heavy is imported."""
+
+import argparse
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+
+def check_output(
+    files: Sequence[Path],
+    inputs: Iterable[Path],
+    overwrite: bool,
+    *,
+    option: str = "--out",
+    folder: Path | None = None,
+    pattern: str | None = None,
+) -> None:
+    """Refuse what could not or must not be written at the end.
+
+    Args:
+        files: Files that will be written.
+        inputs: Files that are read, which stay.
+        overwrite: Whether files that exist may be replaced.
+        option: What names the files.
+        folder: Where there will be further files.
+        pattern: The names of those.
+
+    Raises:
+        ValueError: It says which file, and why not.
+    """
+    read = {path.resolve() for path in inputs}
+    existing = [file for file in files if file.exists() or file.resolve() in read]
+    if folder is not None and pattern is not None and folder.is_dir():
+        existing += sorted(folder.glob(pattern))
+    for file in existing:
+        if file.resolve() in read:
+            _refuse(f"{file} is one of the meshes that are read; choose another {option}")
+        if file.is_dir():
+            _refuse(f"{file} is a folder; a file is to be written there")
+        if not overwrite:
+            _refuse(f"{file} exists; --overwrite replaces it")
+    for above in dict.fromkeys(file.parent for file in files):
+        there = next(parent for parent in (above, *above.absolute().parents) if parent.exists())
+        if not there.is_dir():
+            _refuse(f"{there} is a file, so nothing can be written below it; choose another {option}")
+        if not os.access(there, os.W_OK):
+            _refuse(f"the folder {there} cannot be written; choose another {option}")
+
+
+def check_picture(args: argparse.Namespace, option: str, path: Path | None) -> None:
+    """Leave with the usage if an option names what is no picture."""
+    from torch_modal.io.write import PICTURES
+
+    check_name(args, option, path, PICTURES)
+
+
+def check_page(args: argparse.Namespace, option: str, path: Path | None) -> None:
+    """Leave with the usage if an option names what is no page."""
+    from torch_modal.io.write import PAGES
+
+    check_name(args, option, path, PAGES)
+
+
+def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixes: Sequence[str]) -> None:
+    """Leave with the usage if an option names a file of another kind."""
+    from torch_modal.io.write import check_suffix
+
+    try:
+        if path is not None:
+            check_suffix(path, suffixes, option)
+    except ValueError as error:
+        args.fail(str(error).removesuffix("."))
+
+
+def _refuse(reason: str) -> NoReturn:
+    raise ValueError(reason)

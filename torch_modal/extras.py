@@ -1,0 +1,42 @@
+"""Packages that only some of the work needs: each belongs to an extra of this one."""
+
+import importlib
+import importlib.util
+from typing import Any
+
+from torch_modal.errors import MissingPackageError
+
+
+def require(module: str, extra: str, what: str) -> Any:
+    """Import an optional package.
+
+    Args:
+        module: Its name.
+        extra: What brings it: ``pip install 'torch_modal[extra]'``.
+        what: What needs it, as the message begins.
+
+    Raises:
+        MissingPackageError: It is not installed; the message says how to install it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise _missing([module], extra, what) from error
+
+
+def require_installed(modules: tuple[str, ...], extra: str, what: str) -> None:
+    """Refuse work that needs optional packages before any of it is done; nothing is imported.
+
+    Raises:
+        MissingPackageError: It names those that are not installed.
+    """
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        raise _missing(missing, extra, what)
+
+
+def _missing(modules: list[str], extra: str, what: str) -> MissingPackageError:
+    are = "is" if len(modules) == 1 else "are"
+    return MissingPackageError(
+        f"{what} needs {' and '.join(modules)}, which {are} not installed: pip install 'torch_modal[{extra}]'"
+    )
