@@ -30,6 +30,8 @@ EXTRAS = {
     "pyg": ["torch_geometric>=2.4"],
     # Meshes of different connectivity; libigl's AABB tree came to Python with 2.6.
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
+    # Parts that pass through each other; earlier versions of ipctk have another interface, and were not tried.
+    "contact": ["ipctk>=1.6", "libigl>=2.6"],
     "dask": ["distributed>=2024.5"],
 }
 
@@ -86,9 +88,9 @@ setup(
     ],
     extras_require={
         **EXTRAS,
-        "all": sorted(each for extra in EXTRAS.values() for each in extra),
+        "all": sorted({each for extra in EXTRAS.values() for each in extra}),
         "test": [
-            *sorted(each for extra in EXTRAS.values() for each in extra),
+            *sorted({each for extra in EXTRAS.values() for each in extra}),
             *["pytest>=8", "ruff>=0.6", "mypy>=1.11", "pygltflib>=1.16", "selenium>=4.20"],
             *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],
         ],

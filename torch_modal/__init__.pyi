@@ -31,6 +31,8 @@ from .keyframes.registration.landmarks import suggest_landmarks as suggest_landm
 from .keyframes.registration.register import register as register
 from .keyframes.registration.report import Registration as Registration
 from .keyframes.seams import weld_seams as weld_seams
+from .keyframes.self_contacts import SelfContacts as SelfContacts
+from .keyframes.self_contacts import self_contacts as self_contacts
 from .nn.adjoint import ConvergenceWarning as ConvergenceWarning
 from .nn.between import ConvergenceError as ConvergenceError
 from .nn.between import InBetweenResult as InBetweenResult

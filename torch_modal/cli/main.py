@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli import commands, precompute, register, view
+from torch_modal.cli import check, commands, precompute, register, view
 from torch_modal.cli.messages import PROGRAM, log_as_lines, say, warnings_as_lines
 from torch_modal.version import __version__
 
@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, 1 after an error, 130 after Ctrl-C; `precompute` has one of its own when some sets have no
-        result. Wrong usage leaves with ``SystemExit(2)``.
+        result, `check` when parts pass through each other. Wrong usage leaves with ``SystemExit(2)``.
     """
     try:
         args = _parser().parse_args(argv)
@@ -278,6 +278,9 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("register", register.run, register.SUMMARY, register.DESCRIPTION, register.EXAMPLES)
     register.add_arguments(sub)
     _add_common(sub)
+
+    sub = command("check", check.run, check.SUMMARY, check.DESCRIPTION, check.EXAMPLES)
+    check.add_arguments(sub)
 
     sub = command("modes", commands.modes, "vibration modes of key-frames, as safetensors", MODES, MODES_EXAMPLES)
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")

@@ -1,0 +1,91 @@
+"""``torch-modal check``: what passes through itself, in files."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+SUMMARY = "what passes through itself, in key-frames and results"
+DESCRIPTION = """\
+Say for each mesh which of its triangles pass through others, and colour them in a
+picture. All meshes have the same faces.
+
+With --keyframes, what crosses in these already is told apart from what is new, and
+of that, what are two parts that went through each other (far) from crossings that
+only grew, and from folds. Without, everything is new."""
+EXAMPLES = """\
+examples:
+  torch-modal check open.obj fist.obj
+  torch-modal check out/frame-*.obj --keyframes open.obj fist.obj --picture crossings.png"""
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``check`` besides the common ones."""
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="FILE", help="meshes of one connectivity")
+    sub.add_argument(
+        "--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known"
+    )
+    sub.add_argument(
+        "--picture", type=Path, metavar="FILE", help="draw the meshes with what crosses in colour, as .png or .pdf"
+    )
+    sub.add_argument("--overwrite", action="store_true", help="replace the picture if it exists (default: refuse)")
+    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    sub.set_defaults(quiet=False, verbose=False)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run ``torch-modal check``: 0 where no parts go through each other that do not in the key-frames, else 3."""
+    if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
+        args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
+    from torch_modal.geometry.crossings import require
+    from torch_modal.io.write import refuse_existing
+
+    if args.picture:
+        if args.picture.resolve() in {mesh.resolve() for mesh in [*args.meshes, *args.keyframes]}:
+            raise ValueError(f"{args.picture} is one of the meshes; choose another file")
+        refuse_existing(args.picture, args.overwrite)
+    for name in ("ipctk", "igl"):
+        require(name)
+
+    import torch_modal as tm
+
+    shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
+    n = len(args.keyframes)
+    welded = tm.weld_seams(shapes, faces)
+    found = tm.self_contacts(welded.keyframes[n:], welded.faces, welded.keyframes[:n] if n else None)
+    used = welded.keyframes[0][welded.faces.unique()]
+    diagonal = float((used.amax(0) - used.amin(0)).norm())
+    head = ("pairs", "new", "far", "depth") if n else ("pairs", "far", "depth")
+    width = max(len(str(mesh)) for mesh in args.meshes)
+    print(" " * width + "".join(f"{name:>9s}" for name in head))
+    for i, mesh in enumerate(args.meshes):
+        counts = [found.number[i], *([found.n_new[i]] if n else []), found.n_far[i]]
+        deep = 100 * float(found.depth[i].max()) / diagonal
+        print(f"{mesh!s:{width}s}" + "".join(f"{int(c):9d}" for c in counts) + f"{deep:7.2f} %")
+    total = int(found.n_far.sum())
+    print(
+        "pairs of triangles that cross; far: of two parts that went through each other"
+        + (", and cross in no key-frame" if n else "")
+        + "; depth: of the deepest vertex there, in % of the diagonal"
+    )
+    if args.picture:
+        tm.render_sequence(
+            {"crossings": welded.keyframes[n:]},
+            welded.faces,
+            args.picture,
+            columns=min(len(args.meshes), 8),
+            keyframe_indices=[0],
+            colors={"crossings": _marks(found, welded.faces, welded.keyframes[n:])},
+            color_label="1: crosses, 2: new" if n else "2: crosses",
+            overwrite=args.overwrite,
+        )
+        print(f"picture: {args.picture}")
+    return 3 if total else 0
+
+
+def _marks(found: Any, faces: Any, shapes: Any) -> Any:
+    """0 of vertices where nothing crosses, 1 where something does, 2 where that is new. *Shape:* ``(N, V)``."""
+    marks = shapes.new_zeros(shapes.shape[:2])
+    for value, chosen in ((1.0, found.new == found.new), (2.0, found.new)):
+        which = found.shape[chosen].repeat_interleave(6)
+        marks[which, faces[found.pairs[chosen]].flatten()] = value
+    return marks

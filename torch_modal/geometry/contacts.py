@@ -1,0 +1,205 @@
+"""Which vertices are to stay in front of which faces: what a contact energy holds. NumPy and SciPy only.
+
+A vertex is held by a face where parts went through each other, or nearly touch beside such a place. It is never held
+by a face that it was behind in a known shape: what touches or crosses itself there is left as it is.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, unit
+
+# Lengths are parts of the diagonal.
+REACH = 0.06
+"""How deep a vertex may be to be pushed out."""
+NEAR = 0.015
+"""How far in front of a face a vertex is watched, beside a place where parts went through each other."""
+FACING = -0.1
+"""Most cosine between the normals of a vertex and of a face that face each other."""
+_STRAIGHT = 0.7
+"""Least part of the distance that lies along the face's normal; less is beside the face, not before it."""
+_BEHIND = 0.02
+"""Of the mean edge length: how far behind a face a vertex that is not inside may lie, which is rounding of a fold."""
+_NEAREST = 64
+"""Faces, by their centres, among which the nearest to a vertex is looked for."""
+
+
+class Held(NamedTuple):
+    """Vertices and faces that face each other in one shape."""
+
+    vertices: IntArray
+    """*Shape:* ``(n,)``."""
+    faces: IntArray
+    """*Shape:* ``(n,)``."""
+    n_far: int
+    """Pairs of triangles that went through each other."""
+    watched: BoolArray
+    """Vertices beside places where they do, or did in an earlier search. *Shape:* ``(V,)``."""
+
+
+class Search:
+    """Finds what is to be held.
+
+    Args:
+        crossings: Of the connectivity, with the key-frames as its known shapes.
+    """
+
+    def __init__(self, crossings: Crossings) -> None:
+        self.crossings = crossings
+        i, j = crossings.mesh.edges.T
+        self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
+        self._known = [_Surface(crossings, x) for x in crossings.known]
+
+    def __call__(self, x: FloatArray, watched: BoolArray | None = None) -> Held:
+        """What is to be held in a shape.
+
+        Args:
+            x: *Shape:* ``(V, 3)``.
+            watched: Of earlier searches: what was pushed apart is watched on. *Shape:* ``(V,)``.
+        """
+        crossings = self.crossings
+        pairs = crossings.pairs(x)
+        pairs = pairs[crossings.is_far(pairs)]
+        seeds = np.zeros(len(x), dtype=bool) if watched is None else watched.copy()
+        inside = crossings.inside(x, pairs)
+        if len(pairs):
+            seeds |= crossings.grown(crossings.mesh.faces[pairs.reshape(-1)].reshape(-1), 2)
+            seeds |= crossings.grown(np.flatnonzero(inside))
+        none = np.zeros(0, np.int64)
+        if not seeds.any():
+            return Held(none, none, 0, seeds)
+        vertices, faces, _, _ = self.opposite(x, seeds, inside)
+        return Held(vertices, faces, len(pairs), seeds)
+
+    def opposite(
+        self, x: FloatArray, seeds: BoolArray, inside: BoolArray
+    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """The nearest face before or, of what is inside, behind which each vertex lies.
+
+        Args:
+            x: *Shape:* ``(V, 3)``.
+            seeds: Vertices that are asked for, and corners of faces that may be found. *Shape:* ``(V,)``.
+            inside: Vertices that are inside the surface. *Shape:* ``(V,)``.
+
+        Returns:
+            Vertices and faces, *shape* ``(n,)``, signed distances, *shape* ``(n,)``, and the feet on the faces, *shape*
+            ``(n, 3)``.
+        """
+        crossings, corners = self.crossings, self.crossings.mesh.faces
+        reach, near = REACH * crossings.diagonal, NEAR * crossings.diagonal
+        surface = _Surface(crossings, x)
+        some = np.flatnonzero(seeds[corners].any(1))
+        tree = cKDTree(surface.centres[some])
+        parts = []
+        for chosen, radius in ((seeds & ~inside, near + 1.5 * self._edge), (inside, reach)):
+            own = np.flatnonzero(chosen)
+            if len(own):
+                found = cKDTree(x[own]).sparse_distance_matrix(tree, radius, output_type="ndarray")
+                parts.append((own[found["i"]], some[found["j"]]))
+        if not parts:
+            none = np.zeros(0, np.int64)
+            return none, none, np.zeros(0), np.zeros((0, 3))
+        v, f = (np.concatenate(part) for part in zip(*parts, strict=True))
+        v, f = _kept((surface.vertex_normals[v] * surface.normals[f]).sum(1) < FACING, v, f)
+        v, f = _kept(~(corners[f] == v[:, None]).any(1), v, f)
+        distance, signed, feet = surface.to_faces(v, f)
+        before = (signed > -_BEHIND * self._edge) | inside[v]
+        keep = (signed < near) & (signed > -reach) & (np.abs(signed) > _STRAIGHT * distance - 1e-9 * reach) & before
+        v, f, distance, signed, feet = _kept(keep, v, f, distance, signed, feet)
+        for known in self._known:
+            away, side, _ = known.to_faces(v, f)
+            v, f, distance, signed, feet = _kept(
+                (away > 1.5 * reach) | (side > -1e-3 * self._edge), v, f, distance, signed, feet
+            )
+        order = np.lexsort((distance, v))
+        first = order[np.flatnonzero(np.diff(v[order], prepend=-1))]
+        return v[first], f[first], signed[first], feet[first]
+
+    def depth(self, x: FloatArray, pairs: IntArray) -> FloatArray:
+        """How deep vertices are inside where parts went through each other; 0 elsewhere.
+
+        That is the distance to the nearest face that faces them, other than of the patch that went in with them.
+
+        Args:
+            x: *Shape:* ``(V, 3)``.
+            pairs: Faces that cross. *Shape:* ``(P, 2)``.
+
+        Returns:
+            *Shape:* ``(V,)``.
+        """
+        crossings, faces = self.crossings, self.crossings.mesh.faces
+        deep = np.zeros(len(x))
+        own = np.flatnonzero(crossings.inside(x, pairs))
+        if not len(own):
+            return deep
+        patch = np.full(len(x), -1)
+        patch[own] = connected_components(crossings.adjacency[own][:, own], directed=False)[1]
+        # The patch of each face that is inside as a whole.
+        of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
+        surface = _Surface(crossings, x)
+        n = min(_NEAREST, len(faces))
+        near = np.asarray(cKDTree(surface.centres).query(x[own], n)[1]).reshape(-1)
+        v: Any = np.repeat(own, n)
+        f: Any = near
+        facing = (surface.vertex_normals[v] * surface.normals[f]).sum(1) < FACING
+        v, f = _kept(facing & (of_face[f] != patch[v]), v, f)
+        distance, signed, _ = surface.to_faces(v, f)
+        least = np.full(len(x), np.inf)
+        np.minimum.at(least, v[signed < 0], distance[signed < 0])
+        found = np.isfinite(least)
+        deep[found] = least[found]
+        return deep
+
+
+class _Surface:
+    """A shape with its normals."""
+
+    def __init__(self, crossings: Crossings, x: FloatArray) -> None:
+        self.x, self.faces = x, crossings.mesh.faces
+        corners = x[self.faces]
+        self.centres = corners.mean(1)
+        doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.normals = unit(doubled)
+        self.vertex_normals = crossings.vertex_normals(doubled)
+
+    def to_faces(self, v: IntArray, f: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """From vertices to faces: distances, distances along the normals, nearest points."""
+        corners = self.x[self.faces[f]]
+        feet = nearest_on_triangles(self.x[v], corners)
+        apart = self.x[v] - feet
+        return np.linalg.norm(apart, axis=1), (apart * self.normals[f]).sum(1), feet
+
+
+def _kept(keep: BoolArray, *arrays: Any) -> list[Any]:
+    return [array[keep] for array in arrays]
+
+
+def nearest_on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
+    """The nearest point of each triangle to a point of its own. *Shape:* ``(n, 3), (n, 3, 3) -> (n, 3)``.
+
+    The foot on the plane where it lies within the triangle, otherwise the nearest of those on the three sides.
+    """
+    a, b, c = corners.transpose(1, 0, 2)
+    u, v, w = b - a, c - a, points - a
+    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
+    uw, vw = (u * w).sum(1), (v * w).sum(1)
+    determinant = uu * vv - uv * uv
+    flat = determinant <= 1e-300
+    scale = np.where(flat, 1, determinant)
+    s, t = (vv * uw - uv * vw) / scale, (uu * vw - uv * uw) / scale
+    best = a + s[:, None] * u + t[:, None] * v
+    outside = np.flatnonzero((s < 0) | (t < 0) | (s + t > 1) | flat)
+    least = np.full(len(outside), np.inf)
+    p = points[outside]
+    for start, end in ((a, b), (b, c), (c, a)):
+        from_, along = start[outside], end[outside] - start[outside]
+        squared = (along * along).sum(1)
+        share = np.clip(((p - from_) * along).sum(1) / np.where(squared > 0, squared, 1), 0, 1)
+        foot = from_ + share[:, None] * along
+        distance = ((p - foot) ** 2).sum(1)
+        nearer = distance < least
+        best[outside[nearer]], least[nearer] = foot[nearer], distance[nearer]
+    return best

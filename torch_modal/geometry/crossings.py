@@ -1,0 +1,255 @@
+"""Which triangles of a surface pass through each other, and which vertices lie inside. NumPy and SciPy only.
+
+Pairs come from a broad phase of ``ipctk`` and a test of an edge against a face; winding numbers from ``libigl``. Both
+are the extra ``contact`` and are imported when they are first needed.
+"""
+
+import importlib
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from torch_modal.errors import MissingPackageError
+from torch_modal.geometry.connectivity import Connectivity
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+RINGS = 2
+"""Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
+FAR = 0.06
+"""Of the diagonal, along the surface: what crosses nearer is a fold, not two parts that meet."""
+_OFFSET = 1e-4
+"""Of the diagonal, outwards: where the winding number of a vertex is taken. On the surface itself it is a half."""
+
+
+def require(name: str) -> Any:
+    """Import a library of the extra ``contact``.
+
+    Raises:
+        MissingPackageError: It is not installed; the message says how to install it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingPackageError(
+            f"contact needs {name}, which is not installed: pip install 'torch_modal[contact]'"
+        ) from error
+
+
+def has_contact() -> bool:
+    """Whether the extra ``contact`` is installed."""
+    try:
+        return all(require(name) is not None for name in ("ipctk", "igl"))
+    except MissingPackageError:
+        return False
+
+
+class Crossings:
+    """Finds what crosses, on shapes of one connectivity.
+
+    Args:
+        mesh: The connectivity.
+        known: Shapes whose own crossings are tolerated. *Shape:* ``(K, V, 3)``.
+        like: The shape whose lengths say what is far along the surface. Default: the first of ``known``.
+    """
+
+    def __init__(self, mesh: Connectivity, known: FloatArray, like: FloatArray | None = None) -> None:
+        self.mesh, self.known = mesh, known
+        self.like = known[0] if like is None else like
+        used = self.like[np.unique(mesh.faces)]
+        self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
+
+    # ------------------------------------------------------------------------------------------------- once for a mesh
+    @cached_property
+    def _arrays(self) -> tuple[Any, Any]:
+        """Edges and faces as ipctk takes them."""
+        return tuple(np.asfortranarray(a.astype(np.int32)) for a in (self.mesh.edges, self.mesh.faces))  # type: ignore[return-value]
+
+    @cached_property
+    def adjacency(self) -> sparse.csr_matrix:
+        """One between vertices that an edge joins. *Shape:* ``(V, V)``."""
+        i, j = self.mesh.edges.T
+        n = self.mesh.n_vertices
+        half = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
+        return (half + half.T).tocsr()
+
+    @cached_property
+    def _touching(self) -> sparse.csr_matrix:
+        """One between faces that share a vertex, and of a face with itself. *Shape:* ``(F, F)``."""
+        faces = self.mesh.faces
+        owners = np.repeat(np.arange(len(faces)), 3)
+        corners = sparse.coo_matrix(
+            (np.ones(3 * len(faces)), (owners, faces.reshape(-1))), shape=(len(faces), self.mesh.n_vertices)
+        ).tocsr()
+        return _ones(corners @ corners.T)
+
+    @cached_property
+    def lengths(self) -> sparse.csr_matrix:
+        """Edge lengths as a graph. *Shape:* ``(V, V)``."""
+        i, j = self.mesh.edges.T
+        length = np.maximum(np.linalg.norm(self.like[i] - self.like[j], axis=1), 1e-12 * self.diagonal)
+        n = self.mesh.n_vertices
+        half = sparse.coo_matrix((length, (i, j)), shape=(n, n))
+        return (half + half.T).tocsr()
+
+    @cached_property
+    def known_pairs(self) -> IntArray:
+        """Pairs that cross in any of the known shapes. *Shape:* ``(P, 2)``."""
+        found = [self.pairs(x) for x in self.known]
+        return np.unique(np.concatenate([*found, np.zeros((0, 2), np.int64)]), axis=0)
+
+    @cached_property
+    def _around_known(self) -> sparse.csr_matrix | None:
+        """One where a pair of faces lies within :data:`RINGS` of a known one. *Shape:* ``(F, F)``."""
+        pairs, n = self.known_pairs, len(self.mesh.faces)
+        if not len(pairs):
+            return None
+        near = _ones(
+            sparse.coo_matrix((np.ones(2 * len(pairs)), (pairs.reshape(-1), pairs[:, ::-1].reshape(-1))), (n, n))
+        )
+        for _ in range(RINGS):
+            near = _ones(self._touching @ near @ self._touching)
+        return near
+
+    @cached_property
+    def known_inside(self) -> BoolArray:
+        """Vertices that lie inside the surface in any of the known shapes. *Shape:* ``(V,)``."""
+        inside = np.zeros(self.mesh.n_vertices, dtype=bool)
+        for x in self.known:
+            inside |= self.winding(x, np.arange(len(x))) > 0.5
+        return inside
+
+    # ----------------------------------------------------------------------------------------------------- of one shape
+    def pairs(self, x: FloatArray) -> IntArray:
+        """Pairs of triangles that cross and share no vertex, the smaller number first, sorted.
+
+        Two triangles cross where an edge of one passes through the other. Those that only touch, or lie in one plane,
+        do not.
+
+        Args:
+            x: *Shape:* ``(V, 3)``.
+
+        Returns:
+            *Shape:* ``(P, 2)``.
+        """
+        faces = self.mesh.faces
+        tree = require("ipctk").LBVH()
+        # Scaled and centred: the library's boxes are of single precision.
+        centred = np.asfortranarray((x - self.like.mean(0)) / self.diagonal)
+        tree.build(centred, *self._arrays, 1e-6)
+        found = tree.detect_face_face_candidates()
+        candidates = np.array([(c.face0_id, c.face1_id) for c in found], dtype=np.int64).reshape(-1, 2)
+        shared = (faces[candidates[:, 0]][:, :, None] == faces[candidates[:, 1]][:, None, :]).any((1, 2))
+        candidates = candidates[~shared]
+        corners = centred[faces]
+        crossing = np.zeros(len(candidates), dtype=bool)
+        for one, other in (candidates.T, candidates[:, ::-1].T):
+            triangle = corners[other]
+            normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+            side = ((corners[one] - triangle[:, :1]) * normal[:, None]).sum(-1) > 0
+            for i, j in ((0, 1), (1, 2), (2, 0)):
+                at = np.flatnonzero((side[:, i] != side[:, j]) & ~crossing)
+                start, end = corners[one[at], i], corners[one[at], j]
+                rays = triangle[at] - start[:, None]
+                along = end - start
+                turns = [(np.cross(rays[:, k], rays[:, (k + 1) % 3]) * along).sum(-1) > 0 for k in range(3)]
+                crossing[at[(turns[0] == turns[1]) & (turns[1] == turns[2])]] = True
+        return np.unique(np.sort(candidates[crossing], axis=1), axis=0)
+
+    def is_new(self, pairs: IntArray) -> BoolArray:
+        """Which pairs cross in none of the known shapes. *Shape:* ``(P, 2) -> (P,)``."""
+        n = len(self.mesh.faces)
+        code, known = (p[:, 0] * n + p[:, 1] for p in (pairs, self.known_pairs))
+        return ~np.isin(code, known)
+
+    def is_far(self, pairs: IntArray) -> BoolArray:
+        """Which pairs are two parts that went through each other.
+
+        They are more than :data:`RINGS` from each pair that crosses in a known shape, and their triangles more than
+        :data:`FAR` of the diagonal apart along the surface. *Shape:* ``(P, 2) -> (P,)``.
+        """
+        far = self.is_new(pairs)
+        if self._around_known is not None and far.any():
+            at = np.flatnonzero(far)
+            far[at] = np.asarray(self._around_known[pairs[at, 0], pairs[at, 1]]).reshape(-1) == 0
+        at = np.flatnonzero(far)
+        first, which = np.unique(pairs[at, 0], return_inverse=True)
+        limit, faces = FAR * self.diagonal, self.mesh.faces
+        for k, face in enumerate(first):
+            mine = at[which.reshape(-1) == k]
+            reached = dijkstra(self.lengths, indices=faces[face], min_only=True, limit=limit)
+            far[mine] = (~np.isfinite(reached[faces[pairs[mine, 1]]])).all(1)
+        return far
+
+    def winding(self, x: FloatArray, vertices: IntArray) -> FloatArray:
+        """How often the surface winds around a point just outside each vertex: about 1 inside, about 0 outside.
+
+        Args:
+            x: *Shape:* ``(V, 3)``.
+            vertices: *Shape:* ``(n,)``.
+        """
+        if not len(vertices):
+            return np.zeros(0)
+        faces = self.mesh.faces
+        corners = x[faces]
+        doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        points = x[vertices] + _OFFSET * self.diagonal * self.vertex_normals(doubled)[vertices]
+        number = require("igl").fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
+        turned = (doubled * (corners.mean(1) - x.mean(0))).sum() < 0  # a surface that is inside out
+        return -number if turned else number  # type: ignore[no-any-return]
+
+    def vertex_normals(self, doubled: FloatArray) -> FloatArray:
+        """Unit normals of vertices, from those of the faces times twice their areas. *Shape:* ``(F, 3) -> (V, 3)``."""
+        corners = self.mesh.faces.reshape(-1)
+        n = self.mesh.n_vertices
+        summed: Any = [np.bincount(corners, np.repeat(c, 3), minlength=n) for c in doubled.T]
+        return unit(np.stack(summed, 1))
+
+    def inside(self, x: FloatArray, pairs: IntArray) -> BoolArray:
+        """Vertices that are inside since parts went through each other.
+
+        They are inside by winding number, were not so in any known shape, and hang together with the given pairs.
+
+        Args:
+            x: *Shape:* ``(V, 3)``.
+            pairs: Faces that cross far from each other. *Shape:* ``(P, 2)``.
+        """
+        inside = np.zeros(self.mesh.n_vertices, dtype=bool)
+        if not len(pairs):
+            return inside
+        seeds = self.grown(self.mesh.faces[pairs.reshape(-1)].reshape(-1))
+        # Nothing is nearer to the crossings than those that cross: only what could hang together with them is asked.
+        found = np.flatnonzero(self.winding(x, np.arange(len(x))) > 0.5)
+        found = found[~self.known_inside[found]]
+        if not len(found):
+            return inside
+        _, label = connected_components(self.adjacency[found][:, found], directed=False)
+        inside[found[np.isin(label, np.unique(label[seeds[found]]))]] = True
+        return inside
+
+    def grown(self, vertices: IntArray, rings: int = 1) -> BoolArray:
+        """A set of vertices and the rings around it. *Shape:* ``(n,) -> (V,)``."""
+        chosen = np.zeros(self.mesh.n_vertices, dtype=bool)
+        chosen[vertices] = True
+        for _ in range(rings):
+            chosen |= self.adjacency @ chosen.astype(np.float64) > 0
+        return chosen
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Vectors of length one, or zero. *Shape:* ``(..., 3)``."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)  # type: ignore[no-any-return]
+
+
+def _ones(matrix: Any) -> sparse.csr_matrix:
+    """The same pattern with ones."""
+    found = sparse.csr_matrix(matrix)
+    found.data[:] = 1.0
+    return found
