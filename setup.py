@@ -34,6 +34,8 @@ EXTRAS = {
     "contact": ["ipctk>=1.6", "libigl>=2.6"],
     "dask": ["distributed>=2024.5"],
 }
+# The site: sh docs/build.sh
+DOCS = ["sphinx>=7.4", "furo>=2024.8", "myst-nb>=1.1", "sphinx-copybutton>=0.5"]
 
 setup(
     name="torch_modal",
@@ -89,8 +91,10 @@ setup(
     extras_require={
         **EXTRAS,
         "all": sorted({each for extra in EXTRAS.values() for each in extra}),
+        "docs": DOCS,
         "test": [
             *sorted({each for extra in EXTRAS.values() for each in extra}),
+            *DOCS,
             *["pytest>=8", "ruff>=0.6", "mypy>=1.11", "pygltflib>=1.16", "selenium>=4.20"],
             *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],
         ],

@@ -7,7 +7,9 @@ frames between the key-frames are known: they come from the same smooth curves a
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -263,9 +265,20 @@ SAMPLES = {  # model, motion, grid cell, softness of the joints in radii, times 
 }
 
 
-def make(name: str) -> tuple[Array, IntArray, dict[str, Array]]:
-    """Rest shape ``(V, 3)``, faces ``(F, 3)`` and, by kind, the frames ``(K, V, 3)`` of one sample."""
-    model, motion, cell, softness, times = SAMPLES[name]
+class Body(NamedTuple):
+    """A sculpted sample that can be posed."""
+
+    rest: Array
+    """*Shape:* ``(V, 3)``."""
+    faces: IntArray
+    """*Shape:* ``(F, 3)``."""
+    frame: Callable[[float], Array]
+    """The shape at a time of its motion. *Shape:* ``(V, 3)``."""
+
+
+def sculpted(name: str) -> Body:
+    """Sculpt a sample; its motion is known at any time."""
+    model, motion, cell, softness, _ = SAMPLES[name]
     bones, flesh = model()
     rest, faces = sculpt(flesh, cell)
     weights, radius = bind(flesh, bones, rest, faces, softness)
@@ -275,7 +288,7 @@ def make(name: str) -> tuple[Array, IntArray, dict[str, Array]]:
         posed = skin(rest, weights, *place_bones(bones, *motion(bones, time)))
         return restore_volume(posed, faces, volume, radius)
 
-    return rest, faces, {kind: np.stack([frame(t) for t in values]) for kind, values in times.items()}
+    return Body(rest, faces, frame)
 
 
 def describe(name: str, rest: Array, faces: IntArray, frames: dict[str, Array]) -> None:
@@ -297,7 +310,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "torch_modal" / "samples")
     out = parser.parse_args().out
     for name in SAMPLES:
-        rest, faces, frames = make(name)
+        rest, faces, frame = sculpted(name)
+        frames = {kind: np.stack([frame(t) for t in times]) for kind, times in SAMPLES[name][4].items()}
         describe(name, rest, faces, frames)
         for kind, shapes in frames.items():
             for n, shape in enumerate(shapes, start=0 if kind == "key" or name == "creature" else 1):

@@ -322,7 +322,7 @@ def test_help_has_an_example_that_the_parser_accepts(command: str, capsys: pytes
     assert examples
     for argv in examples:
         assert argv[0] == command
-        cli._parser().parse_args(argv)
+        cli.build_parser().parse_args(argv)
     assert "default: 30" in text and "None" not in text
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from cases import DATA, KeyframeSet
 from torch import Tensor
 
@@ -18,7 +17,6 @@ import torch_modal as tm
 
 sys.path.append(str(Path(__file__).parents[2] / "examples"))
 import make_samples
-from _sculpt import bind, place_bones, restore_volume, sculpt, skin
 
 Truth = Callable[[float], Tensor]
 
@@ -64,17 +62,8 @@ def fractions(times: tuple[float, ...], *parts: float) -> tuple[float, ...]:
 
 def sculpted(name: str) -> tuple[Tensor, Truth]:
     """Faces of a sample, and its shape at any time of its own."""
-    model, motion, cell, softness, _ = make_samples.SAMPLES[name]
-    bones, flesh = model()
-    rest, faces = sculpt(flesh, cell)
-    weights, radius = bind(flesh, bones, rest, faces, softness)
-    volume = trimesh.Trimesh(rest, faces, process=False).volume
-
-    def posed(time: float) -> Tensor:
-        shape = skin(rest, weights, *place_bones(bones, *motion(bones, time)))
-        return torch.from_numpy(restore_volume(shape, faces, volume, radius))
-
-    return torch.from_numpy(faces), posed
+    body = make_samples.sculpted(name)
+    return torch.from_numpy(body.faces), lambda time: torch.from_numpy(body.frame(time))
 
 
 def closed_part(time: float) -> float:

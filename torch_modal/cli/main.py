@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         result, `check` when parts pass through each other. Wrong usage leaves with ``SystemExit(2)``.
     """
     try:
-        args = _parser().parse_args(argv)
+        args = build_parser().parse_args(argv)
         with warnings_as_lines(), log_as_lines(args):
             code = _run(args)
         sys.stdout.flush()
@@ -172,7 +172,8 @@ def _times(text: str) -> list[float]:
         raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
 
 
-def _parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
     parser = argparse.ArgumentParser(
         prog=PROGRAM, description=DESCRIPTION, epilog=MAIN_EXAMPLES, formatter_class=_Formatter
     )

@@ -1,0 +1,235 @@
+"""What the site says of the package by itself: names, commands, benchmarks, pages of shapes, unlisted pages."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.statemachine import StringList
+from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
+from sphinx.util.docutils import SphinxDirective
+from sphinx.util.nodes import nested_parse_with_titles
+
+import torch_modal as tm
+
+DOCS = Path(__file__).parent
+PACKAGE = Path(tm.__file__).parent
+HERE = "<!-- unlisted pages -->"
+"""The line of index.md in whose place pages stand that no list has."""
+
+
+# ----------------------------------------------------------------------------------------------------------- names
+def public_names() -> dict[str, list[str]]:
+    """Public names by the floor that they come from, ``"root"`` for those of none, in the order of the stub."""
+    found: dict[str, list[str]] = {}
+    for node in ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom):
+            floor = (node.module or "").split(".")[0]
+            floor = floor if (PACKAGE / floor).is_dir() and floor else "root"
+            for alias in node.names:
+                found.setdefault(alias.name if node.module is None else floor, []).append(alias.name)
+    return found
+
+
+def directive_for(name: str) -> list[str]:
+    """The autodoc directive of a public name."""
+    value = getattr(tm, name)
+    if inspect.ismodule(value):
+        return [f".. automodule:: torch_modal.{name}", ""]
+    if inspect.isclass(value):
+        kind = "exception" if issubclass(value, BaseException) else "class"
+        return [f".. auto{kind}:: torch_modal.{name}", "   :members:", "   :show-inheritance:", ""]
+    if callable(value):
+        return [f".. autofunction:: torch_modal.{name}", ""]
+    lines = described_at_home(name)
+    return [f".. py:data:: torch_modal.{name}", "", *(f"   {line}" for line in lines), ""]
+
+
+def described_at_home(name: str) -> list[str]:
+    """The text below a public value in the module that it comes from; elsewhere Python knows no text of it."""
+    for node in ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and name in {alias.name for alias in node.names}:
+            analyzer = ModuleAnalyzer.for_module(f"torch_modal.{node.module}")
+            return analyzer.find_attr_docs()["", name]
+    raise KeyError(name)
+
+
+class PublicNames(SphinxDirective):
+    """``{public-names} nn``: all names of a floor, documented; ``all``: a list of links to every one."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """The documentation of the names, or the list."""
+        self.env.note_dependency(str(PACKAGE / "__init__.pyi"))
+        wanted, names = self.arguments[0], public_names()
+        if wanted == "all":
+            lines = list(self._index(names))
+        elif wanted not in names:
+            raise self.error(f"there is no floor {wanted!r} with public names; there are {', '.join(names)}")
+        else:
+            lines = [line for name in names[wanted] for line in directive_for(name)]
+        node = nodes.section()
+        node.document = self.state.document
+        # Docstrings are reStructuredText, the page is Markdown: autodoc's directives are parsed as the former.
+        text = "\n".join(["```{eval-rst}", *lines, "```"]) if wanted != "all" else "\n".join(lines)
+        nested_parse_with_titles(self.state, StringList(text.splitlines(), source=self.env.docname), node)
+        return node.children
+
+    @staticmethod
+    def _index(names: dict[str, list[str]]) -> Iterator[str]:
+        for floor, its_names in names.items():
+            yield f"- [](api/{floor}.md): " + ", ".join(f"[`{name}`](#torch_modal.{name})" for name in its_names)
+
+
+def literal_equations(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Indented blocks of docstrings are equations or examples, as in Markdown: they are shown as they stand."""
+    result: list[str] = []
+    literal = False
+    for number, line in enumerate(lines):
+        begins = line.startswith("    ") and (number > 0 and not lines[number - 1].strip())
+        before = next((other for other in reversed(lines[:number]) if other.strip()), "")
+        if begins and not literal and before and not before.startswith((" ", "- ", "* ", "..")):
+            result += ["::", ""] if not before.rstrip().endswith("::") else []
+            literal = True
+        elif line.strip() and not line.startswith(" "):
+            literal = False
+        # Where a description begins with its shape, napoleon would take that for its type.
+        result.append(re.sub(r"\*(Shapes?[^*]*):\*", r"\1", line))
+    # Napoleon would take what stands before a colon in the first line of an attribute for its type.
+    lines[:] = ["", *result] if what in {"attribute", "property", "data"} else result
+
+
+# -------------------------------------------------------------------------------------------------------- commands
+def command_helps() -> dict[str, str]:
+    """What ``torch-modal COMMAND --help`` says, by command."""
+    from torch_modal.cli.main import build_parser
+
+    parser = build_parser()
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    return {name: each.format_help() for name, each in commands.choices.items()}
+
+
+class CommandHelp(SphinxDirective):
+    """``{command-help}``: a section for each command."""
+
+    def run(self) -> list[nodes.Node]:
+        """The sections."""
+        found: list[nodes.Node] = []
+        for name, text in command_helps().items():
+            section = nodes.section(ids=[nodes.make_id(name)], names=[name])
+            section += nodes.title("", f"torch-modal {name}")
+            section += nodes.literal_block(text, text, language="none")
+            found.append(section)
+        return found
+
+
+# ------------------------------------------------------------------------------------------------------ benchmarks
+def benchmarks() -> dict[str, str]:
+    """What each benchmark says of itself, by the name of its file."""
+    found = {}
+    for path in sorted((DOCS.parent / "tests" / "benchmarks").glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        text = ast.get_docstring(tree)
+        if text and f"python tests/benchmarks/{path.name}" in text:
+            found[path.name] = text
+    return found
+
+
+class BenchmarkList(SphinxDirective):
+    """``{benchmark-list}``: a section for each benchmark, with its command."""
+
+    def run(self) -> list[nodes.Node]:
+        """The sections."""
+        found: list[nodes.Node] = []
+        for name, text in benchmarks().items():
+            section = nodes.section(ids=[nodes.make_id(name)], names=[name])
+            section += nodes.title("", name)
+            for part in re.split(r"\n\s*\n", text):
+                literal = part.startswith("    ")
+                kind = nodes.literal_block if literal else nodes.paragraph
+                section += kind("", inspect.cleandoc("\n" + part))
+                if literal:
+                    section[-1]["language"] = "sh"
+            found.append(section)
+        return found
+
+
+# ----------------------------------------------------------------------------------------------------------- pages
+def listed_pages() -> set[str]:
+    """Pages that a list in index.md names."""
+    text = (DOCS / "index.md").read_text(encoding="utf-8")
+    lists = re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.M | re.S)
+    return {line.strip() for each in lists for line in each.splitlines() if line.strip() and line[0] != ":"}
+
+
+def unlisted_pages() -> list[str]:
+    """Pages that lie in docs/ and in no list: they get one of their own."""
+    there = {path.stem for path in DOCS.glob("*.md")} - {"index", "README"}
+    return sorted(there - listed_pages())
+
+
+def list_unlisted(app: Sphinx, page: str, source: list[str]) -> None:
+    """A page that somebody adds is on the site without any further word."""
+    if page == "index":
+        pages = "\n".join(unlisted_pages())
+        listing = f"```{{toctree}}\n:caption: More\n:hidden:\n\n{pages}\n```" if pages else ""
+        source[0] = source[0].replace(HERE, listing)
+
+
+def always_index(app: Sphinx, *_: Any) -> list[str]:
+    """What is unlisted may have changed although index.md has not."""
+    return ["index"]
+
+
+def write_shape_pages(app: Sphinx) -> None:
+    """The pages of the gallery: the samples between their key-frames, beside linear interpolation and the truth."""
+    if app.builder.format != "html":
+        return
+    from torch_modal.data.samples import SAMPLES, load_sample
+
+    folder = Path(app.outdir) / "shapes"
+    folder.mkdir(parents=True, exist_ok=True)
+    newest = max(path.stat().st_mtime for path in PACKAGE.rglob("*") if path.suffix in {".py", ".js", ".css", ".ply"})
+    for name in SAMPLES:
+        page = folder / f"{name}.html"
+        if page.exists() and page.stat().st_mtime > newest:
+            continue
+        sample = load_sample(name)
+        levels = 2 if sample.cyclic else 4
+        places = tm.keyframe_places(len(sample.keyframes), levels=levels, cyclic=sample.cyclic)
+        rows = {
+            "torch_modal": tm.subdivide(sample.keyframes, sample.faces, levels=levels, cyclic=sample.cyclic),
+            "linear": tm.linear_sequence(sample.keyframes, places),
+        }
+        page.unlink(missing_ok=True)
+        keys = places[:-1] if sample.cyclic else places
+        tm.write_page(
+            rows,
+            sample.faces,
+            page,
+            keyframe_indices=keys,
+            fps=2**levels * 6,
+            cyclic=sample.cyclic,
+            view=sample.view,
+            title=f"torch_modal: {name}",
+        )
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Tell Sphinx of all this."""
+    app.add_directive("public-names", PublicNames)
+    app.add_directive("command-help", CommandHelp)
+    app.add_directive("benchmark-list", BenchmarkList)
+    app.connect("autodoc-process-docstring", literal_equations, priority=400)  # before napoleon
+    app.connect("source-read", list_unlisted)
+    app.connect("env-get-outdated", always_index)
+    app.connect("builder-inited", write_shape_pages)
+    return {"parallel_read_safe": True}

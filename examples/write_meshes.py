@@ -1,0 +1,60 @@
+"""Write the meshes that README and the documentation name, so that what stands there can be tried as it stands.
+
+    python examples/write_meshes.py [FOLDER]
+
+They are the samples under other names: a hand that closes (open.obj, fist.obj, pose-1.obj to pose-5.obj), the same fist
+with other vertices and faces (scan.ply), its true motion (truth), a galloping creature (gait-1.obj to gait-6.obj), and
+both in a folder tree (shapes/hand, shapes/creature).
+"""
+
+import argparse
+from pathlib import Path
+
+import fast_simplification
+import numpy as np
+import torch
+import trimesh
+
+from torch_modal.data.samples import load_sample
+
+
+def write(path: Path, shape: torch.Tensor, faces: torch.Tensor) -> None:
+    """One mesh; its format follows from the name."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trimesh.Trimesh(shape.numpy(), faces.numpy(), process=False).export(path)
+
+
+def write_scan(path: Path, shape: torch.Tensor, faces: torch.Tensor) -> None:
+    """The same surface with half of the faces, its vertices in another order, turned and moved."""
+    points, triangles = fast_simplification.simplify(
+        100 * shape.numpy(), faces.numpy().astype(np.int32), target_count=len(faces) // 2
+    )
+    order = np.random.default_rng(0).permutation(len(points))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    turn = trimesh.transformations.rotation_matrix(0.5, (0, 1, 0))[:3, :3]
+    write(path, torch.from_numpy(points[order] / 100 @ turn.T + 0.2), torch.from_numpy(place[triangles]))
+
+
+def main(folder: Path) -> None:
+    """Write them all into a folder."""
+    hand, creature = load_sample("hand"), load_sample("creature")
+    opened, fist = hand.keyframes
+    write(folder / "open.obj", opened, hand.faces)
+    write(folder / "fist.obj", fist, hand.faces)
+    write_scan(folder / "scan.ply", fist, hand.faces)
+    for number, shape in enumerate([opened, *hand.truth, fist], 1):
+        write(folder / f"pose-{number}.obj", shape, hand.faces)
+        write(folder / "truth" / f"frame-{number}.obj", shape, hand.faces)
+    for number, shape in enumerate(creature.keyframes, 1):
+        write(folder / f"gait-{number}.obj", shape, creature.faces)
+    for name, shape in zip("abc", [opened, hand.truth[1], fist], strict=True):
+        write(folder / "shapes" / "hand" / f"{name}.obj", shape, hand.faces)
+    for name, shape in zip("abc", creature.keyframes[:3], strict=True):
+        write(folder / "shapes" / "creature" / f"{name}.obj", shape, creature.faces)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=Path())
+    main(parser.parse_args().folder)

@@ -1,0 +1,153 @@
+"""The documentation's site: it builds without a warning, and has every page and every public name in it."""
+
+import ast
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from types import ModuleType
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from snippets import ROOT, blocks
+
+import torch_modal as tm
+
+DOCS = ROOT / "docs"
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+
+
+@pytest.fixture(scope="module")
+def extension() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("extension", DOCS / "extension.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+# ----------------------------------------------------------------------------------------------------------- pages
+def test_every_public_name_has_a_page(extension: ModuleType) -> None:
+    floors = extension.public_names()
+    names = [name for each in floors.values() for name in each]
+    assert sorted(names) == sorted(tm.__all__) and len(set(names)) == len(names)
+    listed = re.findall(r"^api/(\w+)$", (DOCS / "api.md").read_text(), re.M)
+    assert sorted(floors) == sorted(listed) == sorted(path.stem for path in (DOCS / "api").glob("*.md"))
+    for floor in floors:
+        assert f"```{{public-names}} {floor}\n" in (DOCS / "api" / f"{floor}.md").read_text()
+
+
+def test_every_page_is_in_a_list(extension: ModuleType) -> None:
+    """By hand in index.md, or else by itself."""
+    listed, unlisted = extension.listed_pages(), extension.unlisted_pages()
+    assert not listed & set(unlisted)
+    there = {path.stem for path in DOCS.glob("*.md")} | {f"notebooks/{path.stem}" for path in NOTEBOOKS}
+    assert listed | set(unlisted) == there - {"index", "README"}
+    source = [(DOCS / "index.md").read_text()]
+    extension.unlisted_pages = lambda: ["a-new-page"]
+    extension.list_unlisted(None, "index", source)
+    assert re.search(r"```\{toctree\}[^`]*\na-new-page\n```", source[0])
+
+
+def test_every_command_and_benchmark_is_shown(extension: ModuleType) -> None:
+    assert {"subdivide", "view", "demo"} <= set(extension.command_helps())
+    shown = extension.benchmarks()
+    assert {"quality.py", "layer.py", "motion.py"} <= set(shown)
+    for name in re.findall(r"`(\w+\.py)`", (DOCS / "benchmarks.md").read_text()):
+        assert name in shown, name
+
+
+# -------------------------------------------------------------------------------------------------------- messages
+def messages() -> list[re.Pattern[str]]:
+    """All texts with holes of the package, as patterns."""
+    found = []
+    for path in Path(tm.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr) and len(node.values) > 1:
+                parts = [re.escape(p.value) if isinstance(p, ast.Constant) else ".*" for p in node.values]  # type: ignore[arg-type]
+                found.append(re.compile("".join(parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and len(node.value) > 20:
+                found.append(re.compile(re.escape(node.value)))
+    return found
+
+
+def test_messages_of_the_questions_are_those_of_the_package() -> None:
+    known = [pattern for pattern in messages() if len(pattern.pattern.replace(".*", "")) > 20]
+    quoted = [block.text.strip() for block in blocks(DOCS / "faq.md") if block.language == "text"]
+    assert len(quoted) > 10
+    for text in quoted:
+        assert any(pattern.fullmatch(text) for pattern in known), f"the package does not say: {text}"
+
+
+# ------------------------------------------------------------------------------------------------------- notebooks
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_small_and_were_run(path: Path) -> None:
+    assert path.stat().st_size < 150_000
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert any(cell.outputs for cell in cells)
+    assert not [output for cell in cells for output in cell.outputs if output.output_type == "error"]
+    assert "/" + "home" not in path.read_text() and len(NOTEBOOKS) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run(path: Path) -> None:
+    """From end to end; each asserts what it shows in its last cell."""
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}).execute()
+
+
+# ------------------------------------------------------------------------------------------------------------ site
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site as docs/build.sh makes it, of a copy with one page more."""
+    root = tmp_path_factory.mktemp("repository")
+    shutil.copytree(DOCS, root / "docs", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "tests" / "benchmarks", root / "tests" / "benchmarks")
+    shutil.copy(ROOT / "README.md", root)
+    (root / "docs" / "added.md").write_text("# A page that nobody listed\n\nSee [the layer](layer.md#gradients).\n")
+    (root / "tests" / "environment.sh").write_text(f"python='{sys.executable}'\n")  # is there already
+    command = ["sh", str(root / "docs" / "build.sh"), "--quiet"]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
+    return root / "out" / "docs"
+
+
+@pytest.mark.slow
+def test_site_has_every_page_and_name(site: Path) -> None:
+    lines = (site / "objects.inv").read_bytes().split(b"\n", 4)
+    inventory = zlib.decompress(lines[4]).decode().splitlines()
+    documented = {line.split()[0] for line in inventory if " py:" in line}
+    assert {f"torch_modal.{name}" for name in tm.__all__} <= documented
+    assert {"torch_modal.InBetween.solve", "torch_modal.ModalBasis.save"} <= documented
+    index = (site / "index.html").read_text()
+    for path in [*DOCS.glob("*.md"), *NOTEBOOKS]:
+        page = path.relative_to(DOCS).with_suffix(".html")
+        if path.stem not in {"index", "README"}:
+            assert (site / page).exists() and f'href="{page}"' in index, page
+    assert 'href="added.html"' in index
+    assert "A page that nobody listed" in (site / "added.html").read_text()
+
+
+@pytest.mark.slow
+def test_gallery_has_pages_of_shapes(site: Path) -> None:
+    frames = re.findall(r'<iframe src="([^"]+)"', (site / "gallery.html").read_text())
+    assert len(frames) == 2
+    for frame in frames:
+        page = (site / frame).read_text()
+        assert 300_000 < len(page) < 3_000_000 and "torchModal" in page
+
+
+@pytest.mark.slow
+def test_links_within_the_site_lead_somewhere(site: Path) -> None:
+    for page in [*site.glob("*.html"), *site.glob("notebooks/*.html"), *site.glob("api/*.html")]:
+        text = page.read_text()
+        for link in re.findall(r'(?:href|src)="([^"#?]+)[^"]*"', text):
+            if not re.match(r"[a-z]+:|//", link):
+                assert (page.parent / link).resolve().exists(), f"{page.name}: {link}"
