@@ -21,6 +21,15 @@ IntArray = NDArray[np.int64]
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 
+NAMES = {
+    "texcoords": "texture coordinates",
+    "normals": "normals",
+    "colors": "vertex colours",
+    "materials": "materials",
+    "groups": "groups",
+}
+"""What people call features that every format has the same words for."""
+
 CLAY = (0.66, 0.52, 0.42, 1.0)
 """Linear RGBA of what has no colour of its own."""
 
@@ -31,6 +40,12 @@ class Image(NamedTuple):
     data: bytes
     mime: str
     """``image/png`` or ``image/jpeg``."""
+
+    @classmethod
+    def of(cls, data: bytes) -> Image | None:
+        """PNG and JPEG by their first bytes, None for all else."""
+        starts = {b"\x89PNG": "image/png", b"\xff\xd8": "image/jpeg"}
+        return next((cls(data, mime) for start, mime in starts.items() if data.startswith(start)), None)
 
 
 class Material(NamedTuple):
@@ -88,6 +103,12 @@ class Asset(ABC):
     def __init__(self, path: Path) -> None:
         self.path = path
         self.carries = {}
+
+    def _carry(self, feature: str, number: int | None = None) -> None:
+        """Note that a feature is there, by its name for people, and how many of them."""
+        name = NAMES[feature]
+        counted = f"{number} {name.removesuffix('s') if number == 1 else name}"
+        self.carries[feature] = name if number is None else counted
 
     @property
     def suffix(self) -> str:

@@ -84,16 +84,11 @@ class GltfAsset(Asset):
         self.positions = np.concatenate(positions)
         self.faces = np.concatenate(faces)
         names = {name for primitive in self._primitives for name in primitive.json["attributes"]}
-        for feature, wanted, name in (
-            ("texcoords", "TEXCOORD_0", "texture coordinates"),
-            ("normals", "NORMAL", "normals"),
-            ("colors", "COLOR_0", "vertex colours"),
-        ):
+        for feature, wanted in (("texcoords", "TEXCOORD_0"), ("normals", "NORMAL"), ("colors", "COLOR_0")):
             if wanted in names:
-                self.carries[feature] = name
+                self._carry(feature)
         if self.document.get("materials"):
-            n_materials = len(self.document.get("materials"))
-            self.carries["materials"] = f"{n_materials} material{'s' * (n_materials > 1)}"
+            self._carry("materials", len(self.document.get("materials")))
         moving = ["skeleton"] if posed else []
         if self.document.get("animations"):
             moving.append("animations")
@@ -253,7 +248,8 @@ class GltfAsset(Asset):
             data = self._image_bytes(number)
             image.pop("uri", None)
             image["bufferView"] = document.add_bytes(data)
-            image.setdefault("mimeType", "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png")
+            known = Image.of(data)
+            image.setdefault("mimeType", known.mime if known else "image/png")
 
     def _image_bytes(self, number: int) -> bytes:
         image = self.document.get("images", number)
@@ -296,7 +292,7 @@ class GltfAsset(Asset):
             texture = self.document.get("textures", surface["baseColorTexture"]["index"])
             if "source" in texture:
                 data = self._image_bytes(texture["source"])
-                image = Image(data, "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png")
+                image = Image.of(data) or Image(data, "image/png")
         color = tuple(float(c) for c in surface.get("baseColorFactor", (1, 1, 1, 1)))
         metallic, roughness = surface.get("metallicFactor", 1.0), surface.get("roughnessFactor", 1.0)
         return Material(material.get("name", f"material-{number}"), color, metallic, roughness, image)

@@ -128,10 +128,8 @@ def _name_in_copy(name: str) -> str:
 
 def as_image(data: bytes) -> Image | None:
     """PNG and JPEG as they are, others as PNG; None for what is no picture."""
-    if data.startswith(b"\x89PNG"):
-        return Image(data, "image/png")
-    if data.startswith(b"\xff\xd8"):
-        return Image(data, "image/jpeg")
+    if (known := Image.of(data)) is not None:
+        return known
     from PIL import Image as pillow
 
     stream = io.BytesIO()

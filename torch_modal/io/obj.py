@@ -126,15 +126,15 @@ class ObjAsset(Asset):
         if (self._sizes > 3).any():
             self.carries["polygons"] = "quads" if set(self._sizes.tolist()) <= {3, 4} else "polygons"
         if (self._corners[:, 1] >= 0).any():
-            self.carries["texcoords"] = "texture coordinates"
+            self._carry("texcoords")
         if (self._corners[:, 2] >= 0).any():
-            self.carries["normals"] = "normals"
+            self._carry("normals")
         if self._has_colors:
-            self.carries["colors"] = "vertex colours"
+            self._carry("colors")
         if self._materials:
-            self.carries["materials"] = f"{len(self._materials)} material{'s' * (len(self._materials) > 1)}"
+            self._carry("materials", len(self._materials))
         if n_groups > 1:
-            self.carries["groups"] = "groups"
+            self._carry("groups")
 
     @property
     def _has_colors(self) -> bool:

@@ -30,7 +30,7 @@ class OffAsset(Asset):
         if len(self.faces) > len(faces):
             self.carries["polygons"] = "polygons"
         if self._colored:
-            self.carries["colors"] = "vertex colours"
+            self._carry("colors")
         elif min(words) > 3:
             self.carries["properties"] = "further numbers of vertices"
 

@@ -72,12 +72,12 @@ class PlyAsset(Asset):
         if len(self.faces) > self._count("face"):
             self.carries["polygons"] = "polygons"
         if {"nx", "ny", "nz"} <= names:
-            self.carries["normals"] = "normals"
+            self._carry("normals")
         if {"red", "green", "blue"} <= names:
-            self.carries["colors"] = "vertex colours"
+            self._carry("colors")
         face = {prop.name for element in self._elements if element.name == "face" for prop in element.properties}
         if self._uv_names is not None:
-            self.carries["texcoords"] = "texture coordinates"
+            self._carry("texcoords")
         if self._textures:
             self.carries["materials"] = "texture"
         known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", *(self._uv_names or ())}
