@@ -215,7 +215,9 @@ class Between(nn.Module):
         faces = self.frame.faces
         ends = [x.detach() for x in (pair.first, pair.second)]
         sizes = [(x.amax(-2) - x.amin(-2)).norm(dim=-1) for x in ends]
-        first, second = (torch.linalg.det(x[:, faces]).sum(-1) for x in ends)
+        # Six times the volumes, without a factorisation of each face, which torch's determinant makes.
+        corners = [[x.index_select(-2, corner) for corner in faces.unbind(1)] for x in ends]
+        first, second = ((a * torch.linalg.cross(b, c)).sum((-2, -1)) for a, b, c in corners)
         mirrored = (first * second < 0) & self.closed
         return (torch.minimum(*sizes) > SMALLEST_SIZE * DIAGONAL) & ~mirrored
 
