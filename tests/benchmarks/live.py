@@ -26,7 +26,7 @@ from torch_modal.view.live_shapes import LiveShapes
 
 
 def milliseconds(function: Callable[[int], object], seconds: float) -> tuple[float, float]:
-    """Median times of calls, after two that do not count, of the clock and of the processor; each is told its number."""
+    """Median times of calls, of the clock and of the processor; two do not count, each is told its number."""
     clock: list[float] = []
     processor: list[float] = []
     end = time.perf_counter() + seconds
