@@ -129,9 +129,18 @@ class LocalRotations(nn.Module):
         bend = excess(own, step(earlier, a, a), step(b, later, b), wide, lambda x: x.square().sum(0))
         return Course(a.e1, a.e2, a.normal, torch.stack(a[3:]), own, *bend, unit)
 
-    def along(self, course: Course, t: Tensor) -> Tensor:
-        """Edge vectors on a course, components first. *Shape:* ``(B,) -> (3, B, E)``."""
-        u = t[:, None]
+    def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
+        """Edge vectors on courses, components first.
+
+        Args:
+            course: Of P pairs of shapes.
+            which: Of which of them. *Shape:* ``(B,)``.
+            t: Times. *Shape:* ``(B,)``.
+
+        Returns:
+            *Shape:* ``(3, B, E)``.
+        """
+        course, u = course.rows(which), t[:, None]
         straight, bent = u * course.step, beyond(Excess(course.first, course.last), u)
         length, along, height = course.size + course.unit * (straight + bent)[3:]
         flat = torch.zeros_like(length)

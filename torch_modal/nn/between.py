@@ -11,10 +11,13 @@ from torch_modal.energy.energy import Energy, Rest
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.hermite import Spacing
+from torch_modal.geometry.vectors import cross, pick
 from torch_modal.nn import trees
 from torch_modal.nn.adjoint import ConvergenceWarning, Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.frame import Frame, Pair
+from torch_modal.nn.fused import FusedRelax
 from torch_modal.nn.joint import JointSpace
+from torch_modal.nn.launch import has_kernels
 from torch_modal.nn.levels import Levels, Stiffness, coarse_values
 from torch_modal.nn.paired import PairedSpace
 from torch_modal.nn.relax import relax
@@ -98,17 +101,30 @@ class Between(nn.Module):
         self.bare = not objective.terms
         self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, weights)
         levels = Levels(self.frame, mesh, terms)
-        turned = self.frame.modes(*modes)
         if objective.space == "joint":
             ends = self.frame.place(*shapes[:, None])
             references = torch.cat([ends.first, ends.second])
             fine = mesh if objective.base == "rotations" else None
-            self.space: Any = JointSpace(self.frame, levels, turned, references, fine)
+            self.space: Any = JointSpace(self.frame, levels, modes, references, fine, has_kernels(solver.backend))
         else:
-            self.space = PairedSpace(self.frame, levels, turned)
+            self.space = PairedSpace(self.frame, levels, modes)
         self.closed = len(mesh.connectivity.boundary_edges) == 0
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
         self.fine = Energy(mesh, terms)
+        self.fused = FusedRelax(self.fine, mesh) if FusedRelax.serves(self.fine, solver.backend) else None
+
+    def prepare(self) -> None:
+        """Make at once what would be made at the first minimisation."""
+        if isinstance(self.space, JointSpace):
+            self.space.modal  # noqa: B018
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Between":
+        """Nothing is made in a lower precision, or on another device, than float64 on the CPU."""
+        before = self.frame.reference
+        after = fn(before)
+        if (after.dtype, after.device) != (before.dtype, before.device):
+            self.prepare()
+        return super()._apply(fn, recurse)
 
     def forward(self, samples: Samples, exact: bool, report: Callable[[Solution], None] | None) -> InBetweenResult:
         """Solve.
@@ -134,7 +150,7 @@ class Between(nn.Module):
         usable = usable & (t >= 0) & (t <= 1)
         if pair.around is not None and self.bare:
             # The course is a shape at rest: there is nothing to minimise.
-            solution = unmoved(t, space.n_unknowns, usable)
+            solution = unmoved(t, 0, usable)
             return self._restored(space.on_course(pair, index, t), placed, t, solution)
         anchors = self._anchors(placed, t)
         problem = self.problem(pair, samples, anchors)
@@ -169,6 +185,11 @@ class Between(nn.Module):
         energy, solver = self.fine, self.solver
         chunk = max(1, FINE_CHUNK // x.shape[-2])
         ends = pair.first, pair.second
+        if self.fused is not None:
+            rest = trees.picked(ends, samples.which)
+            for n_steps, n_products in ((solver.local_steps, LOCAL_PRODUCTS), (solver.polish, POLISH_PRODUCTS)):
+                x = self.fused(x, *rest, samples.t, samples.stiffness, n_steps, n_products, chunk)
+            return x
         known = None if samples.which is None else [self._fine_rest(end) for end in ends]
         parts = []
         for i in range(0, len(x), chunk):
@@ -212,14 +233,20 @@ class Between(nn.Module):
 
         *Shape:* ``(P,)``.
         """
-        faces = self.frame.faces
         ends = [x.detach() for x in (pair.first, pair.second)]
         sizes = [(x.amax(-2) - x.amin(-2)).norm(dim=-1) for x in ends]
-        # Six times the volumes, without a factorisation of each face, which torch's determinant makes.
-        corners = [[x.index_select(-2, corner) for corner in faces.unbind(1)] for x in ends]
-        first, second = ((a * torch.linalg.cross(b, c)).sum((-2, -1)) for a, b, c in corners)
-        mirrored = (first * second < 0) & self.closed
-        return (torch.minimum(*sizes) > SMALLEST_SIZE * DIAGONAL) & ~mirrored
+        usable = torch.minimum(*sizes) > SMALLEST_SIZE * DIAGONAL
+        if not self.closed:
+            return usable
+        first, second = (_enclosed(x, self.frame.faces) for x in ends)
+        return usable & ~(first * second < 0)
+
+
+def _enclosed(x: Tensor, faces: Tensor) -> Tensor:
+    """Six times the signed volume. *Shape:* ``(B, V, 3), (F, 3) -> (B,)``."""
+    rows = x.movedim(-1, 0).contiguous()
+    a, b, c = (pick(rows, corner) for corner in faces.unbind(1))
+    return (a * cross(b, c)).sum((0, -1))
 
 
 def report(solution: Solution, max_steps: int, forbid: bool) -> None:

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.geometry.poisson import Poisson
+from torch_modal.nn.fused import FusedRotations
 
 
 class RotationBlend(nn.Module):
@@ -17,26 +18,28 @@ class RotationBlend(nn.Module):
     Args:
         mesh: The connectivity.
         references: Two shapes near the key-frames. *Shape:* ``(2, V, 3)``.
+        fused: Whether the edges come from kernels.
     """
 
-    def __init__(self, mesh: Connectivity, references: Tensor) -> None:
+    def __init__(self, mesh: Connectivity, references: Tensor, fused: bool = False) -> None:
         super().__init__()
-        self.rotations = LocalRotations(mesh, references)
+        self.rotations = (FusedRotations if fused else LocalRotations)(mesh, references)
         self.poisson = Poisson(mesh, self.rotations.per_length)
 
     def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t``. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``."""
         return self._reached(self.rotations(first, second, t), torch.lerp(first, second, t[:, None, None]))
 
-    def along(self, course: Course, straight: Tensor, t: Tensor) -> Tensor:
+    def along(self, course: Course, which: Tensor, straight: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t`` of a course.
 
         Args:
             course: Of :meth:`LocalRotations.course`.
+            which: Of which pair of shapes. *Shape:* ``(B,)``.
             straight: Shapes whose pieces have their centroids where they are wanted. *Shape:* ``(B, V, 3)``.
             t: *Shape:* ``(B,)``.
         """
-        return self._reached(self.rotations.along(course, t), straight)
+        return self._reached(self.rotations.along(course, which, t), straight)
 
     def _reached(self, edges: Tensor, near: Tensor) -> Tensor:
         return self.poisson(edges, near.movedim(-1, 0)).movedim(0, -1)

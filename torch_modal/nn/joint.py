@@ -1,7 +1,8 @@
 """The joint space: one unknown shape in the sum of both modal spaces and the difference of the key-frames."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -10,10 +11,23 @@ from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.hermite import Spacing, beyond, excess, squared_length
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
-from torch_modal.nn.frame import Frame, Pair
+from torch_modal.nn.frame import Columns, Frame, Pair
 from torch_modal.nn.guess import Guess
 from torch_modal.nn.levels import Levels, Stiffness
-from torch_modal.nn.modal_energy import Placement
+from torch_modal.nn.modal_energy import Placement, SumOfEnergies
+
+
+class Difference(NamedTuple):
+    """The part of ``x_b - x_a`` that neither rigid motions nor modes have, of length one: a column of its own."""
+
+    whole: Tensor
+    """``x_b - x_a``. *Shape:* ``(B, V, 3)``."""
+    rigid: Tensor
+    """How much of it is rigid. *Shape:* ``(B, 6)``."""
+    modal: Tensor
+    """How much of the rest is modal. *Shape:* ``(B, n)``."""
+    scale: Tensor
+    """One over the length of what is left. *Shape:* ``(B,)``."""
 
 
 class JointProblem(NamedTuple):
@@ -25,8 +39,19 @@ class JointProblem(NamedTuple):
     """Where the minimisation may start; None: at zeros. *Shape:* ``(B, n)``."""
     base: Tensor
     """The fine shape that the modes are added to. *Shape:* ``(B, V, 3)``."""
-    difference: Tensor
-    """The fine column of the last amplitude. *Shape:* ``(B, V, 3)``."""
+    difference: Difference
+    """The column of the last amplitude."""
+
+
+class _Modal(nn.Module):
+    """The modes of both ends, the energy in their amplitudes, and where to start. Arguments as for the space."""
+
+    def __init__(self, frame: Frame, levels: Levels, modes: Sequence[Tensor], references: Tensor, guess: bool) -> None:
+        super().__init__()
+        self.columns = frame.elastic_columns(torch.cat(frame.modes(*modes)))
+        self.energy = levels.modal(self.columns)
+        # With the blend as the base there is nothing left to guess.
+        self.guess = Guess(levels.mesh, self.columns.coarse, frame.coarsen(references)) if guess else None
 
 
 class JointSpace(nn.Module):
@@ -39,22 +64,44 @@ class JointSpace(nn.Module):
     Args:
         frame: Frame of the two bases.
         levels: The energies of the modal solve.
-        modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
+        modes: Modes of both ends. *Shape of each:* ``(k, V, 3)``.
         references: Shapes that the modes belong to, in the frame. *Shape:* ``(2, V, 3)``.
         fine: The fine mesh, if there is a blend by local rotations.
+        fused: Whether that is by kernels.
     """
 
     def __init__(
-        self, frame: Frame, levels: Levels, modes: Sequence[Tensor], references: Tensor, fine: Mesh | None
+        self,
+        frame: Frame,
+        levels: Levels,
+        modes: Sequence[Tensor],
+        references: Tensor,
+        fine: Mesh | None,
+        fused: bool = False,
     ) -> None:
         super().__init__()
         self.frame, self.levels = frame, levels
-        self.columns = frame.elastic_columns(torch.cat(list(modes)))
-        self.energy = levels.modal(self.columns)
-        # With the blend as the base there is nothing left to guess.
-        self.blend = None if fine is None else RotationBlend(fine.connectivity, references)
-        coarse = frame.coarsen(references)
-        self.guess = Guess(levels.mesh, self.columns.coarse, coarse) if fine is None else None
+        self.blend = None if fine is None else RotationBlend(fine.connectivity, references, fused)
+        self._modal: Any = None
+        self._make: Any = partial(_Modal, frame, levels, modes, references, guess=fine is None)
+
+    @property
+    def modal(self) -> "_Modal":
+        """What a smooth path does without, made at the first use."""
+        if self._modal is None:
+            with torch.no_grad():
+                self._modal, self._make = self._make(), None
+        return self._modal
+
+    @property
+    def columns(self) -> Columns:
+        """The modes of both ends."""
+        return self.modal.columns
+
+    @property
+    def energy(self) -> SumOfEnergies:
+        """In the amplitudes."""
+        return self.modal.energy
 
     @property
     def n_unknowns(self) -> int:
@@ -75,8 +122,10 @@ class JointSpace(nn.Module):
             anchors: Of the terms, in the frame. *Shape:* ``(B, P, 3)``.
         """
         levels = self.levels
-        difference = self._difference(pair)
-        extras = levels.seen(difference, self.frame.coarsen(difference))
+        coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
+        difference, column = self._difference(pair, coarse_second - coarse_first)
+        # The fine column is not needed before the end, unless terms look at vertices.
+        extras = levels.seen(self._column(difference), column) if levels.sampled else [column]
         difference, extras = trees.picked((difference, extras), index)
         start = None
         if pair.around is not None:
@@ -85,7 +134,6 @@ class JointSpace(nn.Module):
             references = levels.against(base, coarse, stiffness)
             placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
             return JointProblem(placement, start, base, difference)
-        coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
         rests_a, rests_b = (
             levels.rests(levels.seen(x, own)) for x, own in ((pair.first, coarse_first), (pair.second, coarse_second))
         )
@@ -96,9 +144,9 @@ class JointSpace(nn.Module):
         base = torch.lerp(first, second, t[:, None, None])
         coarse = torch.lerp(coarse_first, coarse_second, t[:, None, None])
         placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
-        if self.guess is not None:
+        if self.modal.guess is not None:
             with torch.no_grad():
-                start = self.guess(coarse_first, coarse_second, extras[0], t)
+                start = self.modal.guess(coarse_first, coarse_second, extras[0], t)
         if self.blend is not None:
             blend = self.blend(first, second, t)
             seen = levels.seen(blend, self.frame.coarsen(blend))
@@ -126,7 +174,8 @@ class JointSpace(nn.Module):
         if self.blend is None:
             return straight
         course = self.blend.rotations.course(around.before, pair.first, pair.second, around.after, around.spacing)
-        return self.blend.along(course if index is None else course.rows(index), straight, t)
+        which = torch.arange(len(t), device=t.device) if index is None else index
+        return self.blend.along(course, which, straight, t)
 
     @staticmethod
     def require(t: Tensor) -> None:
@@ -141,13 +190,23 @@ class JointSpace(nn.Module):
 
     def lift(self, a: Tensor, problem: JointProblem) -> Tensor:
         """The fine shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""
-        return problem.base + self.columns.combine(a[:, :-1]) + a[:, -1, None, None] * problem.difference
+        own = problem.difference
+        scale = own.scale * a[:, -1]
+        modal = self.columns.combine(a[:, :-1] - scale[:, None] * own.modal)
+        rigid = self.frame.rigid.combine(scale[:, None] * own.rigid)
+        return problem.base + modal - rigid + scale[:, None, None] * own.whole
 
-    def _difference(self, pair: Pair) -> Tensor:
-        """The part of ``x_b - x_a`` that the modes do not have, of length one. *Shape:* ``(B, V, 3)``."""
-        frame = self.frame
-        own = frame.remove(frame.remove(pair.second - pair.first, frame.rigid), self.columns)
-        squared = (frame.coarsen(own) ** 2 * frame.coarse_weights[:, None]).sum((-1, -2), keepdim=True)
+    def _difference(self, pair: Pair, coarse: Tensor) -> tuple[Difference, Tensor]:
+        """The difference of the key-frames as a column, and that on the coarse mesh. *Shape:* ``(B, V_coarse, 3)``."""
+        rigid, coarse = self.frame.split(coarse, self.frame.rigid)
+        modal, coarse = self.frame.split(coarse, self.columns)
+        squared = (coarse**2 * self.frame.coarse_weights[:, None]).sum((-1, -2))
         # Coincident key-frames leave no difference: its column is then zero, not a quotient of rounding errors.
-        rounding = 1e3 * torch.finfo(own.dtype).eps * pair.first.abs().amax((-1, -2), keepdim=True)
-        return own * (squared + rounding**2).rsqrt()
+        rounding = 1e3 * torch.finfo(coarse.dtype).eps * pair.first.abs().amax((-1, -2))
+        scale = (squared + rounding**2).rsqrt()
+        return Difference(pair.second - pair.first, rigid, modal, scale), coarse * scale[:, None, None]
+
+    def _column(self, own: Difference) -> Tensor:
+        """The difference as a column on the fine mesh. *Shape:* ``(B, V, 3)``."""
+        left = own.whole - self.frame.rigid.combine(own.rigid) - self.columns.combine(own.modal)
+        return own.scale[:, None, None] * left

@@ -43,6 +43,11 @@ class Levels(nn.Module):
         if sampled:
             self.energies.append(Energy(fine, sampled, sampled=True))
 
+    @property
+    def sampled(self) -> bool:
+        """Whether some terms are evaluated at vertices of the fine mesh."""
+        return len(self.energies) > 1
+
     def modal(self, columns: Columns) -> SumOfEnergies:
         """All of them in the amplitudes of a space."""
         coarse, *sampled = self.energies

@@ -108,13 +108,13 @@ class PairedSpace(nn.Module):
     Args:
         frame: Frame of the two bases.
         levels: The energies of the modal solve.
-        modes: Modes of both ends, in the frame. *Shape of each:* ``(k, V, 3)``.
+        modes: Modes of both ends. *Shape of each:* ``(k, V, 3)``.
     """
 
     def __init__(self, frame: Frame, levels: Levels, modes: Sequence[Tensor]) -> None:
         super().__init__()
         self.frame, self.levels = frame, levels
-        self.first, self.second = (frame.elastic_columns(end) for end in modes)
+        self.first, self.second = (frame.elastic_columns(end) for end in frame.modes(*modes))
         ends = (self.first, self.second)
         self.energy = PairedEnergy([levels.modal(end) for end in ends], ends, frame.weights > 0)
 

@@ -63,10 +63,10 @@ class ConvexHessian:
             on_corners.append(blocks)
         blocks = torch.cat(on_corners, -1)
         summed = blocks.new_zeros(*blocks.shape[:-1], self.energy.n_extended)
-        return _inverse_of_symmetric(summed.index_add(-1, self.energy.corners, blocks))
+        return inverse_of_symmetric(summed.index_add(-1, self.energy.corners, blocks))
 
 
-def _inverse_of_symmetric(blocks: Tensor) -> Tensor:
+def inverse_of_symmetric(blocks: Tensor) -> Tensor:
     """Inverse by cofactors, with a ridge. *Shape:* ``(3, 3, ...)``."""
     trace = blocks[0, 0] + blocks[1, 1] + blocks[2, 2]
     # Vertices that no face uses have no stiffness at all, and no gradient either.

@@ -20,6 +20,13 @@ from torch_modal.precompute.basis import ModalBasis
 from torch_modal.sequence.times import checked_times
 
 
+class _Lazy(InBetween):
+    """Pairs of a smooth path, which minimises nothing: what would is made only when asked for."""
+
+    def prepare(self) -> None:
+        """Nothing."""
+
+
 class Path(nn.Module):
     """Shapes at any time of a motion through key-frames.
 
@@ -64,7 +71,8 @@ class Path(nn.Module):
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
         self.register_buffer("times", checked_times(times, n, cyclic))
         pairs = [(i, (i + 1) % n) for i in range(n if cyclic else n - 1)]
-        self.layer = InBetween(list(bases), faces, objective=objective, solver=solver, pairs=pairs)
+        kind = _Lazy if smooth and n > 2 and not objective.terms else InBetween
+        self.layer = kind(list(bases), faces, objective=objective, solver=solver, pairs=pairs)
         self.cyclic = cyclic
         self.smooth = smooth
         #: Which pair of bases each interval has the modes of.

@@ -1,0 +1,244 @@
+"""Kernels against the torch code that they stand in for: values, gradients, vmap, and where they are not used."""
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+from torch.func import vmap
+
+import torch_modal as tm
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.shell import DIAGONAL
+from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
+from torch_modal.errors import MissingPackageError
+from torch_modal.geometry.hermite import Spacing
+from torch_modal.nn import launch
+from torch_modal.nn.fused import FusedRelax, FusedRotations
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+DOUBLE = torch.float64
+
+
+class Case:
+    """Two samples between two shapes each, with stiffnesses of each element."""
+
+    def __init__(self, shapes: Shapes, faces: Tensor, roughness: float) -> None:
+        generator = torch.Generator().manual_seed(0)
+        mesh = Mesh.of(faces, shapes.keyframes.shape[1])
+        self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
+        self.fused = FusedRelax(self.energy, mesh)
+        x = shapes.keyframes * (DIAGONAL / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
+        n_edges, n_hinges = len(mesh.edges), len(mesh.hinges)
+        stiffness = [
+            500 + 100 * torch.rand(2, n_edges, generator=generator, dtype=DOUBLE),
+            10 + torch.rand(2, n_hinges, generator=generator, dtype=DOUBLE),
+            torch.full((2, 1), 1e3, dtype=DOUBLE),
+        ]
+        t = torch.tensor([0.3, 0.6], dtype=DOUBLE)
+        start = torch.lerp(x[:2], x[1:3], 0.5)
+        start = start + roughness * torch.randn(start.shape, dtype=DOUBLE, generator=generator)
+        self.given = [start, x[:2].clone(), x[1:3].clone(), t, *stiffness]
+
+    def by_torch(self, *given: Tensor) -> Tensor:
+        return self.fused.oracle(2, 4, *given)
+
+    def by_warp(self, *given: Tensor) -> Tensor:
+        x, first, second, t, *stiffness = given
+        return self.fused(x, first, second, t, stiffness, 2, 4, 1)
+
+
+@pytest.fixture(params=["closed", "open", "flat"])
+def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
+    if request.param == "flat":  # no volume: its weight is bounded by the area
+        line = torch.linspace(0, 1, 6, dtype=DOUBLE)
+        grid = torch.stack([*torch.meshgrid(line, line, indexing="ij"), torch.zeros(6, 6, dtype=DOUBLE)], -1)
+        bent = grid + torch.stack([torch.zeros(6, 6), torch.zeros(6, 6), 0.3 * grid[..., 0] ** 2], -1)
+        shapes = torch.stack([grid, bent, 1.1 * bent]).flatten(1, 2)
+        corner = (6 * torch.arange(5)[:, None] + torch.arange(5)).flatten()
+        faces = torch.cat(
+            [torch.stack([corner, corner + 6, corner + 1], 1), torch.stack([corner + 1, corner + 6, corner + 7], 1)]
+        )
+        return Case(Shapes(shapes, faces, []), faces, 0.1)
+    faces = small_bars.faces[6:] if request.param == "open" else small_bars.faces
+    return Case(small_bars, faces, 0.3)
+
+
+def gradients(run, given: list[Tensor], create: bool = False) -> tuple[Tensor, ...]:
+    leaves = [value.clone().requires_grad_() for value in given]
+    out = run(*leaves)
+    weights = torch.randn(out.shape, dtype=out.dtype, generator=torch.Generator().manual_seed(1))
+    found = torch.autograd.grad((out * weights).sum(), leaves, create_graph=create)
+    if not create:
+        return found
+    return torch.autograd.grad(sum(g.square().sum() for g in found), leaves)
+
+
+def assert_alike(found: tuple[Tensor, ...], truth: tuple[Tensor, ...], to: float) -> None:
+    for got, wanted in zip(found, truth, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=0, atol=to * max(float(wanted.abs().max()), 0.01))
+
+
+def test_local_steps(case: Case) -> None:
+    found, truth = case.by_warp(*case.given), case.by_torch(*case.given)
+    assert float((truth - case.given[0]).abs().max()) > 1e-2
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-8 * DIAGONAL)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-7)
+
+
+def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 10.0)
+    case.given[5] *= 1e5
+    found, lengths = case.fused.steps(2, 4, *(value.contiguous() for value in case.given))
+    assert len(lengths.unique()) > 1 and float(lengths.min()) < 0.5, "no line search in this case"
+    torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * DIAGONAL)
+
+
+def test_gradient_where_the_steps_start(small_bars: Shapes) -> None:
+    # Edges that turned rigidly have a slope of rounding there: no kink may make noise of it.
+    case = Case(small_bars, small_bars.faces, 0.0)
+    start = case.given[1].clone()
+    given = [start, case.given[1], case.given[1].clone(), *case.given[3:]]
+    assert_alike(gradients(case.by_warp, given), gradients(case.by_torch, given), 1e-5)
+
+
+def test_gradients_of_gradients(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 0.3)
+    assert_alike(gradients(case.by_warp, case.given, True), gradients(case.by_torch, case.given, True), 1e-7)
+
+
+def test_vmap(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 0.3)
+    moved = torch.stack([case.given[0], 1.01 * case.given[0]])
+    found = vmap(lambda x: case.by_warp(x, *case.given[1:]))(moved)
+    truth = torch.stack([case.by_warp(x, *case.given[1:]) for x in moved])
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-12 * DIAGONAL)
+
+
+class TestRotations:
+    @pytest.fixture
+    def rotations(self, small_bars: Shapes) -> FusedRotations:
+        mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
+        return FusedRotations(mesh.connectivity, small_bars.keyframes[:2])
+
+    def test_between_two(self, rotations: FusedRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes
+        given = [x[:2].clone(), x[1:3].clone(), torch.tensor([0.3, 0.8], dtype=DOUBLE)]
+        torch.testing.assert_close(rotations(*given), rotations.oracle(*given), rtol=0, atol=1e-12)
+        assert_alike(gradients(rotations, given), gradients(rotations.oracle, given), 1e-9)
+        assert_alike(gradients(rotations, given, True), gradients(rotations.oracle, given, True), 1e-7)
+        found = vmap(lambda t: rotations(*given[:2], t.expand(2)))(given[2])
+        torch.testing.assert_close(found[1], rotations(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
+
+    def test_the_same_shape(self, rotations: FusedRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes[:1]
+        given = [x.clone(), x.clone(), torch.tensor([0.3], dtype=DOUBLE)]
+        assert_alike(gradients(rotations, given)[:2], gradients(rotations.oracle, given)[:2], 1e-7)
+
+    def test_on_a_course(self, rotations: FusedRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes
+        hours = Spacing(*(torch.ones(1, dtype=DOUBLE) for _ in range(3)))
+        which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
+
+        def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+            course = rotations.course(x[2:3], first, second, None, hours)
+            return kind.along(rotations, course, which, t)
+
+        def by_warp(*given: Tensor) -> Tensor:
+            return by(FusedRotations, *given)
+
+        def by_torch(*given: Tensor) -> Tensor:
+            return by(FusedRotations.__base__, *given)
+
+        given = [x[:1].clone(), x[1:2].clone(), t]
+        torch.testing.assert_close(by_warp(*given), by_torch(*given), rtol=0, atol=1e-12)
+        assert_alike(gradients(by_warp, given), gradients(by_torch, given), 1e-9)
+        assert_alike(gradients(by_warp, given, True), gradients(by_torch, given, True), 1e-7)
+        found = vmap(lambda t: by_warp(*given[:2], t))(torch.stack([t, 0.5 * t]))
+        torch.testing.assert_close(found[1], by_warp(*given[:2], 0.5 * t), rtol=0, atol=1e-12)
+
+
+class TestLayers:
+    @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+    def test_in_between(self, bars: Shapes, dtype: torch.dtype) -> None:
+        x_a, x_b = bars.keyframes[:2].to(dtype)
+        made = [tm.InBetween(bars.bases[:2], bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]
+        assert made[0].members[0].fused is not None and made[1].members[0].fused is None
+        found, truth = (layer.to(dtype)(x_a, x_b, torch.tensor([0.3, 0.5], dtype=dtype)) for layer in made)
+        assert found.dtype == dtype
+        torch.testing.assert_close(found, truth, rtol=0, atol=1e-7 if dtype == torch.float64 else 1e-4)
+
+    def test_path(self, bars: Shapes) -> None:
+        paths = [tm.Path(bars.bases, bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]
+        times = torch.tensor([0.2, 1.0, 1.7], dtype=DOUBLE)
+        found, truth = (path(bars.keyframes, times) for path in paths)
+        torch.testing.assert_close(found, truth, rtol=0, atol=1e-9)
+
+    def test_a_term_of_ones_own_is_torchs(self, bars: Shapes) -> None:
+        objective = tm.Objective(terms=(Volume(1.0),))
+        layer = tm.InBetween(bars.bases[:2], bars.faces, objective=objective)
+        assert layer.members[0].fused is None
+
+    def test_what_has_no_numbers_is_torchs(self, small_bars: Shapes) -> None:
+        from torch._subclasses import FakeTensorMode
+
+        layer = tm.InBetween(small_bars.bases[:2], small_bars.faces)
+        member = layer.members[0]
+        with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
+            x = mode.from_tensor(small_bars.keyframes[:1])
+            assert member.space.blend.rotations(x, x, mode.from_tensor(torch.zeros(1, dtype=DOUBLE))).shape[0] == 3
+
+
+class TestBackend:
+    def test_no_such_backend(self) -> None:
+        with pytest.raises(ValueError, match="backend is one of 'auto', 'torch', 'warp'; got 'cuda'"):
+            tm.Solver(backend="cuda")  # type: ignore[arg-type]
+
+    def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, small_bars: Shapes) -> None:
+        monkeypatch.setattr(launch, "find_spec", lambda name: None)
+        launch._works.cache_clear()
+        try:
+            assert tm.InBetween(small_bars.bases[:2], small_bars.faces).members[0].fused is None
+            with pytest.raises(MissingPackageError, match=r"pip install 'torch_modal\[warp\]'"):
+                tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
+        finally:
+            launch._works.cache_clear()
+
+    def test_not_usable(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def broken() -> None:
+            raise OSError("the cache folder is not writable")
+
+        monkeypatch.setattr(launch, "kernels", broken)
+        launch._works.cache_clear()
+        try:
+            with pytest.warns(UserWarning, match="the cache folder is not writable"):
+                assert not launch.has_kernels("auto")
+        finally:
+            launch._works.cache_clear()
+
+    def test_nothing_is_printed(self) -> None:
+        code = "from torch_modal.nn.launch import kernels; kernels()"
+        folder = Path(tm.__file__).parents[1]
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
+        assert result.returncode == 0 and result.stdout == "", result.stderr
+
+    def test_import_does_not_load_warp(self) -> None:
+        code = "import sys, torch_modal.nn.in_between; sys.exit('warp' in sys.modules)"
+        folder = Path(tm.__file__).parents[1]
+        assert subprocess.run([sys.executable, "-c", code], timeout=120, cwd=folder).returncode == 0
+
+
+def test_what_warp_says_of_itself_is_left_alone() -> None:
+    import warp
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        before = warp.config.log_level
+        launch.kernels.cache_clear()
+        launch.kernels()
+        assert warp.config.log_level == before

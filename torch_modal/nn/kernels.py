@@ -1,0 +1,678 @@
+"""Kernels for NVIDIA Warp: the three terms of Eq. 5 and local rotations, each element read once and written once.
+
+What they compute is what :mod:`torch_modal.energy` and :mod:`torch_modal.geometry.local_rotations` compute in many
+passes over all elements, and is tested equal to it. Importing this needs the package ``warp-lang``;
+:mod:`torch_modal.nn.fused` is the only module that does.
+
+Arrays are flat: entry ``s * n + i`` is the i-th of the n vertices, edges or faces of sample ``s``. A record belongs to
+an edge and to its hinge, where there is one: the vertices ``(i, j, k, l)`` of a row of
+:attr:`~torch_modal.geometry.connectivity.Connectivity.hinges`, with ``k = -1`` where there is none.
+"""
+
+import warp as wp
+
+from torch_modal.energy.measures import COLLAPSED
+from torch_modal.energy.terms import MAX_BENDING_RATIO, SLACK
+
+real = wp.float64
+vec3 = wp.vec3d
+vec4 = wp.vec4d
+packed_course = wp.types.vector(length=31, dtype=real)
+"""A row of :meth:`torch_modal.geometry.local_rotations.Course`, in the order of its parts."""
+symmetric = wp.types.vector(length=6, dtype=real)
+"""Entries ``xx, xy, xz, yy, yz, zz`` of a symmetric matrix."""
+stretched = wp.types.vector(length=5, dtype=real)
+"""An edge: unit vector, stiffness across it, and how much more along it."""
+bent = wp.types.vector(length=10, dtype=real)
+"""A hinge: gradients of the angle in the edge and in both tips, and the stiffness."""
+
+TINY = wp.constant(real(1.4916681462400413e-154))  # vectors.tiny of float64
+TINIEST = wp.constant(real(2.2250738585072014e-308))
+FLAT = wp.constant(real(COLLAPSED))
+RATIO = wp.constant(real(MAX_BENDING_RATIO))
+SLACKNESS = wp.constant(real(SLACK))
+TURN = wp.constant(real(6.283185307179586))
+HALF = wp.constant(real(0.5))
+RIDGE = wp.constant(real(1e-6))  # relax.RIDGE
+
+
+# ------------------------------------------------------------------------------------------------------------- elements
+@wp.func
+def length_of(e: vec3):
+    return wp.sqrt(wp.max(wp.dot(e, e), TINY))
+
+
+@wp.func
+def is_flat(e: vec3, n: vec3):
+    bound = FLAT * wp.dot(e, e)
+    return wp.dot(n, n) <= bound * bound + TINY
+
+
+@wp.func
+def wrapped(angle: real):
+    return angle - TURN * wp.floor(angle / TURN + HALF)
+
+
+@wp.func
+def squared(g: vec3):
+    return symmetric(g[0] * g[0], g[0] * g[1], g[0] * g[2], g[1] * g[1], g[1] * g[2], g[2] * g[2])
+
+
+@wp.func
+def applied(m: symmetric, g: vec3):
+    return vec3(
+        m[0] * g[0] + m[1] * g[1] + m[2] * g[2],
+        m[1] * g[0] + m[3] * g[1] + m[4] * g[2],
+        m[2] * g[0] + m[4] * g[1] + m[5] * g[2],
+    )
+
+
+@wp.func
+def inverted(m: symmetric):
+    trace = m[0] + m[3] + m[5]
+    if trace <= real(0.0):
+        trace = real(1.0)
+    a = m[0] / trace + RIDGE
+    d = m[3] / trace + RIDGE
+    f = m[5] / trace + RIDGE
+    b = m[1] / trace
+    c = m[2] / trace
+    e = m[4] / trace
+    aa = d * f - e * e
+    bb = c * e - b * f
+    cc = b * e - c * d
+    per = real(1.0) / ((a * aa + b * bb + c * cc) * trace)
+    return symmetric(per * aa, per * bb, per * cc, per * (a * f - c * c), per * (b * c - a * e), per * (a * d - b * b))
+
+
+@wp.func
+def angle_of(e: vec3, a: vec3, b: vec3, n1: vec3, n2: vec3):
+    return wp.atan2(-length_of(e) * wp.dot(n1, b), wp.dot(n1, n2))
+
+
+# ----------------------------------------------------------------------------------------------------------- references
+@wp.kernel(enable_backward=False)
+def total_length(x: wp.array(dtype=vec3), record: wp.array(dtype=wp.vec4i), n: int, total: wp.array(dtype=real)):
+    s, k = wp.tid()
+    q = record[k]
+    wp.atomic_add(total, s, length_of(x[s * n + q[1]] - x[s * n + q[0]]))
+
+
+@wp.func
+def bend_weight(e: vec3, n1: vec3, n2: vec3):
+    base = wp.dot(e, e)
+    area = HALF * (length_of(n1) + length_of(n2))
+    return base / wp.max(area, base / RATIO)
+
+
+@wp.kernel
+def rest(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    record: wp.array(dtype=wp.vec4i),
+    hinge: wp.array(dtype=wp.int32),
+    pull: wp.array(dtype=wp.vec2d),
+    shortest: wp.array(dtype=wp.vec2d),
+    alpha: wp.array(dtype=real),
+    beta: wp.array(dtype=real),
+    n: int,
+    n_alpha: int,
+    n_beta: int,
+    stretch: wp.array(dtype=wp.vec2d),
+    bend: wp.array(dtype=vec4),
+):
+    """Both rest shapes as one reference: Eq. 8. Weights are doubled, for derivatives."""
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    out = s * record.shape[0] + k
+    e1 = first[v + q[1]] - first[v + q[0]]
+    e2 = second[v + q[1]] - second[v + q[0]]
+    l1 = length_of(e1)
+    l2 = length_of(e2)
+    both = pull[s]
+    w1 = real(0.0)
+    w2 = real(0.0)
+    if l1 > shortest[s][0]:
+        w1 = both[0] / l1
+    if l2 > shortest[s][1]:
+        w2 = both[1] / l2
+    whole = w1 + w2
+    share = real(0.0)
+    if whole > real(0.0):
+        share = w2 / whole
+    own = alpha[s * n_alpha + wp.min(k, n_alpha - 1)]
+    stretch[out] = wp.vec2d(real(2.0) * own * whole, l1 + share * (l2 - l1))
+    if q[2] >= 0:
+        stiffness = real(2.0) * beta[s * n_beta + wp.min(hinge[k], n_beta - 1)]
+        a1 = first[v + q[2]] - first[v + q[0]]
+        b1 = first[v + q[3]] - first[v + q[0]]
+        a2 = second[v + q[2]] - second[v + q[0]]
+        b2 = second[v + q[3]] - second[v + q[0]]
+        m1 = wp.cross(e1, a1)
+        m2 = wp.cross(b1, e1)
+        n1 = wp.cross(e2, a2)
+        n2 = wp.cross(b2, e2)
+        p1 = real(0.0)
+        t1 = real(0.0)
+        p2 = real(0.0)
+        t2 = real(0.0)
+        if not (is_flat(e1, m1) or is_flat(e1, m2)):
+            p1 = stiffness * both[0] * bend_weight(e1, m1, m2)
+            t1 = angle_of(e1, a1, b1, m1, m2)
+        if not (is_flat(e2, n1) or is_flat(e2, n2)):
+            p2 = stiffness * both[1] * bend_weight(e2, n1, n2)
+            t2 = angle_of(e2, a2, b2, n1, n2)
+        bend[out] = vec4(p1, t1, p2, t2)
+
+
+# --------------------------------------------------------------------------------------------------- value, derivatives
+@wp.kernel(enable_backward=False)
+def value(
+    x: wp.array(dtype=vec3),
+    record: wp.array(dtype=wp.vec4i),
+    stretch: wp.array(dtype=wp.vec2d),
+    bend: wp.array(dtype=vec4),
+    n: int,
+    energy: wp.array(dtype=real),
+):
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    at = s * record.shape[0] + k
+    origin = x[v + q[0]]
+    e = x[v + q[1]] - origin
+    wanted = stretch[at]
+    d = length_of(e) - wanted[1]
+    found = wanted[0] * d * d
+    if q[2] >= 0:
+        a = x[v + q[2]] - origin
+        b = x[v + q[3]] - origin
+        n1 = wp.cross(e, a)
+        n2 = wp.cross(b, e)
+        theta = real(0.0)
+        if not (is_flat(e, n1) or is_flat(e, n2)):
+            theta = angle_of(e, a, b, n1, n2)
+        w = bend[at]
+        d1 = wrapped(theta - w[1])
+        d2 = wrapped(theta - w[3])
+        found += w[0] * d1 * d1 + w[2] * d2 * d2
+    wp.atomic_add(energy, s, HALF * found)
+
+
+@wp.kernel
+def linearise(
+    x: wp.array(dtype=vec3),
+    record: wp.array(dtype=wp.vec4i),
+    stretch: wp.array(dtype=wp.vec2d),
+    bend: wp.array(dtype=vec4),
+    n: int,
+    energy: wp.array(dtype=real),
+    gradient: wp.array(dtype=vec3),
+    diagonal: wp.array(dtype=symmetric),
+    edges: wp.array(dtype=stretched),
+    hinges: wp.array(dtype=bent),
+):
+    """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and what a product with it needs."""
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    at = s * record.shape[0] + k
+    origin = x[v + q[0]]
+    e = x[v + q[1]] - origin
+    base = wp.dot(e, e)
+    length = length_of(e)
+    per_length = real(0.0)
+    if base > TINY:
+        per_length = real(1.0) / length
+    wanted = stretch[at]
+    d = length - wanted[1]
+    slope = wanted[0] * d
+    unit = per_length * e
+    width = SLACKNESS * wanted[0] * length
+    across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
+    along = wanted[0] - across
+    edges[at] = stretched(unit[0], unit[1], unit[2], across, along)
+    block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
+    pull = slope * unit
+    wp.atomic_add(energy, s, HALF * slope * d)
+    wp.atomic_add(gradient, v + q[0], -pull)
+    wp.atomic_add(gradient, v + q[1], pull)
+    wp.atomic_add(diagonal, v + q[0], block)
+    wp.atomic_add(diagonal, v + q[1], block)
+    if q[2] >= 0:
+        a = x[v + q[2]] - origin
+        b = x[v + q[3]] - origin
+        n1 = wp.cross(e, a)
+        n2 = wp.cross(b, e)
+        w = bend[at]
+        if is_flat(e, n1) or is_flat(e, n2):
+            d3 = wrapped(-w[1])
+            d4 = wrapped(-w[3])
+            hinges[at] = bent()
+            wp.atomic_add(energy, s, HALF * (w[0] * d3 * d3 + w[2] * d4 * d4))
+        else:
+            theta = angle_of(e, a, b, n1, n2)
+            d1 = wrapped(theta - w[1])
+            d2 = wrapped(theta - w[3])
+            moment = w[0] * d1 + w[2] * d2
+            stiffness = w[0] + w[2]
+            ga = (-length / wp.dot(n1, n1)) * n1
+            gb = (-length / wp.dot(n2, n2)) * n2
+            ge = (-per_length * per_length) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)
+            gi = -(ga + gb + ge)
+            hinges[at] = bent(ge[0], ge[1], ge[2], ga[0], ga[1], ga[2], gb[0], gb[1], gb[2], stiffness)
+            wp.atomic_add(energy, s, HALF * (w[0] * d1 * d1 + w[2] * d2 * d2))
+            wp.atomic_add(gradient, v + q[0], moment * gi)
+            wp.atomic_add(gradient, v + q[1], moment * ge)
+            wp.atomic_add(gradient, v + q[2], moment * ga)
+            wp.atomic_add(gradient, v + q[3], moment * gb)
+            wp.atomic_add(diagonal, v + q[0], stiffness * squared(gi))
+            wp.atomic_add(diagonal, v + q[1], stiffness * squared(ge))
+            wp.atomic_add(diagonal, v + q[2], stiffness * squared(ga))
+            wp.atomic_add(diagonal, v + q[3], stiffness * squared(gb))
+
+
+@wp.kernel
+def product(
+    field: wp.array(dtype=vec3),
+    record: wp.array(dtype=wp.vec4i),
+    edges: wp.array(dtype=stretched),
+    hinges: wp.array(dtype=bent),
+    n: int,
+    out: wp.array(dtype=vec3),
+    form: wp.array(dtype=real),
+):
+    """The convex Hessian times a field, and the field times that."""
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    at = s * record.shape[0] + k
+    origin = field[v + q[0]]
+    e = field[v + q[1]] - origin
+    r = edges[at]
+    unit = vec3(r[0], r[1], r[2])
+    rate = wp.dot(unit, e)
+    to_j = r[3] * e + (r[4] * rate) * unit
+    wp.atomic_add(form, s, wp.dot(to_j, e))
+    if q[2] >= 0:
+        h = hinges[at]
+        ge = vec3(h[0], h[1], h[2])
+        ga = vec3(h[3], h[4], h[5])
+        gb = vec3(h[6], h[7], h[8])
+        change = wp.dot(ge, e) + wp.dot(ga, field[v + q[2]] - origin) + wp.dot(gb, field[v + q[3]] - origin)
+        moment = h[9] * change
+        wp.atomic_add(form, s, moment * change)
+        wp.atomic_add(out, v + q[0], -moment * (ga + gb + ge) - to_j)
+        wp.atomic_add(out, v + q[1], moment * ge + to_j)
+        wp.atomic_add(out, v + q[2], moment * ga)
+        wp.atomic_add(out, v + q[3], moment * gb)
+    else:
+        wp.atomic_add(out, v + q[0], -to_j)
+        wp.atomic_add(out, v + q[1], to_j)
+
+
+@wp.kernel
+def volume(
+    x: wp.array(dtype=vec3),
+    centre: wp.array(dtype=vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    n: int,
+    total: wp.array(dtype=real),
+    gradient: wp.array(dtype=vec3),
+):
+    """Volume of the tetrahedra from the centre to all faces, and its gradient where the centre does not move."""
+    s, k = wp.tid()
+    v = s * n
+    q = faces[k]
+    a = x[v + q[0]] - centre[s]
+    b = x[v + q[1]] - centre[s]
+    c = x[v + q[2]] - centre[s]
+    bc = wp.cross(b, c)
+    sixth = real(1.0 / 6.0)
+    wp.atomic_add(total, s, sixth * wp.dot(a, bc))
+    if gradient:
+        wp.atomic_add(gradient, v + q[0], sixth * bc)
+        wp.atomic_add(gradient, v + q[1], sixth * wp.cross(c, a))
+        wp.atomic_add(gradient, v + q[2], sixth * wp.cross(a, b))
+
+
+@wp.func
+def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
+    found = centre
+    if v >= 0:
+        found = x[at + v]
+    return found
+
+
+@wp.kernel
+def area(
+    x: wp.array(dtype=vec3),
+    centre: wp.array(dtype=vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    n: int,
+    total: wp.array(dtype=real),
+):
+    """Area of triangles; a vertex of -1 is the centre."""
+    s, k = wp.tid()
+    q = faces[k]
+    a = corner(x, centre[s], s * n, q[0])
+    b = corner(x, centre[s], s * n, q[1])
+    c = corner(x, centre[s], s * n, q[2])
+    wp.atomic_add(total, s, HALF * length_of(wp.cross(b - a, c - a)))
+
+
+# -------------------------------------------------------------------------------------------------- conjugate gradients
+@wp.kernel(enable_backward=False)
+def begin(
+    gradient: wp.array(dtype=vec3),
+    normal: wp.array(dtype=vec3),
+    moment: wp.array(dtype=real),
+    diagonal: wp.array(dtype=symmetric),
+    n: int,
+    residual: wp.array(dtype=vec3),
+    direction: wp.array(dtype=vec3),
+    solution: wp.array(dtype=vec3),
+    product: wp.array(dtype=vec3),
+    size: wp.array(dtype=real),
+    swept: wp.array(dtype=real),
+):
+    s, i = wp.tid()
+    v = s * n + i
+    r = -(gradient[v] + moment[s] * normal[v])
+    inverse = inverted(diagonal[v])
+    z = applied(inverse, r)
+    diagonal[v] = inverse
+    residual[v] = r
+    direction[v] = z
+    solution[v] = vec3()
+    product[v] = vec3()
+    wp.atomic_add(size, s, wp.dot(r, z))
+    wp.atomic_add(swept, s, wp.dot(normal[v], z))
+
+
+@wp.func
+def quotient(a: real, b: real):
+    # A sample that is solved exactly has nothing left: 0 / 0.
+    found = real(0.0)
+    if b > real(0.0):
+        found = a / b
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def advance(
+    direction: wp.array(dtype=vec3),
+    product: wp.array(dtype=vec3),
+    normal: wp.array(dtype=vec3),
+    inverse: wp.array(dtype=symmetric),
+    stiffness: wp.array(dtype=real),
+    swept: wp.array(dtype=real),
+    size: wp.array(dtype=real),
+    form: wp.array(dtype=real),
+    n: int,
+    solution: wp.array(dtype=vec3),
+    residual: wp.array(dtype=vec3),
+    next_size: wp.array(dtype=real),
+):
+    s, i = wp.tid()
+    v = s * n + i
+    push = stiffness[s] * swept[s]
+    step = quotient(size[s], form[s] + push * swept[s])
+    solution[v] = solution[v] + step * direction[v]
+    r = residual[v] - step * (product[v] + push * normal[v])
+    residual[v] = r
+    wp.atomic_add(next_size, s, wp.dot(r, applied(inverse[v], r)))
+
+
+@wp.kernel(enable_backward=False)
+def turn(
+    residual: wp.array(dtype=vec3),
+    inverse: wp.array(dtype=symmetric),
+    normal: wp.array(dtype=vec3),
+    size: wp.array(dtype=real),
+    next_size: wp.array(dtype=real),
+    n: int,
+    direction: wp.array(dtype=vec3),
+    product: wp.array(dtype=vec3),
+    swept: wp.array(dtype=real),
+):
+    s, i = wp.tid()
+    v = s * n + i
+    d = applied(inverse[v], residual[v]) + quotient(next_size[s], size[s]) * direction[v]
+    direction[v] = d
+    product[v] = vec3()
+    wp.atomic_add(swept, s, wp.dot(normal[v], d))
+
+
+@wp.kernel(enable_backward=False)
+def arrive(
+    x: wp.array(dtype=vec3),
+    direction: wp.array(dtype=vec3),
+    stiffness: wp.array(dtype=real),
+    swept: wp.array(dtype=real),
+    size: wp.array(dtype=real),
+    form: wp.array(dtype=real),
+    n: int,
+    solution: wp.array(dtype=vec3),
+    reached: wp.array(dtype=vec3),
+):
+    s, i = wp.tid()
+    v = s * n + i
+    step = quotient(size[s], form[s] + stiffness[s] * swept[s] * swept[s])
+    found = solution[v] + step * direction[v]
+    solution[v] = found
+    reached[v] = x[v] + found
+
+
+# ------------------------------------------------------------------------------------------------------ local rotations
+@wp.struct
+class Triangle:
+    e1: vec3
+    e2: vec3
+    normal: vec3
+    length: real
+    along: real
+    height: real
+
+
+@wp.func
+def triangle(p: vec3, q: vec3, r: vec3):
+    t = Triangle()
+    first = q - p
+    second = r - p
+    t.length = length_of(first)
+    t.e1 = first / t.length
+    t.along = wp.dot(second, t.e1)
+    rise = second - t.along * t.e1
+    t.height = wp.max(length_of(rise), real(1e-6) * (t.length + wp.abs(t.along)))  # triangle_frames._FLAT
+    t.e2 = rise / t.height
+    t.normal = wp.cross(t.e1, t.e2)
+    return t
+
+
+@wp.func
+def quaternion(a: Triangle, b: Triangle):
+    r = wp.outer(b.e1, a.e1) + wp.outer(b.e2, a.e2) + wp.outer(b.normal, a.normal)
+    w = real(1.0) + r[0, 0] + r[1, 1] + r[2, 2]
+    x = real(1.0) + r[0, 0] - r[1, 1] - r[2, 2]
+    y = real(1.0) - r[0, 0] + r[1, 1] - r[2, 2]
+    z = real(1.0) - r[0, 0] - r[1, 1] + r[2, 2]
+    wx = r[2, 1] - r[1, 2]
+    wy = r[0, 2] - r[2, 0]
+    wz = r[1, 0] - r[0, 1]
+    xy = r[0, 1] + r[1, 0]
+    xz = r[0, 2] + r[2, 0]
+    yz = r[1, 2] + r[2, 1]
+    largest = wp.max(wp.max(w, x), wp.max(y, z))
+    row = vec4(w, wx, wy, wz)
+    if w < largest:
+        if x == largest:
+            row = vec4(wx, x, xy, xz)
+        elif y == largest:
+            row = vec4(wy, xy, y, yz)
+        else:
+            row = vec4(wz, xz, yz, z)
+    return (HALF / wp.sqrt(wp.max(largest, real(2.220446049250313e-16)))) * row
+
+
+@wp.kernel(enable_backward=False)
+def turns(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    n: int,
+    quaternions: wp.array(dtype=vec4),
+    areas: wp.array(dtype=real),
+):
+    """Quaternions between the frames of triangles, and twice both areas."""
+    s, k = wp.tid()
+    v = s * n
+    f = faces[k]
+    a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
+    b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
+    quaternions[s * faces.shape[0] + k] = quaternion(a, b)
+    areas[s * faces.shape[0] + k] = a.length * a.height + b.length * b.height
+
+
+@wp.kernel(enable_backward=False)
+def senses(
+    quaternions: wp.array(dtype=vec4),
+    areas: wp.array(dtype=real),
+    order: wp.array(dtype=wp.int32),
+    parent: wp.array(dtype=wp.int32),
+    piece: wp.array(dtype=wp.int32),
+    n_pieces: int,
+    sign: wp.array(dtype=real),
+    vote: wp.array(dtype=real),
+):
+    """Signs passed down the tree, parents before children; then each piece votes. One thread for a sample."""
+    s = wp.tid()
+    n = order.shape[0]
+    for j in range(n):
+        k = order[j]
+        own = real(1.0)
+        if wp.dot(quaternions[s * n + k], quaternions[s * n + parent[k]]) < real(0.0):
+            own = real(-1.0)
+        if parent[k] != k:
+            own = own * sign[s * n + parent[k]]
+        sign[s * n + k] = own
+        q = quaternions[s * n + k]
+        vote[s * n_pieces + piece[k]] = vote[s * n_pieces + piece[k]] + areas[s * n + k] * own * q[0]
+    for k in range(n):
+        if vote[s * n_pieces + piece[k]] < real(0.0):
+            sign[s * n + k] = -sign[s * n + k]
+
+
+@wp.func
+def rotated(real_part: real, axis: vec3, v: vec3):
+    twice = real(2.0) * wp.cross(axis, v)
+    return v + real_part * twice + wp.cross(axis, twice)
+
+
+@wp.func
+def sinc(squared_angle: real):
+    # Of the square: with all derivatives at zero.
+    found = real(1.0) - squared_angle / real(6.0) * (
+        real(1.0) - squared_angle / real(20.0) * (real(1.0) - squared_angle / real(42.0))
+    )
+    if squared_angle >= real(1e-3):
+        angle = wp.sqrt(squared_angle)
+        found = wp.sin(angle) / angle
+    return found
+
+
+@wp.func
+def half_turn(q: vec4):
+    """Axis times half the angle: rotations._arc."""
+    axis = vec3(q[1], q[2], q[3])
+    sine = wp.dot(axis, axis)
+    factor = real(0.0)
+    if sine < real(1e-3) * q[0] * q[0] and q[0] > real(0.0):
+        t = sine / (q[0] * q[0])
+        factor = (
+            real(1.0) - t * (real(1.0 / 3.0) - t * (real(1.0 / 5.0) - t * (real(1.0 / 7.0) - t * real(1.0 / 9.0))))
+        ) / q[0]
+    else:
+        root = wp.sqrt(wp.max(sine, TINIEST))
+        factor = wp.atan2(root, q[0]) / root
+    return factor * axis
+
+
+@wp.func
+def add_sides(total: wp.array(dtype=vec4), edge: int, e: wp.vec3i, g: vec3, area: real, first: vec3, second: vec3):
+    s1 = (area * g[0]) * first
+    s2 = (area * g[1]) * (second - first)
+    s3 = (-area * g[2]) * second
+    wp.atomic_add(total, edge + e[0], vec4(s1[0], s1[1], s1[2], area))
+    wp.atomic_add(total, edge + e[1], vec4(s2[0], s2[1], s2[2], area))
+    wp.atomic_add(total, edge + e[2], vec4(s3[0], s3[1], s3[2], area))
+
+
+@wp.func
+def turned(half: vec3, v: vec3):
+    """A vector turned about an axis by twice its length."""
+    angle = wp.dot(half, half)
+    return rotated(wp.cos(wp.sqrt(wp.max(angle, TINIEST))), sinc(angle) * half, v)
+
+
+@wp.kernel
+def turned_edges(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    time: wp.array(dtype=real),
+    faces: wp.array(dtype=wp.vec3i),
+    sides: wp.array(dtype=wp.vec3i),
+    signs: wp.array(dtype=vec3),
+    sense: wp.array(dtype=real),
+    n: int,
+    n_edges: int,
+    total: wp.array(dtype=vec4),
+):
+    """Sides of all triangles at their times, summed on the edges by area, and the areas."""
+    s, k = wp.tid()
+    v = s * n
+    f = faces[k]
+    a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
+    b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
+    t = time[s]
+    half = t * half_turn(sense[s * faces.shape[0] + k] * quaternion(a, b))
+    x = a.length + t * (b.length - a.length)
+    y = a.along + t * (b.along - a.along)
+    z = a.height + t * (b.height - a.height)
+    one = turned(half, x * a.e1)
+    two = turned(half, y * a.e1 + z * a.e2)
+    add_sides(total, s * n_edges, sides[k], signs[k], a.length * a.height + b.length * b.height, one, two)
+
+
+@wp.kernel
+def course_edges(
+    course: wp.array(dtype=packed_course),
+    which: wp.array(dtype=wp.int32),
+    time: wp.array(dtype=real),
+    sides: wp.array(dtype=wp.vec3i),
+    signs: wp.array(dtype=vec3),
+    n_edges: int,
+    total: wp.array(dtype=vec4),
+):
+    """The same of triangles on a smooth course."""
+    s, k = wp.tid()
+    c = course[which[s] * sides.shape[0] + k]
+    e1 = vec3(c[0], c[1], c[2])
+    e2 = vec3(c[3], c[4], c[5])
+    normal = vec3(c[6], c[7], c[8])
+    u = time[s]
+    a = u * (real(1.0) - u) * (real(1.0) - u)
+    b = -u * (real(1.0) - u) * u
+    straight = (HALF * u) * vec3(c[12], c[13], c[14])
+    bend = HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26]))
+    unit = c[30]
+    length = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
+    along = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
+    height = c[11] + unit * (u * c[17] + a * c[23] + b * c[29])
+    one = turned(straight, turned(bend, vec3(length, real(0.0), real(0.0))))
+    two = turned(straight, turned(bend, vec3(along, height, real(0.0))))
+    area = c[9] * c[11] + (c[9] + unit * c[15]) * (c[11] + unit * c[17])
+    first = one[0] * e1 + one[1] * e2 + one[2] * normal
+    second = two[0] * e1 + two[1] * e2 + two[2] * normal
+    add_sides(total, s * n_edges, sides[k], signs[k], area, first, second)

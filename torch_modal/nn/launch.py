@@ -1,0 +1,96 @@
+"""Whether there are kernels, and how torch runs them: what NVIDIA Warp needs to be told."""
+
+import warnings
+from collections.abc import Sequence
+from functools import cache
+from importlib.util import find_spec
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torch_modal.errors import MissingPackageError
+
+Backend = Literal["auto", "torch", "warp"]
+
+
+@cache
+def kernels() -> Any:
+    """The module of the kernels, compiled for this machine by the first who asks, and kept on disk by Warp."""
+    import warp as wp
+
+    before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
+    try:
+        wp.init()
+        from torch_modal.nn import kernels as module
+
+        wp.load_module(module, device="cpu")
+    finally:
+        wp.config.log_level = before
+    return module
+
+
+@cache
+def _works() -> bool:
+    if find_spec("warp") is None:
+        return False
+    try:
+        kernels()
+    except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
+        warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
+        return False
+    return True
+
+
+def has_kernels(backend: Backend) -> bool:
+    """Whether kernels are used.
+
+    Raises:
+        MissingPackageError: ``"warp"`` is asked for and not installed.
+    """
+    if backend == "warp" and find_spec("warp") is None:
+        raise MissingPackageError("backend='warp' needs the package warp-lang: pip install 'torch_modal[warp]'")
+    return backend != "torch" and _works()
+
+
+def traced(x: Tensor) -> bool:
+    """Whether a tensor only stands for one (torch.compile, export, fake tensors), so that no kernel can have it."""
+    return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter)
+
+
+def _arrays(kernel: Any, given: Sequence[Any]) -> list[Any]:
+    """Tensors as flat arrays of the types that a kernel declares; what is no tensor stays."""
+    import warp as wp
+
+    found = []
+    for argument, value in zip(kernel.adj.args, given, strict=True):
+        if isinstance(value, Tensor):
+            inner = getattr(argument.type.dtype, "_length_", 1)
+            flat = value.detach().view(-1, inner) if inner > 1 else value.detach().view(-1)
+            value = wp.from_torch(flat, dtype=argument.type.dtype, return_ctype=True)
+        found.append(value)
+    return found
+
+
+def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Sequence[Any] | None = None) -> None:
+    """Run a kernel, or its adjoint, on the tensors' device and torch's stream.
+
+    Args:
+        kernel: Of :func:`kernels`.
+        dim: Number of threads.
+        given: What it takes, tensors contiguous.
+        adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
+    """
+    import warp as wp
+
+    device = next(value.device for value in given if isinstance(value, Tensor))
+    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    with wp.ScopedStream(stream):
+        wp.launch(
+            kernel,
+            dim=dim,
+            inputs=_arrays(kernel, given),
+            adj_inputs=[] if adjoints is None else _arrays(kernel, adjoints),
+            adjoint=adjoints is not None,
+            device=str(device),
+        )
