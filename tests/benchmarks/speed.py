@@ -87,15 +87,15 @@ def worker(name: str, backend: str, answer: str) -> None:
         (found,) = torch.autograd.grad(layer(leaf, x_b, 0.5).square().sum(), leaf)
         return found
 
-    found = {
+    found: dict[str, Any] = {
         "forward and backward": seconds(backward, 3),
         "making a layer": seconds(lambda: tm.InBetween(bases, case.faces, solver=solvers(backend)[0]), 3),
     }
     with torch.no_grad():
         found["whole"] = seconds(lambda: layer(x_a, x_b, 0.5), 8)
         found["without local steps"] = seconds(lambda: modal(x_a, x_b, 0.5), 8)
-        size = float((x_a.amax(0) - x_a.amin(0)).norm())
-        np.savez(answer, shape=layer(x_a, x_b, 0.5).numpy() / size, gradient=backward().numpy(), **found)
+        shape = layer(x_a, x_b, 0.5).numpy() / float((x_a.amax(0) - x_a.amin(0)).norm())
+    np.savez(answer, shape=shape, gradient=backward().numpy(), **found)
 
 
 def run(name: str, side: str, before: Path | None) -> dict[str, np.ndarray]:

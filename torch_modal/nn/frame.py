@@ -230,11 +230,15 @@ class _ClusterMeans(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[3:])
+        ctx.given = inputs[1:]
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
+        return _ClusterMeans.apply(tangent, *ctx.given)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        clusters, shares = ctx.saved_tensors
+        _, _, clusters, shares = ctx.given
         return shares[:, None] * grads[0].index_select(-2, clusters), None, None, None, None
 
     @staticmethod
