@@ -26,6 +26,7 @@ highlight_language = "none"  # of indented blocks: equations, tables, output
 nb_execution_mode = "off"  # tests/test_notebooks.py runs them
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
+mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@3/es5/tex-mml-chtml.js"  # what alone needs a network
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
 autodoc_member_order = "bysource"

@@ -25,6 +25,15 @@ HERE = "<!-- unlisted pages -->"
 """The line of index.md in whose place pages stand that no list has."""
 
 
+def parsed(directive: SphinxDirective, lines: list[str], markdown: bool = False) -> list[nodes.Node]:
+    """Text in the place of a directive of a Markdown page; that of docstrings is reStructuredText."""
+    node = nodes.section()
+    node.document = directive.state.document
+    text = lines if markdown else ["```{eval-rst}", *lines, "```"]
+    nested_parse_with_titles(directive.state, StringList(text, source=directive.env.docname), node)
+    return node.children
+
+
 # ----------------------------------------------------------------------------------------------------------- names
 def public_names() -> dict[str, list[str]]:
     """Public names by the floor that they come from, ``"root"`` for those of none, in the order of the stub."""
@@ -71,17 +80,10 @@ class PublicNames(SphinxDirective):
         self.env.note_dependency(str(PACKAGE / "__init__.pyi"))
         wanted, names = self.arguments[0], public_names()
         if wanted == "all":
-            lines = list(self._index(names))
-        elif wanted not in names:
+            return parsed(self, list(self._index(names)), markdown=True)
+        if wanted not in names:
             raise self.error(f"there is no floor {wanted!r} with public names; there are {', '.join(names)}")
-        else:
-            lines = [line for name in names[wanted] for line in directive_for(name)]
-        node = nodes.section()
-        node.document = self.state.document
-        # Docstrings are reStructuredText, the page is Markdown: autodoc's directives are parsed as the former.
-        text = "\n".join(["```{eval-rst}", *lines, "```"]) if wanted != "all" else "\n".join(lines)
-        nested_parse_with_titles(self.state, StringList(text.splitlines(), source=self.env.docname), node)
-        return node.children
+        return parsed(self, [line for name in names[wanted] for line in directive_for(name)])
 
     @staticmethod
     def _index(names: dict[str, list[str]]) -> Iterator[str]:
@@ -89,7 +91,7 @@ class PublicNames(SphinxDirective):
             yield f"- [](api/{floor}.md): " + ", ".join(f"[`{name}`](#torch_modal.{name})" for name in its_names)
 
 
-def literal_equations(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+def literal_blocks(lines: list[str]) -> list[str]:
     """Indented blocks of docstrings are equations or examples, as in Markdown: they are shown as they stand."""
     result: list[str] = []
     literal = False
@@ -101,10 +103,21 @@ def literal_equations(app: Sphinx, what: str, name: str, obj: Any, options: Any,
             literal = True
         elif line.strip() and not line.startswith(" "):
             literal = False
-        # Where a description begins with its shape, napoleon would take that for its type.
-        result.append(re.sub(r"\*(Shapes?[^*]*):\*", r"\1", line))
-    # Napoleon would take what stands before a colon in the first line of an attribute for its type.
-    lines[:] = ["", *result] if what in {"attribute", "property", "data"} else result
+        result.append(line)
+    return result
+
+
+def suit_napoleon(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Our docstrings as napoleon reads them.
+
+    It would take what stands before a colon at the beginning of a result or an attribute for its type.
+    """
+    found = [re.sub(r"\*(Shapes?[^*]*):\*", r"\1", line) for line in literal_blocks(lines)]
+    first = 0 if what in {"attribute", "property", "data"} else None
+    for number in [first, *(n + 1 for n, line in enumerate(found[:-1]) if line.strip() == "Returns:")]:
+        if number is not None and found:
+            found[number] = re.sub(r"^([^:`]*):(?= |$)", r"\1 –", found[number])
+    lines[:] = found
 
 
 # -------------------------------------------------------------------------------------------------------- commands
@@ -152,12 +165,7 @@ class BenchmarkList(SphinxDirective):
         for name, text in benchmarks().items():
             section = nodes.section(ids=[nodes.make_id(name)], names=[name])
             section += nodes.title("", name)
-            for part in re.split(r"\n\s*\n", text):
-                literal = part.startswith("    ")
-                kind = nodes.literal_block if literal else nodes.paragraph
-                section += kind("", inspect.cleandoc("\n" + part))
-                if literal:
-                    section[-1]["language"] = "sh"
+            section += parsed(self, literal_blocks(text.splitlines()))
             found.append(section)
         return found
 
@@ -228,7 +236,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("public-names", PublicNames)
     app.add_directive("command-help", CommandHelp)
     app.add_directive("benchmark-list", BenchmarkList)
-    app.connect("autodoc-process-docstring", literal_equations, priority=400)  # before napoleon
+    app.connect("autodoc-process-docstring", suit_napoleon, priority=400)  # before napoleon
     app.connect("source-read", list_unlisted)
     app.connect("env-get-outdated", always_index)
     app.connect("builder-inited", write_shape_pages)
