@@ -58,7 +58,7 @@ def directive_for(name: str) -> list[str]:
     if callable(value):
         return [f".. autofunction:: torch_modal.{name}", ""]
     lines = described_at_home(name)
-    return [f".. py:data:: torch_modal.{name}", "", *(f"   {line}" for line in lines), ""]
+    return [".. py:currentmodule:: torch_modal", f".. py:data:: {name}", "", *(f"   {line}" for line in lines), ""]
 
 
 def described_at_home(name: str) -> list[str]:
