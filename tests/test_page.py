@@ -19,6 +19,8 @@ from browsers import NoBrowser, console, open_browser, open_page, requests
 import torch_modal as tm
 from torch_modal.cli.main import main
 from torch_modal.errors import MeshError
+from torch_modal.keyframes.load import load_keyframes
+from torch_modal.keyframes.registration.landmarks import read_landmarks
 from torch_modal.view.page_data import LEVELS, grid_of, pack_faces, pack_frames, quantise
 from torch_modal.view.page_input import read_shapes
 
@@ -569,3 +571,92 @@ def test_without_webgl(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], grow
             open_page(browser, path)
     except NoBrowser as reason:
         pytest.skip(f"no page can be opened: {reason}")
+
+
+# ------------------------------------------------------------------------------------------------------- landmarks
+@pytest.fixture
+def two(ball: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> list[Path]:
+    """A ball, and a box of another connectivity elsewhere."""
+    box = trimesh.creation.box(extents=(4, 2, 3)).subdivide().subdivide().subdivide()
+    meshes = [tmp_path / "ball.obj", tmp_path / "box.ply"]
+    trimesh.Trimesh(*ball, process=False).export(meshes[0])
+    trimesh.Trimesh(box.vertices + 50, box.faces, process=False).export(meshes[1])
+    return meshes
+
+
+def test_landmarks_are_picked_and_saved(chrome: Any, two: list[Path], tmp_path: Path) -> None:
+    """Two are there, one is picked on both meshes; what Save writes is what `--landmarks` reads."""
+    given = tmp_path / "given.txt"
+    given.write_text("3 5\n7 9\n")
+    out = tmp_path / "pick.html"
+    assert main(["view", *map(str, two), "--landmarks", str(given), "--page", str(out), "--quiet"]) == 0
+    page = Opened(chrome, out)
+    assert read_text(page) == [[3, 5], [7, 9]]
+    shapes = [load_keyframes([path]).keyframes[0].numpy() for path in two]
+    # The vertices that are straight towards the viewer: each mesh is seen on its own.
+    places = [(panel.rect["x"] + panel.rect["width"] / 2, panel.rect["y"] + panel.rect["height"] / 2)
+              for panel in chrome.find_elements("css selector", ".panel")]  # fmt: skip
+    page.click_at(*places[1])
+    assert "ball.obj" in page.text("#hint") and read_text(page) == [[3, 5], [7, 9]], "not whole yet"
+    page.click_at(places[1][0] + 40, places[1][1])  # another vertex of the same landmark
+    page.click_at(*places[0])
+    rows = read_text(page)
+    assert len(rows) == 3
+    for mesh, vertex in enumerate(rows[2]):
+        place = page.script("return torchModal.placeOf(arguments[0], arguments[1])", vertex, mesh)
+        away = np.hypot(place["x"] - places[mesh][0] - 40 * mesh, place["y"] - places[mesh][1])
+        assert vertex < len(shapes[mesh]) and away < 40, "the vertex that was clicked on"
+    assert [mark.text for mark in chrome.find_elements("css selector", ".mark")] == ["1", "2", "3"] * 2
+    chrome.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+    page.click("#save")
+    saved = tmp_path / "landmarks.txt"
+    for _ in range(100):
+        if saved.exists():
+            break
+        time.sleep(0.05)
+    assert saved.read_text().splitlines()[0] == "# ball.obj  box.ply"
+    np.testing.assert_array_equal(read_landmarks(saved, 2), rows)
+    page.click("#undo")
+    assert read_text(page) == [[3, 5], [7, 9]]
+    page.click("#chips button")
+    assert len(chrome.find_elements("css selector", "#chips button")) == 2
+    page.click("#clear")
+    assert read_text(page) == [] and not chrome.find_element("id", "save").is_enabled()
+    page.click("#undo")
+    assert read_text(page) == [[7, 9]]
+    assert not console(chrome)
+
+
+def read_text(page: Opened) -> list[list[int]]:
+    """The landmarks of a page."""
+    lines = page.script("return torchModal.text").splitlines()
+    return [[int(word) for word in line.split()] for line in lines if not line.startswith("#")]
+
+
+def test_landmarks_as_points_become_vertices(two: list[Path], tmp_path: Path) -> None:
+    shapes = [load_keyframes([path]).keyframes[0].numpy() for path in two]
+    file, out = tmp_path / "points.txt", tmp_path / "page.html"
+    file.write_text(" ".join(map(str, [*(shapes[0][4] + 1e-4), *(shapes[1][6] - 1e-4)])))
+    assert main(["view", *map(str, two), "--landmarks", str(file), "--page", str(out)]) == 0
+    assert data_of(tm.Page(out.read_text(encoding="utf-8")))["landmarks"] == [[4, 6]]
+
+
+def test_landmarks_that_cannot_be_shown(
+    two: list[Path], ball: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "wrong.txt"
+    file.write_text("3 99999")
+    pages = ["--page", str(tmp_path / "page.html")]
+    assert main(["view", *map(str, two), "--landmarks", str(file), *pages]) == 1
+    assert "names vertex 99999 of mesh 1" in capsys.readouterr().err
+    for wrong in (["--linear"], ["--names", "a"], ["--live"]):
+        with pytest.raises(SystemExit):
+            main(["view", *map(str, two), *pages, *wrong, "--landmarks"])
+    with pytest.raises(SystemExit):
+        main(["view", str(two[0]), "--landmarks", *pages])
+    with pytest.raises(ValueError, match="two meshes or more"):
+        tm.show_landmarks({"a": ball})
+    with pytest.raises(ValueError, match="a column for each of the 2"):
+        tm.show_landmarks({"a": ball, "b": ball}, np.zeros((3, 3), dtype=int))
+    with pytest.raises(ValueError, match="vertices of the meshes from 0"):
+        tm.show_landmarks({"a": ball, "b": ball}, np.array([[0, -1]]))

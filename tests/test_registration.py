@@ -20,7 +20,7 @@ from torch_modal.keyframes.registration.register import register
 from torch_modal.keyframes.registration.report import measure
 from torch_modal.keyframes.registration.sequence import landmark_table
 from torch_modal.keyframes.registration.spectrum import SpectralShape
-from torch_modal.keyframes.registration.surface import Surface, largest_piece, outward, referenced
+from torch_modal.keyframes.registration.surface import Surface, largest_piece, outward, referenced, sewn, without_dust
 from torch_modal.view import drawing, landmarks
 
 for library in ("robust_laplacian", "potpourri3d", "igl"):
@@ -274,6 +274,42 @@ def test_pieces_and_winding() -> None:
     np.testing.assert_array_equal(outward(rest, faces), outward(rest, faces[:, ::-1])[:, ::-1][:, ::-1][:, [0, 1, 2]])
     small, used = referenced(rest, faces[:4])
     np.testing.assert_array_equal(small.vertices, rest[used])
+
+
+def cut_through(vertices: np.ndarray, faces: np.ndarray, gap: float) -> tuple[Surface, np.ndarray]:
+    """Without the faces of a band across the first bump, and which of the vertices that are left lie beyond it."""
+    along = vertices @ (direction := np.array([1, 0.2, 0.1]) / np.linalg.norm([1, 0.2, 0.1]))
+    at = 0.6 * along.max()
+    kept = np.abs(vertices[faces].mean(1) @ direction - at) > gap
+    surface, used = referenced(vertices, faces[kept])
+    return surface, along[used] > at
+
+
+def test_what_a_cut_has_parted_is_sewn_on() -> None:
+    """Sewn up, a tip that is cut off is as far from the rest as before; dust and distant pieces are left alone."""
+    rest, faces = limbs(5)
+    cut, beyond = cut_through(rest, faces, 0.15)
+    assert cut.connectivity.vertex_pieces.max() == 1 and 200 < beyond.sum() < 0.2 * len(beyond)
+    whole = largest_piece(sewn(cut, 0.04))
+    assert len(whole.vertices) == len(cut.vertices)
+    shape, before = SpectralShape(cut), SpectralShape(Surface(rest, faces))
+    tip, far = rest[(rest @ [1, 0.2, 0.1]).argmax()], rest[(rest @ [1, 0.2, 0.1]).argmin()]
+    lengths = []
+    for one in (shape, before):
+        ends = [int(np.linalg.norm(one.positions - place, axis=1).argmin()) for place in (tip, far)]
+        lengths.append(one.geodesics_from(np.array(ends[:1]))[ends[1], 0] * one.scale)
+    assert lengths[0] == pytest.approx(lengths[1], rel=0.08)
+    assert sewn(cut, 0.001).connectivity.vertex_pieces.max() == 1, "the gap is wider"
+    speck = Surface(np.vstack([rest, rest[0] + 0.1 * np.eye(3)]), np.vstack([faces, len(rest) + np.arange(3)[None]]))
+    assert len(without_dust(speck).vertices) == len(rest)
+
+
+def test_a_limb_that_is_cut_off_stays_where_it_belongs(pair: tuple[Mesh, Mesh, np.ndarray]) -> None:
+    (rest, faces), _, _ = pair
+    cut, _ = cut_through(*limbs(5), 0.15)
+    moved = Surface(bent(cut.vertices), cut.faces)
+    result = register(rest, faces, moved.vertices, moved.faces, progress=False)
+    assert not result.doubtful and errors(result, bent(rest)).mean() < 1.0
 
 
 def test_spectrum_of_the_sphere() -> None:

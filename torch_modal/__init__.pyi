@@ -58,9 +58,10 @@ from .sequence.subdivide import keyframe_places as keyframe_places
 from .sequence.subdivide import linear_sequence as linear_sequence
 from .sequence.subdivide import subdivide as subdivide
 from .view.animation import save_animation as save_animation
+from .view.document import Page as Page
+from .view.landmark_page import show_landmarks as show_landmarks
 from .view.live import LiveSession as LiveSession
 from .view.live import live as live
-from .view.page import Page as Page
 from .view.page import show as show
 from .view.page import write_page as write_page
 from .view.picture import render_sequence as render_sequence

@@ -8,9 +8,12 @@ import webbrowser
 from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch_modal.cli.output import check_output, check_page
+
+if TYPE_CHECKING:
+    from torch_modal.view.document import Page
 
 SUMMARY = "look at sequences of shapes, in a page for the browser"
 
@@ -21,6 +24,9 @@ distance or volume change, pick vertices and copy their indices.
 The page is one HTML file that needs no network. Shapes are numbered mesh files, a
 folder of them, or a GLB that `subdivide` or save_animation wrote.
 
+With --landmarks, they are meshes of any connectivity, side by side, on which vertices
+that belong together are picked, for `register` and `subdivide --register`.
+
 With --live, they are key-frames, and what lies between is computed while you drag
 the time, the stiffnesses, single modes, or handles of the key-frames."""
 
@@ -30,6 +36,8 @@ examples:
     torch-modal view hand.glb --linear
   write a page of three sequences side by side:
     torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
+  pick landmarks on two meshes, and save them as the file that --landmarks of `register` takes:
+    torch-modal view cat.obj dog.obj --landmarks
   drag what lies between two key-frames (pip install 'torch_modal[view]'):
     torch-modal view --live open.obj fist.obj"""
 
@@ -71,6 +79,13 @@ def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None
     sub.add_argument(
         "--page", type=Path, metavar="FILE", help="write the page there, as .html (default: a temporary file, opened)"
     )
+    sub.add_argument(
+        "--landmarks",
+        nargs="?",
+        const=True,
+        metavar="FILE",
+        help="a page to pick landmarks of two meshes or more; with a FILE, those of it are there already",
+    )
     sub.add_argument("--live", action="store_true", help="a live session of key-frames, in place of a page")
     sub.add_argument(
         "--port", type=number(int, 1), metavar="N", default=8080, help="of --live, the first to try (default: 8080)"
@@ -87,6 +102,9 @@ def run(args: argparse.Namespace) -> None:
         _live(args)
         return
     check_page(args, "--page", args.page)
+    if args.landmarks:
+        _landmarks(args)
+        return
     given = [args.meshes, *args.compare]
     n_sequences = len(given) + args.linear
     if args.names and len(args.names) != n_sequences:
@@ -107,18 +125,51 @@ def run(args: argparse.Namespace) -> None:
         up=args.up,
         title=args.title or next(iter(sequences)),
     )
+    shapes = next(iter(sequences.values()))
+    times = f"{len(sequences)} x " if len(sequences) > 1 else ""
+    _open(page, f"{times}{len(shapes)} shapes of {shapes.shape[1]} vertices", args)
+
+
+def _open(page: Page, what: str, args: argparse.Namespace) -> None:
+    """Write the page, and open it if it is not wanted as a file."""
     written = page.save(args.page or _temporary_file(), args.overwrite)
     if not args.quiet:
-        shapes = next(iter(sequences.values()))
-        times = f"{len(sequences)} x " if len(sequences) > 1 else ""
-        print(f"{times}{len(shapes)} shapes of {shapes.shape[1]} vertices: {written}", flush=True)
+        print(f"{what}: {written}", flush=True)
     if not args.page and not webbrowser.open(written.absolute().as_uri()):
         print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {written}")
+
+
+def _landmarks(args: argparse.Namespace) -> None:
+    """Meshes of any connectivity, to pick landmarks on."""
+    of_sequences = {"--compare": args.compare, "--linear": args.linear, "--keyframes": args.keyframes}
+    given = [option for option, value in of_sequences.items() if value]
+    if given:
+        args.fail(f"{', '.join(given)} belong to sequences; --landmarks shows single meshes")
+    if len(args.meshes) < 2:
+        args.fail("--landmarks needs two meshes or more")
+    if args.names and len(args.names) != len(args.meshes):
+        args.fail(f"--names names {len(args.names)} meshes, but there are {len(args.meshes)}")
+    if args.page:
+        inputs = args.meshes if args.landmarks is True else [*args.meshes, Path(args.landmarks)]
+        check_output([args.page], inputs, args.overwrite, option="--page")
+
+    import torch_modal as tm
+    from torch_modal.io.read import read_mesh
+    from torch_modal.keyframes.registration.landmarks import landmark_vertices
+
+    meshes = [read_mesh(path) for path in args.meshes]
+    rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
+    names = args.names or [path.name for path in args.meshes]
+    if len(set(names)) < len(names):
+        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
+    page = tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title=args.title or "Landmarks")
+    _open(page, f"{len(meshes)} meshes to pick landmarks on", args)
 
 
 def _live(args: argparse.Namespace) -> None:
     """Key-frames in a live session, until Ctrl-C."""
     of_pages = {"--page": args.page, "--compare": args.compare, "--linear": args.linear, "--names": args.names}
+    of_pages["--landmarks"] = args.landmarks
     given = [option for option, value in of_pages.items() if value]
     if given:
         args.fail(f"{', '.join(given)} belong to pages; --live shows what is computed now")

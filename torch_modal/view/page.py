@@ -1,86 +1,30 @@
-"""A page to look at: sequences of shapes in one HTML file that needs nothing else, neither files nor a network.
-
-The files in page_assets are joined with the shapes (page_data.py). The page names the scripts that may run by their
-hashes, and forbids itself all else, so that nothing that stands in a file name or title can do anything.
-"""
+"""A page to look at: sequences of shapes, packed by page_data.py, in one HTML file."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import html
-import json
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from torch_modal.io.write import (
-    PAGES,
     FloatArray,
     IntArray,
     check_frames,
     check_indices,
-    check_suffix,
-    refuse_existing,
     to_numpy,
-    write_file,
 )
-from torch_modal.version import __version__
+from torch_modal.view.document import Page, checked_path, document
 from torch_modal.view.page_data import grid_of, pack_faces, pack_frames, quantise
 from torch_modal.view.picture import check_view, up_axis, view_rotation
 
 if TYPE_CHECKING:
     from torch_modal.io.write import Array
 
-__all__ = ["Page", "show", "write_page"]
+__all__ = ["show", "write_page"]
 
-PROGRAM = ("decode.js", "measure.js", "stage.js", "timeline.js", "page.js")
-POLICY = "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 'none'"
-
-
-class Page:
-    """A page of shapes: shown by notebooks where it is the last value of a cell, or saved.
-
-    Attributes:
-        html: The whole page.
-        height: Pixels that it takes in a notebook.
-    """
-
-    def __init__(self, html: str, height: int = 600) -> None:
-        self.html = html
-        self.height = height
-
-    def __repr__(self) -> str:
-        return f"<torch_modal.Page of {len(self.html) / 1e6:.1f} MB; its save(path) writes it>"
-
-    def _repr_html_(self) -> str:
-        # The sandbox keeps the page's scripts apart from the notebook's.
-        return (
-            '<iframe sandbox="allow-scripts" allow="clipboard-write" loading="lazy" '
-            f'style="width: 100%; height: {self.height}px; border: 1px solid #dde3e9; border-radius: 8px" '
-            f'srcdoc="{html.escape(self.html)}"></iframe>'
-        )
-
-    def save(self, out: str | Path, overwrite: bool = False) -> Path:
-        """Write the page as one HTML file.
-
-        Args:
-            out: File to write, ``*.html``.
-            overwrite: Replace the file if it exists.
-
-        Returns:
-            The file.
-
-        Raises:
-            ValueError: ``out`` does not end in .html.
-            FileExistsError: The file exists and ``overwrite`` is off.
-        """
-        path = _checked_path(out, overwrite)
-        write_file(path, self.html.encode("utf-8"))
-        return path
+SCRIPTS = ("dom.js", "decode.js", "measure.js", "stage.js", "timeline.js", "page.js")
 
 
 def show(
@@ -148,10 +92,9 @@ def show(
         "fps": float(fps),
         "closed": closed,
         "keyframes": keyframes,
-        **_content(checked, triangles, view_rotation(shapes[0][0], view, up)),
+        **packed(checked, triangles, view, up),
     }
-    data["view"]["world_up"] = [0, 1, 0] if up_axis(shapes[0][0], up) == "y" else [0, 0, 1]
-    return Page(_document(title, data), height)
+    return Page(document("page.html", SCRIPTS, title, data), height)
 
 
 def write_page(
@@ -190,7 +133,7 @@ def write_page(
         ValueError: An argument cannot be used; the message says why.
         FileExistsError: The file exists and ``overwrite`` is off.
     """
-    path = _checked_path(out, overwrite)
+    path = checked_path(out, overwrite)
     page = show(
         sequences,
         faces,
@@ -205,13 +148,6 @@ def write_page(
     return page.save(path, overwrite)
 
 
-def _checked_path(out: str | Path, overwrite: bool) -> Path:
-    path = Path(out)
-    check_suffix(path, PAGES)
-    refuse_existing(path, overwrite)
-    return path
-
-
 def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
     stamps: FloatArray = np.asarray(to_numpy(times), dtype=np.float64)  # type: ignore[arg-type]
     if stamps.shape != (n_frames,) or not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
@@ -222,14 +158,20 @@ def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
     return stamps
 
 
-def _content(sequences: dict[str, FloatArray], faces: IntArray, rotation: FloatArray) -> dict[str, Any]:
-    """Shapes and faces packed, and how they are first seen; lengths in steps of the grid."""
+def packed(
+    sequences: dict[str, FloatArray],
+    faces: IntArray,
+    view: tuple[float, float] | None = None,
+    up: Literal["y", "z"] | None = None,
+) -> dict[str, Any]:
+    """Shapes and faces for a page, and how they are first seen; lengths in steps of the grid."""
+    first = next(iter(sequences.values()))[0]
+    rotation = view_rotation(first, view, up)
     grid = grid_of(list(sequences.values()))
     numbers = {name: quantise(frames, grid) for name, frames in sequences.items()}
     # The box around everything along right, up and front: its middle is what the camera turns around.
     low = np.min([_extreme(frames, rotation, np.min) for frames in numbers.values()], axis=0)
     high = np.max([_extreme(frames, rotation, np.max) for frames in numbers.values()], axis=0)
-    first = next(iter(sequences.values()))[0]
     return {
         "origin": grid.origin.tolist(),
         "step": grid.step,
@@ -242,6 +184,7 @@ def _content(sequences: dict[str, FloatArray], faces: IntArray, rotation: FloatA
             "front": rotation[2].tolist(),
             "centre": (0.5 * (low + high) @ rotation).tolist(),
             "half": (0.5 * (high - low)).tolist(),
+            "world_up": [0, 1, 0] if up_axis(first, up) == "y" else [0, 0, 1],
         },
     }
 
@@ -250,37 +193,3 @@ def _extreme(numbers: Any, rotation: FloatArray, which: Any) -> FloatArray:
     """Least or largest coordinates of shapes ``(N, V, 3)`` in view directions, a frame at a time to save memory."""
     found: FloatArray = which([which(shape @ rotation.T, axis=0) for shape in numbers], axis=0)
     return found
-
-
-def _document(title: str, data: dict[str, Any]) -> str:
-    """The page's text. What callers named is escaped; scripts and style are allowed by their hashes."""
-    assets = files("torch_modal.view") / "page_assets"
-
-    def asset(*names: str) -> str:
-        return "\n".join((assets / name).read_text(encoding="utf-8") for name in names)
-
-    style, library = asset("page.css"), asset("three.min.js")
-    # In a function of its own, and strict.
-    program = f'(() => {{\n"use strict";\n{asset(*PROGRAM)}}})();\n'
-    policy = f"{POLICY}; style-src {_hash(style)}; script-src {_hash(library)} {_hash(program)}"
-    parts = {
-        "@POLICY@": policy,
-        "@GENERATOR@": f"torch_modal {__version__}",
-        "@TITLE@": html.escape(title),
-        "@STYLE@": style,
-        "@DATA@": json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
-        "@LIBRARY@": library,
-        "@PROGRAM@": program,
-    }
-    # Each marker is replaced where it stands in the template, not in what came in its place.
-    text, pieces = asset("page.html"), []
-    while text:
-        place, marker = min(((text.find(m), m) for m in parts if m in text), default=(len(text), ""))
-        pieces += [text[:place], parts.get(marker, "")]
-        text = text[place + len(marker) :]
-    return "".join(pieces)
-
-
-def _hash(text: str) -> str:
-    """What a content security policy calls an inline script or style."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"

@@ -1,11 +1,13 @@
 """Landmarks: points that belong together; their files, and suggestions where to put them."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from torch_modal.errors import MeshError
 from torch_modal.keyframes.check import check_keyframes
@@ -122,6 +124,25 @@ def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | Fl
         raise MeshError(f"{path}: no landmarks in this file; write a line for each, with a vertex number for each mesh")
     table = np.array(rows)
     return table.astype(np.int64) if table.shape[1] == n_meshes else table.reshape(-1, n_meshes, 3)
+
+
+def landmark_vertices(path: str | os.PathLike[str], shapes: Sequence[FloatArray]) -> IntArray:
+    """The landmarks of a file as vertices of the meshes: of points, the nearest ones. *Shape:* ``(n, K)``.
+
+    Args:
+        path: As for `read_landmarks`.
+        shapes: Vertices of the K meshes. *Shape of each:* ``(V, 3)``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        MeshError: A line cannot be used, or a mesh has no such vertex.
+    """
+    table: Any = read_landmarks(path, len(shapes))
+    if table.ndim == 3:
+        return np.stack([cKDTree(shape).query(table[:, k])[1] for k, shape in enumerate(shapes)], axis=1)
+    for k, shape in enumerate(shapes):
+        vertices_named(table[:, k], shape, f"mesh {k}")
+    return np.asarray(table, dtype=np.int64)
 
 
 def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArray:

@@ -1,6 +1,7 @@
 """One mesh laid onto another: the whole path, from two meshes to a report."""
 
 import os
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from torch_modal.keyframes.registration.maps import (
     landmark_map,
     rate,
     spectral_maps,
+    zoom_out,
 )
 from torch_modal.keyframes.registration.report import Quality, Registration, judge, measure
 from torch_modal.keyframes.registration.spectrum import SpectralShape
@@ -29,7 +31,7 @@ from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Sur
 from torch_modal.keyframes.seams import weld_seams
 from torch_modal.progress import Progress, ProgressReport
 
-VERSION = 2
+VERSION = 3
 """Part of the key of kept results: raise it when the algorithm changes."""
 FEWEST_ACROSS = 5
 """Landmarks that two different subjects need: their spectra do not tell which map is right."""
@@ -40,6 +42,9 @@ _NEAR_LANDMARK = 0.1  # of a surface of area one: spectral maps further off are 
 _RIVALS = 3  # maps that are fitted before one is chosen
 _RIVAL_SCORE = 0.15  # behind the best, in score minus distortion
 _SAME = 0.1  # maps that differ by less at all but 2 % of the vertices, of a surface of area one, count as one
+_REFINEMENTS = (True, True, False, False)  # whether the map of each is refined by spectra first
+_AT_REST = 0.3  # mean way of the vertices in one of them, in percent of the diagonal, that is none
+_WORSE = 0.05  # of a candidate's cost, which does not know the truth that well
 _RESCALED = 0.02  # change of scale of the whole, as a logarithm, that is worth another fit
 
 
@@ -158,23 +163,15 @@ class _Problem:
     def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
         candidates = [self._coarse(found, distortion) for found, distortion in rivals]
-        best = self._rescaled(min(candidates, key=lambda one: one.cost))
+        best = self._rescaled(self._refined(min(candidates, key=lambda one: one.cost)))
         x, everything = self._fine(best)
         return self._report(x, everything, best)
 
     # ------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
         if len(self.marks):
-            marks = [
-                shape.nearest(places, _normals(surface, places))
-                for shape, surface, places in (
-                    (self.first, self.template, self.marks),
-                    (self.second, self.target, self.mark_places),
-                )
-            ]
-            pairs = np.stack(marks, axis=1)
-            maps = [landmark_map(self.first, self.second, pairs)]
-            return maps + [one for one in self._spectral() if self._agrees(one, pairs)] if self.same_subject else maps
+            maps = [landmark_map(self.first, self.second, self._pairs)]
+            return maps + [one for one in self._spectral() if self._agrees(one)] if self.same_subject else maps
         maps = self._spectral()
         if maps[0].score < _SURE_SCORE:
             self.progress.expect(2**_MORE_SIGNS + N_OTHER_STARTS)
@@ -185,16 +182,24 @@ class _Problem:
         self.progress.expect(2**_SIGNS + N_OTHER_STARTS)
         return spectral_maps(self.first, self.second, _SIGNS, tick=self.progress.update)
 
-    def _agrees(self, found: Map, pairs: IntArray) -> bool:
+    @cached_property
+    def _pairs(self) -> IntArray:
+        """Landmarks as coarse vertices. *Shape:* ``(n, 2)``."""
+        if not len(self.marks):
+            return np.zeros((0, 2), dtype=np.int64)
+        both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
+        return np.stack([shape.nearest(at, _normals(surface, at)) for shape, surface, at in both], axis=1)
+
+    def _agrees(self, found: Map) -> bool:
         """Whether a map sends all landmarks near their places."""
         places = self.second.coarse.vertices
-        apart = np.linalg.norm(places[found.vertices[pairs[:, 0]]] - places[pairs[:, 1]], axis=1)
+        apart = np.linalg.norm(places[found.vertices[self._pairs[:, 0]]] - places[self._pairs[:, 1]], axis=1)
         return bool((apart < _NEAR_LANDMARK).all())
 
     def _rivals(self, maps: list[Map]) -> list[tuple[Map, float]]:
         """The maps that are worth a fit, and their distortions: those found, and those mended, which differ."""
         mended = [self.consistency.mended(found) for found in maps] if self.same_subject else []
-        everything = [*maps, *(found for found in mended if found is not None)]
+        everything = [*maps, *(found for found in mended if found is not None and self._agrees(found))]
         rated = [(found, self.consistency.distortion(found.vertices)) for found in everything]
         rated.sort(key=lambda pair: pair[1] - pair[0].score)
         places = self.second.coarse.vertices
@@ -233,6 +238,28 @@ class _Problem:
             stretchable=not self.same_subject,
             tick=self.progress.update,
         )
+
+    def _refined(self, candidate: _Candidate) -> _Candidate:
+        """Fitted again from the start along the map that it makes itself, until nothing moves any more.
+
+        An elastic fit drags along what slid on the way; its map, at first refined by all functions, does not.
+        """
+        if not self.same_subject:
+            return candidate
+        most = candidate.cost + _WORSE
+        for spectral in _REFINEMENTS:
+            shape = self.first.placed.moved(candidate.x)
+            vertices = self.second.nearest(shape.vertices, shape.vertex_normals)
+            if spectral:
+                vertices = zoom_out(self.first, self.second, vertices, FINE_FUNCTIONS, FINE_FUNCTIONS)
+            found = Map(vertices, rate(self.first, self.second, vertices, FINE_FUNCTIONS))
+            again = self._coarse(found, self.consistency.distortion(vertices))
+            if again.cost > most:
+                break
+            if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _AT_REST:
+                return min(candidate, again, key=lambda one: one.cost)
+            candidate = again
+        return candidate
 
     def _rescaled(self, candidate: _Candidate) -> _Candidate:
         """Fitted again with the scale that it has on the target: areas mislead where parts are missing."""

@@ -18,10 +18,14 @@ from torch_modal.keyframes.registration.surface import (
     Surface,
     largest_piece,
     referenced,
+    sewn,
+    without_dust,
 )
 
 N_COARSE = 2000
 """Vertices of the coarse copies."""
+CUT = 0.04
+"""The widest cut through a surface that is sewn up again, in diagonals."""
 N_FUNCTIONS = 60
 """Eigenfunctions, the constant one among them."""
 
@@ -110,12 +114,15 @@ class SpectralShape:
 
 
 def decimated(surface: Surface, n_vertices: int) -> Surface:
-    """The largest piece with fewer vertices; as it is if it has no more than a fifth above."""
-    surface = largest_piece(surface)
+    """The largest piece, and those that a cut has parted from it, with fewer vertices.
+
+    With no more than a fifth above, all are kept.
+    """
+    surface = without_dust(surface)
     if len(surface.vertices) <= 1.2 * n_vertices:
-        return surface
+        return largest_piece(sewn(surface, CUT))
     wanted = int(n_vertices / len(surface.vertices) * len(surface.faces))
     vertices, faces, _ = decimate(surface.vertices, surface.faces, wanted)
     faces = faces[~inspect.degenerate_faces(faces)]
     faces = faces[~inspect.repeated_faces(faces)]
-    return largest_piece(referenced(vertices, faces)[0])
+    return largest_piece(sewn(referenced(vertices, faces)[0], CUT))

@@ -183,6 +183,42 @@ def referenced(vertices: FloatArray, faces: IntArray) -> tuple[Surface, IntArray
     return Surface(vertices[used], renumbered.reshape(-1, 3)), used
 
 
+def without_dust(surface: Surface, share: float = 0.01) -> Surface:
+    """The connected pieces with so much of the area, or the largest if none has."""
+    pieces = surface.connectivity.vertex_pieces
+    if pieces.max() == 0:
+        return surface
+    of_faces = pieces[surface.faces[:, 0]]
+    areas = np.bincount(of_faces, surface.face_areas, minlength=pieces.max() + 1)
+    return referenced(surface.vertices, surface.faces[areas[of_faces] >= min(share * surface.area, areas.max())])[0]
+
+
+def sewn(surface: Surface, reach: float) -> Surface:
+    """Pieces whose edges lie side by side, as a cut leaves them, joined by strips of triangles.
+
+    Args:
+        surface: Of several pieces.
+        reach: The widest gap that is closed, in diagonals.
+    """
+    mesh = surface.connectivity
+    pieces = mesh.vertex_pieces
+    open_sides = np.flatnonzero((mesh.counts == 1)[mesh.sides])
+    if pieces.max() == 0 or not len(open_sides):
+        return surface
+    start, end = mesh.start[open_sides], mesh.end[open_sides]
+    strips = []
+    for piece in np.unique(pieces[start]):
+        own = pieces[start] == piece
+        others = np.unique(start[~own])
+        if not len(others):
+            break
+        middle = 0.5 * (surface.vertices[start[own]] + surface.vertices[end[own]])
+        distances, found = cKDTree(surface.vertices[others]).query(middle)
+        near = distances < reach * surface.diagonal
+        strips.append(np.column_stack([end[own], start[own], others[found]])[near])
+    return Surface(surface.vertices, np.concatenate([surface.faces, *strips]))
+
+
 def largest_piece(surface: Surface) -> Surface:
     """The connected piece with the largest area."""
     pieces = surface.connectivity.vertex_pieces

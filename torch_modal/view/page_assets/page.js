@@ -10,9 +10,6 @@ const LOOKS = [
 ];
 const GIVEN = [0.91, 0.6, 0.36]; // key-frames, as in the pictures
 const COMPUTED = LOOKS[0].tint;
-const CLICK_PIXELS = 4; // a press that moves further turns the camera
-
-const find = (id) => document.getElementById(id);
 
 class Viewer {
   constructor(data, faces, sequences) {
@@ -303,7 +300,7 @@ class Viewer {
     click("reset", () => this.stage.resetView());
     click("play", () => (this.playing ? this.pause() : this.play()));
     click("clear", () => this.setPicks([]));
-    click("copy", () => this.#copy());
+    click("copy", () => copyFrom(find("indices"), find("copy")));
     find("ending").value = this.data.closed ? "loop" : "turn";
     find("against").hidden = true;
     this.#showWires();
@@ -318,13 +315,8 @@ class Viewer {
   }
 
   #connectPicking(canvas) {
-    let pressed = null;
-    canvas.addEventListener("pointerdown", (event) => (pressed = event.isPrimary && !event.button ? event : null));
-    canvas.addEventListener("pointerup", (event) => {
-      const moved = pressed && Math.hypot(event.clientX - pressed.clientX, event.clientY - pressed.clientY);
-      if (moved === null || moved > CLICK_PIXELS) return;
-      const { left, top } = canvas.getBoundingClientRect();
-      const vertex = this.stage.vertexAt(event.clientX - left, event.clientY - top);
+    whenClicked(canvas, (x, y) => {
+      const vertex = this.stage.vertexAt(x, y);
       if (vertex === null) return;
       const there = this.picks.includes(vertex);
       this.setPicks(there ? this.picks.filter((other) => other !== vertex) : [...this.picks, vertex]);
@@ -348,18 +340,6 @@ class Viewer {
     event.preventDefault();
     if (key !== " " && key !== "r") this.pause();
     acts[key]();
-  }
-
-  async #copy() {
-    const text = this.picks.join(", ");
-    try {
-      await navigator.clipboard.writeText(text);
-    } catch {
-      find("indices").select(); // in frames, and where the page is not trusted with the clipboard
-      document.execCommand("copy");
-    }
-    find("copy").textContent = "Copied";
-    setTimeout(() => (find("copy").textContent = "Copy"), 1200);
   }
 
   // ---------------------------------------------------------------------------------------------------- loop
@@ -430,10 +410,4 @@ async function main() {
   };
 }
 
-main().catch((error) => {
-  const webgl = /webgl/i.test(error.message);
-  find("message").textContent = webgl
-    ? "This page needs WebGL 2, which this browser does not offer or has switched off."
-    : `This page cannot be shown: ${error.message}`;
-  console.error(error);
-});
+main().catch(sayWhy);

@@ -1,16 +1,5 @@
 // The slider with its key-frames, and over it a curve of each sequence.
 
-const SVG = "http://www.w3.org/2000/svg";
-
-/** An element with attributes and children; text children are text, never markup. */
-function make(tag, attributes = {}, ...children) {
-  const svg = ["svg", "path", "line", "text"].includes(tag);
-  const element = svg ? document.createElementNS(SVG, tag) : document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  element.append(...children);
-  return element;
-}
-
 /** Frame numbers, with fractions between the frames, and their places on the time line from 0 to 1. */
 class Clock {
   /** `times` rise; a closed sequence leads on from its last frame to its first, which is then frame N. */

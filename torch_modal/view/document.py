@@ -1,0 +1,114 @@
+"""One HTML file that needs nothing else, neither files nor a network.
+
+The files in page_assets are joined with the data of a page, which names the scripts that may run by their hashes, and
+forbids itself all else, so that nothing that stands in a file name or title can do anything.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from torch_modal.io.write import PAGES, check_suffix, refuse_existing, write_file
+from torch_modal.version import __version__
+
+__all__ = ["Page"]
+
+POLICY = "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 'none'"
+
+
+class Page:
+    """A page of shapes: shown by notebooks where it is the last value of a cell, or saved.
+
+    Attributes:
+        html: The whole page.
+        height: Pixels that it takes in a notebook.
+    """
+
+    def __init__(self, html: str, height: int = 600) -> None:
+        self.html = html
+        self.height = height
+
+    def __repr__(self) -> str:
+        return f"<torch_modal.Page of {len(self.html) / 1e6:.1f} MB; its save(path) writes it>"
+
+    def _repr_html_(self) -> str:
+        # The sandbox keeps the page's scripts apart from the notebook's.
+        return (
+            '<iframe sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy" '
+            f'style="width: 100%; height: {self.height}px; border: 1px solid #dde3e9; border-radius: 8px" '
+            f'srcdoc="{html.escape(self.html)}"></iframe>'
+        )
+
+    def save(self, out: str | Path, overwrite: bool = False) -> Path:
+        """Write the page as one HTML file.
+
+        Args:
+            out: File to write, ``*.html``.
+            overwrite: Replace the file if it exists.
+
+        Returns:
+            The file.
+
+        Raises:
+            ValueError: ``out`` does not end in .html.
+            FileExistsError: The file exists and ``overwrite`` is off.
+        """
+        path = checked_path(out, overwrite)
+        write_file(path, self.html.encode("utf-8"))
+        return path
+
+
+def checked_path(out: str | Path, overwrite: bool) -> Path:
+    """The path of a page that may be written; raises as `Page.save` does."""
+    path = Path(out)
+    check_suffix(path, PAGES)
+    refuse_existing(path, overwrite)
+    return path
+
+
+def document(template: str, scripts: Sequence[str], title: str, data: dict[str, Any]) -> str:
+    """A page's text. What callers named is escaped; scripts and style are allowed by their hashes.
+
+    Args:
+        template: Its file in page_assets.
+        scripts: Those that it runs besides three.js, in their order.
+        title: Of the page.
+        data: What the scripts show.
+    """
+    assets = files("torch_modal.view") / "page_assets"
+
+    def asset(*names: str) -> str:
+        return "\n".join((assets / name).read_text(encoding="utf-8") for name in names)
+
+    style, library = asset("page.css"), asset("three.min.js")
+    # In a function of its own, and strict.
+    program = f'(() => {{\n"use strict";\n{asset(*scripts)}}})();\n'
+    policy = f"{POLICY}; style-src {_hash(style)}; script-src {_hash(library)} {_hash(program)}"
+    parts = {
+        "@POLICY@": policy,
+        "@GENERATOR@": f"torch_modal {__version__}",
+        "@TITLE@": html.escape(title),
+        "@STYLE@": style,
+        "@DATA@": json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
+        "@LIBRARY@": library,
+        "@PROGRAM@": program,
+    }
+    # Each marker is replaced where it stands in the template, not in what came in its place.
+    text, pieces = asset(template), []
+    while text:
+        place, marker = min(((text.find(m), m) for m in parts if m in text), default=(len(text), ""))
+        pieces += [text[:place], parts.get(marker, "")]
+        text = text[place + len(marker) :]
+    return "".join(pieces)
+
+
+def _hash(text: str) -> str:
+    """What a content security policy calls an inline script or style."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
