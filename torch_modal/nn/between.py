@@ -29,8 +29,10 @@ from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, unmoved
 LOCAL_PRODUCTS = 4
 POLISH_PRODUCTS = 20
 
-# Vertices of all samples that are relaxed at a time: more would not fit into caches.
+# Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into
+# its memory (6 KB a vertex where gradients are recorded).
 FINE_CHUNK = 20_000
+FINE_CHUNK_OF_GPU = 1_000_000
 
 # A key-frame smaller than this part of the basis' reference is a point.
 SMALLEST_SIZE = 1e-6
@@ -183,7 +185,7 @@ class Between(nn.Module):
     def _refine(self, x: Tensor, base: Tensor, pair: Pair, samples: Samples, anchors: Tensor | None) -> Tensor:
         """Local interpolation and polish: what the modes cannot do. *Shape:* ``(B, V, 3)``."""
         energy, solver = self.fine, self.solver
-        chunk = max(1, FINE_CHUNK // x.shape[-2])
+        chunk = max(1, (FINE_CHUNK if x.device.type == "cpu" else FINE_CHUNK_OF_GPU) // x.shape[-2])
         ends = pair.first, pair.second
         if self.fused is not None:
             rest = trees.picked(ends, samples.which)
