@@ -213,8 +213,11 @@ def write_shape_pages(app: Sphinx) -> None:
         sample = load_sample(name)
         levels = 2 if sample.cyclic else 4
         places = tm.keyframe_places(len(sample.keyframes), levels=levels, cyclic=sample.cyclic)
+        bases = tm.extract_bases(sample.keyframes, sample.faces, progress=False)
         rows = {
-            "torch_modal": tm.subdivide(sample.keyframes, sample.faces, levels=levels, cyclic=sample.cyclic),
+            "torch_modal": tm.subdivide(
+                sample.keyframes, sample.faces, levels=levels, bases=bases, cyclic=sample.cyclic, progress=False
+            ),
             "linear": tm.linear_sequence(sample.keyframes, places),
         }
         page.unlink(missing_ok=True)
