@@ -175,14 +175,17 @@ class FusedRelax(nn.Module):
 
     def _area(self, x: Tensor) -> Tensor:
         """Of the surface, closed towards the centre. *Shape:* ``(B, V, 3) -> (B,)``."""
-        given = [x, x[:, self.used].mean(1), self.walls, self.n_vertices, None]
+        given = [x, self.centre(x), self.walls, self.n_vertices, None]
         return self._run(kernels().area, {4: (len(x),)}, given, len(self.walls))[0]
+
+    def centre(self, x: Tensor) -> Tensor:
+        """The mean of all vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
+        return x.mean(1) if len(self.used) == self.n_vertices else x[:, self.used].mean(1)
 
     def volume(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The volume about the centre, and its gradient. *Shape:* ``(B,), (B, V, 3)``."""
-        centre = x[:, self.used].mean(1)
         n_samples = len(x)
-        given = [x, centre, self.faces, self.n_vertices, None, None]
+        given = [x, self.centre(x), self.faces, self.n_vertices, None, None]
         total, normal = self._run(kernels().volume, {4: (n_samples,), 5: tuple(x.shape)}, given, len(self.faces))
         if not self.closed:  # the centre moves with all vertices; of a closed surface it does not matter
             share = normal.sum(1, keepdim=True) / len(self.used)
@@ -206,7 +209,11 @@ class FusedRelax(nn.Module):
         energy = x.new_zeros(len(x))
         given = [x, self.record, to.stretch, to.bend, self.n_vertices, energy]
         launch(kernels().value, (len(x), len(self.record)), given)
-        return energy + self._of_volume(self.volume(x)[0], to)
+        volume = torch.zeros_like(energy)
+        launch(
+            kernels().volume, (len(x), len(self.faces)), [x, self.centre(x), self.faces, self.n_vertices, volume, None]
+        )
+        return energy + self._of_volume(volume, to)
 
     @staticmethod
     def _of_volume(volume: Tensor, to: _Reference) -> Tensor:

@@ -1,15 +1,15 @@
 """Whether there are kernels, and how torch runs them: what NVIDIA Warp needs to be told."""
 
+import importlib.util
 import warnings
 from collections.abc import Sequence
 from functools import cache
-from importlib.util import find_spec
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from torch_modal.errors import MissingPackageError
+from torch_modal.extras import require_installed
 
 Backend = Literal["auto", "torch", "warp"]
 
@@ -32,7 +32,7 @@ def kernels() -> Any:
 
 @cache
 def _works() -> bool:
-    if find_spec("warp") is None:
+    if importlib.util.find_spec("warp") is None:
         return False
     try:
         kernels()
@@ -48,8 +48,8 @@ def has_kernels(backend: Backend) -> bool:
     Raises:
         MissingPackageError: ``"warp"`` is asked for and not installed.
     """
-    if backend == "warp" and find_spec("warp") is None:
-        raise MissingPackageError("backend='warp' needs the package warp-lang: pip install 'torch_modal[warp]'")
+    if backend == "warp":
+        require_installed(("warp",), "warp", "backend='warp'")
     return backend != "torch" and _works()
 
 
