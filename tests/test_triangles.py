@@ -15,7 +15,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Poisson, Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.sparse import factorize
+from torch_modal.geometry.sparse import SparseSolver, factorize, solve_by
 from torch_modal.geometry.triangle_frames import (
     Bend,
     Sides,
@@ -363,3 +363,24 @@ def test_frames_have_gradients(small_bars: Shapes) -> None:
         return first.first + second.first, first.second + second.second
 
     assert torch.autograd.gradcheck(wanted, [x])
+
+
+def test_by_the_inverse_as_by_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(12, 12, generator=generator, dtype=torch.float64)
+    matrix = sparse.csr_matrix((root @ root.T + torch.eye(12, dtype=torch.float64)).numpy())
+    for free in (None, np.array([0, 2, 3, 7, 11])):
+        solver = SparseSolver(matrix, free)
+        right = torch.randn(2, 12, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+        assert not solver.has_inverse(right.device)
+        truth = solver(right)
+        (slope,) = torch.autograd.grad(truth.square().sum(), right)
+        with monkeypatch.context() as there:
+            there.setattr(SparseSolver, "has_inverse", lambda self, device: True)
+            found = solve_by(lambda solver=solver: solver, right)  # type: ignore[misc]
+            torch.testing.assert_close(found, truth, rtol=1e-10, atol=1e-12)
+            torch.testing.assert_close(
+                torch.autograd.grad(found.square().sum(), right)[0], slope, rtol=1e-9, atol=1e-11
+            )
+    assert solver.has_inverse(torch.device("cuda"))
+    assert solver._inverses and not solver.__getstate__()["_inverses"]

@@ -26,7 +26,7 @@ class Poisson(nn.Module):
     r"""Vertices of :math:`\min_x \sum_e w_e |x_j - x_i - \bar e|^2`, each piece of the surface where it is told.
 
     The weights serve all shapes, so that one factorisation does
-    (:class:`~torch_modal.geometry.sparse.SparseSolver`, on the CPU). It is made at the first use, and again whenever
+    (:class:`~torch_modal.geometry.sparse.SparseSolver`). It is made at the first use, and again whenever
     the weights are others than those that it was made of.
 
     Args:

@@ -10,6 +10,9 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
+# An inverse of so many unknowns takes 3.2 GB.
+MOST_DENSE = 20_000
+
 
 def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> SuperLU:
     """Sparse LU of a symmetric positive definite matrix: no pivoting, which would spoil the ordering.
@@ -25,8 +28,9 @@ def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> Super
 class SparseSolver:
     """The inverse of a sparse symmetric positive definite matrix.
 
-    SciPy's sparse LU in float64 on the CPU: tensors on a GPU go there and back. Backward solves once more. The
-    factorisation is made at the first use, and again after pickling.
+    SciPy's sparse LU in float64 on the CPU. On a GPU, where triangular solves of one sample wait for each other and
+    products of matrices do not, the inverse itself, dense, up to :data:`MOST_DENSE` unknowns; beyond, tensors go to the
+    CPU and back. Backward solves once more. Factors and inverses are made at the first use, and again after pickling.
 
     Args:
         matrix: *Shape:* ``(V, V)``.
@@ -38,10 +42,11 @@ class SparseSolver:
         self.free = np.arange(self.n) if free is None else free
         self._inner = matrix if free is None else matrix.tocsr()[free][:, free]
         self._factor: SuperLU | None = None
+        self._inverses: dict[torch.device, Tensor] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the factorisation, which cannot be pickled."""
-        return {**self.__dict__, "_factor": None}
+        """Without the factorisation, which cannot be pickled, and inverses, which are large."""
+        return {**self.__dict__, "_factor": None, "_inverses": {}}
 
     def __call__(self, right: Tensor) -> Tensor:
         """Solve for one or more columns. *Shape:* ``(..., V, m) -> (..., V, m)``."""
@@ -55,6 +60,21 @@ class SparseSolver:
         out[self.free] = self._factor.solve(right[self.free])
         return out
 
+    def has_inverse(self, device: torch.device) -> bool:
+        """Whether tensors there are multiplied by the inverse."""
+        return device.type != "cpu" and len(self.free) <= MOST_DENSE
+
+    def times_inverse(self, right: Tensor) -> Tensor:
+        """The same by the dense inverse, in float64, on the device. *Shape:* ``(..., V, m) -> (..., V, m)``."""
+        if right.device not in self._inverses:
+            dense = torch.from_numpy(self._inner.toarray()).to(right.device)
+            self._inverses[right.device] = torch.cholesky_inverse(torch.linalg.cholesky(dense))
+        free = torch.from_numpy(self.free).to(right.device)
+        columns = right.double().movedim(-2, 0)
+        solved = self._inverses[right.device] @ columns.index_select(0, free).flatten(1)
+        out = torch.zeros_like(columns).flatten(1).index_copy(0, free, solved)
+        return out.reshape(columns.shape).movedim(0, -2).to(right).contiguous()
+
 
 def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
     """Solve with what is made only then: inside ``torch.func`` transforms, no tensor can be read before.
@@ -67,8 +87,11 @@ def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
 class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
+        inverse = solver()
+        if inverse.has_inverse(right.device):
+            return inverse.times_inverse(right.detach())
         columns = right.detach().double().cpu().movedim(-2, 0)
-        solved = solver().solve(np.ascontiguousarray(columns.flatten(1).numpy()))
+        solved = inverse.solve(np.ascontiguousarray(columns.flatten(1).numpy()))
         return torch.from_numpy(solved).reshape(columns.shape).movedim(0, -2).to(right).contiguous()
 
     @staticmethod
