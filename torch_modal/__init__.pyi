@@ -38,6 +38,7 @@ from .nn.between import ConvergenceError as ConvergenceError
 from .nn.between import InBetweenResult as InBetweenResult
 from .nn.in_between import InBetween as InBetween
 from .nn.mid_shape import MidShape as MidShape
+from .nn.modal_decoder import ModalDecoder as ModalDecoder
 from .nn.modal_energy import ModalEnergy as ModalEnergy
 from .nn.settings import PRESETS as PRESETS
 from .nn.settings import Objective as Objective
@@ -51,6 +52,10 @@ from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
 from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
+from .sequence.codec import ModalSequence as ModalSequence
+from .sequence.codec import encode as encode
+from .sequence.compress import Compressed as Compressed
+from .sequence.compress import compress as compress
 from .sequence.editor import PathEditor as PathEditor
 from .sequence.path import Path as Path
 from .sequence.subdivide import frame_times as frame_times

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli import check, commands, precompute, register, view
+from torch_modal.cli import check, commands, compress, precompute, register, view
 from torch_modal.cli.messages import PROGRAM, log_as_lines, say, warnings_as_lines
 from torch_modal.version import __version__
 
@@ -305,6 +305,16 @@ def build_parser() -> argparse.ArgumentParser:
     precompute.add_arguments(sub, _number)
     _add_modes(sub)
     precompute.add_common(sub)
+
+    sub = command(
+        "compress", compress.compress, compress.COMPRESS, compress.COMPRESS_DESCRIPTION, compress.COMPRESS_EXAMPLES
+    )
+    compress.add_compress(sub, _number)
+    _add_common(sub)
+
+    sub = command("expand", compress.expand, compress.EXPAND, compress.EXPAND_DESCRIPTION, compress.EXPAND_EXAMPLES)
+    compress.add_expand(sub, _number)
+    _add_common(sub)
 
     sub = command("view", view.run, view.SUMMARY, view.DESCRIPTION, view.EXAMPLES)
     view.add_arguments(sub, _number)

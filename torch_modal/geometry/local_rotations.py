@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
-from torch_modal.geometry.triangle_frames import Frames, Sides, edge_means, frames, sides
+from torch_modal.geometry.triangle_frames import Frames, Sides, edge_means, frames, sides, stretched
 from torch_modal.geometry.vectors import pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
@@ -140,18 +140,40 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        course, u = course.rows(which), t[:, None]
+        return self._along(course.rows(which), t, None)
+
+    def bent_along(self, course: Course, t: Tensor, bending: Tensor) -> Tensor:
+        """The same of one pair of shapes, whose triangles also bend: they are strained, then turned, and carried along.
+
+        Args:
+            course: Of one pair.
+            t: *Shape:* ``(B,)``.
+            bending: In coordinates of the triangles (:func:`~torch_modal.geometry.triangle_frames.convected`). *Shape:*
+                ``(6, B, F)``.
+
+        Returns:
+            *Shape:* ``(3, B, E)``.
+        """
+        return self._along(course, t, bending)
+
+    def _along(self, course: Course, t: Tensor, bending: Tensor | None) -> Tensor:
+        u = t[:, None]
         straight, bent = u * course.step, beyond(Excess(course.first, course.last), u)
         length, along, height = course.size + course.unit * (straight + bent)[3:]
         flat = torch.zeros_like(length)
 
         def placed(x: Tensor, y: Tensor) -> Tensor:
-            x, y, z = turned(straight[:3], turned(bent[:3], torch.stack([x, y, flat])))
+            side = torch.stack([x, y, flat])
+            side = side if bending is None else turned(bending[:3], side)
+            x, y, z = turned(straight[:3], turned(bent[:3], side))
             return x * course.e1 + y * course.e2 + z * course.normal
 
         end = course.size + course.unit * course.step[3:]
         areas = course.size[0] * course.size[2] + end[0] * end[2]
-        return self._edges(Sides(placed(length, flat), placed(along, height)), areas)
+        first, second = (length, flat), (along, height)
+        if bending is not None:
+            first, second = stretched(bending[3:], length, along, height)
+        return self._edges(Sides(placed(*first), placed(*second)), areas)
 
     def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
         """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""

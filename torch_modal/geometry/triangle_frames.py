@@ -120,6 +120,23 @@ def bend(displaced: Sides, reference: Frames) -> Bend:
     return Bend(n_y * axes[0] - n_x * axes[1] + spin * axes[2], (x_x, 0.5 * (x_y + y_x), y_y))
 
 
+def convected(bending: Bend, own: Frames) -> Tensor:
+    """A bend in the coordinates of the triangles, which it keeps wherever they turn: turn, then strain.
+
+    *Shape:* ``(6, B, F)``.
+    """
+    turn = [_dot(bending.turn, axis) for axis in (own.e1, own.e2, own.normal)]
+    return torch.stack([*turn, *bending.strain])
+
+
+def stretched(
+    strain: Tensor, length: Tensor, along: Tensor, height: Tensor
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Both sides, in their plane, after the exponential of a strain ``xx, xy, yy``. *Shape:* ``(3, B, F), (B, F)``."""
+    xx, xy, yy = _exponential(*strain)
+    return (xx * length, xy * length), (xx * along + xy * height, xy * along + yy * height)
+
+
 def bent_sides(bending: Bend, own: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
@@ -129,10 +146,8 @@ def bent_sides(bending: Bend, own: Frames) -> Sides:
         bending: Rotations in the coordinates of ``own``.
         own: Frames of the shape whose sides are wanted.
     """
-    xx, xy, yy = _exponential(*bending.strain)
-    first = own.world(xx * own.length, xy * own.length)
-    second = own.world(xx * own.along + xy * own.height, xy * own.along + yy * own.height)
-    return Sides(turned(bending.turn, first), turned(bending.turn, second))
+    first, second = stretched(torch.stack(bending.strain), own.length, own.along, own.height)
+    return Sides(turned(bending.turn, own.world(*first)), turned(bending.turn, own.world(*second)))
 
 
 def mirrored_sides(centre: Frames, other: Frames) -> Sides:

@@ -41,5 +41,9 @@ class RotationBlend(nn.Module):
         """
         return self._reached(self.rotations.along(course, which, t), straight)
 
+    def bent_along(self, course: Course, straight: Tensor, t: Tensor, bending: Tensor) -> Tensor:
+        """The same of one pair of shapes, whose triangles also bend, see :meth:`LocalRotations.bent_along`."""
+        return self._reached(self.rotations.bent_along(course, t, bending), straight)
+
     def _reached(self, edges: Tensor, near: Tensor) -> Tensor:
         return self.poisson(edges, near.movedim(-1, 0)).movedim(0, -1)

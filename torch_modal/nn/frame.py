@@ -67,7 +67,76 @@ class Columns(nn.Module):
         return (a @ self.fine.flatten(1)).unflatten(-1, (-1, 3))
 
 
-class Frame(nn.Module):
+class Alignment(nn.Module):
+    """Between the caller's coordinates and a frame that is centred, scaled and turned to a reference.
+
+    Args:
+        reference: The shape that others are turned to, centred and scaled. *Shape:* ``(V, 3)``.
+        scale: From the caller's units to the frame's.
+        weights: Of the vertices. *Shape:* ``(V,)``.
+    """
+
+    scale: Tensor
+    weights: Tensor
+    reference: Tensor
+
+    def __init__(self, reference: Tensor, scale: Tensor, weights: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("scale", scale, persistent=False)
+        self.register_buffer("weights", weights, persistent=False)
+        self.register_buffer("reference", reference, persistent=False)
+
+    def place(self, x_a: Tensor, x_b: Tensor) -> Pair:
+        """Bring key-frames into the frame. *Shape:* ``(B, V, 3)`` each."""
+        placed = best_fit(x_a, (self.reference / self.scale).expand_as(x_a), self.weights)
+        first, second = (placed.apply(x) * self.scale for x in (x_a, x_b))
+        back = best_fit(second, first, self.weights)
+        return Pair(first, back.apply(second), placed, back.inverse())
+
+    def surround(self, pair: Pair, before: Tensor | None, after: Tensor | None, spacing: Spacing) -> Pair:
+        """The pair with its neighbours in time, of the caller. *Shape of each:* ``(B, V, 3)``."""
+        wide = Spacing(*(h[:, None] for h in spacing))
+        turns: list[Tensor | None] = [None, None]
+        moves: list[Tensor | None] = [None, None]
+        if before is not None:
+            placed = pair.placed.apply(before) * self.scale
+            back = best_fit(placed, pair.first, self.weights)
+            before, turns[0], moves[0] = back.apply(placed), log(back.rotation), back.target - back.source
+        if after is not None:
+            placed = pair.placed.apply(after) * self.scale
+            unturned = pair.between.inverse().apply(placed)
+            back = best_fit(unturned, pair.second, self.weights)
+            moves[1] = centroid(placed, self.weights) - pair.between.target
+            after, turns[1] = back.apply(unturned), log(back.rotation.mT)
+        turn = excess(log(pair.between.rotation), turns[0], turns[1], wide, squared_length)
+        move = excess(pair.between.target - pair.between.source, moves[0], moves[1], wide, squared_length)
+        return pair._replace(around=Around(before, after, spacing, turn, move))
+
+    def _motion(self, pair: Pair, t: Tensor) -> RigidMotion:
+        """From the frame to the pose at the time ``t``, in its units."""
+        straight = pair.between.fraction(t)
+        if pair.around is None:
+            return straight
+        bent = exp(beyond(pair.around.turn, t[:, None]))
+        moved = straight.target + beyond(pair.around.move, t[:, None])
+        return RigidMotion(straight.rotation @ bent, straight.source, moved)
+
+    def restore(self, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
+        """Bring a shape at the time ``t`` back to the caller, moved along the course of the rigid motion.
+
+        Args:
+            x: Shapes of the frame. *Shape:* ``(B, V, 3)``.
+            pair: The key-frames that they lie between.
+            t: *Shape:* ``(B,)``.
+        """
+        return pair.placed.inverse().apply(self._motion(pair, t).apply(x) / self.scale)
+
+    def bring(self, points: Tensor, pair: Pair, t: Tensor) -> Tensor:
+        """The inverse of :meth:`restore`, of points of the caller's. *Shape:* ``(B, P, 3), (B,) -> (B, P, 3)``."""
+        return self._motion(pair, t).inverse().apply(pair.placed.apply(points) * self.scale)
+
+
+class Frame(Alignment):
     """The scale of 100, the alignment of two bases, and the coarse mesh that the energy is evaluated on.
 
     Args:
@@ -77,35 +146,30 @@ class Frame(nn.Module):
         weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
     """
 
-    scale: Tensor
     faces: Tensor
     coarse_faces: Tensor
-    weights: Tensor
     coarse_weights: Tensor
     clusters: Tensor
     shares: Tensor
     members: Tensor
     first_member: Tensor
-    reference: Tensor
     turn: Tensor
 
     def __init__(self, shapes: Tensor, faces: Tensor, coarse_faces: int, weights: Tensor | None = None) -> None:
-        super().__init__()
         used = shapes[0][faces.unique()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
         weights = mean_areas(shapes, faces) if weights is None else weights
         turn = best_fit(shapes[1], shapes[0], weights)
         references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale
+        super().__init__(references[0].clone(), scale, weights)
         coarsening = coarsen(references.numpy(), faces.numpy(), coarse_faces)
         clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
         member = torch.from_numpy(coarsening.clusters >= 0).double()
         per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
 
         self.n_coarse = coarsening.n_vertices
-        self.register_buffer("scale", scale, persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("coarse_faces", torch.from_numpy(coarsening.faces), persistent=False)
-        self.register_buffer("weights", weights, persistent=False)
         self.register_buffer("coarse_weights", per_cluster.index_add(0, clusters, weights), persistent=False)
         self.register_buffer("clusters", clusters, persistent=False)
         self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters], persistent=False)
@@ -113,7 +177,6 @@ class Frame(nn.Module):
         self.register_buffer("members", torch.argsort(clusters, stable=True), persistent=False)
         sizes = torch.bincount(clusters, minlength=self.n_coarse)
         self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
-        self.register_buffer("reference", references[0].clone(), persistent=False)
         #: Rigid motions of the shape half-way between the references, to first order.
         self.rigid = self.orthonormal(_rigid_fields(references.mean(0)))
         self.register_buffer("turn", turn.rotation, persistent=False)
@@ -167,55 +230,6 @@ class Frame(nn.Module):
         sizes = torch.linalg.norm(self.coarsen(directions).flatten(1), dim=1)[:, None, None]
         return self.orthonormal(directions / sizes.clamp_min(torch.finfo(sizes.dtype).tiny))
 
-    def place(self, x_a: Tensor, x_b: Tensor) -> Pair:
-        """Bring key-frames into the frame. *Shape:* ``(B, V, 3)`` each."""
-        placed = best_fit(x_a, (self.reference / self.scale).expand_as(x_a), self.weights)
-        first, second = (placed.apply(x) * self.scale for x in (x_a, x_b))
-        back = best_fit(second, first, self.weights)
-        return Pair(first, back.apply(second), placed, back.inverse())
-
-    def surround(self, pair: Pair, before: Tensor | None, after: Tensor | None, spacing: Spacing) -> Pair:
-        """The pair with its neighbours in time, of the caller. *Shape of each:* ``(B, V, 3)``."""
-        wide = Spacing(*(h[:, None] for h in spacing))
-        turns: list[Tensor | None] = [None, None]
-        moves: list[Tensor | None] = [None, None]
-        if before is not None:
-            placed = pair.placed.apply(before) * self.scale
-            back = best_fit(placed, pair.first, self.weights)
-            before, turns[0], moves[0] = back.apply(placed), log(back.rotation), back.target - back.source
-        if after is not None:
-            placed = pair.placed.apply(after) * self.scale
-            unturned = pair.between.inverse().apply(placed)
-            back = best_fit(unturned, pair.second, self.weights)
-            moves[1] = centroid(placed, self.weights) - pair.between.target
-            after, turns[1] = back.apply(unturned), log(back.rotation.mT)
-        turn = excess(log(pair.between.rotation), turns[0], turns[1], wide, squared_length)
-        move = excess(pair.between.target - pair.between.source, moves[0], moves[1], wide, squared_length)
-        return pair._replace(around=Around(before, after, spacing, turn, move))
-
-    def _motion(self, pair: Pair, t: Tensor) -> RigidMotion:
-        """From the frame to the pose at the time ``t``, in its units."""
-        straight = pair.between.fraction(t)
-        if pair.around is None:
-            return straight
-        bent = exp(beyond(pair.around.turn, t[:, None]))
-        moved = straight.target + beyond(pair.around.move, t[:, None])
-        return RigidMotion(straight.rotation @ bent, straight.source, moved)
-
-    def restore(self, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
-        """Bring a shape at the time ``t`` back to the caller, moved along the course of the rigid motion.
-
-        Args:
-            x: Shapes of the frame. *Shape:* ``(B, V, 3)``.
-            pair: The key-frames that they lie between.
-            t: *Shape:* ``(B,)``.
-        """
-        return pair.placed.inverse().apply(self._motion(pair, t).apply(x) / self.scale)
-
-    def bring(self, points: Tensor, pair: Pair, t: Tensor) -> Tensor:
-        """The inverse of :meth:`restore`, of points of the caller's. *Shape:* ``(B, P, 3), (B,) -> (B, P, 3)``."""
-        return self._motion(pair, t).inverse().apply(pair.placed.apply(points) * self.scale)
-
 
 class _ClusterMeans(torch.autograd.Function):
     """Sums over clusters, one after the other: ten times as fast as ``index_add``. *Shape:* ``(B, V, 3)``."""
@@ -245,6 +259,17 @@ class _ClusterMeans(torch.autograd.Function):
     def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, *given: Tensor) -> tuple[Tensor, int]:
         flat = x.movedim(in_dims[0], 0)
         return _ClusterMeans.apply(flat.flatten(0, 1), *given).unflatten(0, flat.shape[:2]), 0
+
+
+def vertex_excess(pair: Pair) -> Excess:
+    """What the neighbours in time say of the vertices of a pair. *Shape of each:* ``(B, V, 3)``."""
+    step = pair.second - pair.first
+    if pair.around is None:
+        return Excess(torch.zeros_like(step), torch.zeros_like(step))
+    before, after, spacing = pair.around[:3]
+    earlier = None if before is None else pair.first - before
+    later = None if after is None else after - pair.second
+    return excess(step, earlier, later, Spacing(*(h[:, None, None] for h in spacing)), squared_length)
 
 
 def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:

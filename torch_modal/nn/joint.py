@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
-from torch_modal.geometry.hermite import Spacing, beyond, excess, squared_length
+from torch_modal.geometry.hermite import beyond
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
-from torch_modal.nn.frame import Columns, Frame, Pair
+from torch_modal.nn.frame import Columns, Frame, Pair, vertex_excess
 from torch_modal.nn.guess import Guess
 from torch_modal.nn.levels import Levels, Stiffness
 from torch_modal.nn.modal_energy import Placement, SumOfEnergies
@@ -164,11 +164,7 @@ class JointSpace(nn.Module):
         """The shape that the motion passes through, by what the neighbours in time say. *Shape:* ``(B, V, 3)``."""
         around = pair.around
         assert around is not None
-        earlier = None if around.before is None else pair.first - around.before
-        later = None if around.after is None else around.after - pair.second
-        wide = Spacing(*(h[:, None, None] for h in around.spacing))
-        bend = excess(pair.second - pair.first, earlier, later, wide, squared_length)
-        first, second, bend = trees.picked((pair.first, pair.second, bend), index)
+        first, second, bend = trees.picked((pair.first, pair.second, vertex_excess(pair)), index)
         u = t[:, None, None]
         straight = torch.lerp(first, second, u) + beyond(bend, u)
         if self.blend is None:

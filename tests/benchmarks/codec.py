@@ -1,0 +1,209 @@
+"""A motion as key-frames and amplitudes, against a plain PCA of its frames.
+
+    python tests/benchmarks/codec.py [floats selection decode] [--motions creature hand-path]
+
+Distances are means over the vertices and frames, over the diagonal; edge errors are means of ``|l - l_true| / l_true``.
+PCA keeps the mean frame, its components and their coefficients: with as many components as fit into the floats of the
+encoded motion, and with one more, which takes more floats. Times are of the processor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import torch
+from cases import DATA
+from motions import sculpted
+from threads import limit_threads
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.sequence.codec_modes import fixed_modes
+from torch_modal.sequence.codec_selection import Judge, select_keyframes
+
+GALLOP = 96
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """A motion whose frames are all known."""
+
+    name: str
+    frames: Tensor
+    faces: Tensor
+    cyclic: bool
+    keyframes: tuple[tuple[int, ...], ...]
+    """Choices of key-frames, evenly spaced."""
+
+    @property
+    def diagonal(self) -> float:
+        """Of the bounding box of the first frame."""
+        return float((self.frames[0].amax(0) - self.frames[0].amin(0)).norm())
+
+    def measured(self, x: Tensor) -> tuple[float, float]:
+        """Distance, in 1e-3 of the diagonal, and edge error, in %."""
+        i, j = torch.tensor(Connectivity(self.faces.numpy()).edges).T
+        lengths, true = ((y[:, i] - y[:, j]).norm(dim=-1) for y in (x, self.frames))
+        distance = float((x - self.frames).norm(dim=-1).mean()) / self.diagonal
+        return 1e3 * distance, 100 * float(((lengths - true).abs() / true).mean())
+
+
+def creature() -> Sequence:
+    """The sample creature's gallop."""
+    faces, posed = sculpted("creature")
+    frames = torch.stack([posed(6 * i / GALLOP) for i in range(GALLOP)])
+    choices = tuple(tuple(range(0, GALLOP, GALLOP // n)) for n in (3, 4, 6))
+    return Sequence("creature", frames, faces, True, choices)
+
+
+def hand_path() -> Sequence | None:
+    """The rigged hand that closes."""
+    folder = DATA / "mh-hand-path"
+    if not folder.is_dir():
+        print(f"(without {folder.name}: the folder {folder} is not there)")
+        return None
+    frames, faces = tm.load_keyframes([folder / f"{i:02}.obj" for i in range(9)])
+    return Sequence("mh-hand-path", frames, faces, False, ((0, 8), (0, 4, 8), (0, 2, 4, 6, 8)))
+
+
+MOTIONS = {"creature": creature, "hand-path": hand_path}
+
+
+def chosen(names: list[str]) -> Iterator[Sequence]:
+    """Those motions that are there."""
+    for name in names:
+        found = MOTIONS[name]()
+        if found is not None:
+            yield found
+
+
+def pca(frames: Tensor, n: int) -> Tensor:
+    """Frames from their mean and so many components."""
+    flat = frames.flatten(1)
+    mean = flat.mean(0)
+    u, s, vh = torch.linalg.svd(flat - mean, full_matrices=False)
+    return ((u[:, :n] * s[:n]) @ vh[:n] + mean).reshape(frames.shape)
+
+
+def components(frames: Tensor, n_floats: int) -> int:
+    """The most components of PCA with at most so many floats."""
+    t, numbers = len(frames), frames[0].numel()
+    return min(t, (n_floats - numbers) // (numbers + t))
+
+
+def print_floats(sequence: Sequence) -> None:
+    """Rows of distances at the same floats."""
+    frames = sequence.frames
+    for keys in sequence.keyframes:
+        encoded = tm.encode(frames, sequence.faces, keys, 60, cyclic=sequence.cyclic, progress=False)
+        still = tm.ModalSequence(
+            **{**vars_of(encoded), "amplitudes": 0 * encoded.amplitudes, "motions": 0 * encoded.motions}
+        )
+        n = components(frames, encoded.n_floats)
+        numbers = frames[0].numel()
+        own, path = sequence.measured(encoded.decode()), sequence.measured(still.decode())
+        others = [(m, *sequence.measured(pca(frames, m))) for m in (n, n + 1)]
+        cells = [f"{m}: {d:.3g}, {e:.2g} = **{own[0] / d:.2f}, {own[1] / e:.2f}**" for m, d, e in others]
+        print(
+            f"| {sequence.name} | {len(keys)} | {encoded.n_floats / numbers:.2f} | {path[0]:.3g}, {path[1]:.2g} "
+            f"| {own[0]:.3g}, {own[1]:.2g} | {cells[0]} | {cells[1]} |",
+            flush=True,
+        )
+
+
+def vars_of(sequence: tm.ModalSequence) -> dict[str, object]:
+    """The fields of a sequence."""
+    return {name: getattr(sequence, name) for name in sequence.__dataclass_fields__}
+
+
+def print_selection(sequence: Sequence) -> None:
+    """Rows of chosen against even key-frames, judged alike, by all frames."""
+    frames, cyclic = sequence.frames, sequence.cyclic
+    when = torch.arange(len(frames) + cyclic, dtype=torch.float64)
+    modes = fixed_modes(frames[0], sequence.faces, 20)
+    for even in sequence.keyframes:
+        start = time.process_time()
+        keys = select_keyframes(frames, sequence.faces, when, modes.modes, len(even), 0.0, cyclic, False)
+        seconds = time.process_time() - start
+        errors = []
+        for choice in (even, keys):
+            found = tm.encode(frames, sequence.faces, choice, 20, cyclic=cyclic, progress=False)
+            errors.append(1e3 * float(found.errors.mean()))
+        best = ""
+        if len(frames) < 12:
+            judge = Judge(frames, sequence.faces, when, modes.modes, cyclic)
+            inner = combinations(range(1, len(frames) - 1), len(even) - 2)
+            best = f"{1e3 * min(judge.total([0, *each, len(frames) - 1]) for each in inner):.3g}"
+        print(
+            f"| {sequence.name} | {len(even)} | {errors[0]:.3g} | {errors[1]:.3g} {keys} "
+            f"| {errors[1] / errors[0]:.2f} | {best or '-'} | {seconds:.0f} |",
+            flush=True,
+        )
+
+
+def print_decode(sequence: Sequence) -> None:
+    """A row of speed: 100 frames of about 8,000 vertices."""
+    frames, faces = sequence.frames[:2], sequence.faces
+    x, faces = refined(frames, faces, 8000)
+    keys = tm.encode(x, faces, [0, 1], 60, progress=False)
+    t = torch.linspace(0, 1, 100, dtype=torch.float64)
+    a = torch.randn(100, keys.n_modes, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for kind in (torch.float64, torch.float32):
+        decoder = keys.decoder.to(kind)
+        with torch.no_grad():
+            decoder(a[:1].to(kind), t[:1].to(kind))
+            start = time.process_time()
+            decoder(a.to(kind), t.to(kind))
+            seconds = time.process_time() - start
+        print(f"| {sequence.name}, {x.shape[1]} vertices, {kind} | {100 / seconds:.0f} frames a second |", flush=True)
+
+
+def refined(frames: Tensor, faces: Tensor, n_vertices: int) -> tuple[Tensor, Tensor]:
+    """Triangles cut in four until there are that many vertices."""
+    while frames.shape[1] < n_vertices:
+        mesh = Connectivity(faces.numpy())
+        edges = torch.tensor(mesh.edges)
+        middle = torch.tensor(mesh.sides).reshape(3, -1).T + frames.shape[1]  # of sides 01, 12, 20
+        frames = torch.cat([frames, frames[:, edges].mean(2)], 1)
+        (a, b, c), (ab, bc, ca) = faces.T, middle.T
+        parts = [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+        faces = torch.cat([torch.stack(part, 1) for part in parts])
+    return frames, faces
+
+
+TABLES = {
+    "floats": (
+        "| motion | key-frames | floats / 3V | path: distance, edges | + 60 amplitudes "
+        "| PCA, components: distance, edges = ours over it | PCA of more floats |",
+        print_floats,
+    ),
+    "selection": (
+        "| motion | key-frames | evenly spaced | chosen | ratio | exhaustive | seconds |",
+        print_selection,
+    ),
+    "decode": ("| decoding on one core | speed |", print_decode),
+}
+
+
+def main() -> None:
+    """Print what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tables", nargs="*", help=f"of {', '.join(TABLES)}; default: all")
+    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS))
+    args = parser.parse_args()
+    limit_threads()
+    for name in args.tables or TABLES:
+        head, row = TABLES[name]
+        print(head)
+        print("|---" * (head.count("|") - 1) + "|")
+        for sequence in chosen(args.motions):
+            row(sequence)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,250 @@
+"""Small files of motions: what is promised is kept, the same everywhere, and a damaged or hostile file is an error."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import Shapes
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.cli import main as cli
+from torch_modal.sequence import codec_packing as packing
+from torch_modal.sequence.codec_prediction import WAYS, generations, residuals, restored
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def motion(bars: Shapes) -> Tensor:
+    """Twelve frames: the path through three poses, and a mode that swings beside it."""
+    basis = bars.bases[0]
+    decoder = tm.ModalDecoder(
+        bars.keyframes, bars.faces, torch.tensor([0.0, 5.0, 11.0]).double(), basis.reference, basis.modes
+    )
+    t = torch.arange(12).double()
+    a = torch.zeros(12, 8).double()
+    a[:, 0], a[:, 2] = 2 * torch.sin(t), torch.sin(1.3 * t)
+    return decoder(a, t)
+
+
+@pytest.fixture(scope="module")
+def written(motion: Tensor, bars: Shapes, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tm.Compressed]:
+    path = tmp_path_factory.mktemp("tms") / "bar.tms"
+    return path, tm.compress(motion, bars.faces, path, 0.003, 12, progress=False)
+
+
+@pytest.mark.parametrize("error", [0.0005, 0.02])
+def test_the_promised_error_is_kept(motion: Tensor, bars: Shapes, tmp_path: Path, error: float) -> None:
+    found = tm.compress(motion, bars.faces, tmp_path / "a.tms", error, 12, progress=False)
+    read = tm.ModalSequence.load(tmp_path / "a.tms")
+    assert torch.equal(read.faces, bars.faces)
+    size = (motion[0].amax(0) - motion[0].amin(0)).norm()
+    measured = (read.decode() - motion).norm(dim=-1).mean(1) / size
+    assert float(measured.max()) <= error and torch.allclose(measured, found.errors, rtol=0, atol=1e-12)
+    assert found.n_bytes == (tmp_path / "a.tms").stat().st_size < motion.numel() * 4 / (4 if error < 0.001 else 10)
+
+
+def test_times_and_cycles_come_back(bars: Shapes, tmp_path: Path) -> None:
+    basis = bars.bases[0]
+    decoder = tm.ModalDecoder(
+        bars.keyframes, bars.faces, torch.tensor([0.0, 2.0, 4.0, 6.0]).double(), basis.reference, basis.modes
+    )
+    frames = decoder(torch.zeros(6, 8).double(), torch.arange(6).double())
+    times = [0.0, 0.5, 1.0, 2.0, 2.5, 3.0, 4.0]
+    tm.compress(frames, bars.faces, tmp_path / "a.tms", 0.01, 8, times=times, cyclic=True, progress=False)
+    found = tm.ModalSequence.load(tmp_path / "a.tms")
+    assert found.cyclic and found.times.tolist() == times[:-1] and float(found.keyframe_times[-1]) == 4.0
+
+
+CODE = """
+import sys, torch
+import torch_modal as tm
+torch.set_num_threads(int(sys.argv[1]))
+motion, faces = torch.load(sys.argv[2])
+tm.compress(motion, faces, sys.argv[3], 0.003, 12, progress=False, cache=False)
+torch.save(tm.ModalSequence.load(sys.argv[3], cache=False).decode(), sys.argv[4])
+"""
+
+
+def test_another_process_with_other_threads_writes_and_reads_the_same(
+    motion: Tensor, bars: Shapes, written: tuple[Path, tm.Compressed], tmp_path: Path
+) -> None:
+    torch.save((motion, bars.faces), tmp_path / "in.pt")
+    out = tmp_path / "a.tms"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "3"}
+    arguments = ["3", str(tmp_path / "in.pt"), str(out), str(tmp_path / "out.pt")]
+    subprocess.run([sys.executable, "-c", CODE, *arguments], check=True, env=environment, timeout=300)
+    assert out.read_bytes() == written[0].read_bytes()
+    x = torch.load(tmp_path / "out.pt")
+    assert float((x - tm.ModalSequence.load(written[0]).decode()).abs().max()) < 1e-9
+    size = (motion[0].amax(0) - motion[0].amin(0)).norm()
+    assert float((x - motion).norm(dim=-1).mean(1).max() / size) <= 0.003
+
+
+# ------------------------------------------------------------------------------------------------------------- packing
+@pytest.mark.parametrize("way", WAYS)
+def test_prediction_is_undone(bars: Shapes, way: str) -> None:
+    faces = bars.faces.numpy()
+    x, guide = (np.round(100 * y.numpy()).astype(np.int64) for y in bars.keyframes[:2])
+    plan = generations(faces, len(x))
+    left = residuals(x, plan, way, guide)  # type: ignore[arg-type]
+    assert np.array_equal(restored(left, plan, way, guide), x)  # type: ignore[arg-type]
+    assert np.abs(left[1:]).mean() < 0.3 * np.abs(x).mean()
+
+
+def test_a_turned_shape_is_predicted_by_its_triangles(bars: Shapes) -> None:
+    guide = np.round(1000 * bars.keyframes[0].numpy()).astype(np.int64)
+    turned = np.stack([-guide[:, 1], guide[:, 0], guide[:, 2]], axis=1)
+    plan = generations(bars.faces.numpy(), len(guide))
+    left = {way: np.abs(residuals(turned, plan, way, guide)[20:]).mean() for way in WAYS}
+    assert left["turned"] < 2 < 0.1 * min(left["parallelogram"], left["moved"])
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        [[0, 1, 2], [3, 4, 5]],  # two pieces
+        [[0, 1, 2], [0, 1, 3], [0, 1, 4]],  # three at one edge
+        [[2, 1, 0]],  # and vertices of no face
+    ],
+)
+def test_prediction_of_any_connectivity(faces: list[list[int]]) -> None:
+    x = np.random.default_rng(0).integers(-50, 50, (7, 3))
+    plan = generations(np.array(faces), 7)
+    assert sorted(np.concatenate([g.targets for g in plan])) == list(range(7))
+    for way in WAYS:
+        assert np.array_equal(restored(residuals(x, plan, way, x[::-1].copy()), plan, way, x[::-1].copy()), x)
+
+
+@pytest.mark.parametrize("numbers", [[], [0], [-1, 1, 0], [2**40, -(2**40), 3], list(range(-200, 200))])
+def test_numbers_are_packed_and_unpacked(numbers: list[int]) -> None:
+    array = np.array(numbers, dtype=np.int64)
+    assert packing.unsqueeze(packing.squeeze(array), len(array)).tolist() == numbers
+    with pytest.raises(ValueError, match="damaged"):
+        packing.unsqueeze(packing.squeeze(array), len(array) + 1)
+
+
+# -------------------------------------------------------------------------------------------------- damaged and hostile
+def rewritten(path: Path, out: Path, **changes: object) -> Path:
+    """The file with other entries in its header."""
+    tensors = load_file(path)
+    data = path.read_bytes()
+    header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["torch_modal"])
+    save_file(tensors, out, {"torch_modal": json.dumps({**header, **changes})})
+    return out
+
+
+def test_a_cut_file_is_an_error(written: tuple[Path, tm.Compressed], tmp_path: Path) -> None:
+    data = written[0].read_bytes()
+    for n in (0, 4, 100, len(data) // 2, len(data) - 1):
+        (tmp_path / "cut.tms").write_bytes(data[:n])
+        with pytest.raises(ValueError, match=r"cut\.tms"):
+            tm.ModalSequence.load(tmp_path / "cut.tms")
+
+
+def test_any_changed_byte_is_an_error_or_changes_nothing(
+    written: tuple[Path, tm.Compressed], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from torch_modal.sequence import codec_file
+
+    data = written[0].read_bytes()
+    before = tm.ModalSequence.load(written[0])
+    # Modes follow from what the digest covers.
+    monkeypatch.setattr(codec_file, "fixed_modes", lambda *_: before.modes)
+    start = 8 + int.from_bytes(data[:8], "little")
+    for place in np.random.default_rng(0).integers(start, len(data), 60).tolist():
+        changed = bytearray(data)
+        changed[place] ^= 0x55
+        (tmp_path / "a.tms").write_bytes(changed)
+        try:
+            found = tm.ModalSequence.load(tmp_path / "a.tms")
+        except ValueError:
+            continue
+        assert torch.equal(found.amplitudes, before.amplitudes) and torch.equal(found.keyframes, before.keyframes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"version": "2"}, "version"),
+        ({"format": "other"}, "holds no motion"),
+        ({"coding": "pickle"}, "coding"),
+        ({"vertices": 2**31}, "vertices that it does not have"),
+        ({"vertices": 10**6}, "vertices that it does not have|claims|damaged"),
+        ({"frames": 2**30}, "claims to hold|damaged"),
+        ({"faces": 10**8}, "claims to hold"),
+        ({"faces": 10**9}, "damaged"),
+        ({"vertices": 10**18}, "header"),
+        ({"vertices": -1}, "header"),
+        ({"modes": 1.5}, "header"),
+        ({"clusters": "many"}, "cannot be read"),
+        ({"keys": [0, 99]}, "key-frames"),
+        ({"ways": [[0, 0], [2, 9], [1, 0]]}, "no known way"),
+        ({"orders": [7, 0]}, "no known way"),
+        ({"steps": [1e-3, 0.0, 1.0, 1.0]}, "header"),
+        ({"low": ["a", 0, 0]}, "header"),
+        ({"digest": "0"}, "damaged"),
+        ({"reference": 77}, "do not fit"),
+    ],
+)
+def test_a_header_is_not_believed(
+    written: tuple[Path, tm.Compressed], tmp_path: Path, changes: dict[str, object], match: str
+) -> None:
+    with pytest.raises(ValueError, match=match):
+        tm.ModalSequence.load(rewritten(written[0], tmp_path / "a.tms", **changes))
+
+
+def test_other_files_are_refused(tmp_path: Path, bars: Shapes) -> None:
+    bars.bases[0].save(tmp_path / "basis.tms")
+    with pytest.raises(ValueError, match="holds no motion"):
+        tm.ModalSequence.load(tmp_path / "basis.tms")
+    (tmp_path / "text.tms").write_text("o bar\nv 0 0 0\n")
+    with pytest.raises(ValueError, match=r"text\.tms is no \.tms file"):
+        tm.ModalSequence.load(tmp_path / "text.tms")
+    with pytest.raises(FileNotFoundError):
+        tm.ModalSequence.load(tmp_path / "missing.tms")
+
+
+def test_other_modes_are_noticed(written: tuple[Path, tm.Compressed], monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch_modal.sequence import codec_file
+
+    real = codec_file.fixed_modes
+
+    def other(*arguments: object) -> object:
+        found = real(*arguments)  # type: ignore[arg-type]
+        return found._replace(modes=found.modes.flip(0))
+
+    monkeypatch.setattr(codec_file, "fixed_modes", other)
+    with pytest.raises(ValueError, match="modes computed here differ"):
+        tm.ModalSequence.load(written[0])
+
+
+# ------------------------------------------------------------------------------------------------------------ commands
+def test_commands(motion: Tensor, bars: Shapes, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    meshes = [str(file) for file in tm.save_frames(motion, bars.faces, tmp_path / "in", "obj")]
+    out = tmp_path / "bar.tms"
+    assert cli.main(["compress", *meshes, "--error", "0.5%", "--modes", "8", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "12 frames of 164 vertices" in said and "allowed: 0.5 %" in said
+    assert cli.main(["compress", *meshes, "--out", str(out)]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert cli.main(["expand", str(out), "--out", str(tmp_path / "back"), "--format", "obj", "--quiet"]) == 0
+    frames, faces = tm.load_keyframes(sorted((tmp_path / "back").glob("*.obj")))
+    assert torch.equal(faces, bars.faces)
+    size = (motion[0].amax(0) - motion[0].amin(0)).norm()
+    assert float((frames - motion).norm(dim=-1).mean(1).max() / size) <= 0.005
+    assert cli.main(["expand", str(out), "--frames", "30", "--out", str(tmp_path / "slow.npz"), "--quiet"]) == 0
+    assert (tmp_path / "slow.npz").exists()
+    (tmp_path / "bad.tms").write_bytes(out.read_bytes()[:500])
+    assert cli.main(["expand", str(tmp_path / "bad.tms"), "--out", str(tmp_path / "no")]) == 1
+    assert not (tmp_path / "no").exists()
+    for wrong in (["compress", meshes[0], "--out", str(out)], ["compress", *meshes, "--error", "2", "--out", "a.tms"]):
+        with pytest.raises(SystemExit):
+            cli.main(wrong)

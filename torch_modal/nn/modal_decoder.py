@@ -1,0 +1,230 @@
+r"""Shapes of a motion from amplitudes: what modes do beside the smooth path through key-frames.
+
+A mode is a displacement of one key-frame. To first order it turns and strains each triangle, and both are kept in the
+triangle's own coordinates, which go along with it (rotation-strain coordinates; Huang et al. 2011). So the modes of one
+key-frame serve all shapes of the motion: they bend the shape on the path, and large amplitudes turn, rather than
+stretch.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.energy.shell import DIAGONAL
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.hermite import Excess, Spacing, beyond
+from torch_modal.geometry.local_rotations import Course
+from torch_modal.geometry.rotations import exp
+from torch_modal.geometry.triangle_frames import bend, convected, frames, sides
+from torch_modal.nn.blend import RotationBlend
+from torch_modal.nn.frame import Alignment, Pair, mean_areas, vertex_excess
+
+UNIT = 0.01
+"""An amplitude of 1 moves the vertices of the key-frame by this part of its diagonal, in the root mean square."""
+
+CHUNK = 40_000
+"""Vertices of all shapes that are decoded at a time: more would not fit into caches."""
+
+
+class Interval(NamedTuple):
+    """Between two key-frames: all that does not depend on the time."""
+
+    pair: Pair
+    course: Course
+    vertices: Excess
+    """Of the vertices, which say where loose pieces are."""
+
+
+class ModalDecoder(nn.Module):
+    """Amplitudes in the modes of one key-frame, and times, to shapes: differentiable in both and in the key-frames.
+
+    Amplitudes of zero give the path through the key-frames (:class:`torch_modal.Path`; with two key-frames, their blend
+    by local rotations). An amplitude of 1 moves the vertices by 1 % of the diagonal in the root mean square.
+
+    Args:
+        keyframes: Two or more, finite, of one connectivity, with faces that can be used. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        times: When the key-frames are, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)`` or
+            ``(K + 1,)``.
+        reference: The shape that the modes belong to, one of the key-frames. *Shape:* ``(V, 3)``.
+        modes: Displacements of it, of any size. *Shape:* ``(k, V, 3)``.
+    """
+
+    keyframes: Tensor
+    times: Tensor
+    columns: Tensor
+    moves: Tensor
+    faces: Tensor
+    size: Tensor
+
+    def __init__(self, keyframes: Tensor, faces: Tensor, times: Tensor, reference: Tensor, modes: Tensor) -> None:
+        super().__init__()
+        keyframes, reference, modes = (x.detach().double().cpu() for x in (keyframes, reference, modes))
+        faces = faces.cpu()
+        mesh = self._mesh = Connectivity(faces.numpy(), len(reference))
+        used = reference[faces.unique()]
+        size = torch.linalg.norm(used.amax(0) - used.amin(0))
+        placed = reference * (DIAGONAL / size)
+        self.register_buffer("faces", faces, persistent=False)
+        #: Diagonal of the reference's bounding box.
+        self.register_buffer("size", size, persistent=False)
+        self._start(keyframes, times.detach().double().cpu(), placed)
+        rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
+        displaced = (modes * (UNIT * DIAGONAL / rms)[:, None, None]).movedim(-1, 0).contiguous()
+        own = frames(sides(placed.T[:, None].contiguous(), faces))
+        #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
+        self.register_buffer("columns", convected(bend(sides(displaced, faces), own), own).movedim(0, 1).contiguous())
+        n_pieces = int(mesh.vertex_pieces.max()) + 1
+        #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
+        centres = self.blend(0).poisson.centres(displaced) if n_pieces > 1 else displaced[..., :0]
+        self.register_buffer("moves", centres.permute(1, 2, 0).flatten(1).contiguous(), persistent=False)
+
+    def _start(self, keyframes: Tensor, times: Tensor, placed: Tensor) -> None:
+        """What depends on the key-frames."""
+        self.cyclic = len(times) > len(keyframes)
+        self.register_buffer("keyframes", keyframes.clone())
+        self.register_buffer("times", times.clone())
+        weights = mean_areas(keyframes.cpu(), self.faces.cpu()).to(keyframes)
+        centre = (weights[:, None] * placed).sum(0) / weights.sum()
+        self.alignment = Alignment(placed - centre, DIAGONAL / self.size, weights)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._known: list[Interval | None] = [None] * self.n_intervals
+        self._blends: list[RotationBlend | None] = [None] * self.n_intervals
+
+    def through(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
+        """The same modes beside a path through other key-frames, of the same connectivity."""
+        other = ModalDecoder.__new__(ModalDecoder)
+        nn.Module.__init__(other)
+        other._mesh = self._mesh
+        for name in ("faces", "size", "columns", "moves"):
+            other.register_buffer(name, getattr(self, name), persistent=name == "columns")
+        other._start(keyframes.detach().to(self.keyframes), times.detach().to(self.times), self.alignment.reference)
+        return other
+
+    def blend(self, i: int) -> RotationBlend:
+        """Of an interval; made at the first use."""
+        known = self._blends[i]
+        if known is None:
+            with torch.no_grad():
+                ends = torch.cat(self._pair(i, self.keyframes)[:2]).double().cpu()
+                known = self._blends[i] = RotationBlend(self._mesh, ends).to(self.keyframes)
+        return known
+
+    @property
+    def n_intervals(self) -> int:
+        """Between key-frames."""
+        return len(self.times) - 1
+
+    @property
+    def n_modes(self) -> int:
+        """Number of amplitudes, k."""
+        return len(self.columns)
+
+    def _apply(self, *args: object, **kwargs: object) -> "ModalDecoder":
+        self._forget()
+        return super()._apply(*args, **kwargs)  # type: ignore[arg-type]
+
+    def forward(
+        self, amplitudes: Tensor, t: Tensor | float, motions: Tensor | None = None, keyframes: Tensor | None = None
+    ) -> Tensor:
+        """The shapes of amplitudes at times.
+
+        Args:
+            amplitudes: *Shape:* ``(..., k)``.
+            t: Times within those of the key-frames; if cyclic, any. *Shape:* broadcasts against ``(...)``.
+            motions: A turn, axis times angle about the shape's centre, and a move in units of the diagonal, after all
+                else. Default: none. *Shape:* ``(..., 6)``.
+            keyframes: Others in the place of those that the decoder was made with, near them. *Shape:* ``(K, V, 3)``.
+
+        Returns:
+            *Shape:* ``(..., V, 3)``.
+
+        Raises:
+            ValueError: Shapes that do not fit, or times outside.
+        """
+        if amplitudes.shape[-1:] != (self.n_modes,):
+            raise ValueError(f"amplitudes have the shape (..., {self.n_modes}); got {tuple(amplitudes.shape)}")
+        if keyframes is not None and keyframes.shape != self.keyframes.shape:
+            raise ValueError(f"keyframes have the shape {tuple(self.keyframes.shape)}; got {tuple(keyframes.shape)}")
+        t = torch.as_tensor(t, dtype=self.times.dtype, device=amplitudes.device)
+        lead = torch.broadcast_shapes(amplitudes.shape[:-1], t.shape)
+        a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
+        segment, u = self.located(t.expand(lead).reshape(-1))
+        order, parts = [], []
+        for i in segment.unique().tolist():
+            interval = self.interval(i, keyframes)
+            for rows in torch.nonzero(segment == i).flatten().split(max(1, CHUNK // self.keyframes.shape[1])):
+                order.append(rows)
+                parts.append(self.alignment.restore(self.bent(i, interval, a[rows], u[rows]), interval.pair, u[rows]))
+        if not parts:
+            return amplitudes.new_zeros(*lead, *self.keyframes.shape[1:])
+        x = torch.cat(parts)[torch.argsort(torch.cat(order))]
+        if motions is not None:
+            x = moved(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
+        return x.reshape(*lead, *x.shape[1:])
+
+    def bent(self, i: int, interval: Interval, a: Tensor, u: Tensor) -> Tensor:
+        """Shapes of one interval, in the frame that the key-frames are aligned in. *Shape:* ``(B, k), (B,)``."""
+        pair, course, vertices = interval
+        wide = u[:, None, None]
+        straight = torch.lerp(pair.first, pair.second, wide) + beyond(vertices, wide)
+        if self.moves.shape[1]:
+            straight = straight + (a @ self.moves).unflatten(1, (-1, 3))
+        bending = (a @ self.columns.flatten(1)).unflatten(1, (6, -1)).movedim(1, 0)
+        return self.blend(i).bent_along(course, straight, u, bending)
+
+    def located(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
+        times = self.times
+        if self.cyclic:
+            period = times[-1] - times[0]
+            t = t - period * torch.floor((t.detach() - times[0]) / period)
+        outside = ~((t >= times[0]) & (t <= times[-1]))
+        if bool(outside.any()):
+            raise ValueError(
+                f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
+                f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
+            )
+        segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
+        return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
+
+    def interval(self, i: int, keyframes: Tensor | None = None) -> Interval:
+        """What does not depend on the time; kept, of the decoder's own key-frames."""
+        if keyframes is not None:
+            return self._interval(i, keyframes)
+        known = self._known[i]
+        if known is None:
+            with torch.no_grad():
+                known = self._known[i] = self._interval(i, self.keyframes)
+        return known
+
+    def _interval(self, i: int, keyframes: Tensor) -> Interval:
+        pair = self._pair(i, keyframes)
+        rotations = self.blend(i).rotations
+        if pair.around is None:
+            still = Spacing(*(torch.ones_like(pair.first[:, 0, 0]),) * 3)
+            course = rotations.course(None, pair.first, pair.second, None, still)
+        else:
+            before, after, spacing = pair.around[:3]
+            course = rotations.course(before, pair.first, pair.second, after, spacing)
+        return Interval(pair, course, vertex_excess(pair))
+
+    def _pair(self, i: int, keyframes: Tensor) -> Pair:
+        n, last = len(keyframes), self.n_intervals - 1
+        x = keyframes[:, None]
+        pair = self.alignment.place(x[i], x[(i + 1) % n])
+        if n < 3:
+            return pair
+        before = x[i - 1] if self.cyclic or i > 0 else None
+        after = x[(i + 2) % n] if self.cyclic or i < last else None
+        h = self.times.diff().to(x)
+        return self.alignment.surround(pair, before, after, Spacing(*(h[j % len(h)][None] for j in (i - 1, i, i + 1))))
+
+
+def moved(x: Tensor, motions: Tensor, size: Tensor) -> Tensor:
+    """Shapes turned about their centres, and moved. *Shape:* ``(B, V, 3), (B, 6) -> (B, V, 3)``."""
+    centre = x.mean(1, keepdim=True)
+    return (x - centre) @ exp(motions[:, :3]).mT + centre + size * motions[:, None, 3:]
