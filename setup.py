@@ -96,7 +96,15 @@ setup(
         "test": [
             *sorted({each for extra in EXTRAS.values() for each in extra}),
             *DOCS,
-            *["pytest>=8", "ruff>=0.6", "mypy>=1.11", "pygltflib>=1.16", "selenium>=4.20"],
+            *[
+                "pytest>=8",
+                "ruff>=0.6",
+                "mypy>=1.11",
+                "pygltflib>=1.16",
+                "DracoPy>=1.7",
+                "zstandard>=0.22",
+                "selenium>=4.20",
+            ],
             *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],
         ],
     },

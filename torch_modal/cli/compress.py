@@ -113,10 +113,9 @@ def compress(args: argparse.Namespace) -> None:
         n, v = frames.shape[:2]
         worst = int(found.errors.argmax())
         bits = 8 * (found.n_bytes - found.n_faces_bytes) / (n * v)
-        print(f"{n} frames of {v} vertices -> {args.out}, {found.n_bytes} bytes")
-        print(
-            f"1/{12 * n * v / found.n_bytes:.0f} of float32; faces: {found.n_faces_bytes} bytes; {bits:.3g} bits a vertex"
-        )
+        less = 12 * n * v / found.n_bytes
+        print(f"{n} frames of {v} vertices -> {args.out}, {found.n_bytes} bytes, 1/{less:.0f} of float32")
+        print(f"faces: {found.n_faces_bytes} bytes; all else: {bits:.3g} bits a vertex and frame")
         print(f"key-frames: {', '.join(map(str, found.keyframes))}")
         print(
             f"distance, of the written file: mean {100 * float(found.errors.mean()):.3g} %, at most "

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.modal_decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
+from torch_modal.sequence.codec_file import read, write_exact
 from torch_modal.sequence.codec_fit import fit
 from torch_modal.sequence.codec_modes import FixedModes, fixed_modes
 from torch_modal.sequence.codec_selection import select_keyframes
@@ -137,9 +138,7 @@ class ModalSequence:
         Raises:
             OSError: The file cannot be written.
         """
-        from torch_modal.sequence.codec_file import write_exact
-
-        write_exact(self, FilePath(path))
+        write_exact(self.__dict__, FilePath(path))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], cache_dir: str | None = None, cache: bool = True) -> "ModalSequence":
@@ -154,9 +153,7 @@ class ModalSequence:
             FileNotFoundError: There is no such file.
             ValueError: It is damaged, holds something else, or has another version; or this machine finds other modes.
         """
-        from torch_modal.sequence.codec_file import read
-
-        return read(FilePath(path), cache_dir, cache)
+        return cls(**read(FilePath(path), cache_dir, cache))
 
 
 def encode(

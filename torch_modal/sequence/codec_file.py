@@ -4,6 +4,7 @@ Nothing in a file is believed before it is checked.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from torch import Tensor
 
 from torch_modal.errors import MeshError
 from torch_modal.io.files import write_atomically
-from torch_modal.sequence.codec import ModalSequence
 from torch_modal.sequence.codec_modes import FixedModes, fixed_modes
 from torch_modal.sequence.codec_packing import PACKED, unpack
 
@@ -39,9 +39,12 @@ EXACT = {
 }
 
 
-def write_exact(sequence: ModalSequence, path: Path) -> None:
-    """Without loss."""
-    write_atomically(path, to_bytes(exact_tensors(sequence), {"coding": "exact", "reference": sequence.reference}))
+def write_exact(fields: Mapping[str, Any], path: Path) -> None:
+    """The fields of a sequence, without loss."""
+    modes = fields["modes"]
+    values = {**fields, "clusters": modes.clusters, "pivots": modes.pivots, "probe": probe(modes)}
+    tensors = {name: values[name].to(kind) for name, (kind, _) in EXACT.items()}
+    write_atomically(path, to_bytes(tensors, {"coding": "exact", "reference": fields["reference"]}))
 
 
 def to_bytes(tensors: dict[str, Tensor], header: dict[str, Any]) -> bytes:
@@ -49,14 +52,6 @@ def to_bytes(tensors: dict[str, Tensor], header: dict[str, Any]) -> bytes:
     whole = {"format": FORMAT, "version": VERSION, **header}
     parts = {name: part.contiguous() for name, part in tensors.items()}
     return save_tensors(parts, {"torch_modal": json.dumps(whole, sort_keys=True)})
-
-
-def exact_tensors(sequence: ModalSequence) -> dict[str, Tensor]:
-    """All that a sequence is made of, but its modes."""
-    modes = sequence.modes
-    values = {name: getattr(sequence, name, None) for name in EXACT}
-    values |= {"clusters": modes.clusters, "pivots": modes.pivots, "probe": probe(modes)}
-    return {name: values[name].to(kind) for name, (kind, _) in EXACT.items()}  # type: ignore[union-attr]
 
 
 def probe(modes: FixedModes) -> Tensor:
@@ -68,12 +63,12 @@ def probe(modes: FixedModes) -> Tensor:
     return (flat / rms)[rows, columns]
 
 
-def read(path: Path, cache_dir: str | None = None, cache: bool = True) -> ModalSequence:
-    """Read a file; :meth:`ModalSequence.load` says more."""
+def read(path: Path, cache_dir: str | None = None, cache: bool = True) -> dict[str, Any]:
+    """The fields of a sequence; :meth:`torch_modal.ModalSequence.load` says more."""
     return read_bytes(path.read_bytes(), path, cache_dir, cache)
 
 
-def read_bytes(data: bytes, path: Path | str, cache_dir: str | None = None, cache: bool = True) -> ModalSequence:
+def read_bytes(data: bytes, path: Path | str, cache_dir: str | None = None, cache: bool = True) -> dict[str, Any]:
     """The same of what was read."""
     try:
         tensors = load_tensors(data)
@@ -118,7 +113,7 @@ def _checked_exact(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return tensors
 
 
-def _assembled(parts: dict[str, Tensor], header: dict[str, Any], cache_dir: str | None, cache: bool) -> ModalSequence:
+def _assembled(parts: dict[str, Tensor], header: dict[str, Any], cache_dir: str | None, cache: bool) -> dict[str, Any]:
     """Check that all parts fit each other, and compute the modes."""
     x, faces = parts["keyframes"], parts["faces"]
     k_times, times, a, motions = (parts[name] for name in ("keyframe_times", "times", "amplitudes", "motions"))
@@ -156,4 +151,5 @@ def _assembled(parts: dict[str, Tensor], header: dict[str, Any], cache_dir: str 
             f"the modes computed here differ from those that it was written with (by {apart:.1e} of what they may); "
             "it is damaged, or was written by another version of torch_modal"
         )
-    return ModalSequence(x, faces, k_times, times, a, motions, modes, reference, parts["errors"])
+    names = ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions", "errors")
+    return {**{name: parts[name] for name in names}, "modes": modes, "reference": reference}

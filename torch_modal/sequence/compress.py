@@ -16,7 +16,7 @@ from torch_modal.io.files import write_atomically
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.progress import Progress
 from torch_modal.sequence import codec_packing as packing
-from torch_modal.sequence.codec import ERROR, encode, fitted, with_worst
+from torch_modal.sequence.codec import ERROR, ModalSequence, encode, fitted, with_worst
 from torch_modal.sequence.codec_file import probe, read_bytes, to_bytes
 from torch_modal.sequence.codec_modes import fixed_modes
 from torch_modal.sequence.times import checked_times
@@ -207,7 +207,7 @@ def _attempt(
         "digest": packing.digest(triangles, grid, a, m, clusters, pivots),
     }
     data = to_bytes(tensors, header)
-    read = read_bytes(data, "the file", **kept)
+    read = ModalSequence(**read_bytes(data, "the file", **kept))
     errors = (read.decode() - x).norm(dim=-1).mean(1) / size
     return data, errors, len(tensors["faces"])
 
