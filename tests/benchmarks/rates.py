@@ -11,7 +11,8 @@ All are lossy; each baseline is swept, and its fewest bits at an error come from
 - *Draco*: each frame as a mesh by DracoPy, less what it takes with all vertices in one place, for the faces.
 
 Bits are of a vertex and frame, without the faces, which all but Draco would keep once. Distances are means over
-vertices and frames, over the diagonal; KG is Karni and Gotsman's error in %; edge errors are means of ``|l - l_true| / l_true``.
+vertices and frames, over the diagonal; KG is Karni and Gotsman's error in %; edge errors are means of
+``|l - l_true| / l_true``.
 """
 
 from __future__ import annotations
