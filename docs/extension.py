@@ -175,7 +175,8 @@ def listed_pages() -> set[str]:
     """Pages that a list in index.md names."""
     text = (DOCS / "index.md").read_text(encoding="utf-8")
     lists = re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.M | re.S)
-    return {line.strip() for each in lists for line in each.splitlines() if line.strip() and line[0] != ":"}
+    entries = {line.strip() for each in lists for line in each.splitlines() if line.strip() and line[0] != ":"}
+    return {re.sub(r"^.*<(.+)>$", r"\1", entry) for entry in entries}  # with a title of its own, or without
 
 
 def unlisted_pages() -> list[str]:
@@ -190,6 +191,31 @@ def list_unlisted(app: Sphinx, page: str, source: list[str]) -> None:
         pages = "\n".join(unlisted_pages())
         listing = f"```{{toctree}}\n:caption: More\n:hidden:\n\n{pages}\n```" if pages else ""
         source[0] = source[0].replace(HERE, listing)
+
+
+def readme() -> str:
+    """README as the front page: it needs no second one."""
+    return (DOCS.parent / "README.md").read_text(encoding="utf-8").partition("\n")[2]
+
+
+def follow_links(app: Sphinx, page: str, source: list[str]) -> None:
+    """Links of the repository's pages lead to those of the site, or else to the repository."""
+    setup = (DOCS.parent / "setup.py").read_text(encoding="utf-8")
+    repository = re.search(r'^REPOSITORY = "(.+)"', setup, re.M)
+    assert repository is not None
+
+    def followed(match: re.Match[str]) -> str:
+        path = match[1]
+        if path.startswith("README.md"):
+            return f"](index.md{path.removeprefix('README.md')})"
+        return f"]({path[5:]})" if path.startswith("docs/") else f"]({repository[1]}/blob/HEAD/{path})"
+
+    if page == "index":
+        # As seen from the repository's root. Where a link shows the name of a file, the site shows a page's title.
+        text = re.sub(r"\]\((?!https?:|mailto:|#)([^)\s]+)\)", followed, re.sub(r"\[docs/[\w/.-]+\]\(", "[](", readme()))
+        source[0] = source[0].replace("<!-- README -->", text)
+    elif "/" not in page:
+        source[0] = re.sub(r"\]\(\.\./([^)\s]+)\)", followed, source[0])
 
 
 def always_index(app: Sphinx, *_: Any) -> list[str]:
@@ -241,6 +267,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("benchmark-list", BenchmarkList)
     app.connect("autodoc-process-docstring", suit_napoleon, priority=400)  # before napoleon
     app.connect("source-read", list_unlisted)
+    app.connect("source-read", follow_links)
     app.connect("env-get-outdated", always_index)
     app.connect("builder-inited", write_shape_pages)
     return {"parallel_read_safe": True}

@@ -110,7 +110,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("repository")
     shutil.copytree(DOCS, root / "docs", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "tests" / "benchmarks", root / "tests" / "benchmarks")
-    shutil.copy(ROOT / "README.md", root)
+    for name in ("README.md", "setup.py"):
+        shutil.copy(ROOT / name, root)
     (root / "docs" / "added.md").write_text("# A page that nobody listed\n\nSee [the layer](layer.md#gradients).\n")
     (root / "tests" / "environment.sh").write_text(f"python='{sys.executable}'\n")  # is there already
     command = ["sh", str(root / "docs" / "build.sh"), "--quiet"]
