@@ -212,7 +212,9 @@ def follow_links(app: Sphinx, page: str, source: list[str]) -> None:
 
     if page == "index":
         # As seen from the repository's root. Where a link shows the name of a file, the site shows a page's title.
-        text = re.sub(r"\]\((?!https?:|mailto:|#)([^)\s]+)\)", followed, re.sub(r"\[docs/[\w/.-]+\]\(", "[](", readme()))
+        text = re.sub(
+            r"\]\((?!https?:|mailto:|#)([^)\s]+)\)", followed, re.sub(r"\[docs/[\w/.-]+\]\(", "[](", readme())
+        )
         source[0] = source[0].replace("<!-- README -->", text)
     elif "/" not in page:
         source[0] = re.sub(r"\]\(\.\./([^)\s]+)\)", followed, source[0])
