@@ -2,9 +2,9 @@
 
     python examples/write_meshes.py [FOLDER]
 
-They are the samples under other names: a hand that closes (open.obj, fist.obj, pose-1.obj to pose-5.obj), the same fist
-with other vertices and faces (scan.ply; landmarks in pairs.txt), its true motion (truth), a galloping creature (gait-1.obj to gait-6.obj), and
-both in a folder tree (shapes/hand, shapes/creature).
+They are the samples under other names: a hand that closes (open.obj, fist.obj, pose-1.obj to pose-5.obj), its true
+motion (truth), the same fist with other vertices and faces (scan.ply; landmarks in pairs.txt), a galloping creature
+(gait-1.obj to gait-6.obj), and both in a folder tree (shapes/hand, shapes/creature).
 """
 
 import argparse
