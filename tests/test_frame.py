@@ -69,26 +69,31 @@ def test_place_and_restore(frame: Frame, moved: Tensor) -> None:
 def test_orthonormal_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
     directions = torch.randn(5, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
     mixed = torch.cat([directions, 3 * directions[:2] - directions[2:4], torch.zeros_like(directions[:1])])
-    columns = frame.orthonormal(mixed)
+    columns = frame.elastic_columns(mixed)
     assert len(columns.fine) == len(columns.coarse) == 5, "three of eight are dependent"
     weighted = columns.coarse * frame.coarse_weights[:, None]
     gram = torch.einsum("mvc,nvc->mn", weighted, columns.coarse)
     torch.testing.assert_close(gram, torch.eye(5, dtype=torch.float64), atol=1e-9, rtol=0)
     torch.testing.assert_close(frame.coarsen(columns.fine), columns.coarse, atol=1e-9, rtol=0)
-    # The same space as the directions'.
-    fit = torch.linalg.lstsq(columns.fine.flatten(1).T, directions.flatten(1).T).solution
-    torch.testing.assert_close(fit.T @ columns.fine.flatten(1), directions.flatten(1), atol=1e-9, rtol=0)
+    # With the rigid motions, the same space as the directions'.
+    span = torch.cat([frame.rigid.fine, columns.fine]).flatten(1)
+    fit = torch.linalg.lstsq(span.T, directions.flatten(1).T).solution
+    torch.testing.assert_close(fit.T @ span, directions.flatten(1), atol=1e-9, rtol=0)
     a = torch.randn(2, 5, dtype=torch.float64, generator=generator)
     torch.testing.assert_close(columns.combine(a), torch.einsum("bn,nvc->bvc", a, columns.fine))
 
 
-def test_remove_leaves_nothing_of_the_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
+def test_split_leaves_nothing_of_the_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
     directions = torch.randn(3, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
-    columns = frame.orthonormal(directions[:2])
-    left = frame.remove(directions, columns)
-    assert left[:2].abs().max() < 1e-9
-    inner = torch.einsum("mvc,nvc->mn", frame.coarsen(left) * frame.coarse_weights[:, None], columns.coarse)
+    columns = frame.elastic_columns(directions[:2])
+    amplitudes, left = frame.split(frame.coarsen(directions), columns)
+    inner = torch.einsum("mvc,nvc->mn", left * frame.coarse_weights[:, None], columns.coarse)
     assert inner.abs().max() < 1e-12
+    torch.testing.assert_close(left + frame.coarsen(columns.combine(amplitudes)), frame.coarsen(directions))
+    within = torch.tensor([[2.0, -3.0]], dtype=torch.float64)
+    amplitudes, left = frame.split(frame.coarsen(columns.combine(within)), columns)
+    torch.testing.assert_close(amplitudes, within)
+    assert left.abs().max() < 1e-9
 
 
 def test_elastic_columns_have_no_rigid_motion(frame: Frame, bars: Shapes) -> None:

@@ -178,7 +178,10 @@ class Frame(Alignment):
         sizes = torch.bincount(clusters, minlength=self.n_coarse)
         self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
         #: Rigid motions of the shape half-way between the references, to first order.
-        self.rigid = self.orthonormal(_rigid_fields(references.mean(0)))
+        fields = _rigid_fields(references.mean(0))
+        coarse = self.coarsen(fields)
+        mix = self._orthonormal(coarse)
+        self.rigid = Columns(torch.tensordot(mix, fields, 1), torch.tensordot(mix, coarse, 1))
         self.register_buffer("turn", turn.rotation, persistent=False)
 
     def modes(self, first: Tensor, second: Tensor) -> list[Tensor]:
@@ -191,26 +194,6 @@ class Frame(Alignment):
         means = _ClusterMeans.apply(flat, self.members, self.first_member, self.clusters, self.shares)
         return means.reshape(*x.shape[:-2], self.n_coarse, 3)
 
-    def orthonormal(self, directions: Tensor) -> Columns:
-        """Combinations of directions that are orthonormal on the coarse mesh; dependent ones are dropped.
-
-        Args:
-            directions: Displacements of the fine vertices. *Shape:* ``(m, V, 3)``.
-
-        Returns:
-            ``n <= m`` columns.
-        """
-        coarse = self.coarsen(directions)
-        weighted = (coarse * self.coarse_weights[:, None]).flatten(1)
-        values, vectors = torch.linalg.eigh(weighted @ coarse.flatten(1).mT)
-        keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
-        mix = (vectors[:, keep] / values[keep].sqrt()).mT
-        return Columns(torch.tensordot(mix, directions, 1), torch.tensordot(mix, coarse, 1))
-
-    def remove(self, directions: Tensor, columns: Columns) -> Tensor:
-        """Directions less their part in the span of columns, as the coarse mesh sees it. *Shape:* ``(..., V, 3)``."""
-        return directions - columns.combine(self.split(self.coarsen(directions), columns)[0])
-
     def split(self, coarse: Tensor, columns: Columns) -> tuple[Tensor, Tensor]:
         """Amplitudes of columns in coarse directions, and what is left. *Shape:* ``(..., n), (..., V_coarse, 3)``."""
         weighted = (columns.coarse * self.coarse_weights[:, None]).flatten(1)
@@ -218,17 +201,30 @@ class Frame(Alignment):
         return amplitudes, coarse - (amplitudes @ columns.coarse.flatten(1)).unflatten(-1, (-1, 3))
 
     def elastic_columns(self, directions: Tensor) -> Columns:
-        """Independent combinations of directions, without rigid motions.
+        """Independent combinations of directions, without rigid motions, orthonormal on the coarse mesh.
 
         The energy does not see translations, and rotations only to second order: left in, they are null directions of
         its Hessian. Modes of two key-frames are partly the same: what is dependent is dropped here, explicitly.
 
         Args:
             directions: Displacements of the fine vertices, of any scale. *Shape:* ``(m, V, 3)``.
+
+        Returns:
+            ``n <= m`` columns.
         """
-        directions = self.remove(directions, self.rigid)
-        sizes = torch.linalg.norm(self.coarsen(directions).flatten(1), dim=1)[:, None, None]
-        return self.orthonormal(directions / sizes.clamp_min(torch.finfo(sizes.dtype).tiny))
+        rigid, coarse = self.split(self.coarsen(directions), self.rigid)
+        sizes = torch.linalg.norm(coarse.flatten(1), dim=1)[:, None].clamp_min(torch.finfo(coarse.dtype).tiny)
+        mix = self._orthonormal(coarse / sizes[:, None]) / sizes.T
+        # The fine columns are as large as all modes: one product makes them.
+        fine = torch.tensordot(mix, directions, 1) - self.rigid.combine(mix @ rigid)
+        return Columns(fine, torch.tensordot(mix, coarse, 1))
+
+    def _orthonormal(self, coarse: Tensor) -> Tensor:
+        """Combinations of coarse directions that are orthonormal; dependent ones are dropped. *Shape:* ``(n, m)``."""
+        weighted = (coarse * self.coarse_weights[:, None]).flatten(1)
+        values, vectors = torch.linalg.eigh(weighted @ coarse.flatten(1).mT)
+        keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
+        return (vectors[:, keep] / values[keep].sqrt()).mT
 
 
 class _ClusterMeans(torch.autograd.Function):

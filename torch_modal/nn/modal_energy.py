@@ -59,8 +59,9 @@ class ModalEnergy(nn.Module):
         self.curvature = Curvature(self.energy)
         self.congruence = Congruence(self.curvature.pairs, rows)
         self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
+        of_vertices = rows.permute(2, 0, 1).contiguous()
         for i, part in enumerate(self.energy.parts):
-            spokes = None if part.term.total else part.spokes(rows).permute(3, 0, 1, 2).flatten(1, 2).contiguous()
+            spokes = None if part.term.total else _spokes_of_rows(of_vertices, part.corners)
             self.register_buffer(f"spoke_columns_{i}", spokes, persistent=False)
 
     @property
@@ -174,6 +175,15 @@ class ModalEnergy(nn.Module):
         pushed = self.curvature.push(blocks, extra)
         border = pushed.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
         return _bordered(inner, border, (extra * pushed).sum((0, -1)))
+
+
+def _spokes_of_rows(values: Tensor, corners: Tensor) -> Tensor:
+    """:meth:`torch_modal.energy.energy.OnMesh.spokes` of rows that lie together in memory.
+
+    *Shape:* ``(V, 3, n), (c, M) -> (M, 3 (c-1), n)``.
+    """
+    first, *others = (values.index_select(0, corner) for corner in corners)
+    return torch.cat([other - first for other in others], 1)
 
 
 def _normal_equations(one: Linearised, columns: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor]:
