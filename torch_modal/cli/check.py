@@ -36,15 +36,14 @@ def run(args: argparse.Namespace) -> int:
     """Run ``torch-modal check``: 0 where no parts go through each other that do not in the key-frames, else 3."""
     if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
         args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
-    from torch_modal.geometry.crossings import require
+    from torch_modal.geometry.crossings import require_contact
     from torch_modal.io.write import refuse_existing
 
     if args.picture:
         if args.picture.resolve() in {mesh.resolve() for mesh in [*args.meshes, *args.keyframes]}:
             raise ValueError(f"{args.picture} is one of the meshes; choose another file")
         refuse_existing(args.picture, args.overwrite)
-    for name in ("ipctk", "igl"):
-        require(name)
+    require_contact()
 
     import torch_modal as tm
 

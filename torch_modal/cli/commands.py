@@ -18,6 +18,8 @@ def subdivide(args: argparse.Namespace) -> None:
     """Run ``torch-modal subdivide``."""
     if len(args.meshes) < 2:
         args.fail("subdivide needs two key-frames or more")
+    if args.contact and args.preset == "paper":
+        args.fail("--contact needs one shape for each in-between; --preset paper has two")
     if args.mu is not None and args.preset != "paper":
         args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if (args.landmarks or args.across) and not args.register:
@@ -59,6 +61,7 @@ def subdivide(args: argparse.Namespace) -> None:
         progress=progress,
         objective=objective,
         solver=replace(solver, polish=args.polish),
+        contact=args.contact,
     )
     frames = welded.scatter(solved)
     keys = [place for place in places if place < len(frames)]

@@ -225,6 +225,9 @@ def build_parser() -> argparse.ArgumentParser:
         help="treat each pair of key-frames alone, without what its neighbours in time know",
     )
     sub.add_argument(
+        "--contact", action="store_true", help="keep parts from passing through each other (extra contact)"
+    )
+    sub.add_argument(
         "--preset",
         choices=("accurate", "fast", "paper"),
         default="accurate",

@@ -16,6 +16,7 @@ from torch_modal.data.recent import Recent
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
@@ -69,6 +70,8 @@ class ShapeSpace:
         keyframe_times: When the key-frames are, if they are a motion, as for :class:`torch_modal.Path`. Partners of
             key-frames are then those before and after them in time, and what is between is that path's.
         cyclic: Whether the last key-frame of the motion leads on to the first.
+        contact: Whether parts are kept from passing through each other, in the place of what the objective says
+            (docs/contact.md; extra ``contact``).
 
     Raises:
         ValueError: The bases do not fit each other or the faces, ``times`` is below 4, or ``keyframe_times`` are not
@@ -88,6 +91,7 @@ class ShapeSpace:
         folder: str | os.PathLike[str] | None = None,
         keyframe_times: Tensor | Sequence[float] | None = None,
         cyclic: bool = False,
+        contact: bool | None = None,
     ) -> None:
         self.bases = [basis.to("cpu") for basis in ([bases] if isinstance(bases, ModalBasis) else bases)]
         if not self.bases:
@@ -99,7 +103,9 @@ class ShapeSpace:
             raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between anew")
         # What is wrong with the faces is said here, and repaired as everywhere.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
-        self.settings = settings(preset, objective, solver)
+        self.settings = settings(preset, objective, solver, contact)
+        if self.settings.objective.contact:
+            require_contact()
         self.times = times
         self.dtype = dtype
         self.folder = None if folder is None else Path(folder)
@@ -220,9 +226,13 @@ class ShapeSpace:
     def _between(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
         """Between two key-frames themselves: along the motion if they follow each other in it, else of the pair."""
         span = self._span(i, j)
+        objective, solver = self.settings
+        if span is None and objective.contact:
+            # Pushed apart the same way at all times, so that tables are smooth.
+            pair = MotionPath([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver).to(like)
+            return partial(pair.solve, self.keyframes(like)[[i, j]])
         if span is None:
             return partial(self._layer(i, j).to(like).solve, *self.keyframes(like)[[i, j]])
-        objective, solver = self.settings
         bases = [self.bases[key] for key in span.keyframes]
         # The neighbours are all that it depends on; a path of all key-frames would be made anew for each table.
         course = MotionPath(bases, self.faces, span.times, objective=objective, solver=solver).to(like)

@@ -92,6 +92,10 @@ class OnMesh(nn.Module):
         measures = self.term.measures(spokes)
         return measures.sum(-1, keepdim=True) if self.term.total else measures
 
+    def acting(self, weight: Tensor, difference: Tensor) -> Tensor:
+        """The weights where the measures are stiff. *Shape:* ``(B, R, M)``."""
+        return torch.where(difference == 0, 0, weight) if self.term.one_sided else weight
+
     def to_corners(self, on_spokes: Tensor) -> Tensor:
         """From the spokes to the vertices of the elements. *Shape:* ``(n-1, 3, ..., M) -> (3, ..., n M)``."""
         return torch.cat([-on_spokes.sum(0), *on_spokes], -1)
@@ -222,7 +226,7 @@ class Energy(nn.Module):
                 corners = part.to_corners(gradients)
                 gradients = torch.zeros_like(extended).index_add(-1, part.corners.flatten(), corners)
             difference = part.term.difference(measures[..., None, :], rest)
-            slope, curvature = 2 * (weight * difference).sum(-2), 2 * weight.sum(-2)
+            slope, curvature = 2 * (weight * difference).sum(-2), 2 * part.acting(weight, difference).sum(-2)
             found.append(Linearised(spokes, gradients, difference, slope, curvature.expand_as(slope)))
         return found
 

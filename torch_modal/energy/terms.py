@@ -108,6 +108,8 @@ class Term(nn.Module):
     """Whether the measures of all elements add up to one, such as a volume."""
     periodic = False
     """Whether measures come round, such as angles."""
+    one_sided = False
+    """Whether a difference of zero stands for all on one side of the rest, where nothing is stiff either."""
     sampled = False
     """Whether elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
     stiffness: Any

@@ -34,6 +34,8 @@ class Held(NamedTuple):
     """*Shape:* ``(n,)``."""
     faces: IntArray
     """*Shape:* ``(n,)``."""
+    slack: FloatArray
+    """How far behind the face the vertex was in each known shape; 0 if in front. *Shape:* ``(n, K)``."""
     n_far: int
     """Pairs of triangles that went through each other."""
     watched: BoolArray
@@ -70,53 +72,62 @@ class Search:
             seeds |= crossings.grown(np.flatnonzero(inside))
         none = np.zeros(0, np.int64)
         if not seeds.any():
-            return Held(none, none, 0, seeds)
-        vertices, faces, _, _ = self.opposite(x, seeds, inside)
-        return Held(vertices, faces, len(pairs), seeds)
+            return Held(none, none, np.zeros((0, len(self._known))), 0, seeds)
+        # What was inside in a key-frame is not to go in elsewhere.
+        asked = np.flatnonzero(seeds & crossings.known_inside)
+        stuck = np.zeros(len(x), dtype=bool)
+        stuck[asked[crossings.winding(x, asked) > 0.5]] = True
+        return Held(*self.opposite(x, seeds, inside, stuck), len(pairs), seeds)
 
     def opposite(
-        self, x: FloatArray, seeds: BoolArray, inside: BoolArray
-    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """The nearest face before or, of what is inside, behind which each vertex lies.
+        self, x: FloatArray, seeds: BoolArray, inside: BoolArray, stuck: BoolArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """The nearest face before which, or of what is inside, behind which each vertex lies.
 
         Args:
             x: *Shape:* ``(V, 3)``.
             seeds: Vertices that are asked for, and corners of faces that may be found. *Shape:* ``(V,)``.
-            inside: Vertices that are inside the surface. *Shape:* ``(V,)``.
+            inside: Vertices that are inside the surface, and were not in any known shape. *Shape:* ``(V,)``.
+            stuck: Vertices that are inside the surface, and were in a known shape. *Shape:* ``(V,)``.
 
         Returns:
-            Vertices and faces, *shape* ``(n,)``, signed distances, *shape* ``(n,)``, and the feet on the faces, *shape*
-            ``(n, 3)``.
+            Vertices, faces and slack of :class:`Held`.
         """
         crossings, corners = self.crossings, self.crossings.mesh.faces
         reach, near = REACH * crossings.diagonal, NEAR * crossings.diagonal
         surface = _Surface(crossings, x)
         some = np.flatnonzero(seeds[corners].any(1))
         tree = cKDTree(surface.centres[some])
+        within = inside | stuck
         parts = []
-        for chosen, radius in ((seeds & ~inside, near + 1.5 * self._edge), (inside, reach)):
+        for chosen, radius in ((seeds & ~within, near + 1.5 * self._edge), (within, reach)):
             own = np.flatnonzero(chosen)
             if len(own):
                 found = cKDTree(x[own]).sparse_distance_matrix(tree, radius, output_type="ndarray")
                 parts.append((own[found["i"]], some[found["j"]]))
         if not parts:
             none = np.zeros(0, np.int64)
-            return none, none, np.zeros(0), np.zeros((0, 3))
+            return none, none, np.zeros((0, len(self._known)))
         v, f = (np.concatenate(part) for part in zip(*parts, strict=True))
         v, f = _kept((surface.vertex_normals[v] * surface.normals[f]).sum(1) < FACING, v, f)
         v, f = _kept(~(corners[f] == v[:, None]).any(1), v, f)
-        distance, signed, feet = surface.to_faces(v, f)
-        before = (signed > -_BEHIND * self._edge) | inside[v]
+        distance, signed, _ = surface.to_faces(v, f)
+        before = (signed > -_BEHIND * self._edge) | within[v]
         keep = (signed < near) & (signed > -reach) & (np.abs(signed) > _STRAIGHT * distance - 1e-9 * reach) & before
-        v, f, distance, signed, feet = _kept(keep, v, f, distance, signed, feet)
+        v, f, distance = _kept(keep, v, f, distance)
+        slack: list[FloatArray] = []
         for known in self._known:
             away, side, _ = known.to_faces(v, f)
-            v, f, distance, signed, feet = _kept(
-                (away > 1.5 * reach) | (side > -1e-3 * self._edge), v, f, distance, signed, feet
-            )
+            behind = (away <= 1.5 * reach) & (side <= -1e-3 * self._edge)
+            keep = ~behind | stuck[v]
+            slack = [part[keep] for part in slack] + [np.where(behind, -side, 0.0)[keep]]
+            v, f, distance = _kept(keep, v, f, distance)
         order = np.lexsort((distance, v))
         first = order[np.flatnonzero(np.diff(v[order], prepend=-1))]
-        return v[first], f[first], signed[first], feet[first]
+        v, f, both = v[first], f[first], np.stack(slack, 1)[first] if slack else np.zeros((len(first), 0))
+        # Folds are inside, too, where they are in a key-frame.
+        keep = ~stuck[v] | crossings.apart(v, f)
+        return v[keep], f[keep], both[keep]
 
     def depth(self, x: FloatArray, pairs: IntArray) -> FloatArray:
         """How deep vertices are inside where parts went through each other; 0 elsewhere.

@@ -4,7 +4,6 @@ Pairs come from a broad phase of ``ipctk`` and a test of an edge against a face;
 are the extra ``contact`` and are imported when they are first needed.
 """
 
-import importlib
 from functools import cached_property
 from typing import Any
 
@@ -13,12 +12,16 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from torch_modal import extras
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+PACKAGES = ("ipctk", "igl")
+"""Of the extra."""
 
 RINGS = 2
 """Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
@@ -34,20 +37,25 @@ def require(name: str) -> Any:
     Raises:
         MissingPackageError: It is not installed; the message says how to install it.
     """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingPackageError(
-            f"contact needs {name}, which is not installed: pip install 'torch_modal[contact]'"
-        ) from error
+    return extras.require(name, "contact", "contact")
+
+
+def require_contact() -> None:
+    """Refuse work with contact where the extra is not installed, before any of it is done.
+
+    Raises:
+        MissingPackageError: It names what is missing.
+    """
+    extras.require_installed(PACKAGES, "contact", "contact")
 
 
 def has_contact() -> bool:
     """Whether the extra ``contact`` is installed."""
     try:
-        return all(require(name) is not None for name in ("ipctk", "igl"))
+        require_contact()
     except MissingPackageError:
         return False
+    return True
 
 
 class Crossings:
@@ -186,6 +194,22 @@ class Crossings:
             reached = dijkstra(self.lengths, indices=faces[face], min_only=True, limit=limit)
             far[mine] = (~np.isfinite(reached[faces[pairs[mine, 1]]])).all(1)
         return far
+
+    def apart(self, vertices: IntArray, faces: IntArray) -> BoolArray:
+        """Whether a vertex and a face are more than :data:`FAR` apart along the surface. *Shape:* ``(n,)`` each."""
+        found = np.ones(len(vertices), dtype=bool)
+        for k, (vertex, face) in enumerate(zip(vertices, faces, strict=True)):
+            reached = dijkstra(self.lengths, indices=vertex, limit=FAR * self.diagonal)
+            found[k] = not np.isfinite(reached[self.mesh.faces[face]]).any()
+        return found
+
+    def within(self, vertices: BoolArray, part: float) -> BoolArray:
+        """Vertices within a part of the diagonal of given ones, along the surface. *Shape:* ``(V,) -> (V,)``."""
+        if not vertices.any():
+            return vertices
+        limit = part * self.diagonal
+        reached = dijkstra(self.lengths, indices=np.flatnonzero(vertices), min_only=True, limit=limit)
+        return np.asarray(np.isfinite(reached))
 
     def winding(self, x: FloatArray, vertices: IntArray) -> FloatArray:
         """How often the surface winds around a point just outside each vertex: about 1 inside, about 0 outside.

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import Search
-from torch_modal.geometry.crossings import Crossings, FloatArray, require
+from torch_modal.geometry.crossings import Crossings, FloatArray, require_contact
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 
@@ -60,8 +60,7 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
         MeshError: Arrays that are no shapes of these faces, or not finite.
         MissingPackageError: The extra ``contact`` is not installed.
     """
-    require("ipctk")
-    require("igl")
+    require_contact()
     given = as_positions(x)
     corners = as_faces(faces)
     shapes = _shapes("x", given, None)

@@ -54,7 +54,7 @@ class _ArgMin(torch.autograd.Function):
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         if minimisation.report is not None:
             minimisation.report(solution)
-        return tuple(solution)
+        return tuple(value for value in solution if value is not None)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
+from torch_modal.geometry.crossings import require_contact
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.between import Between, InBetweenResult, Samples, report
@@ -37,10 +38,14 @@ class InBetween(nn.Module):
         preset: ``"accurate"``, ``"fast"`` or ``"paper"``: docs/layer.md says what each costs and gives.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
+        contact: Whether parts are kept from passing through each other, in the place of what the objective says
+            (docs/contact.md; extra ``contact``). Each in-between is then pushed apart on its own: a motion is made by
+            :class:`torch_modal.Path`, which does it the same way at all times.
         pairs: Which bases belong together, where there are more than two. Default: each with the next.
 
     Raises:
         ValueError: An argument is not usable.
+        MissingPackageError: ``contact`` without that extra.
     """
 
     terms: Any
@@ -55,6 +60,7 @@ class InBetween(nn.Module):
         *,
         objective: Objective | None = None,
         solver: Solver | None = None,
+        contact: bool | None = None,
         pairs: Sequence[tuple[int, int]] | None = None,
     ) -> None:
         super().__init__()
@@ -67,7 +73,9 @@ class InBetween(nn.Module):
         sizes = sorted({basis.n_vertices for basis in bases})
         if len(sizes) > 1:
             raise ValueError(f"the bases belong to meshes of {sizes} vertices; an in-between needs one connectivity")
-        self.objective, self.solver = settings(preset, objective, solver)
+        self.objective, self.solver = settings(preset, objective, solver, contact)
+        if self.objective.contact:
+            require_contact()
         self.terms = nn.ModuleList(self.objective.all_terms())
         mu = self.objective.mu
         if isinstance(mu, Tensor) and not isinstance(mu, nn.Parameter):
@@ -310,14 +318,16 @@ def joined(parts: Sequence[InBetweenResult], order: Sequence[Tensor]) -> InBetwe
     amplitudes = torch.cat(
         [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]
     )
-    others = [torch.cat(values)[back] for values in zip(*(part.solution[1:] for part in parts), strict=True)]
+    each = zip(*(part.solution[1:] for part in parts), strict=True)
+    others = [None if values[0] is None else torch.cat(values)[back] for values in each]
     shapes = torch.cat([part.shapes for part in parts])
-    return InBetweenResult(shapes[back], Solution(amplitudes[back], *others))
+    return InBetweenResult(shapes[back], Solution(amplitudes[back], *others))  # type: ignore[arg-type]
 
 
 def unflattened(result: InBetweenResult, lead: torch.Size) -> InBetweenResult:
     """A flat batch with these leading dimensions."""
-    solution = Solution(*(value.reshape(lead + value.shape[1:]) for value in result.solution))
+    values = (None if value is None else value.reshape(lead + value.shape[1:]) for value in result.solution)
+    solution = Solution(*values)  # type: ignore[arg-type]
     return InBetweenResult(result.shapes.reshape(*lead, *result.shapes.shape[1:]), solution)
 
 

@@ -125,7 +125,7 @@ class JointSpace(nn.Module):
         coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
         difference, column = self._difference(pair, coarse_second - coarse_first)
         # The fine column is not needed before the end, unless terms look at vertices.
-        extras = levels.seen(self._column(difference), column) if levels.sampled else [column]
+        extras = levels.seen(self.column(difference), column) if levels.sampled else [column]
         difference, extras = trees.picked((difference, extras), index)
         start = None
         if pair.around is not None:
@@ -202,7 +202,7 @@ class JointSpace(nn.Module):
         scale = (squared + rounding**2).rsqrt()
         return Difference(pair.second - pair.first, rigid, modal, scale), coarse * scale[:, None, None]
 
-    def _column(self, own: Difference) -> Tensor:
+    def column(self, own: Difference) -> Tensor:
         """The difference as a column on the fine mesh. *Shape:* ``(B, V, 3)``."""
         left = own.whole - self.frame.rigid.combine(own.rigid) - self.columns.combine(own.modal)
         return own.scale[:, None, None] * left

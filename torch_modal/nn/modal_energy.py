@@ -153,7 +153,8 @@ class ModalEnergy(nn.Module):
             own = energy.gradient(at).transpose(0, 1)
             to_extra = a[:, n, None, None] * to_base + direction[:, n, None, None] * own
         rates = [rate[:, None] for rate in rates]
-        to_measures = [-2 * weight * rate for weight, rate in zip(placement.reference.weights, rates, strict=True)]
+        parts = zip(energy.parts, placement.reference.weights, at, rates, strict=True)
+        to_measures = [-2 * part.acting(weight, one.difference) * rate for part, weight, one, rate in parts]
         to_weights = [2 * rate * one.difference for one, rate in zip(at, rates, strict=True)]
         constant = placement.reference.constant
         to_constant = torch.zeros_like(constant) if isinstance(constant, Tensor) else constant

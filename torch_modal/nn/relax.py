@@ -47,8 +47,8 @@ class ConvexHessian:
                 received.append(tension * spokes + (one.curvature - tension) * rate * one.gradients)
         return self.energy.scatter(self.at, received)
 
-    def inverse_diagonal(self) -> Tensor:
-        """Inverses of the 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
+    def diagonal(self) -> Tensor:
+        """The 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
         on_corners = []
         for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
             if part.term.total:
@@ -63,7 +63,11 @@ class ConvexHessian:
             on_corners.append(blocks)
         blocks = torch.cat(on_corners, -1)
         summed = blocks.new_zeros(*blocks.shape[:-1], self.energy.n_extended)
-        return inverse_of_symmetric(summed.index_add(-1, self.energy.corners, blocks))
+        return summed.index_add(-1, self.energy.corners, blocks)
+
+    def inverse_diagonal(self) -> Tensor:
+        """Inverses of the 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
+        return inverse_of_symmetric(self.diagonal())
 
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:

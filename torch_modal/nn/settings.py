@@ -36,6 +36,8 @@ class Objective:
             broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.
         coarse_faces: Faces of the mesh that the energy is evaluated on in the modal space.
+        contact: Whether parts are kept from passing through each other (docs/contact.md). It needs the extra
+            ``contact``, and the joint space.
 
     Raises:
         ValueError: A choice that does not exist, or a number out of range.
@@ -49,11 +51,14 @@ class Objective:
     mu: float | Tensor = 1.0  # the best of a grid over three spans of a hand; it depends on the mesh
     terms: tuple[Term, ...] = ()
     coarse_faces: int = 1000
+    contact: bool = False
 
     def __post_init__(self) -> None:
         _choice("space", self.space, ("joint", "paired"))
         _choice("base", self.base, ("rotations", "linear"))
         _whole("coarse_faces", self.coarse_faces, 4)
+        if self.contact and self.space == "paired":
+            raise ValueError("contact needs one shape for each in-between: space='joint', not 'paired'")
         wrong = [term for term in self.terms if not isinstance(term, Term)]
         if wrong:
             raise ValueError(f"terms holds a {type(wrong[0]).__name__}; each is an instance of torch_modal.Term")
@@ -128,7 +133,9 @@ PRESETS = {
 """What the names stand for; docs/layer.md says what each costs and gives."""
 
 
-def settings(preset: str, objective: Objective | None = None, solver: Solver | None = None) -> Settings:
+def settings(
+    preset: str, objective: Objective | None = None, solver: Solver | None = None, contact: bool | None = None
+) -> Settings:
     """The settings of a preset, with what is given in the place of its own.
 
     Raises:
@@ -136,7 +143,10 @@ def settings(preset: str, objective: Objective | None = None, solver: Solver | N
     """
     _choice("preset", preset, tuple(PRESETS))
     chosen = PRESETS[preset]
-    return Settings(objective or chosen.objective, solver or chosen.solver)
+    objective = objective or chosen.objective
+    if contact is not None:
+        objective = replace(objective, contact=contact)
+    return Settings(objective, solver or chosen.solver)
 
 
 def with_space(chosen: Settings, space: str | None, mu: float | Tensor | None) -> Settings:

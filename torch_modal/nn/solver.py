@@ -93,6 +93,8 @@ class Solution(NamedTuple):
     """Steps taken. *Shape:* ``(B,)``, int64."""
     status: Tensor
     """A :class:`Status` for each. *Shape:* ``(B,)``, int64."""
+    n_crossing: Tensor | None = None
+    """With contact, the pairs of triangles of parts that still go through each other. *Shape:* ``(B,)``, int64."""
 
     @property
     def converged(self) -> Tensor:
@@ -316,7 +318,8 @@ def minimise(
         relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
         left = Solution(a, energy, relative, result.n_steps[rows], status)
         for whole, part in zip(result, left, strict=True):
-            whole[rows[leaving]] = part[leaving]
+            if whole is not None and part is not None:
+                whole[rows[leaving]] = part[leaving]
         if bool(leaving.all()):
             break
         slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)

@@ -6,18 +6,24 @@ a shape of it. Nothing is minimised unless there are terms beyond Eq. 5, which t
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.nn.between import InBetweenResult, Samples
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
+from torch_modal.sequence.contact import push_apart
 from torch_modal.sequence.times import checked_times
+
+# Even times between two key-frames at which a path looks for contacts.
+N_SEARCHED = 15
 
 
 class _Lazy(InBetween):
@@ -43,9 +49,13 @@ class Path(nn.Module):
         preset: As for :class:`torch_modal.InBetween`; not ``"paper"``, which knows the middle of a pair only.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
+        contact: Whether parts are kept from passing through each other, in the place of what the objective says
+            (docs/contact.md; extra ``contact``). Shapes are searched at 15 times between any two key-frames, and
+            pushed apart by one displacement that is smooth in time. It is a constant of the graph.
 
     Raises:
         ValueError: An argument is not usable.
+        MissingPackageError: ``contact`` without that extra.
     """
 
     times: Tensor
@@ -61,15 +71,21 @@ class Path(nn.Module):
         *,
         objective: Objective | None = None,
         solver: Solver | None = None,
+        contact: bool | None = None,
     ) -> None:
         super().__init__()
         n = len(bases)
         if n < 2:
             raise ValueError(f"a path needs two key-frames or more, got {n} bases")
-        objective, solver = settings(preset, objective, solver)
+        objective, solver = settings(preset, objective, solver, contact)
         if objective.space == "paired":
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
         self.register_buffer("times", checked_times(times, n, cyclic))
+        #: Whether shapes are pushed apart. The layer does not: what it did at each time alone would jump.
+        self.contact = objective.contact
+        if self.contact:
+            require_contact()
+        objective = replace(objective, contact=False)
         pairs = [(i, (i + 1) % n) for i in range(n if cyclic else n - 1)]
         kind = _Lazy if smooth and n > 2 and not objective.terms else InBetween
         self.layer = kind(list(bases), faces, objective=objective, solver=solver, pairs=pairs)
@@ -101,7 +117,7 @@ class Path(nn.Module):
             raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
         other = Path.__new__(Path)
         nn.Module.__init__(other)
-        other.layer, other.cyclic, other.smooth = self.layer, self.cyclic, self.smooth
+        other.layer, other.cyclic, other.smooth, other.contact = self.layer, self.cyclic, self.smooth, self.contact
         other.members = [*self.members[: i + 1], *self.members[i:]]
         other.register_buffer(
             "times", torch.cat([self.times[: i + 1], self.times.new_tensor([t]), self.times[i + 1 :]])
@@ -188,6 +204,17 @@ class Path(nn.Module):
         report: Callable[[Solution], None] | None,
     ) -> InBetweenResult:
         """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
+        member = self.layer.members[self.members[i]]
+        samples = self.samples(keyframes, i, which, u)
+        with full_precision(u.device.type):
+            result = member(samples, exact, report)
+            if self.contact:
+                result = self._in_contact(keyframes, i, samples, result)
+        ends = keyframes[which, i], keyframes[which, (i + 1) % self.n_keyframes]
+        return InBetweenResult(with_exact_ends(result.shapes, *ends, samples.t), result.solution)
+
+    def samples(self, keyframes: Tensor, i: int, which: Tensor, u: Tensor) -> Samples:
+        """Times of one interval as a batch. *Shape:* ``(L, K, V, 3), (B,), (B,)``."""
         layer, n = self.layer, self.n_keyframes
         x = keyframes.to(layer.dtype)
         around: dict[str, Any] = {}
@@ -199,10 +226,23 @@ class Path(nn.Module):
             spacing = Spacing(*(h[j % len(h)].expand(len(x)) for j in (i - 1, i, i + 1)))
             around = {"before": before, "after": after, "spacing": spacing}
         u = u.to(x)
-        samples = Samples(
-            x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), layer.stiffness_of(u, u.shape), **around
-        )
-        with full_precision(x.device.type):
-            result = layer.members[self.members[i]](samples, exact, report)
-        ends = keyframes[which, i], keyframes[which, (i + 1) % n]
-        return InBetweenResult(with_exact_ends(result.shapes, *ends, u), result.solution)
+        stiffness = layer.stiffness_of(u, u.shape)
+        return Samples(x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), stiffness, **around)
+
+    def _in_contact(self, keyframes: Tensor, i: int, samples: Samples, result: InBetweenResult) -> InBetweenResult:
+        """Shapes of one interval pushed apart, by what is found at even times of each motion."""
+        member = self.layer.members[self.members[i]]
+        even = torch.arange(1, N_SEARCHED + 1).to(samples.t) / (N_SEARCHED + 1)
+        shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)
+        which = samples.which
+        assert which is not None
+        for motion in which.unique().tolist():
+            own = keyframes[motion : motion + 1]
+            grid = self.samples(own, i, torch.zeros(len(even), dtype=torch.int64, device=which.device), even)
+            with torch.no_grad():
+                found = push_apart(member, grid, member(grid, False, None).shapes)
+            mine = torch.nonzero(which == motion).flatten()
+            at = self.samples(own, i, torch.zeros_like(mine), samples.t[mine])
+            shapes = shapes.index_copy(0, mine, found.apply(member, at, result.shapes[mine]))
+            left[mine] = found.n_crossing.sum()
+        return InBetweenResult(shapes, result.solution._replace(n_crossing=left))

@@ -1,22 +1,31 @@
 """From key-frames to a dense sequence: recursive subdivision (section 3.3 of the paper) and linear fill."""
 
+import logging
+import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
+from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.nn.between import Between, Samples
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import extract_bases
 from torch_modal.progress import Progress, ProgressReport
+from torch_modal.sequence.contact import push_apart
 from torch_modal.sequence.path import Path
 from torch_modal.sequence.times import checked_times
+
+logger = logging.getLogger(__name__)
 
 MAX_LEVELS = 12
 
@@ -35,6 +44,7 @@ def subdivide(
     preset: Preset = "accurate",
     objective: Objective | None = None,
     solver: Solver | None = None,
+    contact: bool | None = None,
     progress: Progress = None,
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
@@ -60,6 +70,9 @@ def subdivide(
         preset: As for :class:`torch_modal.InBetween`.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
+        contact: Whether parts are kept from passing through each other, in the place of what the objective says
+            (docs/contact.md; extra ``contact``). The shapes between two key-frames are pushed apart together, by a
+            displacement that is smooth in time.
         progress: What is said while it goes on: see :data:`torch_modal.progress.Progress`.
 
     Returns:
@@ -68,11 +81,22 @@ def subdivide(
 
     Raises:
         ValueError: Input that cannot be used; the message says what arrived and what to do.
+        MissingPackageError: ``contact`` without that extra.
+
+    Warns:
+        MeshWarning: With ``contact``, which key-frames pass through themselves, and how many frames still do that no
+            key-frame does.
     """
     keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2, warn=bases is not None)
     n_keys = len(keyframes)
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    chosen = settings(preset, objective, solver)
+    chosen = settings(preset, objective, solver, contact)
+    apart = None
+    if chosen.objective.contact:
+        require_contact()
+        apart = _Apart()
+        # Not each shape on its own: what was done at one time would not fit what was done at the next.
+        chosen = chosen._replace(objective=replace(chosen.objective, contact=False))
     if smooth is None:
         smooth = n_keys > 2 and chosen.objective.space == "joint"
     if smooth and chosen.objective.space == "paired":
@@ -85,13 +109,15 @@ def subdivide(
     total = len(places) - 1 if smooth else (len(places) - 1) * levels
     with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
         if smooth:
-            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, chosen)
+            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, chosen, apart)
         else:
-            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar)
+            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar, apart)
         for i, shapes in enumerate(parts):
             sequence[places[i] : places[i + 1] + 1] = shapes
             sequence[places[i]], sequence[places[i + 1]] = keyframes[i], keyframes[(i + 1) % n_keys]
             bar.update(smooth)
+    if apart is not None:
+        apart.report(keyframes, working_faces)
     return sequence[:-1] if cyclic else sequence
 
 
@@ -103,13 +129,19 @@ def _along_path(
     times: Tensor | Sequence[float] | None,
     cyclic: bool,
     chosen: Settings,
+    apart: "_Apart | None",
 ) -> Iterator[Tensor]:
     """Shapes of each interval, smooth in time."""
     path = Path(bases, faces.cpu(), times, cyclic, objective=chosen.objective, solver=chosen.solver)
     path.to(keyframes.device)
-    for when in _times_of_intervals(path.times, places):
+    for i, when in enumerate(_times_of_intervals(path.times, places)):
+        shapes = path(keyframes, when[1:-1])
+        if apart is not None and len(shapes):
+            u = (when[1:-1] - when[0]) / (when[-1] - when[0])
+            samples = path.samples(keyframes[None], i, torch.zeros_like(u, dtype=torch.int64), u)
+            shapes = apart(path.layer.members[path.members[i]], samples, shapes)
         ends = keyframes[:1]  # the key-frames are put there by the caller
-        yield torch.cat([ends, path(keyframes, when[1:-1]), ends])
+        yield torch.cat([ends, shapes, ends])
 
 
 def _by_recursion(
@@ -121,6 +153,7 @@ def _by_recursion(
     n_frames: int | None,
     chosen: Settings,
     bar: ProgressReport,
+    apart: "_Apart | None",
 ) -> Iterator[Tensor]:
     """Shapes of each interval, of the pair alone."""
     weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
@@ -131,7 +164,10 @@ def _by_recursion(
         for _ in range(levels):
             shapes = _interleave(shapes, segment.mid_shapes(shapes))
             bar.update()
-        yield shapes if n_frames is None else _resample(shapes, n, weights)
+        shapes = shapes if n_frames is None else _resample(shapes, n, weights)
+        if apart is not None and len(shapes) > 2:
+            shapes[1:-1] = apart(*segment.samples(shapes), shapes[1:-1])
+        yield shapes
 
 
 def keyframe_places(
@@ -211,6 +247,45 @@ def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
     return torch.cat(parts if cyclic else [*parts, keyframes[-1:]])
 
 
+class _Apart:
+    """Pushes the shapes of each interval apart, and remembers what is left."""
+
+    def __init__(self) -> None:
+        self.n_before = self.n_left = self.n_frames = 0
+
+    def __call__(self, member: Between, samples: Samples, shapes: Tensor) -> Tensor:
+        """The shapes between two key-frames, of their times. *Shape:* ``(T, V, 3)``."""
+        given = shapes.to(samples.x_a)
+        found = push_apart(member, samples, given)
+        self.n_frames += len(shapes)
+        self.n_before += int((found.n_before > 0).sum())
+        self.n_left += int((found.n_crossing > 0).sum())
+        return found.apply(member, samples, given).to(shapes)
+
+    def report(self, keyframes: Tensor, faces: Tensor) -> None:
+        """Say which key-frames pass through themselves, and what is left."""
+        mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
+        for i, shape in enumerate(keyframes.detach().double().cpu().numpy()):
+            pairs = Crossings(mesh, shape[None]).pairs(shape)
+            if len(pairs):
+                where = ", ".join(f"{c:.4g}" for c in shape[mesh.faces[pairs[0]]].mean((0, 1)))
+                warnings.warn(
+                    f"key-frame {i} passes through itself: {len(pairs)} pairs of triangles, the first "
+                    f"{pairs[0].tolist()} near ({where}); beside it that is tolerated",
+                    MeshWarning,
+                    stacklevel=3,
+                )
+        counts = (self.n_before, self.n_frames, self.n_left)
+        logger.info("parts went through each other in %d of %d in-betweens, and are left so in %d", *counts)
+        if self.n_left:
+            warnings.warn(
+                f"in {self.n_left} of {self.n_frames} in-betweens parts still go through each other (without contact "
+                f"in {self.n_before}): a key-frame between those around them may help",
+                MeshWarning,
+                stacklevel=3,
+            )
+
+
 class _Segment:
     """Mid-shapes between neighbours of one interval of key-frames."""
 
@@ -235,6 +310,15 @@ class _Segment:
             for a, b, x, y in zip(nearest[:-1], nearest[1:], shapes[:-1], shapes[1:], strict=True)
         ]
         return torch.stack(mids)
+
+    def samples(self, shapes: Tensor) -> tuple[Between, Samples]:
+        """The in-betweens of the joint space, and the times of even shapes, without the first and the last."""
+        layer = self._layer(0, 1).in_between
+        t = torch.linspace(0, 1, len(shapes), dtype=layer.dtype, device=shapes.device)[1:-1]
+        which = torch.zeros(len(t), dtype=torch.int64, device=t.device)
+        ends = shapes[:1].to(layer.dtype), shapes[-1:].to(layer.dtype)
+        stiffness = layer.stiffness_of(t, t.shape)
+        return layer.members[0], Samples(*ends, which, t, layer.mu_of(t, t.shape), stiffness)
 
     def _layer(self, a: int, b: int) -> MidShape:
         if (a, b) not in self.layers:

@@ -1,0 +1,225 @@
+"""In-betweens whose parts are kept from passing through each other: alone, as a course, and their gradients."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.cli import main as cli
+from torch_modal.data.samples import load_sample, sample_files
+from torch_modal.energy.contact import Contact
+from torch_modal.energy.energy import Energy, Reference
+from torch_modal.energy.terms import Mesh, Term
+from torch_modal.nn.between import Between, Samples
+from torch_modal.nn.contact import Contacts
+from torch_modal.sequence.contact import splines
+
+pytest.importorskip("ipctk")
+DOUBLE = torch.float64
+
+
+@pytest.fixture(scope="module")
+def hand() -> Shapes:
+    """Open and closed; on the way, fingers go through each other."""
+    sample = load_sample("hand")
+    bases = tm.extract_bases(sample.keyframes, sample.faces, 20, mesher="lattice", progress=False)
+    return Shapes(sample.keyframes, sample.faces, bases)
+
+
+def far(x: Tensor, shapes: Shapes) -> Tensor:
+    """Pairs of triangles of parts that went through each other."""
+    return tm.self_contacts(x, shapes.faces, ignore=shapes.keyframes).n_far
+
+
+def peak_acceleration(frames: Tensor) -> float:
+    return float((frames[2:] - 2 * frames[1:-1] + frames[:-2]).norm(dim=-1).max())
+
+
+# ---------------------------------------------------------------------------------------------------------------- term
+def test_term_measures_the_height_over_a_plane(generator: torch.Generator) -> None:
+    x = torch.randn(9, 3, dtype=DOUBLE, generator=generator)
+    elements = torch.tensor([[0, 1, 2, 5], [3, 4, 5, 8], [6, 7, 8, 0]])
+    energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [3, 4, 5], [6, 7, 8]]), 9), [Contact(elements)], sampled=True)
+    heights = energy.parts[0].measures(energy.parts[0].spokes(energy.extend(x[energy.vertices].T)))
+    for (a, b, c, v), height in zip(x[elements].unbind(0), heights, strict=True):
+        normal = torch.linalg.cross(b - a, c - a)
+        assert float(height) == pytest.approx(float((v - b) @ normal / normal.norm()), abs=1e-12)
+
+
+def test_term_has_the_derivatives_of_torch_func(generator: torch.Generator) -> None:
+    spokes = torch.randn(3, 3, 2, 5, dtype=DOUBLE, generator=generator)
+    term = Contact(torch.zeros(5, 4, dtype=torch.int64))
+    torch.testing.assert_close(term.gradients(spokes), Term.gradients(term, spokes), rtol=1e-12, atol=1e-12)
+
+
+def test_term_is_one_sided(generator: torch.Generator) -> None:
+    faces, elements = torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1, 2, 3]])
+    x = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0]], dtype=DOUBLE).repeat(3, 1, 1)
+    x[:, 3, 2] = torch.tensor([-0.1, 0.1, 0.3])
+    energy = Energy(Mesh.of(faces, 4), [Contact(elements, gap=0.2)], sampled=True)
+    gaps = torch.full((3, 1, 1), 0.2, dtype=DOUBLE)
+    reference = Reference((gaps,), (torch.full_like(gaps, 5.0),), torch.zeros(3, dtype=DOUBLE))
+    rows = energy.extend(x.movedim(-1, 0))
+    assert energy.value(rows, reference).tolist() == pytest.approx([5 * 0.3**2, 5 * 0.1**2, 0])
+    (at,) = energy.linearise(rows, reference)
+    assert at.slope[:, 0].tolist() == pytest.approx([-3.0, -1.0, 0])
+    assert at.curvature[:, 0].tolist() == [10, 10, 0]
+
+
+# --------------------------------------------------------------------------------------------------------------- layer
+def test_layer_pushes_fingers_apart(hand: Shapes) -> None:
+    x_a, x_b = hand.keyframes
+    t = torch.tensor([0.25, 0.875], dtype=DOUBLE)
+    with torch.no_grad():
+        plain = tm.InBetween(hand.bases, hand.faces)(x_a, x_b, t)
+        layer = tm.InBetween(hand.bases, hand.faces, contact=True)
+        shapes, solution = layer.solve(x_a, x_b, t)
+    before = far(plain, hand)
+    assert int(before[0]) == 0 and int(before[1]) > 20
+    assert solution.n_crossing is not None and solution.n_crossing.tolist() == far(shapes, hand).tolist() == [0, 0]
+    assert bool(solution.usable.all())
+    # What does not touch is what it is without contact; what does is bent no more than it has to.
+    assert torch.equal(shapes[0], plain[0])
+    shell = tm.ShellEnergy(hand.faces)
+    scale = 100 / float((x_a.amax(0) - x_a.amin(0)).norm())
+
+    def energy(x: Tensor) -> float:
+        return float(torch.lerp(shell(scale * x, scale * x_a), shell(scale * x, scale * x_b), t[1]))
+
+    assert energy(shapes[1]) < 1.01 * energy(plain[1])
+
+
+def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    x_a, x_b = hand.keyframes
+    layer = tm.InBetween(hand.bases, hand.faces, contact=True)
+    member = layer.members[0]
+    held: list[Contacts] = []
+    search = Between._found
+    monkeypatch.setattr(Between, "_found", lambda *a: (held.append((r := search(*a)).held), r)[1])
+
+    def samples(x_a: Tensor, x_b: Tensor, t: Tensor) -> Samples:
+        return Samples(x_a[None], x_b[None], None, t, layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape))
+
+    given = [x_a.clone(), x_b.clone(), torch.tensor([0.875], dtype=DOUBLE)]
+    for tensor in given:
+        tensor.requires_grad_()
+    shapes = member(samples(*given), True, None).shapes[0]
+    assert len(held[0].elements) > 10
+    weights = torch.cos(7 * x_a)
+    gradients = torch.autograd.grad((shapes * weights).sum(), given)
+    direction = 0.01 * torch.sin(9 * x_a + 1)
+
+    def value(*arguments: Tensor) -> float:
+        with torch.no_grad():
+            return float((member(samples(*arguments), True, None, held[0]).shapes[0] * weights).sum())
+
+    at = [tensor.detach() for tensor in given]
+    for which, moved, size in ((0, direction, 1e-3), (1, direction, 1e-3), (2, torch.ones(1, dtype=DOUBLE), 1e-5)):
+        up, down = (
+            value(*(x + sign * size * moved if i == which else x for i, x in enumerate(at))) for sign in (1, -1)
+        )
+        assert float((gradients[which] * moved).sum()) == pytest.approx((up - down) / (2 * size), rel=1e-5)
+
+
+def test_contact_needs_one_shape() -> None:
+    with pytest.raises(ValueError, match="joint"):
+        tm.Objective(space="paired", contact=True)
+
+
+def test_missing_extra_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch_modal import extras
+
+    real = extras.importlib.util.find_spec
+    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None if name == "ipctk" else real(name))
+    for make in (
+        lambda: tm.InBetween(hand.bases, hand.faces, contact=True),
+        lambda: tm.Path(hand.bases, hand.faces, contact=True),
+        lambda: tm.ShapeSpace(hand.bases, hand.faces, contact=True),
+        lambda: tm.subdivide(hand.keyframes, hand.faces, contact=True),
+    ):
+        with pytest.raises(ImportError, match=r"contact needs ipctk.*torch_modal\[contact\]"):
+            make()
+
+
+# ------------------------------------------------------------------------------------------------------------ sequence
+def test_splines_vanish_at_the_ends_and_know_their_curvature() -> None:
+    t = torch.linspace(0, 1, 4001, dtype=DOUBLE)
+    values, bend = splines(t, 8)
+    assert values.shape == (4001, 9) and float(values[[0, -1]].abs().max()) == 0
+    second = (values[2:] - 2 * values[1:-1] + values[:-2]) * 4000**2
+    torch.testing.assert_close(second.T @ second / 4000, bend, rtol=2e-3, atol=2e-3 * float(bend.max()))
+    at = torch.tensor([0.3], dtype=DOUBLE, requires_grad=True)
+    (slope,) = torch.autograd.grad(splines(at, 8).values[0, 3], at)
+    assert float(slope) == pytest.approx(float((values[1201, 3] - values[1199, 3]) * 2000), rel=1e-5)
+
+
+def test_course_is_free_of_crossings_and_does_not_pop(hand: Shapes) -> None:
+    options = {"bases": hand.bases, "progress": False}
+    plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
+    frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)
+    assert int((far(plain, hand) > 0).sum()) >= 3
+    assert int(far(frames, hand).sum()) == 0
+    assert torch.equal(frames[[0, -1]], hand.keyframes)
+    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
+
+
+def test_path_takes_any_time(hand: Shapes) -> None:
+    path = tm.Path(hand.bases, hand.faces, contact=True)
+    t = torch.tensor([0.1, 0.86, 0.9, 1.0], dtype=DOUBLE)
+    with torch.no_grad():
+        shapes, solution = path.solve(hand.keyframes, t)
+        alone = path(hand.keyframes, 0.9)
+    assert int(far(shapes, hand).sum()) == 0
+    assert int(solution.n_crossing.sum()) == 0
+    torch.testing.assert_close(alone, shapes[2], rtol=0, atol=1e-6)  # the time alone says what a shape is
+    assert torch.equal(shapes[3], hand.keyframes[1])
+
+
+def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
+    pair = bars.pick(0, 1)
+    options = {"levels": 2, "bases": pair.bases, "progress": False}
+    plain = tm.subdivide(pair.keyframes, pair.faces, **options)
+    assert torch.equal(plain, tm.subdivide(pair.keyframes, pair.faces, contact=True, **options))
+
+
+def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
+    crossed = hand.keyframes.clone()
+    # The tip of the little finger goes into its neighbour, in the open hand.
+    x = crossed[0]
+    tip = x[:, 0].argmin()
+    reach = (x - x[tip]).norm(dim=-1)
+    x[:, 0] += 0.22 * torch.exp(-((reach / 0.12) ** 2))
+    both = Shapes(crossed, hand.faces, hand.bases)
+    pairs = int(tm.self_contacts(crossed[0], hand.faces).number)
+    assert pairs > 10
+    options = {"levels": 3, "bases": hand.bases, "progress": False}
+    plain = tm.subdivide(crossed, hand.faces, **options)
+    with pytest.warns(tm.MeshWarning, match=f"key-frame 0 passes through itself: {pairs} pairs"):
+        frames = tm.subdivide(crossed, hand.faces, contact=True, **options)
+    assert int(far(frames, both).sum()) <= int(far(plain, both).sum())
+    assert torch.equal(frames[[0, -1]], crossed)
+
+
+def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
+    space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
+    assert int(far(space.table(0, 1).double(), hand).sum()) == 0
+
+
+@pytest.mark.slow
+def test_command_line(tmp_path: Path) -> None:
+    keys = [str(file) for file in sample_files("hand")]
+    out = tmp_path / "frames"
+    assert cli.main(["subdivide", *keys, "--out", str(out), "--levels", "3", "--contact", "--quiet"]) == 0
+    files = sorted(map(str, out.glob("frame-*.ply")))
+    assert cli.main(["check", *files, "--keyframes", *keys]) == 0
+
+
+@pytest.mark.slow
+def test_scanned_like_figure_walks_without_new_crossings(women: Shapes) -> None:
+    pair = women.pick(1, 2)
+    with torch.no_grad():
+        _, solution = tm.InBetween(pair.bases, pair.faces, contact=True).solve(*pair.keyframes, 0.5)
+    assert int(solution.n_crossing) == 0

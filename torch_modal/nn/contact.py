@@ -1,0 +1,171 @@
+"""Contacts of a batch of in-betweens: what is held in each, as a term of the modal solve and of the fine steps."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.energy.contact import GAP, STIFFNESS, Contact
+from torch_modal.energy.energy import Energy, Reference
+from torch_modal.energy.terms import Mesh, Term
+from torch_modal.geometry.contacts import Search
+from torch_modal.geometry.crossings import Crossings
+from torch_modal.nn.modal_energy import ModalEnergy, Placement
+
+ROUNDS = 4
+"""How often it is looked for contacts; what was pushed apart may touch elsewhere."""
+FINE_STEPS = 3
+FINE_PRODUCTS = 20
+"""Newton steps of all vertices with contacts, and iterations in each: contacts are stiff."""
+
+LENIENT = 0.25
+"""Part of the time between two key-frames over which what crosses in one of them is pushed out."""
+
+
+class Contacts(NamedTuple):
+    """What is held in the samples of a batch that pass through themselves."""
+
+    samples: Tensor
+    """Which of the batch these are. *Shape:* ``(S,)``."""
+    elements: Tensor
+    """A face and the vertex before it; all that is held in any sample. *Shape:* ``(M, 4)``."""
+    weights: Tensor
+    """Stiffness times the area around the vertex; zero where a sample does not hold it. *Shape:* ``(S, M)``."""
+    gaps: Tensor
+    """Distances that are kept. *Shape:* ``(S, M)``."""
+
+    def rows(self, some: Any) -> "Contacts":
+        """Some of these samples."""
+        return self._replace(samples=self.samples[some], weights=self.weights[some], gaps=self.gaps[some])
+
+    def of_all(self, samples: Tensor) -> "Contacts":
+        """The same for samples of which some may hold nothing. *Shape:* ``(S,)``."""
+        weights = self.weights.new_zeros(len(samples), self.weights.shape[1])
+        places = self.samples
+        return Contacts(
+            samples,
+            self.elements,
+            weights.index_copy(0, places, self.weights),
+            (weights + GAP).index_copy(0, places, self.gaps),
+        )
+
+    @property
+    def term(self) -> Contact:
+        """The term; its stiffness is in the weights."""
+        return Contact(self.elements, 1.0)
+
+    def joined(self, reference: Reference) -> Reference:
+        """A reference with that of the term, which comes last."""
+        measures, weights = self.gaps[:, None], self.weights[:, None]
+        return Reference((*reference.measures, measures), (*reference.weights, weights), reference.constant)
+
+    def modal(self, mesh: Mesh, columns: Tensor) -> ModalEnergy:
+        """The term in the amplitudes of fine columns. *Shape:* ``(n, V, 3)``."""
+        energy = Energy(mesh, [self.term], sampled=True)
+        return ModalEnergy(energy.to(columns.device), columns[:, energy.vertices])
+
+    def place(self, modal: ModalEnergy, base: Tensor, extra: Tensor | None) -> Placement:
+        """The samples' spaces as the term sees them. *Shape:* ``(B, V, 3)`` each."""
+        vertices = modal.energy.vertices
+        zero = self.weights.new_zeros(len(self.weights))
+        return modal.place(
+            base[:, vertices],
+            self.joined(Reference((), (), zero)),
+            None if extra is None else extra[:, vertices],
+        )
+
+    def fine(self, mesh: Mesh, terms: Sequence[Term]) -> Energy:
+        """The energy on the fine mesh with the term."""
+        return Energy(mesh, [*terms, self.term]).to(self.elements.device)
+
+
+class ContactSearch:
+    """Looks for contacts in the in-betweens of several pairs of key-frames, and remembers where it found some.
+
+    Args:
+        mesh: The fine mesh.
+        first: Key-frames, in the frame. *Shape:* ``(P, V, 3)``.
+        second: Likewise.
+        which: The pair of each sample; each its own where None. *Shape:* ``(B,)``.
+        t: Times. *Shape:* ``(B,)``.
+    """
+
+    def __init__(self, mesh: Mesh, first: Tensor, second: Tensor, which: Tensor | None, t: Tensor) -> None:
+        known = torch.stack([first, second], 1).detach().double().cpu().numpy()
+        self.searches = [Search(Crossings(mesh.connectivity, both)) for both in known]
+        self.which = list(range(len(t))) if which is None else which.tolist()
+        self.faces = mesh.faces
+        self.areas = torch.stack([_areas(x.detach(), mesh.faces) for x in first])
+        self.t = t.detach()
+        self.watched: list[Any] = [None] * len(t)
+        #: Pairs of triangles that went through each other in the shapes that were searched last. *Shape:* ``(B,)``.
+        self.n_far = torch.zeros_like(t, dtype=torch.int64)
+
+    def crosses(self, x: Tensor, some: Sequence[int]) -> bool:
+        """Whether in any of some samples parts went through each other. *Shape:* ``(B, V, 3)``."""
+        for i in some:
+            crossings = self.searches[self.which[i]].crossings
+            if bool(x[i].isfinite().all()):
+                pairs = crossings.pairs(x[i].detach().double().cpu().numpy())
+                if len(pairs) and crossings.is_far(pairs).any():
+                    return True
+        return False
+
+    def __call__(self, x: Tensor) -> Contacts | None:
+        """Contacts of the samples; None where nothing has gone through anything, now or before.
+
+        Args:
+            x: *Shape:* ``(B, V, 3)``.
+        """
+        shapes = x.detach().double().cpu().numpy()
+        found = []
+        for i, shape in enumerate(shapes):
+            held = None
+            if bool(x[i].isfinite().all()):
+                held = self.searches[self.which[i]](shape, self.watched[i])
+                self.watched[i] = held.watched
+            found.append(held)
+        n_far = [0 if held is None else held.n_far for held in found]
+        self.n_far = torch.tensor(n_far, dtype=torch.int64, device=x.device)
+        if not any(held is not None and len(held.vertices) for held in found):
+            return None
+        n = len(self.faces)
+        nothing = torch.zeros(0, dtype=torch.int64)
+        codes = [nothing if held is None else torch.from_numpy(held.vertices * n + held.faces) for held in found]
+        every = torch.cat(codes).unique()
+        vertices, faces = every // n, every % n
+        elements = torch.cat([self.faces[faces], vertices[:, None]], 1)
+        weights = torch.zeros(len(shapes), len(every), dtype=x.dtype)
+        gaps = torch.full_like(weights, GAP)
+        for i, (code, held) in enumerate(zip(codes, found, strict=True)):
+            places = torch.searchsorted(every, code)
+            weights[i, places] = STIFFNESS * self.areas[self.which[i]].cpu()[vertices[places]].to(x.dtype)
+            if held is not None and held.slack.any():
+                t = float(self.t[i])
+                slack = torch.from_numpy(held.slack).to(x.dtype)
+                # 1 at the key-frame in which a vertex was behind its face, 0 some time later.
+                ramps = torch.tensor([max(0.0, 1 - t / LENIENT), max(0.0, 1 - (1 - t) / LENIENT)], dtype=x.dtype)
+                ramps = ramps * (slack > 0)
+                gaps[i, places] = GAP * (1 - ramps.amax(1)) - (slack * ramps).sum(1)
+        some = torch.nonzero((weights > 0).any(1)).flatten()
+        to = x.device
+        return Contacts(some.to(to), elements.to(to), weights[some].to(to), gaps[some].to(to))
+
+    def near(self, part: float) -> Tensor:
+        """Vertices within a part of the diagonal of those that were ever watched, of one pair. *Shape:* ``(V,)``."""
+        watched = [own for own in self.watched if own is not None]
+        return torch.from_numpy(self.searches[0].crossings.within(sum(watched[1:], watched[0]) > 0, part))
+
+    def keep(self, some: Tensor) -> None:
+        """Go on with some of the samples only."""
+        chosen = some.tolist()
+        self.which, self.watched = [self.which[i] for i in chosen], [self.watched[i] for i in chosen]
+        self.t = self.t[some]
+
+
+def _areas(x: Tensor, faces: Tensor) -> Tensor:
+    """A third of the area of the faces around each vertex. *Shape:* ``(V, 3) -> (V,)``."""
+    a, b, c = (x[corner] for corner in faces.to(x.device).unbind(1))
+    area = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 6
+    return x.new_zeros(len(x)).index_add(0, faces.to(x.device).flatten(), area[:, None].expand(-1, 3).flatten())
