@@ -24,7 +24,7 @@ _STRAIGHT = 0.7
 _BEHIND = 0.02
 """Of the mean edge length: how far behind a face a vertex that is not inside may lie, which is rounding of a fold."""
 _NEAREST = 64
-"""Faces, by their centres, among which the nearest to a vertex is looked for."""
+"""Faces, by their centres, among which the nearest to a vertex is looked for; four times as many from inside."""
 
 
 class Held(NamedTuple):
@@ -103,8 +103,10 @@ class Search:
         for chosen, radius in ((seeds & ~within, near + 1.5 * self._edge), (within, reach)):
             own = np.flatnonzero(chosen)
             if len(own):
-                found = cKDTree(x[own]).sparse_distance_matrix(tree, radius, output_type="ndarray")
-                parts.append((own[found["i"]], some[found["j"]]))
+                n = min(_NEAREST if chosen is not within else 4 * _NEAREST, len(some))
+                distance, found = tree.query(x[own], n, distance_upper_bound=radius)
+                there = np.isfinite(distance.reshape(-1))
+                parts.append((np.repeat(own, n)[there], some[found.reshape(-1)[there]]))
         if not parts:
             none = np.zeros(0, np.int64)
             return none, none, np.zeros((0, len(self._known)))
