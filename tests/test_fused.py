@@ -227,7 +227,7 @@ class TestBackend:
         code = "from torch_modal.nn.launch import kernels; kernels()"
         folder = Path(tm.__file__).parents[1]
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
-        assert result.returncode == 0 and result.stdout == "", result.stderr
+        assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
     def test_import_does_not_load_warp(self) -> None:
         code = "import sys, torch_modal.nn.in_between; sys.exit('warp' in sys.modules)"

@@ -1,8 +1,10 @@
 """Whether there are kernels, and how torch runs them: what NVIDIA Warp needs to be told."""
 
 import importlib.util
+import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any, Literal
 
@@ -21,13 +23,27 @@ def kernels() -> Any:
 
     before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
     try:
-        wp.init()
+        with nullcontext() if torch.cuda.is_available() else _silent():
+            wp.init()
         from torch_modal.nn import kernels as module
 
         wp.load_module(module, device="cpu")
     finally:
         wp.config.log_level = before
     return module
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Nothing on standard error: there Warp's C code says that there is no CUDA driver, whatever it is told."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 @cache
