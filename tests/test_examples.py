@@ -7,6 +7,9 @@ from types import ModuleType
 
 import torch
 
+from torch_modal.keyframes.load import load_keyframes
+from torch_modal.keyframes.registration.landmarks import read_landmarks
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -68,3 +71,26 @@ def test_train_parts_learns_more_from_in_betweens(tmp_path: Path) -> None:
     assert iou["torch_modal"] > iou["none"] + 0.04
     assert found["torch_modal"][0].right.shape == (3, 3782)
     assert picture.stat().st_size > 10_000
+
+
+def test_morph_animals_goes_from_one_body_to_another(tmp_path: Path) -> None:
+    """The short form, on coarse meshes: legs that swing keep their lengths, which linear interpolation cuts short."""
+    found, frames, faces, _ = load_example("morph_animals").main(tmp_path, levels=1, cell=0.042, n_modes=8)
+    assert not found.doubtful and found.flipped_area < 0.02
+    assert found.to_target.mean < 0.12 and found.from_target.mean < 0.12
+    assert frames.shape == (3, len(found.positions), 3)
+    torch.testing.assert_close(frames[2], found.positions)
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+    def lengths(x: torch.Tensor) -> torch.Tensor:
+        return (x[edges[:, 0]] - x[edges[:, 1]]).norm(dim=1)
+
+    between = (lengths(frames[0]) + lengths(frames[2])) / 2
+
+    def off(x: torch.Tensor) -> float:
+        return float((lengths(x) / between - 1).abs().mean())
+
+    assert off(frames[1]) < 0.6 * off((frames[0] + frames[2]) / 2)
+    assert read_landmarks(tmp_path / "landmarks.txt", 2).shape == (8, 2)
+    assert (tmp_path / "morph.glb").stat().st_size > 50_000 and (tmp_path / "morph.png").stat().st_size > 30_000
+    assert len(load_keyframes([tmp_path / "slender.obj"]).keyframes[0]) == len(frames[0])
