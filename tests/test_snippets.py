@@ -15,7 +15,7 @@ from test_examples import load_example
 
 from torch_modal.cli import main as cli
 
-QUICK = {"datasets", "layer", "viewing"}
+QUICK = {"layer", "viewing"}
 """Pages that are tried in the default run; what others cost is not known beforehand."""
 
 
