@@ -114,6 +114,7 @@ class LocalRotations(nn.Module):
         earlier, a, b, later = (None if x is None else _frames(x, self.faces) for x in (before, first, second, after))
         assert a is not None and b is not None
         unit = 0.5 * (a.length + b.length)
+        unit = torch.maximum(unit, SHORTEST * unit.mean(-1, keepdim=True))
 
         def step(p: Frames | None, q: Frames | None, at: Frames) -> Tensor | None:
             if p is None or q is None:

@@ -16,12 +16,18 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.hermite import Excess, Spacing, beyond
 from torch_modal.geometry.local_rotations import Course
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import bend, convected, frames, sides
+from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Alignment, Pair, mean_areas, vertex_excess
 
 UNIT = 0.01
 """An amplitude of 1 moves the vertices of the key-frame by this part of its diagonal, in the root mean square."""
+
+LEAST = 1e-4
+"""A triangle with less than this part of the mean side has no turn or strain of its own."""
+
+MOST = 30.0
+"""A triangle turns and strains by at most this many times the mode's mean over the area: more is that of a sliver."""
 
 CHUNK = 40_000
 """Vertices of all shapes that are decoded at a time: more would not fit into caches."""
@@ -74,7 +80,7 @@ class ModalDecoder(nn.Module):
         displaced = (modes * (UNIT * DIAGONAL / rms)[:, None, None]).movedim(-1, 0).contiguous()
         own = frames(sides(placed.T[:, None].contiguous(), faces))
         #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
-        self.register_buffer("columns", convected(bend(sides(displaced, faces), own), own).movedim(0, 1).contiguous())
+        self.register_buffer("columns", _bounded(convected(bend(sides(displaced, faces), own), own), own))
         n_pieces = int(mesh.vertex_pieces.max()) + 1
         #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
         centres = self.blend(0).poisson.centres(displaced) if n_pieces > 1 else displaced[..., :0]
@@ -222,6 +228,16 @@ class ModalDecoder(nn.Module):
         after = x[(i + 2) % n] if self.cyclic or i < last else None
         h = self.times.diff().to(x)
         return self.alignment.surround(pair, before, after, Spacing(*(h[j % len(h)][None] for j in (i - 1, i, i + 1))))
+
+
+def _bounded(columns: Tensor, own: Frames) -> Tensor:
+    """Turns and strains; less where they are those of slivers, none without a size. *Shape:* ``(6, k, F)``."""
+    areas, least = own.doubled_areas, torch.minimum(own.length, own.height)
+    columns = torch.where(least > LEAST * own.length.mean(), columns, 0)
+    squared = columns.square().sum(0)
+    limit = MOST * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()
+    bound = (limit / squared.sqrt().clamp_min(torch.finfo(squared.dtype).tiny)).clamp_max(1)
+    return (bound * columns).movedim(0, 1).contiguous()
 
 
 def moved(x: Tensor, motions: Tensor, size: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.files import write_atomically
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.progress import Progress
@@ -25,6 +26,8 @@ OF_SELECTION = 0.7
 """Of the error, what is left for shapes between key-frames when these are chosen, before anything is rounded."""
 OF_KEYFRAMES = 0.85
 """What rounding adds to key-frames."""
+MOST_OF_EDGE = 0.5
+"""Of the median edge, the step of the grid: beyond, triangles would be noise, and their modes with them."""
 OF_AMPLITUDES = 0.15
 OF_MOTIONS = 0.05
 PER_STEP = 0.48
@@ -164,7 +167,9 @@ def _attempt(
     used = x[0, faces.unique()]
     size = float((used.amax(0) - used.amin(0)).norm())
     low = x[keys].amin((0, 1)).tolist()
-    step = part * OF_KEYFRAMES * error * size / PER_STEP
+    edges = torch.from_numpy(Connectivity(faces.numpy(), x.shape[1]).edges.copy())
+    short = float(x[0, edges].diff(dim=1).norm(dim=-1).median())
+    step = part * min(OF_KEYFRAMES * error * size / PER_STEP, MOST_OF_EDGE * short)
     grid = np.floor((x[keys].numpy() - np.asarray(low)) / step + 0.5).astype(np.int64)
     rounded = packing.positions(grid, low, step)
     modes = fixed_modes(rounded[0], faces, n_modes, **kept)
