@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import pytest
 import torch
 
 from torch_modal.keyframes.load import load_keyframes
@@ -94,3 +95,9 @@ def test_morph_animals_goes_from_one_body_to_another(tmp_path: Path) -> None:
     assert read_landmarks(tmp_path / "landmarks.txt", 2).shape == (8, 2)
     assert (tmp_path / "morph.glb").stat().st_size > 50_000 and (tmp_path / "morph.png").stat().st_size > 30_000
     assert len(load_keyframes([tmp_path / "slender.obj"]).keyframes[0]) == len(frames[0])
+
+
+@pytest.mark.slow
+def test_motion_from_markers_is_nearer_than_pca_and_than_the_path() -> None:
+    errors = load_example("motion_from_markers").main()
+    assert errors["amplitudes"] < 0.5 * min(errors["path"], errors["PCA"])

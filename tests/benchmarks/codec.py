@@ -1,6 +1,6 @@
 """A motion as key-frames and amplitudes, against a plain PCA of its frames.
 
-    python tests/benchmarks/codec.py [floats selection decode] [--motions creature hand-path]
+    python tests/benchmarks/codec.py [floats selection decode] [--motions creature hand-path grip]
 
 Distances are means over the vertices and frames, over the diagonal; edge errors are means of ``|l - l_true| / l_true``.
 PCA keeps the mean frame, its components and their coefficients: with as many components as fit into the floats of the
@@ -17,7 +17,7 @@ from itertools import combinations
 
 import torch
 from cases import DATA
-from motions import sculpted
+from motions import OPENED, closed_part, sculpted
 from threads import limit_threads
 from torch import Tensor
 
@@ -26,7 +26,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.sequence.codec_modes import fixed_modes
 from torch_modal.sequence.codec_selection import Judge, select_keyframes
 
-GALLOP = 96
+GALLOP, GRIP = 96, 41
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,14 @@ def hand_path() -> Sequence | None:
     return Sequence("mh-hand-path", frames, faces, False, ((0, 8), (0, 4, 8), (0, 2, 4, 6, 8)))
 
 
-MOTIONS = {"creature": creature, "hand-path": hand_path}
+def grip() -> Sequence:
+    """A hand that closes, rests, and opens in part."""
+    faces, posed = sculpted("hand")
+    frames = torch.stack([posed(closed_part(OPENED * i / (GRIP - 1))) for i in range(GRIP)])
+    return Sequence("hand with a stop", frames, faces, False, ((0, 13, 27, 40), (0, 8, 16, 24, 32, 40)))
+
+
+MOTIONS = {"creature": creature, "hand-path": hand_path, "grip": grip}
 
 
 def chosen(names: list[str]) -> Iterator[Sequence]:

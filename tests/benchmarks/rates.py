@@ -8,7 +8,7 @@ All are lossy; each baseline is swept, and its fewest bits at an error come from
 - *PCA*: mean, components times their deviation, and coefficients, rounded, with the vertex prediction and the packing
   of `compress`: better than common practice.
 - *zstd*: rounded vertices, as differences in time, zstandard at level 19.
-- *Draco*: each frame as a mesh by DracoPy, less what it takes with all vertices in one place, for the faces.
+- *Draco*: each frame as a mesh by DracoPy, less what it takes at one bit a coordinate, for the faces.
 
 Bits are of a vertex and frame, without the faces, which all but Draco would keep once. Distances are means over
 vertices and frames, over the diagonal; KG is Karni and Gotsman's error in %; edge errors are means of
@@ -30,7 +30,6 @@ import numpy as np
 import torch
 import zstandard
 from codec import MOTIONS, Sequence
-from motions import OPENED, closed_part, sculpted
 from threads import limit_threads
 
 import torch_modal as tm
@@ -41,16 +40,6 @@ from torch_modal.sequence.codec_prediction import generations, residuals
 ERRORS = (0.001, 0.003, 0.01)
 COLOURS = {"ours": "#d62728", "PCA": "#1f77b4", "zstd": "#7f7f7f", "Draco": "#2ca02c"}
 Point = dict[str, float]
-
-
-def grip() -> Sequence:
-    """A hand that closes, rests, and opens in part: 61 frames."""
-    faces, posed = sculpted("hand")
-    frames = torch.stack([posed(closed_part(OPENED * i / 60)) for i in range(61)])
-    return Sequence("hand with a stop", frames, faces, False, ())
-
-
-SEQUENCES = {"creature": MOTIONS["creature"], "grip": grip, "hand-path": MOTIONS["hand-path"]}
 
 
 class Judge:
@@ -133,9 +122,7 @@ def draco(judge: Judge) -> Iterator[Point]:
         total, found = 0.0, []
         for x in judge.frames.numpy():
             data = DracoPy.encode(x.astype(np.float32), faces, quantization_bits=bits, compression_level=10)
-            nothing = DracoPy.encode(
-                np.zeros_like(x, dtype=np.float32), faces, quantization_bits=1, compression_level=10
-            )
+            nothing = DracoPy.encode(x.astype(np.float32), faces, quantization_bits=1, compression_level=10)
             total += len(data) - len(nothing)
             low, width = x.min(0), float((x.max(0) - x.min(0)).max())
             step = width / (2**bits - 1)  # its order of vertices is another: the same rounding in ours
@@ -192,23 +179,22 @@ def draw(found: dict[str, dict[str, list[Point]]], out: Path) -> None:
 def main() -> None:
     """Print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("motions", nargs="*", help=f"of {', '.join(SEQUENCES)}; default: all")
+    parser.add_argument("motions", nargs="*", help=f"of {', '.join(MOTIONS)}; default: all")
     parser.add_argument("--errors", nargs="+", type=float, default=list(ERRORS))
     parser.add_argument("--picture", type=Path, metavar="FILE")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="points of earlier runs, and of this one")
     args = parser.parse_args()
     limit_threads()
     found = json.loads(args.keep.read_text()) if args.keep and args.keep.exists() else {}
-    for name in args.motions or SEQUENCES:
-        sequence = SEQUENCES[name]()
+    for name in args.motions or MOTIONS:
+        sequence = MOTIONS[name]()
         if sequence is None or sequence.name in found:
             continue
         judge = Judge(sequence)
+        methods = {"PCA": pca, "zstd": zstd, "Draco": draco}
         found[sequence.name] = {
             "ours": list(ours(judge, args.errors)),
-            "PCA": list(pca(judge)),
-            "zstd": list(zstd(judge)),
-            "Draco": list(draco(judge)),
+            **{method: list(points(judge)) for method, points in methods.items()},
         }
         if args.keep:
             args.keep.write_text(json.dumps(found, indent=0))
