@@ -41,5 +41,7 @@ napoleon_use_rtype = False
 html_theme = "furo"
 html_title = "torch_modal"
 html_show_sphinx = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
 copybutton_prompt_text = "$ "

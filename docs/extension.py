@@ -54,7 +54,8 @@ def directive_for(name: str) -> list[str]:
         return [f".. automodule:: torch_modal.{name}", ""]
     if inspect.isclass(value):
         kind = "exception" if issubclass(value, BaseException) else "class"
-        return [f".. auto{kind}:: torch_modal.{name}", "   :members:", "   :show-inheritance:", ""]
+        bases = [] if value.__bases__ == (object,) else ["   :show-inheritance:"]
+        return [f".. auto{kind}:: torch_modal.{name}", "   :members:", *bases, ""]
     if callable(value):
         return [f".. autofunction:: torch_modal.{name}", ""]
     lines = described_at_home(name)
@@ -139,7 +140,7 @@ class CommandHelp(SphinxDirective):
         for name, text in command_helps().items():
             section = nodes.section(ids=[nodes.make_id(name)], names=[name])
             section += nodes.title("", f"torch-modal {name}")
-            section += nodes.literal_block(text, text, language="none")
+            section += nodes.literal_block(text, text, language="none", classes=["command-help"])
             found.append(section)
         return found
 
