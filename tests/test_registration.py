@@ -467,6 +467,14 @@ def test_subdivide_meshes_of_different_connectivity(files: list[Path], tmp_path:
 
 
 @pytest.mark.slow
+def test_skin_that_stretches_is_found_with_landmarks() -> None:
+    """Gathered to stretched: the first fit is 1.3 % off and more, and with what contradicts the landmarks 3.7 %."""
+    import registration
+
+    assert registration.one("creature", 3, 0, "non-manifold", 1017, True)["mean"] < 1.2
+
+
+@pytest.mark.slow
 def test_hand_in_another_pose(data_dir: Path) -> None:
     import registration
 

@@ -1,6 +1,7 @@
 """How well meshes are registered whose truth is known: the table of docs/registration.md.
 
     python tests/benchmarks/registration.py [--parts poses pairs marked across middle time] [--rows FILE] [--n-pairs 50]
+    python tests/benchmarks/registration.py --picture docs/images/registration.png
 
 The template is a pose decimated to 60 % of its vertices and shuffled; the target is another pose, turned, scaled and
 moved, and often damaged. The truth of a template vertex is the point of the other pose with the same place in the same
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -108,8 +109,21 @@ def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> tuple[Fl
     return rest[chosen], truth[chosen]
 
 
-def one(name: str, i: int, j: int, how: str, seed: int, marked: bool) -> dict[str, Any]:
-    """One registration against its truth."""
+class Case(NamedTuple):
+    """Two meshes to be registered, and the truth."""
+
+    rest: FloatArray
+    triangles: IntArray
+    there: FloatArray
+    there_faces: IntArray
+    truth: FloatArray
+    """Of the template's vertices. *Shape:* ``(V, 3)``."""
+    size: float
+    """Diagonal of the whole target."""
+
+
+def pair(name: str, i: int, j: int, how: str, seed: int) -> Case:
+    """Two poses of a body, the second with a flaw."""
     random = np.random.default_rng(seed)
     shapes, faces = poses(name)
     rest, triangles = remeshed(shapes[i], faces, random)
@@ -118,6 +132,12 @@ def one(name: str, i: int, j: int, how: str, seed: int, marked: bool) -> dict[st
     rotation, scale = Rotation.random(rng=random).as_matrix(), random.uniform(0.3, 3)
     shift = scale * random.normal(size=3)
     there, truth = (scale * p @ rotation.T + shift for p in (there, truth))
+    return Case(rest, triangles, there, there_faces, truth, float(scale * np.linalg.norm(np.ptp(shapes[j], axis=0))))
+
+
+def one(name: str, i: int, j: int, how: str, seed: int, marked: bool) -> dict[str, Any]:
+    """One registration against its truth."""
+    rest, triangles, there, there_faces, truth, size = pair(name, i, j, how, seed)
     marks = five_marks(rest, triangles, truth) if marked else None
     row: dict[str, Any] = {"case": f"{name} {i}-{j}", "how": how, "marked": marked, "vertices": len(rest)}
     started = time.process_time()
@@ -126,7 +146,6 @@ def one(name: str, i: int, j: int, how: str, seed: int, marked: bool) -> dict[st
     except tm.MeshError as error:
         return row | {"error": str(error)}
     seconds = time.process_time() - started
-    size = np.linalg.norm(np.ptp(scale * shapes[j], axis=0))
     errors = 100 / size * np.linalg.norm(found.positions.numpy() - truth, axis=1)
     return row | {
         "mean": errors.mean(),
@@ -298,13 +317,46 @@ def tasks(part: str, n_pairs: int) -> list[Callable[[], dict[str, Any]]]:
     return [lambda: timed(0), lambda: timed(1), lambda: timed(1, 0.785)]
 
 
+def picture(out: Path) -> None:
+    """The template, then laid onto another pose, and onto a gathered one in a mesh with a slit; above it the truth."""
+    shapes, faces = poses("creature")
+    case = pair("creature", 0, 3, "slit", 1004)
+    truths = [transported(case.rest, shapes[0], shape, faces) for shape in shapes[[0, 1, 3]]]
+    laid = [case.rest]
+    for target, target_faces in ((shapes[1], faces), (case.there, case.there_faces)):
+        found = tm.register(case.rest, case.triangles, target, target_faces, cache=False, progress=False)
+        print(found.summary())
+        laid.append(found.positions.numpy())
+    # The last target is turned, scaled and moved: back again.
+    turned, upright = (x - x.mean(0) for x in (case.truth, truths[2]))
+    back = Rotation.align_vectors(upright, turned)[0]
+    laid[2] = back.apply(laid[2] - case.truth.mean(0)) * np.linalg.norm(upright) / np.linalg.norm(turned)
+    laid[2] += truths[2].mean(0)
+    size = [100 / np.linalg.norm(np.ptp(shape, axis=0)) for shape in shapes[[0, 1, 3]]]
+    errors = [k * np.linalg.norm(x - y, axis=1) for k, x, y in zip(size, laid, truths, strict=True)]
+    print("mean errors:", " ".join(f"{error.mean():.2f}" for error in errors))
+    tm.render_sequence(
+        {"true": np.stack(truths), "registered": np.stack(laid)},
+        case.triangles,
+        out,
+        keyframe_indices=[0],
+        colors={"registered": np.stack(errors)},
+        color_label="error, % of the diagonal",
+        overwrite=True,
+    )
+
+
 def main() -> None:
     """Run parts and print their rows; rows are kept, and the table at the end is made of all that are kept."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="*", default=["poses", "pairs", "marked", "across", "middle", "time"])
     parser.add_argument("--n-pairs", type=int, default=50)
     parser.add_argument("--rows", type=Path, help="a file of rows from earlier runs, which is added to")
+    parser.add_argument("--picture", type=Path, help="only draw three examples there")
     args = parser.parse_args()
+    if args.picture:
+        picture(args.picture)
+        return
     rows = [json.loads(line) for line in args.rows.read_text().splitlines()] if args.rows and args.rows.exists() else []
     done = [row["part"] for row in rows]
     for part in args.parts:
