@@ -62,19 +62,20 @@ def around(pairs: Tensor, faces: Tensor, rings: int = 2) -> Tensor:
     return near
 
 
-def measure(name: str, n: int, n_intersections: int) -> None:
+def measure(name: str, n: int, n_intersections: int, kinds: list[str], contact: bool) -> None:
     """Print a line for each transform."""
     found = keyframes_of(name)
     if found is None:
         return
     keyframes, faces = found
-    space = tm.ShapeSpace(tm.extract_bases(keyframes, faces, 30), faces)
+    space = tm.ShapeSpace(tm.extract_bases(keyframes, faces, 30), faces, contact=contact)
     pool = tm.ShapeBatch.of_keyframes(space)
     k = len(space)
     shell = tm.ShellEnergy(faces)
     volumes = shell.measure(pool.shapes.double()).volume
     old = [None if pairs is None else around(pairs, faces) for pairs in (crossings(x, faces) for x in pool.shapes)]
-    for kind, augment in TRANSFORMS.items():
+    for kind in kinds:
+        augment = TRANSFORMS[kind]
         generator = torch.Generator().manual_seed(0)
         ratios, strains, new = [], [], []
         finite = 0
@@ -112,9 +113,13 @@ if __name__ == "__main__":
     parser.add_argument("--meshes", nargs="+", default=["creature", "hand", "woman"])
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--intersections", type=int, default=300, help="draws that are searched for crossings")
+    parser.add_argument("--transforms", nargs="+", default=list(TRANSFORMS), choices=list(TRANSFORMS))
+    parser.add_argument(
+        "--contact", action="store_true", help="spaces whose in-betweens do not pass through themselves"
+    )
     given = parser.parse_args()
     for each in given.meshes:
         print(f"\n{each}")
         print(f"{'':32s}{'finite':>7s}{'volume off':>11s}{'most':>9s}{'strain':>10s}{'most':>8s}", end="")
         print(f"{'new crossings':>18s}{'pairs':>12s}")
-        measure(each, given.draws, given.intersections)
+        measure(each, given.draws, given.intersections, given.transforms, given.contact)

@@ -19,7 +19,7 @@ FINE_STEPS = 3
 FINE_PRODUCTS = 20
 """Newton steps of all vertices with contacts, and iterations in each: contacts are stiff."""
 
-LENIENT = 0.25
+LENIENT = 0.1
 """Part of the time between two key-frames over which what crosses in one of them is pushed out."""
 
 

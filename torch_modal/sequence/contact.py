@@ -29,9 +29,12 @@ SMOOTHNESS = 100.0
 """``lambda``, at a diagonal of 100, with the time between two key-frames as the unit."""
 REGION = 0.2
 """Of the diagonal, along the surface: how far from what is held vertices move on their own, beside the modes."""
+WIDE_REGION = 0.5
+"""The same once nothing passes through anything any more, for :data:`FINAL_STEPS`."""
 ROUNDS = 5
 MODAL_STEPS = 2
 FINE_STEPS = 2
+FINAL_STEPS = 2
 FINE_PRODUCTS = 15
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 
@@ -178,15 +181,23 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor, every: int = 1
     solver = _Coupled(member, samples, pair, rows)
     at = rows.new_zeros(3, solver.basis.shape[1], rows.shape[-1])
     best: tuple[Tensor | None, Tensor] = None, n_far
+    kept = torch.arange(len(t), device=t.device)
     for _ in range(ROUNDS):
-        held = held.of_all(torch.arange(len(t), device=t.device))
-        at = solver.fine(solver.modal(at, held), held, search.near(REGION))
+        held = held.of_all(kept)
+        at = solver.fine(solver.modal(at, held), held, search.near(REGION), FINE_STEPS)
         found = search(solver.moved(at).movedim(0, -1))
         if int(search.n_far.sum()) < int(best[1].sum()):
             best = at, search.n_far
         if found is None or not bool(search.n_far.any()):
             break
         held = found
+    if best[0] is not None and not bool(best[1].any()):
+        # What was pushed apart in a hurry is brought to rest, in a wider region.
+        held = held.of_all(kept) if len(held.samples) < len(t) else held
+        rested = solver.fine(best[0], held, search.near(WIDE_REGION), FINAL_STEPS)
+        search(solver.moved(rested).movedim(0, -1))
+        if not bool(search.n_far.any()):
+            best = rested, search.n_far
     return Displacement(best[0], n_before, best[1])
 
 
@@ -216,13 +227,14 @@ class _Coupled:
         """Half the gradient of the squared acceleration. *Shape:* ``(3, J, V), (V,) -> (3, J, V)``."""
         return (self.bend @ at) * area
 
-    def fine(self, at: Tensor, held: Contacts, near: Tensor) -> Tensor:
+    def fine(self, at: Tensor, held: Contacts, near: Tensor, n_steps: int) -> Tensor:
         """Steps of a truncated Newton method on the vertices near by, at all times, never uphill.
 
         Args:
             at: *Shape:* ``(3, J, V)``.
             held: Of all times.
             near: The vertices that may move. *Shape:* ``(V,)``.
+            n_steps: How many.
         """
         local = _Fine(self.member, self.samples, self.pair, held, near)
         chosen = local.vertices.to(at.device)
@@ -232,7 +244,7 @@ class _Coupled:
             return float(local.value(rows + self.basis @ own).sum() + (own * self.bent(own, area)).sum())
 
         before = value(own)
-        for _ in range(FINE_STEPS):
+        for _ in range(n_steps):
             gradient, hessians, diagonal = local.linearised(rows + self.basis @ own)
             right = -self.gather(gradient) - 2 * self.bent(own, area)
             step = self._solved(local, hessians, self._preconditioner(diagonal, area), right * local.free, area)

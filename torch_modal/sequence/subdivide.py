@@ -29,6 +29,10 @@ logger = logging.getLogger(__name__)
 
 MAX_LEVELS = 12
 
+# Shapes between two key-frames that are searched first: where none of them passes through itself, the others are not
+# searched.
+N_SEARCHED = 8
+
 
 def subdivide(
     keyframes: Any,
@@ -256,7 +260,7 @@ class _Apart:
     def __call__(self, member: Between, samples: Samples, shapes: Tensor) -> Tensor:
         """The shapes between two key-frames, of their times. *Shape:* ``(T, V, 3)``."""
         given = shapes.to(samples.x_a)
-        found = push_apart(member, samples, given)
+        found = push_apart(member, samples, given, every=max(1, len(given) // N_SEARCHED))
         self.n_frames += len(shapes)
         self.n_before += int((found.n_before > 0).sum())
         self.n_left += int((found.n_crossing > 0).sum())

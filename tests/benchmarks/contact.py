@@ -1,0 +1,255 @@
+"""Contact: what is left of crossings, what it costs, whether it pops, and key-frames that pass through themselves.
+
+    python tests/benchmarks/contact.py
+    python tests/benchmarks/contact.py --cases hand legs --rows crossings cost
+    python tests/benchmarks/contact.py --pictures docs/images
+
+Each case is two key-frames, subdivided into 33 shapes with and without contact. *Far* pairs of triangles are those of
+parts that went through each other (docs/contact.md). Energies are those of Eq. 5 without the contact term, at each time
+between both key-frames; times are of the processor, with one thread. The legs are the sample creature's, made by
+``examples/make_samples.py``: they swing past each other in one line.
+"""
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from cases import DATA
+from threads import limit_threads
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+LEVELS = 5
+
+
+class Case(NamedTuple):
+    """Two key-frames."""
+
+    name: str
+    keyframes: Tensor
+    faces: Tensor
+
+
+def legs(inward: float = 10.0, swing: float = 14.0) -> Case:
+    """A creature whose legs of each pair swing past each other, and would meet in the middle."""
+    sys.path.append(str(EXAMPLES))
+    import make_samples as made
+    import trimesh
+    from scipy.spatial.transform import Rotation
+
+    bones, flesh = made.creature()
+    rest, faces = made.sculpt(flesh, 0.0270)
+    weights, radius = made.bind(flesh, bones, rest, faces, 1.15)
+    volume = trimesh.Trimesh(rest, faces, process=False).volume
+    poses = []
+    for sign in (1, -1):
+        turns = {name: Rotation.identity() for name in bones}
+        for root in ("scapula", "thigh"):
+            for side, way in (("right", 1), ("left", -1)):
+                angles = [way * inward, sign * way * swing]
+                turns[f"{root}-{side}"] = Rotation.from_euler("xz", angles, degrees=True)
+        posed = made.skin(rest, weights, *made.place_bones(bones, turns, np.zeros(3)))
+        poses.append(made.restore_volume(posed, faces, volume, radius))
+    return Case("swapped legs", torch.from_numpy(np.stack(poses)), torch.from_numpy(faces.astype(np.int64)))
+
+
+def files(name: str, *paths: str) -> Case | None:
+    """A pair of the larger meshes; None, with a word, where they are not there."""
+    if not (DATA / paths[0]).is_file():
+        print(f"(without {name}: {DATA / paths[0]} is not there)")
+        return None
+    return Case(name, *tm.load_keyframes([DATA / path for path in paths]))
+
+
+def sample_hand() -> Case:
+    """The sample's."""
+    sample = load_sample("hand")
+    return Case("sample hand", sample.keyframes, sample.faces)
+
+
+CASES: dict[str, Callable[[], Case | None]] = {
+    "hand": sample_hand,
+    "legs": legs,
+    "mh-hand": lambda: files("mh-hand 02/04", "mh-hand/02-fist.obj", "mh-hand/04-spread.obj"),
+    "woman-02": lambda: files("mh-woman 00/02", "mh-woman/00-rest.obj", "mh-woman/02-walk-a.obj"),
+    "woman-23": lambda: files("mh-woman 02/03", "mh-woman/02-walk-a.obj", "mh-woman/03-walk-b.obj"),
+}
+
+
+class Run(NamedTuple):
+    """The same with and without contact."""
+
+    plain: Tensor
+    apart: Tensor
+    seconds: tuple[float, float]
+
+
+def subdivided(case: Case, bases: list[tm.ModalBasis], **options: Any) -> tuple[Tensor, float]:
+    """33 shapes, and the processor's time."""
+    start = time.process_time()
+    frames = tm.subdivide(case.keyframes, case.faces, LEVELS, bases=bases, progress=False, **options)
+    return frames, time.process_time() - start
+
+
+def run(case: Case) -> Run:
+    """Both, one after the other."""
+    bases = tm.extract_bases(case.keyframes, case.faces, 30, progress=False)
+    subdivided(case, bases)  # what is made once
+    plain, without = subdivided(case, bases)
+    apart, with_ = subdivided(case, bases, contact=True)
+    return Run(plain, apart, (without, with_))
+
+
+def energies(frames: Tensor, case: Case) -> Tensor:
+    """Of Eq. 5, between both key-frames at a diagonal of 100. *Shape:* ``(T,)``."""
+    scale = 100 / (case.keyframes[0].amax(0) - case.keyframes[0].amin(0)).norm()
+    shell = tm.ShellEnergy(case.faces)
+    t = torch.linspace(0, 1, len(frames), dtype=frames.dtype)[1:-1]
+    to_first, to_last = (torch.stack([shell(scale * x, scale * key) for x in frames[1:-1]]) for key in case.keyframes)
+    return torch.lerp(to_first, to_last, t)
+
+
+def peak(frames: Tensor) -> float:
+    """Largest second difference in time, in % of the diagonal."""
+    diagonal = (frames[0].amax(0) - frames[0].amin(0)).norm()
+    return float(100 * (frames[2:] - 2 * frames[1:-1] + frames[:-2]).norm(dim=-1).max() / diagonal)
+
+
+def crossings(names: list[str]) -> Iterator[tuple[Case, Run]]:
+    """The main table."""
+    head = ("far, sum", "most", "left", "frames", "energy", "most", "peak", "ratio", "s", "times")
+    print(f"\n{'':16s}" + "".join(f"{word:>10s}" for word in head))
+    for name in names:
+        case = CASES[name]()
+        if case is None:
+            continue
+        found = run(case)
+        before, after = (
+            tm.self_contacts(frames, case.faces, ignore=case.keyframes).n_far for frames in (found.plain, found.apart)
+        )
+        plain, apart = energies(found.plain, case), energies(found.apart, case)
+        peaks = peak(found.plain), peak(found.apart)
+        line = f"{case.name:16s}{int(before.sum()):10d}{int(before.max()):10d}{int(after.sum()):10d}"
+        line += (
+            f"{int((after > 0).sum()):10d}{float(apart.sum() / plain.sum()):10.4f}{float((apart / plain).max()):10.4f}"
+        )
+        line += f"{peaks[1]:8.3f} %{peaks[1] / peaks[0]:10.2f}{found.seconds[1]:10.2f}"
+        print(line + f"{found.seconds[1] / found.seconds[0]:10.2f}", flush=True)
+        yield case, found
+
+
+def edges(case: Case, found: Run) -> None:
+    """Edge errors of the sample hand against its true frames."""
+    sample = load_sample("hand")
+    i, j = torch.tensor(tm.ShapeSpace(tm.extract_bases(*sample[:2], 30, progress=False), sample.faces).edges).T
+
+    def error(x: Tensor, true: Tensor) -> float:
+        mine, its = ((y[i] - y[j]).norm(dim=-1) for y in (x, true))
+        return float(100 * ((mine - its).abs() / its).mean())
+
+    print("\nedge error of the sample hand, %, without and with contact")
+    for t, true in zip(sample.true_times, sample.truth, strict=True):
+        k = round(t * 2**LEVELS)
+        print(f"  t = {t:.2f}{error(found.plain[k], true):10.3f}{error(found.apart[k], true):10.3f}")
+
+
+def untouched() -> None:
+    """What the search costs where it finds nothing."""
+    sample = load_sample("creature")
+    case = Case("creature 0/1", sample.keyframes[:2], sample.faces)
+    found = run(case)
+    same = torch.equal(found.plain, found.apart)
+    print(f"\nnothing touches ({case.name}): {found.seconds[1] / found.seconds[0]:.2f} times, same shapes: {same}")
+
+
+def selfish(sizes: tuple[int, ...] = (10, 100, 1000)) -> None:
+    """Key-frames of the hand that pass through themselves: fingertips are moved into what is beside them."""
+    case = sample_hand()
+    bases = tm.extract_bases(case.keyframes, case.faces, 30, progress=False)
+    print(f"\nkey-frames that cross{'pairs':>12s}{'far':>8s}{'left':>8s}{'said':>8s}{'s':>8s}")
+    for wanted in sizes:
+        keyframes = crossed(case, wanted)
+        number = int(tm.self_contacts(keyframes[0], case.faces).number)
+        own = Case("", keyframes, case.faces)
+        plain, _ = subdivided(own, bases)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            apart, seconds = subdivided(own, bases, contact=True)
+        far = [int(tm.self_contacts(x, case.faces, ignore=keyframes).n_far.sum()) for x in (plain, apart)]
+        told = any("key-frame 0 passes through itself" in str(warning.message) for warning in said)
+        print(f"{wanted:21d}{number:12d}{far[0]:8d}{far[1]:8d}{'yes' if told else 'no':>8s}{seconds:8.1f}", flush=True)
+
+
+def crossed(case: Case, wanted: int) -> Tensor:
+    """The key-frames, with the fingers of the first pushed together until so many pairs cross."""
+    keyframes = case.keyframes.clone()
+    x = case.keyframes[0]
+    height = ((x[:, 1] - 0.45) / 0.3).clamp(0, 1)  # the fingers
+    low, high = 0.0, 1.2
+    for _ in range(12):
+        middle = (low + high) / 2
+        moved = x.clone()
+        moved[:, 0] = x[:, 0] * (1 - middle * height)
+        number = int(tm.self_contacts(moved, case.faces).number)
+        low, high = (middle, high) if number < wanted else (low, middle)
+    keyframes[0] = x
+    keyframes[0, :, 0] = x[:, 0] * (1 - high * height)
+    return keyframes
+
+
+def pictures(folder: Path, case: Case, found: Run) -> None:
+    """Before and after, with what crosses in colour."""
+    before, after = (
+        tm.self_contacts(frames, case.faces, ignore=case.keyframes) for frames in (found.plain, found.apart)
+    )
+    marks = {}
+    for name, frames, contacts in (("without", found.plain, before), ("contact", found.apart, after)):
+        mark = torch.zeros(frames.shape[:2])
+        which = contacts.shape[contacts.far].repeat_interleave(6)
+        mark[which, case.faces[contacts.pairs[contacts.far]].flatten()] = 1
+        marks[name] = mark
+    worst = int(before.n_far.argmax())
+    columns = sorted({max(1, worst - 4), max(1, worst - 2), worst, min(31, worst + 2)})
+    path = folder / f"contact-{case.name.replace(' ', '-')}.png"
+    view = (30.0, 15.0) if "legs" in case.name else None
+    tm.render_sequence(
+        {"without": found.plain, "contact": found.apart},
+        case.faces,
+        path,
+        columns=columns,
+        keyframe_indices=[0],
+        view=view,
+        colors=marks,
+        color_label="1: passes through",
+        overwrite=True,
+    )
+    print(f"picture: {path}")
+
+
+if __name__ == "__main__":
+    limit_threads()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--rows", nargs="+", default=["crossings", "cost", "keyframes"])
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of the sample hand and the legs")
+    given = parser.parse_args()
+    warnings.simplefilter("ignore")
+    if "crossings" in given.rows:
+        for case, found in crossings(given.cases):
+            if case.name == "sample hand":
+                edges(case, found)
+            if given.pictures and case.name in ("sample hand", "swapped legs"):
+                pictures(given.pictures, case, found)
+    if "cost" in given.rows:
+        untouched()
+    if "keyframes" in given.rows:
+        selfish()
