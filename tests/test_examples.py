@@ -101,3 +101,12 @@ def test_morph_animals_goes_from_one_body_to_another(tmp_path: Path) -> None:
 def test_motion_from_markers_is_nearer_than_pca_and_than_the_path() -> None:
     errors = load_example("motion_from_markers").main()
     assert errors["amplitudes"] < 0.5 * min(errors["path"], errors["PCA"])
+
+
+@pytest.mark.slow
+def test_figures_of_the_paper_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    load_example("paper/run").main(tmp_path)
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == [f"paper-figure{n}.png" for n in (1, 3, 6)]
+    said = capsys.readouterr().out
+    errors = [float(line.split()[-2]) for line in said.splitlines() if "edge error" in line]
+    assert errors[2] < errors[1] < errors[0]  # ours, Eq. 4, linear
