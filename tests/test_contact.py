@@ -178,6 +178,16 @@ def test_path_takes_any_time(hand: Shapes) -> None:
     assert torch.equal(shapes[3], hand.keyframes[1])
 
 
+def test_smooth_path_through_three_keyframes(hand: Shapes) -> None:
+    there_and_back = hand.pick(0, 1, 0)
+    options = {"bases": there_and_back.bases, "progress": False}
+    plain = tm.subdivide(there_and_back.keyframes, hand.faces, 3, **options)
+    frames = tm.subdivide(there_and_back.keyframes, hand.faces, 3, contact=True, **options)
+    assert int((far(plain, hand) > 0).sum()) >= 4
+    assert int(far(frames, hand).sum()) == 0
+    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
+
+
 def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
     pair = bars.pick(0, 1)
     options = {"levels": 2, "bases": pair.bases, "progress": False}
