@@ -26,7 +26,7 @@ N_MODES, N_MARKERS = 30, 20
 NOISE, LOST = 0.01, 0.1
 STIFFEST = 3.0
 """Prior deviation of the softest mode's amplitude; a stiffer one has it less by the ratio of their frequencies."""
-JERK = 0.15
+JERK = 0.07
 """Prior deviation of second differences in time, over that of the amplitude itself, at 48 frames."""
 
 
