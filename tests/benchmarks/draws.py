@@ -5,8 +5,8 @@
 
 Volumes are relative to the source: the key-frame, or the two that a shape lies between, in proportion to its time. New
 crossings are pairs of faces that cross in the draw, both of them two rings or more away from any that cross in a source
-(parts that touch in a key-frame cross a little more or less with every rounding). libigl with CGAL finds them exactly,
-where it is installed (``pip install libigl``). ``linear`` draws the same pairs and times as ``RandomInBetween``.
+(parts that touch in a key-frame cross a little more or less with every rounding); counted where the extra ``contact``
+is installed. ``linear`` draws the same pairs and times as ``RandomInBetween``.
 """
 
 import argparse
@@ -19,6 +19,8 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.crossings import Crossings, has_contact
 
 TRANSFORMS: dict[str, tm.ShapeAugmentation] = {
     "linear": RandomLinear(p=1.0),
@@ -42,13 +44,11 @@ def keyframes_of(name: str) -> tuple[Tensor, Tensor] | None:
 
 
 def crossings(x: Tensor, faces: Tensor) -> Tensor | None:
-    """Pairs of faces that cross, *shape* ``(n, 2)``; None without libigl."""
-    try:
-        from igl.copyleft.cgal import remesh_self_intersections
-    except ImportError:
+    """Pairs of faces that cross, *shape* ``(n, 2)``; None without the extra ``contact``."""
+    if not has_contact():
         return None
-    pairs = remesh_self_intersections(x.double().numpy(), faces.numpy(), detect_only=True)[2]
-    return torch.from_numpy(pairs.astype("int64")).reshape(-1, 2)
+    shape = x.double().numpy()
+    return torch.from_numpy(Crossings(Connectivity(faces.numpy(), len(shape)), shape[None]).pairs(shape))
 
 
 def around(pairs: Tensor, faces: Tensor, rings: int = 2) -> Tensor:

@@ -7,14 +7,11 @@ import torch
 from torch_modal.data.augmentation import ShapeAugmentation, ShapeBatch
 from torch_modal.data.sequential import AugmentationSequential
 from torch_modal.data.space import ShapeSpace
+from torch_modal.extras import require_installed
 
-try:
-    from torch_geometric.data import Batch, Data
-    from torch_geometric.transforms import BaseTransform
-except ImportError as error:  # pragma: no cover
-    raise ImportError(
-        "torch_modal.data.pyg needs PyTorch Geometric: pip install torch_geometric, or torch_modal[pyg]"
-    ) from error
+require_installed(("torch_geometric",), "pyg", "torch_modal.data.pyg")
+from torch_geometric.data import Batch, Data  # noqa: E402
+from torch_geometric.transforms import BaseTransform  # noqa: E402
 
 
 class RandomShape(BaseTransform):
