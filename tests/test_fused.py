@@ -1,6 +1,7 @@
 """Kernels against the torch code that they stand in for: values, gradients, vmap, and where they are not used."""
 
 import importlib.util
+import math
 import subprocess
 import sys
 import warnings
@@ -135,6 +136,23 @@ class TestRotations:
         assert_alike(gradients(rotations, given, True), gradients(rotations.oracle, given, True), 1e-7)
         found = vmap(lambda t: rotations(*given[:2], t.expand(2)))(given[2])
         torch.testing.assert_close(found[1], rotations(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
+
+    def test_beyond_half_a_turn(self) -> None:
+        # A strip that is rolled up: its far end turns by 300 degrees, which only its neighbours tell from -60.
+        n = 24
+        s = torch.linspace(0, 1, n, dtype=DOUBLE)
+        angle = math.radians(300) * s
+        arc = torch.stack([angle.sin(), 0 * s, 1 - angle.cos()], -1) / math.radians(300)
+        width = torch.tensor([0.0, 0.2, 0.0], dtype=DOUBLE)
+        flat = torch.stack([s, 0 * s, 0 * s], -1)
+        shapes = torch.stack([torch.cat([x, x + width]) for x in (flat, arc)])
+        i = torch.arange(n - 1)
+        faces = torch.cat([torch.stack([i, i + 1, i + n], 1), torch.stack([i + 1, i + n + 1, i + n], 1)])
+        rotations = FusedRotations(Mesh.of(faces, 2 * n).connectivity, shapes)
+        given = [shapes[:1].clone(), shapes[1:].clone(), torch.tensor([0.5], dtype=DOUBLE)]
+        truth = rotations.oracle(*given)
+        assert float(truth[0].min()) < -0.5 / (n - 1), "nothing turns by more than 90 degrees half-way"
+        torch.testing.assert_close(rotations(*given), truth, rtol=0, atol=1e-12)
 
     def test_the_same_shape(self, rotations: FusedRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes[:1]

@@ -94,7 +94,7 @@ class FusedRelax(nn.Module):
         chain = torch.tensor(own.boundary_chain)
         cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], -1)], 1)
         self.register_buffer("walls", torch.cat([mesh.faces, cones]).int(), persistent=False)
-        self.register_buffer("used", mesh.faces.unique(), persistent=False)
+        self.register_buffer("used", energy.used, persistent=False)
 
     @staticmethod
     def serves(energy: Energy, backend: Backend) -> bool:
