@@ -99,6 +99,20 @@ def test_columns_and_keyframes_are_chosen(tmp_path):
         assert warm_found == warm
 
 
+def test_titles_stand_above_the_columns(tmp_path):
+    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
+    given = [["t = 0", "t = 0.5", "t = 1"], ["t = 0", "mode 2", "t = 1"]]
+    sheets = []
+    for titles in (None, *given):
+        render_sequence(rows, faces, tmp_path / "a.png", titles=titles, renderer="matplotlib", overwrite=True)
+        sheets.append(np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int))
+    np.testing.assert_array_equal(sheets[0], sheets[1], "times are the default")
+    changed = np.argwhere(np.abs(sheets[0] - sheets[2]).sum(2) > 0)
+    height, width = sheets[0].shape[:2]
+    assert len(changed) and changed[:, 0].max() < height / 4, "only what is above the shapes"
+    assert width / 3 < changed[:, 1].min() and changed[:, 1].max() < 5 * width / 6, "only the one in the middle"
+
+
 def test_numbers_become_colours_with_one_bar(tmp_path):
     """The first row is 0 (the scale's light end), the second 5 (its dark end), the third has none."""
     frames, faces = growing(3), np.asarray(BALL.faces)
@@ -231,6 +245,7 @@ def test_pdf(tmp_path):
         ({"out": "a.jpg"}, r"\.png or \.pdf.*a\.jpg"),
         ({"renderer": "opengl"}, "opengl"),
         ({"columns": 0}, "columns must be at least 1"),
+        ({"titles": ["first"]}, "titles stand above 3 columns, got 1"),
         ({"columns": [0, 3]}, r"columns.*0 to 2.*\[0, 3\]"),
         ({"keyframe_indices": [3]}, "keyframe_indices.*0 to 2"),
         ({"view": (0,)}, "azimuth and elevation"),

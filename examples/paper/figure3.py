@@ -63,6 +63,7 @@ def main(out: Path, overwrite: bool = True) -> list[str]:
         faces,
         out / "paper-figure3.png",
         columns=range(N_MODES),
+        titles=[f"mode {i + 1}" for i in range(N_MODES)],
         keyframe_indices=range(N_MODES),
         overwrite=overwrite,
     )

@@ -151,6 +151,7 @@ def draw(found: dict[str, dict[str, list[Point]]], out: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     measures = {"distance": "mean distance, % of the diagonal", "kg": "KG error, %", "edges": "edge error, %"}
     figure, axes = plt.subplots(len(found), 3, figsize=(11, 3 * len(found)), squeeze=False, constrained_layout=True)
@@ -172,7 +173,8 @@ def draw(found: dict[str, dict[str, list[Point]]], out: Path) -> None:
                 )
             axis.set(xscale="log", yscale="log", xlabel="bits a vertex and frame", ylabel=label, title=name)
             axis.grid(alpha=0.3)
-        row[0].legend()
+            axis.xaxis.set_minor_formatter(NullFormatter())
+        row[2].legend(fontsize="small")
     figure.savefig(out, dpi=70)
 
 

@@ -152,6 +152,7 @@ def render_sequence(
     faces: Array,
     out: str | Path,
     columns: int | Sequence[int] | None = None,
+    titles: Sequence[str] | None = None,
     keyframe_indices: Sequence[int] | None = None,
     view: tuple[float, float] | None = None,
     up: Literal["y", "z"] | None = None,
@@ -169,6 +170,7 @@ def render_sequence(
         out: File to write, ``*.png`` or ``*.pdf``.
         columns: How many frames to show, evenly chosen with the first and the last, or their numbers. By
             default all up to seven, and of more a number from four to seven that gives equal steps.
+        titles: What stands above the columns. Default: when they are, from 0 to 1.
         keyframe_indices: Frames that are key-frames, drawn in the other colour. The first and the last by
             default.
         view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is
@@ -217,6 +219,9 @@ def render_sequence(
         chosen = np.unique(np.linspace(0, n_frames - 1, count).round().astype(int)).tolist()
     else:
         chosen = check_indices(columns, n_frames, "columns")
+    titles = [f"t = {n / max(n_frames - 1, 1):.3g}" for n in chosen] if titles is None else titles
+    if len(titles) != len(chosen):
+        raise ValueError(f"titles stand above {len(chosen)} columns, got {len(titles)}.")
     given = [0, n_frames - 1] if keyframe_indices is None else keyframe_indices
     keyframes = check_indices(given, n_frames, "keyframe_indices")
 
@@ -239,8 +244,7 @@ def render_sequence(
         np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64),
     )
     images = draw(scene, renderer)
-    last = max(n_frames - 1, 1)
-    labels = [(f"t = {n / last:.3g}", "#b4581a" if n in keyframes else "#333333") for n in chosen]
+    labels = [(title, "#b4581a" if n in keyframes else "#333333") for n, title in zip(chosen, titles, strict=True)]
     write_file(path, _sheet(images.reshape(*shown.shape[:2], *images.shape[1:]), rows, labels, color_bar, fmt))
     return path
 
