@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.extras import require_installed
+from torch_modal.progress import ProgressReport
 
 Backend = Literal["auto", "torch", "warp"]
 
@@ -27,7 +28,8 @@ def kernels() -> Any:
             wp.init()
         from torch_modal.nn import kernels as module
 
-        wp.load_module(module, device="cpu")
+        with ProgressReport(1, "kernels, which are compiled once", unit="module"):
+            wp.load_module(module, device="cpu")
     finally:
         wp.config.log_level = before
     return module
