@@ -86,6 +86,55 @@ def _velocity(
     return wanted * (part * (2 - part))
 
 
+def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
+    """The interval between key-frames that each time lies in, and how far along it is.
+
+    Args:
+        t: *Shape:* ``(B,)``.
+        times: Of the key-frames, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``.
+        cyclic: Whether times are taken modulo the period.
+        rounding: Relative. Times so near to a key-frame are taken for its own: 0.3 in float32 is beside 0.3 in float64,
+            and would miss the key-frame, or lie after the last.
+
+    Returns:
+        *Shape of each:* ``(B,)``.
+
+    Raises:
+        ValueError: A time is before the first or after the last.
+    """
+    scale = torch.maximum(t.detach().abs(), times.abs().amax())
+    if cyclic:
+        period = times[-1] - times[0]
+        t = t - period * torch.floor((t.detach() - times[0]) / period)
+    if rounding:
+        differences = times - t.detach()[:, None]
+        to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
+        t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
+    outside = ~((t >= times[0]) & (t <= times[-1]))
+    if bool(outside.any()):
+        raise ValueError(
+            f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
+            f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
+        )
+    segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
+    return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
+
+
+def around(i: int, times: Tensor, cyclic: bool) -> tuple[int | None, int | None, Spacing]:
+    """The key-frames before and after an interval, None where there are none, and how long it and its neighbours are.
+
+    Args:
+        i: Number of the interval.
+        times: As for :func:`located`.
+        cyclic: Whether the last key-frame leads on to the first.
+    """
+    h = times.diff()
+    n = len(h) + (not cyclic)
+    before = (i - 1) % n if cyclic or i > 0 else None
+    after = (i + 2) % n if cyclic or i < len(h) - 1 else None
+    return before, after, Spacing(*(h[j % len(h)] for j in (i - 1, i, i + 1)))
+
+
 def beyond(bend: Excess, u: Tensor) -> Tensor:
     """What the cubic adds to the straight step at ``u``, which broadcasts against the excess."""
     return u * (1 - u) * ((1 - u) * bend.first - u * bend.last)

@@ -12,7 +12,7 @@ from torch_modal.geometry.rotations import turned
 from torch_modal.geometry.vectors import cross, norm, pick, tiny
 
 # Below this part of the sides a height is rounding, and dividing by it would make noise into a gradient.
-_FLAT = 1e-6
+FLAT = 1e-6
 
 
 class Sides(NamedTuple):
@@ -78,7 +78,7 @@ def frames(given: Sides) -> Frames:
     e1 = first / length
     along = _dot(second, e1)
     across = second - along * e1
-    height = torch.maximum(norm(across), _FLAT * (length + along.abs()))
+    height = torch.maximum(norm(across), FLAT * (length + along.abs()))
     e2 = across / height
     return Frames(e1, e2, cross(e1, e2), length, along, height)
 

@@ -40,6 +40,11 @@ FINE_CHUNK_OF_GPU = 1_000_000
 SMALLEST_SIZE = 1e-6
 
 
+def fine_chunk(n_vertices: int, device: torch.device) -> int:
+    """How many samples of so many vertices are relaxed at a time."""
+    return max(1, (FINE_CHUNK if device.type == "cpu" else FINE_CHUNK_OF_GPU) // n_vertices)
+
+
 class ConvergenceError(RuntimeError):
     """A gradient was asked for through a minimisation that did not converge."""
 
@@ -145,7 +150,6 @@ class Between(nn.Module):
         self.solver = solver
         self.contact = objective.contact
         self.mesh = mesh
-        self._terms = tuple(terms)
         #: Whether Eq. 5 has no company: what has no strain then stays as it is.
         self.bare = not objective.terms
         self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, weights)
@@ -325,7 +329,7 @@ class Between(nn.Module):
     @property
     def terms(self) -> tuple[Term, ...]:
         """Of the energy; the layer owns them."""
-        return self._terms
+        return tuple(part.term for part in self.fine.parts)
 
     @property
     def step(self) -> GaussNewtonStep:
@@ -344,7 +348,7 @@ class Between(nn.Module):
         """Local interpolation and polish: what the modes cannot do. *Shape:* ``(B, V, 3)``."""
         energy, solver = self.fine, self.solver
         in_contact = energy if contacts is None else contacts.fine(self.mesh, self.terms)
-        chunk = max(1, FINE_CHUNK // x.shape[-2])
+        chunk = fine_chunk(x.shape[-2], x.device)
         ends = pair.first, pair.second
         if self.fused is not None and contacts is None:
             rest = trees.picked(ends, samples.which)

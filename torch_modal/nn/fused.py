@@ -16,7 +16,7 @@ from torch_modal.energy.terms import MIN_RELATIVE_LENGTH, MIN_RELATIVE_VOLUME, B
 from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.launch import Backend, has_kernels, kernels, launch, traced
-from torch_modal.nn.relax import STEP_LENGTHS, inverse_of_symmetric, relax
+from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric, relax
 
 Shapes = dict[int, tuple[int, ...]]
 """Of the arguments of a kernel that are its output, by their places."""
@@ -280,37 +280,31 @@ class FusedRelax(nn.Module):
     def recorded(self, n_products: int, lengths: Tensor, x: Tensor, *rest: Tensor) -> Tensor:
         """The same steps of known lengths, by kernels that autograd can go back through. *Shape:* ``(B, V, 3)``."""
         to = self.reference(*rest)
-        b, n = x.shape[:2]
-
-        def dot(p: Tensor, q: Tensor) -> Tensor:
-            return (p * q).sum((1, 2))[:, None, None]
-
-        def quotient(p: Tensor, q: Tensor) -> Tensor:
-            return torch.where(q > 0, p / torch.where(q > 0, q, 1), 0)
-
         for length in lengths:
-            _, gradient, diagonal, edges, hinges, normal, moment = self._linearised(x, to)
-            inverse = _inverse(diagonal)
-
-            def applied(field: Tensor, inverse: Tensor = inverse) -> Tensor:
-                return (inverse @ field[..., None]).squeeze(-1)
-
-            residual = -(gradient + moment[:, None, None] * normal)
-            direction = preconditioned = applied(residual)
-            size, solution = dot(residual, preconditioned), torch.zeros_like(x)
-            for k in range(n_products):
-                given = [direction, self.record, edges, hinges, n, None, None]
-                product, _ = self._run(kernels().product, {5: tuple(x.shape), 6: (b,)}, given)
-                product = product + to.stiffness[:, None, None] * dot(normal, direction) * normal
-                step = quotient(size, dot(direction, product))
-                solution = solution + step * direction
-                if k < n_products - 1:
-                    residual = residual - step * product
-                    preconditioned = applied(residual)
-                    before, size = size, dot(residual, preconditioned)
-                    direction = preconditioned + quotient(size, before) * direction
+            at = self._linearised(x, to)
+            _, gradient, diagonal, _, _, normal, moment = at
+            right = -(gradient + moment[:, None, None] * normal)
+            product, precondition = partial(self._product, at, to), partial(_applied, _inverse(diagonal))
+            solution = conjugate_gradients(product, precondition, _dot, right, n_products)
             x = x + length[:, None, None] * solution
         return x
+
+    def _product(self, at: Sequence[Tensor], to: _Reference, field: Tensor) -> Tensor:
+        """The convex Hessian times a field. *Shape:* ``(B, V, 3)``."""
+        edges, hinges, normal = at[3:6]
+        given = [field, self.record, edges, hinges, self.n_vertices, None, None]
+        found, _ = self._run(kernels().product, {5: tuple(field.shape), 6: (len(field),)}, given)
+        return found + to.stiffness[:, None, None] * _dot(normal, field) * normal
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """*Shape:* ``(B, V, 3), (B, V, 3) -> (B, 1, 1)``."""
+    return (a * b).sum((1, 2))[:, None, None]
+
+
+def _applied(inverse: Tensor, residual: Tensor) -> Tensor:
+    """*Shape:* ``(B, V, 3, 3), (B, V, 3) -> (B, V, 3)``."""
+    return (inverse @ residual[..., None]).squeeze(-1)
 
 
 def _inverse(packed: Tensor) -> Tensor:

@@ -13,6 +13,8 @@ import warp as wp
 
 from torch_modal.energy.measures import COLLAPSED
 from torch_modal.energy.terms import MAX_BENDING_RATIO, SLACK
+from torch_modal.geometry import rotations, triangle_frames
+from torch_modal.nn import relax
 
 real = wp.float64
 vec3 = wp.vec3d
@@ -33,7 +35,9 @@ RATIO = wp.constant(real(MAX_BENDING_RATIO))
 SLACKNESS = wp.constant(real(SLACK))
 TURN = wp.constant(real(6.283185307179586))
 HALF = wp.constant(real(0.5))
-RIDGE = wp.constant(real(1e-6))  # relax.RIDGE
+RIDGE = wp.constant(real(relax.RIDGE))
+NO_HEIGHT = wp.constant(real(triangle_frames.FLAT))
+SMALL = wp.constant(real(rotations.SMALL))
 
 
 # ------------------------------------------------------------------------------------------------------------- elements
@@ -485,7 +489,7 @@ def triangle(p: vec3, q: vec3, r: vec3):
     t.e1 = first / t.length
     t.along = wp.dot(second, t.e1)
     rise = second - t.along * t.e1
-    t.height = wp.max(length_of(rise), real(1e-6) * (t.length + wp.abs(t.along)))  # triangle_frames._FLAT
+    t.height = wp.max(length_of(rise), NO_HEIGHT * (t.length + wp.abs(t.along)))
     t.e2 = rise / t.height
     t.normal = wp.cross(t.e1, t.e2)
     return t
@@ -576,7 +580,7 @@ def sinc(squared_angle: real):
     found = real(1.0) - squared_angle / real(6.0) * (
         real(1.0) - squared_angle / real(20.0) * (real(1.0) - squared_angle / real(42.0))
     )
-    if squared_angle >= real(1e-3):
+    if squared_angle >= SMALL:
         angle = wp.sqrt(squared_angle)
         found = wp.sin(angle) / angle
     return found
@@ -588,7 +592,7 @@ def half_turn(q: vec4):
     axis = vec3(q[1], q[2], q[3])
     sine = wp.dot(axis, axis)
     factor = real(0.0)
-    if sine < real(1e-3) * q[0] * q[0] and q[0] > real(0.0):
+    if sine < SMALL * q[0] * q[0] and q[0] > real(0.0):
         t = sine / (q[0] * q[0])
         factor = (
             real(1.0) - t * (real(1.0 / 3.0) - t * (real(1.0 / 5.0) - t * (real(1.0 / 7.0) - t * real(1.0 / 9.0))))

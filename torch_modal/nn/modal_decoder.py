@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.hermite import Excess, Spacing, beyond
+from torch_modal.geometry.hermite import Excess, Spacing, around, beyond, located
 from torch_modal.geometry.local_rotations import Course
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
@@ -184,18 +184,7 @@ class ModalDecoder(nn.Module):
 
     def located(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
-        times = self.times
-        if self.cyclic:
-            period = times[-1] - times[0]
-            t = t - period * torch.floor((t.detach() - times[0]) / period)
-        outside = ~((t >= times[0]) & (t <= times[-1]))
-        if bool(outside.any()):
-            raise ValueError(
-                f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
-                f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
-            )
-        segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
-        return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
+        return located(t, self.times, self.cyclic)
 
     def interval(self, i: int, keyframes: Tensor | None = None) -> Interval:
         """What does not depend on the time; kept, of the decoder's own key-frames."""
@@ -219,15 +208,14 @@ class ModalDecoder(nn.Module):
         return Interval(pair, course, vertex_excess(pair))
 
     def _pair(self, i: int, keyframes: Tensor) -> Pair:
-        n, last = len(keyframes), self.n_intervals - 1
+        n = len(keyframes)
         x = keyframes[:, None]
         pair = self.alignment.place(x[i], x[(i + 1) % n])
         if n < 3:
             return pair
-        before = x[i - 1] if self.cyclic or i > 0 else None
-        after = x[(i + 2) % n] if self.cyclic or i < last else None
-        h = self.times.diff().to(x)
-        return self.alignment.surround(pair, before, after, Spacing(*(h[j % len(h)][None] for j in (i - 1, i, i + 1))))
+        before, after, spacing = around(i, self.times, self.cyclic)
+        earlier, later = (None if j is None else x[j] for j in (before, after))
+        return self.alignment.surround(pair, earlier, later, Spacing(*(h.to(x)[None] for h in spacing)))
 
 
 def _bounded(columns: Tensor, own: Frames) -> Tensor:

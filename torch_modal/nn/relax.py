@@ -1,6 +1,6 @@
 """An energy with every vertex free: a convex Hessian that is applied without being assembled, and steps with it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -110,7 +110,7 @@ def relax(
         extended = energy.extend(rows, fixed)
         at = energy.linearise(extended, reference)
         right = -energy.fold(energy.gradient(at))
-        direction = _conjugate_gradients(energy, ConvexHessian(energy, at), right, n_products)
+        direction = _solved(energy, ConvexHessian(energy, at), right, n_products)
         moves = energy.extend(direction)
         before = energy.value_at(at, reference)
         length = _downhill(energy, before, extended, moves, reference)
@@ -118,32 +118,54 @@ def relax(
     return rows.movedim(0, -1)
 
 
-def _conjugate_gradients(energy: Energy, hessian: ConvexHessian, right: Tensor, n_products: int) -> Tensor:
+def _solved(energy: Energy, hessian: ConvexHessian, right: Tensor, n_products: int) -> Tensor:
     """An approximate solution. *Shape:* ``(3, B, V)``."""
+    inverse = hessian.inverse_diagonal()[..., : right.shape[-1]]
+
+    def product(field: Tensor) -> Tensor:
+        return energy.fold(hessian(energy.extend(field)))
 
     def precondition(residual: Tensor) -> Tensor:
         return (inverse * residual).sum(1)
 
     def dot(a: Tensor, b: Tensor) -> Tensor:
-        return (a * b).sum((0, -1))
+        return (a * b).sum((0, -1))[:, None]
+
+    return conjugate_gradients(product, precondition, dot, right, n_products)
+
+
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    dot: Callable[[Tensor, Tensor], Tensor],
+    right: Tensor,
+    n_products: int,
+) -> Tensor:
+    """An approximate solution, preconditioned, of one or more systems.
+
+    Args:
+        product: With the matrix, symmetric and never negative.
+        precondition: With an approximate inverse.
+        dot: Inner products of two such fields, one of each system, that broadcast against them.
+        right: The right side.
+        n_products: How many.
+    """
 
     def quotient(a: Tensor, b: Tensor) -> Tensor:
-        # A sample that is solved exactly has nothing left: 0 / 0.
-        return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0)[:, None]
+        # A system that is solved exactly has nothing left: 0 / 0.
+        return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0)
 
-    inverse = hessian.inverse_diagonal()[..., : right.shape[-1]]
     solution = torch.zeros_like(right)
     residual = right
-    preconditioned = precondition(residual)
-    direction = preconditioned
+    direction = preconditioned = precondition(residual)
     size = dot(residual, preconditioned)
     for k in range(n_products):
-        product = energy.fold(hessian(energy.extend(direction)))
-        length = quotient(size, dot(direction, product))
+        along = product(direction)
+        length = quotient(size, dot(direction, along))
         solution = solution + length * direction
         if k == n_products - 1:
             break
-        residual = residual - length * product
+        residual = residual - length * along
         preconditioned = precondition(residual)
         previous, size = size, dot(residual, preconditioned)
         direction = preconditioned + quotient(size, previous) * direction

@@ -19,9 +19,9 @@ from torch import Tensor
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.terms import Mesh
 from torch_modal.nn import trees
-from torch_modal.nn.between import FINE_CHUNK, Between, Samples
+from torch_modal.nn.between import Between, Samples, fine_chunk
 from torch_modal.nn.contact import Contacts, ContactSearch
-from torch_modal.nn.relax import ConvexHessian, inverse_of_symmetric
+from torch_modal.nn.relax import STEP_LENGTHS, ConvexHessian, conjugate_gradients, inverse_of_symmetric
 
 KNOTS = 16
 """Intervals of the spline."""
@@ -36,7 +36,6 @@ MODAL_STEPS = 2
 FINE_STEPS = 2
 FINAL_STEPS = 2
 FINE_PRODUCTS = 15
-_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
 
 
 class Displacement(NamedTuple):
@@ -120,7 +119,7 @@ class _Fine:
         own = Energy(local, terms).to(held.weights.device)
         stiffness = [k for term, k in zip(member.terms, samples.stiffness, strict=True) if term in terms]
         self.references = member.fine_reference(samples, pair, own, self.vertices, stiffness)
-        self.size = max(1, FINE_CHUNK // len(self.vertices))
+        self.size = fine_chunk(len(self.vertices), held.weights.device)
 
     def _parts(self, rows: Tensor) -> Any:
         """Chunks of extended rows, with their references. *Shape:* ``(3, T, R)``."""
@@ -248,7 +247,7 @@ class _Coupled:
             gradient, hessians, diagonal = local.linearised(rows + self.basis @ own)
             right = -self.gather(gradient) - 2 * self.bent(own, area)
             step = self._solved(local, hessians, self._preconditioner(diagonal, area), right * local.free, area)
-            for length in _LENGTHS:
+            for length in STEP_LENGTHS:
                 after = value(own + length * step)
                 if after < before:
                     own, before = own + length * step, after
@@ -263,24 +262,17 @@ class _Coupled:
         return inverse_of_symmetric((self.basis**2).T @ diagonal + 2 * self.bend.diagonal()[:, None] * area * eye)
 
     def _solved(self, local: _Fine, hessians: list[Any], inverse: Tensor, right: Tensor, area: Tensor) -> Tensor:
-        solution = torch.zeros_like(right)
-        residual = right
-        preconditioned = (inverse * residual).sum(1)
-        direction = preconditioned
-        size = (residual * preconditioned).sum()
-        for _ in range(FINE_PRODUCTS):
-            product = self.gather(local.product(hessians, self.expand(direction))) + 2 * self.bent(direction, area)
-            product = product * local.free
-            curvature = (direction * product).sum()
-            if not float(curvature) > 0:
-                break
-            length = size / curvature
-            solution = solution + length * direction
-            residual = residual - length * product
-            preconditioned = (inverse * residual).sum(1)
-            previous, size = size, (residual * preconditioned).sum()
-            direction = preconditioned + size / previous * direction
-        return solution
+        def product(field: Tensor) -> Tensor:
+            found = self.gather(local.product(hessians, self.expand(field))) + 2 * self.bent(field, area)
+            return found * local.free
+
+        def precondition(residual: Tensor) -> Tensor:
+            return (inverse * residual).sum(1)
+
+        def dot(a: Tensor, b: Tensor) -> Tensor:
+            return (a * b).sum()
+
+        return conjugate_gradients(product, precondition, dot, right, FINE_PRODUCTS)
 
     def modal(self, at: Tensor, held: Contacts) -> Tensor:
         """Newton steps in the modes, with the energy of the coarse mesh, never uphill. *Shape:* ``(3, J, V)``."""
@@ -314,7 +306,7 @@ class _Coupled:
             field = columns.combine(step).permute(2, 0, 1)
             value = partial(self._along, places, at, field, self.basis @ step)
             before = value(0.0)
-            taken = next((length for length in _LENGTHS if value(length) < before), 0.0)
+            taken = next((length for length in STEP_LENGTHS if value(length) < before), 0.0)
             at = at + taken * field
             if not taken:
                 break

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.crossings import require_contact
-from torch_modal.geometry.hermite import Spacing
+from torch_modal.geometry.hermite import Spacing, around, located
 from torch_modal.nn.between import InBetweenResult, Samples
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
@@ -111,8 +111,7 @@ class Path(nn.Module):
         Raises:
             ValueError: The time is outside, or that of a key-frame.
         """
-        interval, _ = self._located(self.times.new_tensor([t]))
-        i = int(interval)
+        i = int(located(self.times.new_tensor([t]), self.times, self.cyclic)[0])
         if bool((self.times == t).any()):
             raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
         other = Path.__new__(Path)
@@ -165,7 +164,7 @@ class Path(nn.Module):
             ) from None
         flat = keyframes.reshape(-1, *keyframes.shape[-3:])
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
-        segment, u = self._located(t.expand(lead).reshape(-1), rounding)
+        segment, u = located(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
         exact = layer.records(keyframes, t)
         order, parts = [], []
         for i in segment.unique().tolist() or [0]:  # of nothing, nothing
@@ -173,26 +172,6 @@ class Path(nn.Module):
             order.append(mine)
             parts.append(self._between(flat, i, which[mine], u[mine], exact, report))
         return unflattened(joined(parts, order), lead)
-
-    def _located(self, t: Tensor, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
-        """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
-        times = self.times
-        # 0.3 in float32 is beside 0.3 in float64, and would miss the key-frame, or lie after the last.
-        scale = torch.maximum(t.detach().abs(), times.abs().amax())
-        if self.cyclic:
-            period = times[-1] - times[0]
-            t = t - period * torch.floor((t.detach() - times[0]) / period)
-        differences = times - t.detach()[:, None]
-        to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
-        t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
-        outside = ~((t >= times[0]) & (t <= times[-1]))
-        if bool(outside.any()):
-            raise ValueError(
-                f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
-                f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
-            )
-        segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
-        return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
 
     def _between(
         self,
@@ -217,17 +196,14 @@ class Path(nn.Module):
         """Times of one interval as a batch. *Shape:* ``(L, K, V, 3), (B,), (B,)``."""
         layer, n = self.layer, self.n_keyframes
         x = keyframes.to(layer.dtype)
-        around: dict[str, Any] = {}
+        neighbours: dict[str, Any] = {}
         if self.smooth and n > 2:
-            last = len(self.times) - 2
-            before = x[:, (i - 1) % n] if self.cyclic or i > 0 else None
-            after = x[:, (i + 2) % n] if self.cyclic or i < last else None
-            h = self.times.diff().to(x)
-            spacing = Spacing(*(h[j % len(h)].expand(len(x)) for j in (i - 1, i, i + 1)))
-            around = {"before": before, "after": after, "spacing": spacing}
+            before, after, spacing = around(i, self.times, self.cyclic)
+            neighbours["before"], neighbours["after"] = (None if j is None else x[:, j] for j in (before, after))
+            neighbours["spacing"] = Spacing(*(h.to(x).expand(len(x)) for h in spacing))
         u = u.to(x)
         stiffness = layer.stiffness_of(u, u.shape)
-        return Samples(x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), stiffness, **around)
+        return Samples(x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), stiffness, **neighbours)
 
     def _in_contact(self, keyframes: Tensor, i: int, samples: Samples, result: InBetweenResult) -> InBetweenResult:
         """Shapes of one interval pushed apart, by what is found at even times of each motion."""

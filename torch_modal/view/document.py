@@ -29,9 +29,14 @@ class Page:
     Attributes:
         html: The whole page.
         height: Pixels that it takes in a notebook.
+
+    Raises:
+        ValueError: A height below 1.
     """
 
     def __init__(self, html: str, height: int = 600) -> None:
+        if height < 1:
+            raise ValueError(f"height is a number of pixels, at least 1; got {height}.")
         self.html = html
         self.height = height
 

@@ -72,8 +72,6 @@ def show(
         raise ValueError("sequences is empty; it needs at least one sequence of shapes.")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps must be a positive number, got {fps}.")
-    if height < 1:
-        raise ValueError(f"height is a number of pixels, at least 1; got {height}.")
     checked: dict[str, FloatArray] = {}
     for name, frames in named.items():
         checked[str(name)], triangles = check_frames(frames, faces, f"sequences[{name!r}]")
