@@ -20,7 +20,8 @@ from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.nn import launch
-from torch_modal.nn.fused import FusedRelax, FusedRotations
+from torch_modal.nn.fused_relax import FusedRelax
+from torch_modal.nn.fused_rotations import FusedRotations
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 

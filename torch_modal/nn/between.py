@@ -16,7 +16,7 @@ from torch_modal.nn import trees
 from torch_modal.nn.adjoint import ConvergenceWarning, Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.contact import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
 from torch_modal.nn.frame import Frame, Pair
-from torch_modal.nn.fused import FusedRelax
+from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
 from torch_modal.nn.levels import Levels, Stiffness, coarse_values

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.geometry.poisson import Poisson
-from torch_modal.nn.fused import FusedRotations
+from torch_modal.nn.fused_rotations import FusedRotations
 
 
 class RotationBlend(nn.Module):

@@ -2,7 +2,7 @@
 
 What they compute is what :mod:`torch_modal.energy` and :mod:`torch_modal.geometry.local_rotations` compute in many
 passes over all elements, and is tested equal to it. Importing this needs the package ``warp-lang``;
-:mod:`torch_modal.nn.fused` is the only module that does.
+:mod:`torch_modal.nn.launch` is the only module that does.
 
 Arrays are flat: entry ``s * n + i`` is the i-th of the n vertices, edges or faces of sample ``s``. A record belongs to
 an edge and to its hinge, where there is one: the vertices ``(i, j, k, l)`` of a row of

@@ -112,3 +112,60 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
             adjoint=adjoints is not None,
             device=str(device),
         )
+
+
+Shapes = dict[int, tuple[int, ...]]
+"""Of the arguments of a kernel that are its output, by their places."""
+
+
+def recorded(kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any) -> tuple[Tensor, ...]:
+    """Run a kernel whose outputs start as zeros and are added to, so that autograd can go back through it.
+
+    Args:
+        kernel: Of :func:`kernels`.
+        dim: Number of threads.
+        shapes: Of the outputs.
+        given: What it takes, tensors contiguous; anything in the places of the outputs.
+
+    Returns:
+        The outputs.
+    """
+    return _Recorded.apply(kernel, dim, shapes, *given)
+
+
+class _Recorded(torch.autograd.Function):
+    """With the adjoint that Warp derives."""
+
+    @staticmethod
+    def forward(ctx: Any, kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any) -> tuple[Tensor, ...]:
+        like = next(value for value in given if isinstance(value, Tensor) and value.is_floating_point())
+        outputs = {place: like.new_zeros(shape) for place, shape in shapes.items()}
+        whole = [outputs.get(place, value) for place, value in enumerate(given)]
+        launch(kernel, dim, whole)
+        ctx.kernel, ctx.dim, ctx.places, ctx.whole = kernel, dim, list(shapes), whole
+        return tuple(outputs.values())
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
+        received = dict(zip(ctx.places, (grad.contiguous() for grad in grads), strict=True))
+        adjoints: list[Any] = []
+        for place, value in enumerate(ctx.whole):
+            if place in received:
+                adjoints.append(received[place].clone())
+            elif isinstance(value, Tensor) and value.is_floating_point():
+                adjoints.append(torch.zeros_like(value))
+            else:
+                adjoints.append(None)
+        launch(ctx.kernel, ctx.dim, ctx.whole, adjoints)
+        return (None,) * 3 + tuple(None if place in received else own for place, own in enumerate(adjoints))
+
+
+def pulled_back(run: Any, given: Sequence[Tensor], to_output: Tensor, needed: Sequence[bool]) -> tuple[Any, ...]:
+    """Gradients of a function of tensors in those that need one."""
+    if torch.is_grad_enabled():  # gradients of gradients, or a transform of torch.func
+        return torch.func.vjp(run, *given)[1](to_output)
+    with torch.enable_grad():
+        leaves = [value.detach().requires_grad_(need) for value, need in zip(given, needed, strict=True)]
+        wanted = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
+        found = iter(torch.autograd.grad(run(*leaves), wanted, to_output, allow_unused=True))
+    return tuple(next(found) if need else None for need in needed)

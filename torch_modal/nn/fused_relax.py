@@ -1,4 +1,4 @@
-"""The local steps and the local rotations by kernels of NVIDIA Warp, where that is installed.
+"""The local steps by kernels of NVIDIA Warp, where that is installed.
 
 Each kernel does in one pass over the elements what torch does in dozens. The torch code stays: it is what these are
 tested against, what runs where Warp is not, and what differentiates a gradient once more.
@@ -13,43 +13,11 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.terms import MIN_RELATIVE_LENGTH, MIN_RELATIVE_VOLUME, Bend, Mesh, Stretch, Volume
-from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.nn.adjoint import flattened
-from torch_modal.nn.launch import Backend, has_kernels, kernels, launch, traced
+from torch_modal.nn.launch import Backend, Shapes, has_kernels, kernels, launch, pulled_back, recorded, traced
 from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric, relax
 
-Shapes = dict[int, tuple[int, ...]]
-"""Of the arguments of a kernel that are its output, by their places."""
 
-
-class _Recorded(torch.autograd.Function):
-    """A kernel whose outputs start as zeros and are added to, with the adjoint that Warp derives."""
-
-    @staticmethod
-    def forward(ctx: Any, kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any) -> tuple[Tensor, ...]:
-        like = next(value for value in given if isinstance(value, Tensor) and value.is_floating_point())
-        outputs = {place: like.new_zeros(shape) for place, shape in shapes.items()}
-        whole = [outputs.get(place, value) for place, value in enumerate(given)]
-        launch(kernel, dim, whole)
-        ctx.kernel, ctx.dim, ctx.places, ctx.whole = kernel, dim, list(shapes), whole
-        return tuple(outputs.values())
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
-        received = dict(zip(ctx.places, (grad.contiguous() for grad in grads), strict=True))
-        adjoints: list[Any] = []
-        for place, value in enumerate(ctx.whole):
-            if place in received:
-                adjoints.append(received[place].clone())
-            elif isinstance(value, Tensor) and value.is_floating_point():
-                adjoints.append(torch.zeros_like(value))
-            else:
-                adjoints.append(None)
-        launch(ctx.kernel, ctx.dim, ctx.whole, adjoints)
-        return (None,) * 3 + tuple(None if place in received else own for place, own in enumerate(adjoints))
-
-
-# ---------------------------------------------------------------------------------------------------------- local steps
 class _Reference(NamedTuple):
     """Both rest shapes of each sample, as the kernels see them."""
 
@@ -194,7 +162,7 @@ class FusedRelax(nn.Module):
 
     def _run(self, kernel: Any, shapes: Shapes, given: list[Any], n: int | None = None) -> tuple[Tensor, ...]:
         n_samples = next(iter(shapes.values()))[0]
-        return _Recorded.apply(kernel, (n_samples, len(self.record) if n is None else n), shapes, *given)
+        return recorded(kernel, (n_samples, len(self.record) if n is None else n), shapes, *given)
 
     def linearise(self, x: Tensor, to: _Reference) -> tuple[Tensor, ...]:
         """Energy, gradient but for the volume, diagonal blocks, and records of edges and hinges."""
@@ -335,7 +303,7 @@ class _Relaxed(torch.autograd.Function):
         else:
             run = partial(ctx.fused.recorded, ctx.n_products, lengths)
             given = [value.detach().contiguous() for value in given]
-        return (None,) * 3 + _pulled_back(run, given, to_shape, ctx.needs_input_grad[3:])
+        return (None,) * 3 + pulled_back(run, given, to_shape, ctx.needs_input_grad[3:])
 
     @staticmethod
     def vmap(
@@ -345,151 +313,3 @@ class _Relaxed(torch.autograd.Function):
         x, lengths = _Relaxed.apply(fused, n_steps, n_products, *flat)
         lengths = lengths.unflatten(1, (info.batch_size, -1))
         return (x.unflatten(0, (info.batch_size, -1)), lengths), (0, 1)
-
-
-def _pulled_back(run: Any, given: Sequence[Tensor], to_output: Tensor, needed: Sequence[bool]) -> tuple[Any, ...]:
-    """Gradients of a function of tensors in those that need one."""
-    if torch.is_grad_enabled():  # gradients of gradients, or a transform of torch.func
-        return torch.func.vjp(run, *given)[1](to_output)
-    with torch.enable_grad():
-        leaves = [value.detach().requires_grad_(need) for value, need in zip(given, needed, strict=True)]
-        wanted = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
-        found = iter(torch.autograd.grad(run(*leaves), wanted, to_output, allow_unused=True))
-    return tuple(next(found) if need else None for need in needed)
-
-
-# ------------------------------------------------------------------------------------------------------ local rotations
-class FusedRotations(LocalRotations):
-    """:class:`~torch_modal.geometry.local_rotations.LocalRotations` whose edges come from kernels, in float64."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        parent = self.ancestors[0]
-        depth, above = (parent != torch.arange(len(parent))).long(), parent
-        while bool((above != above[above]).any()):
-            depth, above = depth + depth[above], above[above]
-        of_faces = {
-            "face": self.faces,
-            "order": torch.argsort(depth, stable=True),
-            "parent": parent,
-            "piece_of": self.piece,
-            "edge_of": self.sides.unflatten(0, (3, -1)).T,
-        }
-        for name, values in of_faces.items():
-            self.register_buffer(f"_{name}", values.int().contiguous(), persistent=False)
-        self.register_buffer("_signs", self.side_signs.unflatten(0, (3, -1)).T.contiguous(), persistent=False)
-
-    def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """As the other's."""
-        if traced(first):
-            return self.oracle(first, second, t)
-        given = [value.double() for value in (first, second, t)]
-        return _Turned.apply(self, *given).to(first)
-
-    def oracle(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """The same by torch."""
-        return super().forward(first, second, t)
-
-    def sense(self, first: Tensor, second: Tensor) -> Tensor:
-        """The sign of the quaternion of each triangle. *Shape:* ``(B, F)``."""
-        module, (b, n), n_faces = kernels(), first.shape[:2], len(self.faces)
-        quaternions, areas = first.new_empty(b, n_faces, 4), first.new_empty(b, n_faces)
-        launch(module.turns, (b, n_faces), [first, second, self._face, n, quaternions, areas])
-        if first.device.type != "cpu":  # the walk down the tree is one thread's
-            return self._senses(quaternions.movedim(-1, 0), areas)
-        n_pieces = int(self.piece.max()) + 1
-        sign, vote = torch.empty_like(areas), first.new_zeros(b, n_pieces)
-        given = [quaternions, areas, self._order, self._parent, self._piece_of, n_pieces, sign, vote]
-        launch(module.senses, (b,), given)
-        return sign
-
-    def edges(self, sense: Tensor, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """Edge vectors where the senses are known. *Shape:* ``(3, B, E)``."""
-        b, n, n_edges = len(first), first.shape[1], len(self.per_length)
-        given = [first, second, t, self._face, self._edge_of, self._signs.double(), sense, n, n_edges, None]
-        return _means(*_Recorded.apply(kernels().turned_edges, (b, len(self.faces)), {9: (b, n_edges, 4)}, *given))
-
-    def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
-        """As the other's."""
-        if traced(t):
-            return super().along(course, which, t)
-        packed = torch.cat([part if part.dim() > 2 else part[None] for part in course])
-        edges = _OnCourse.apply(self, packed.movedim(0, -1).double(), which, t.double())
-        return edges.to(course.unit)
-
-    def course_oracle(self, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
-        """Edges on a packed course, by torch. *Shape:* ``(P, F, 31)``."""
-        parts = packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6, 1])
-        return super().along(Course._make([*parts[:-1], parts[-1][0]]), which, t)
-
-    def course_edges(self, which: Tensor, packed: Tensor, t: Tensor) -> Tensor:
-        """The same by kernels. *Shape:* ``(3, B, E)``."""
-        b, n_edges = len(t), len(self.per_length)
-        given = [packed, which.int(), t, self._edge_of, self._signs.double(), n_edges, None]
-        return _means(*_Recorded.apply(kernels().course_edges, (b, len(self.faces)), {6: (b, n_edges, 4)}, *given))
-
-
-def _means(total: Tensor) -> Tensor:
-    """Weighted sums over their weights. *Shape:* ``(B, E, 4) -> (3, B, E)``."""
-    return (total[..., :3] / total[..., 3:].clamp_min(torch.finfo(total.dtype).tiny)).movedim(-1, 0)
-
-
-class _OnCourse(torch.autograd.Function):
-    @staticmethod
-    def forward(fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
-        return fused.course_edges(which, packed.detach().contiguous(), t.detach().contiguous())
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.fused, *given = inputs
-        ctx.save_for_backward(*given)
-
-    @staticmethod
-    def backward(ctx: Any, to_edges: Tensor) -> tuple[Tensor | None, ...]:
-        packed, which, t = ctx.saved_tensors
-        if torch.is_grad_enabled():
-            given, run = [packed, t], lambda packed, t: ctx.fused.course_oracle(packed, which, t)
-        else:
-            given, run = [packed.contiguous(), t.contiguous()], partial(ctx.fused.course_edges, which)
-        to_packed, to_t = _pulled_back(run, given, to_edges, [ctx.needs_input_grad[1], ctx.needs_input_grad[3]])
-        return None, to_packed, None, to_t
-
-    @staticmethod
-    def vmap(
-        info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor
-    ) -> tuple[Tensor, int]:
-        n = info.batch_size
-        packed, which, t = (
-            x.expand(n, *x.shape) if dim is None else x.movedim(dim, 0)
-            for x, dim in zip((packed, which, t), in_dims[1:], strict=True)
-        )
-        which = which + packed.shape[1] * torch.arange(n, device=which.device)[:, None]
-        out = _OnCourse.apply(fused, packed.flatten(0, 1), which.flatten(), t.flatten())
-        return out.unflatten(1, (n, -1)), 1
-
-
-class _Turned(torch.autograd.Function):
-    @staticmethod
-    def forward(fused: FusedRotations, *given: Tensor) -> Tensor:
-        first, second, t = (value.detach().contiguous() for value in given)
-        return fused.edges(fused.sense(first, second), first, second, t)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.fused, *given = inputs
-        ctx.save_for_backward(*given)
-
-    @staticmethod
-    def backward(ctx: Any, to_edges: Tensor) -> tuple[Tensor | None, ...]:
-        given = ctx.saved_tensors
-        if torch.is_grad_enabled():
-            run = ctx.fused.oracle
-        else:
-            given = [value.detach().contiguous() for value in given]
-            run = partial(ctx.fused.edges, ctx.fused.sense(*given[:2]))
-        return (None, *_pulled_back(run, given, to_edges, ctx.needs_input_grad[1:]))
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, *given: Tensor) -> tuple[Tensor, int]:
-        flat = flattened(info.batch_size, in_dims[1:], given)
-        return _Turned.apply(fused, *flat).unflatten(1, (info.batch_size, -1)), 1
