@@ -12,6 +12,7 @@ from torch.func import hessian, jacfwd, vmap
 from torch_modal.energy.energy import Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry.vectors import norm
+from torch_modal.nn.between import fine_chunk
 from torch_modal.nn.relax import RIDGE, ConvexHessian, relax
 
 BATCH = 2
@@ -127,3 +128,9 @@ def test_under_vmap(small_bars: Shapes, polish: int) -> None:
 
     shifted = torch.stack([case.x, case.x + 0.5])
     torch.testing.assert_close(vmap(relaxed)(shifted), torch.stack([relaxed(x) for x in shifted]))
+
+
+def test_chunks_fit_into_caches_or_the_memory_of_a_gpu() -> None:
+    assert fine_chunk(10_000, torch.device("cpu")) == 2
+    assert fine_chunk(10_000, torch.device("cuda")) == 100
+    assert fine_chunk(10**8, torch.device("cpu")) == 1, "never none"
