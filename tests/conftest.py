@@ -16,9 +16,9 @@ from threads import limit_threads
 
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.keyframes.load import load_keyframes
-from torch_modal.nn.between import Samples
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.samples import Samples
 from torch_modal.nn.settings import Objective, Solver
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes

@@ -1,6 +1,7 @@
 """In-betweens whose parts are kept from passing through each other: alone, as a course, and their gradients."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,8 +14,8 @@ from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.contact import Contact
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.terms import Mesh, Term
-from torch_modal.nn.between import Between, Samples
-from torch_modal.nn.contact import Contacts
+from torch_modal.nn.contact_rounds import ContactRounds
+from torch_modal.nn.samples import Samples
 from torch_modal.sequence.contact import splines
 
 pytest.importorskip("ipctk")
@@ -96,9 +97,15 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
     x_a, x_b = hand.keyframes
     layer = tm.InBetween(hand.bases, hand.faces, contact=True)
     member = layer.members[0]
-    held: list[Contacts] = []
-    search = Between._found
-    monkeypatch.setattr(Between, "_found", lambda *a: (held.append((r := search(*a)).held), r)[1])
+    first: list[Any] = []
+    search = ContactRounds.found
+
+    def kept(*given: Any) -> Any:
+        if not first:
+            first.append(search(*given))
+        return first[0]
+
+    monkeypatch.setattr(ContactRounds, "found", kept)
 
     def samples(x_a: Tensor, x_b: Tensor, t: Tensor) -> Samples:
         return Samples(x_a[None], x_b[None], None, t, layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape))
@@ -107,14 +114,14 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
     for tensor in given:
         tensor.requires_grad_()
     shapes = member(samples(*given), True, None).shapes[0]
-    assert len(held[0].elements) > 10
+    assert len(first[0][1].held.elements) > 10
     weights = torch.cos(7 * x_a)
     gradients = torch.autograd.grad((shapes * weights).sum(), given)
     direction = 0.01 * torch.sin(9 * x_a + 1)
 
     def value(*arguments: Tensor) -> float:
-        with torch.no_grad():
-            return float((member(samples(*arguments), True, None, held[0]).shapes[0] * weights).sum())
+        moved = [argument.clone().requires_grad_() for argument in arguments]  # as if for a gradient: to the tolerance
+        return float((member(samples(*moved), True, None).shapes[0].detach() * weights).sum())
 
     at = [tensor.detach() for tensor in given]
     for which, moved, size in ((0, direction, 1e-3), (1, direction, 1e-3), (2, torch.ones(1, dtype=DOUBLE), 1e-5)):
@@ -122,6 +129,14 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
             value(*(x + sign * size * moved if i == which else x for i, x in enumerate(at))) for sign in (1, -1)
         )
         assert float((gradients[which] * moved).sum()) == pytest.approx((up - down) / (2 * size), rel=1e-5)
+
+
+def test_however_many_rounds_one_report(hand: Shapes) -> None:
+    layer = tm.InBetween(hand.bases, hand.faces, solver=tm.Solver(max_steps=2), contact=True)
+    x_a, x_b = hand.keyframes.clone().requires_grad_()
+    with pytest.warns(tm.ConvergenceWarning, match="1 of 1") as said:
+        layer(x_a, x_b, 0.875)
+    assert len(said) == 1
 
 
 def test_contact_needs_one_shape() -> None:

@@ -14,8 +14,8 @@ from torch.func import functional_call
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import best_fit, blend
-from torch_modal.nn.between import ConvergenceWarning
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.samples import ConvergenceWarning
 from torch_modal.nn.settings import Objective
 from torch_modal.precompute.basis import ModalBasis
 

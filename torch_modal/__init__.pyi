@@ -34,12 +34,12 @@ from .keyframes.seams import weld_seams as weld_seams
 from .keyframes.self_contacts import SelfContacts as SelfContacts
 from .keyframes.self_contacts import self_contacts as self_contacts
 from .nn.adjoint import ConvergenceWarning as ConvergenceWarning
-from .nn.between import ConvergenceError as ConvergenceError
-from .nn.between import InBetweenResult as InBetweenResult
 from .nn.in_between import InBetween as InBetween
 from .nn.mid_shape import MidShape as MidShape
 from .nn.modal_decoder import ModalDecoder as ModalDecoder
 from .nn.modal_energy import ModalEnergy as ModalEnergy
+from .nn.samples import ConvergenceError as ConvergenceError
+from .nn.samples import InBetweenResult as InBetweenResult
 from .nn.settings import PRESETS as PRESETS
 from .nn.settings import Objective as Objective
 from .nn.settings import Solver as Solver

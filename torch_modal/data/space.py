@@ -23,8 +23,8 @@ from torch_modal.geometry.triangle_frames import Frames, frames, sides
 from torch_modal.geometry.vectors import norm, pick
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.adjoint import ConvergenceWarning
-from torch_modal.nn.between import InBetweenResult
 from torch_modal.nn.in_between import InBetween
+from torch_modal.nn.samples import InBetweenResult
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Status
 from torch_modal.precompute.basis import ModalBasis

@@ -1,7 +1,6 @@
 """In-betweens of one pair of bases, for flat batches: what all layers share."""
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -10,19 +9,17 @@ from torch import Tensor, nn
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Mesh, Term
-from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.vectors import cross, pick
 from torch_modal.nn import trees
-from torch_modal.nn.adjoint import ConvergenceWarning, Minimisation, solve_implicit, solve_unrolled
-from torch_modal.nn.contact import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
+from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
 from torch_modal.nn.levels import Levels, Stiffness, coarse_values
-from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.paired import PairedSpace
 from torch_modal.nn.relax import relax
+from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.settings import Objective, Solver
 from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, unmoved
 
@@ -45,44 +42,8 @@ def fine_chunk(n_vertices: int, device: torch.device) -> int:
     return max(1, (FINE_CHUNK if device.type == "cpu" else FINE_CHUNK_OF_GPU) // n_vertices)
 
 
-class ConvergenceError(RuntimeError):
-    """A gradient was asked for through a minimisation that did not converge."""
-
-
-class InBetweenResult(NamedTuple):
-    """Shapes with the solution that they came from."""
-
-    shapes: Tensor
-    """*Shape:* ``(..., V, 3)``; NaN where the status is ``INVALID``."""
-    solution: Solution
-    """One value per shape: energy, relative gradient norm, number of steps, status."""
-
-
-class Samples(NamedTuple):
-    """A flat batch of in-betweens."""
-
-    x_a: Tensor
-    """Key-frames at 0. *Shape:* ``(P, V, 3)``."""
-    x_b: Tensor
-    """Key-frames at 1. *Shape:* ``(P, V, 3)``."""
-    which: Tensor | None
-    """Which of the P pairs each sample lies between; each its own where None. *Shape:* ``(B,)``."""
-    t: Tensor
-    """*Shape:* ``(B,)``."""
-    mu: Tensor
-    """*Shape:* ``(B,)``."""
-    stiffness: list[Tensor]
-    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
-    before: Tensor | None = None
-    """The key-frames before those at 0, where the course is to be smooth in time. *Shape:* ``(P, V, 3)``."""
-    after: Tensor | None = None
-    """The key-frames after those at 1. *Shape:* ``(P, V, 3)``."""
-    spacing: Spacing | None = None
-    """Durations of the three intervals; None if the course is of the pair alone. *Shape of each:* ``(P,)``."""
-
-
-class _Batch(NamedTuple):
-    """The minimisations of a batch."""
+class Batch(NamedTuple):
+    """The minimisations of a batch, in the frame."""
 
     problem: Any
     minimisation: Minimisation
@@ -91,36 +52,6 @@ class _Batch(NamedTuple):
     pair: Pair
     samples: Samples
     anchors: Tensor | None
-
-    def rows(self, some: Tensor, solution: Solution, start: Tensor | None = None) -> "_Batch":
-        """Some of the samples, started where they ended, or elsewhere."""
-        samples = self.samples
-        of = torch.arange(len(samples.t), device=some.device) if samples.which is None else samples.which
-        picked = samples._replace(
-            which=of[some], t=samples.t[some], mu=samples.mu[some], stiffness=[k[some] for k in samples.stiffness]
-        )
-        return _Batch(
-            trees.rows(self.problem, some),
-            self.minimisation,
-            solution.amplitudes.detach()[some] if start is None else start,
-            self.usable[some],
-            self.pair,
-            picked,
-            None if self.anchors is None else self.anchors[some],
-        )
-
-
-class _Apart(NamedTuple):
-    """In-betweens that were pushed apart."""
-
-    x: Tensor
-    """In the frame. *Shape:* ``(B, V, 3)``."""
-    solution: Solution
-    held: Contacts
-    start: Tensor
-    """Where the minimisation started. *Shape:* ``(B, n)``."""
-    n_far: Tensor
-    """*Shape:* ``(B,)``."""
 
 
 class Between(nn.Module):
@@ -148,7 +79,6 @@ class Between(nn.Module):
     ) -> None:
         super().__init__()
         self.solver = solver
-        self.contact = objective.contact
         self.mesh = mesh
         #: Whether Eq. 5 has no company: what has no strain then stays as it is.
         self.bare = not objective.terms
@@ -179,41 +109,50 @@ class Between(nn.Module):
             self.prepare()
         return super()._apply(fn, recurse)
 
-    def forward(
-        self,
-        samples: Samples,
-        exact: bool,
-        report: Callable[[Solution], None] | None,
-        held: Contacts | None = None,
-    ) -> InBetweenResult:
+    def forward(self, samples: Samples, exact: bool, report: Callable[[Solution], None] | None) -> InBetweenResult:
         """Solve.
 
         Args:
             samples: The batch.
             exact: Whether the minimisation goes on to the tolerance, whatever ``least_gain`` says.
             report: Told how it went.
-            held: What is held, in the place of what would be found.
         """
-        space, solver = self.space, self.solver
-        index, t = samples.which, samples.t
+        space, t = self.space, samples.t
         pair, finite = self._placed(samples)
-        usable, placed = trees.picked((finite & self._solvable(pair), pair), index)
+        usable, placed = trees.picked((finite & self._solvable(pair), pair), samples.which)
         usable = usable & (t >= 0) & (t <= 1)
         if pair.around is not None and self.bare:
             # The course is a shape at rest: there is nothing to minimise.
-            solution = unmoved(t, 0, usable)
-            return self._restored(space.on_course(pair, index, t), solution, placed, t)
-        anchors = self.anchors(placed, t)
-        problem = self.problem(pair, samples, anchors)
+            x, solution = space.on_course(pair, samples.which, t), unmoved(t, 0, usable)
+        else:
+            anchors = self.anchors(placed, t)
+            problem = self.problem(pair, samples, anchors)
+            start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
+            minimisation = self._minimisation(exact, problem.start is not None, report)
+            x, solution = self.solved(Batch(problem, minimisation, start, usable, pair, samples, anchors))
+        shapes = self.frame.restore(x, placed, t)
+        valid = solution.status != Status.INVALID
+        return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
+
+    def solved(self, batch: Batch) -> tuple[Tensor, Solution]:
+        """The fine shapes of the frame, with what they came from. *Shape:* ``(B, V, 3)``."""
+        x, solution = self.modal(batch)
+        if len(x) and (self.solver.local_steps or self.solver.polish):
+            x = self._refine(x, batch)
+        return x, solution
+
+    def modal(self, batch: Batch) -> tuple[Tensor, Solution]:
+        """The shapes of the modal space that have the least energy, likewise."""
+        solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
+        problem = batch.problem
+        solution = solve(batch.minimisation, problem.placement, batch.start, batch.usable, batch.samples.t)
+        return self.space.lift(solution.amplitudes, problem), solution
+
+    def _minimisation(self, exact: bool, guessed: bool, report: Callable[[Solution], None] | None) -> Minimisation:
+        space, solver = self.space, self.solver
         least_gain = 0.0 if exact or isinstance(space, PairedSpace) else solver.least_gain
         limits = solver.max_steps, solver.tolerance, least_gain
-        minimisation = Minimisation(self.step, *limits, problem.start is not None, space.require, report)
-        start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
-        batch = _Batch(problem, minimisation, start, usable, pair, samples, anchors)
-        if not self.contact:
-            return self._restored(*self._minimised(batch), placed, t)
-        x, solution, n_crossing = self._in_contact(batch, held, exact)
-        return self._restored(x, solution._replace(n_crossing=n_crossing), placed, t)
+        return Minimisation(self.step, *limits, guessed, space.require, report)
 
     def placed(self, samples: Samples) -> Pair:
         """The pairs of key-frames in the frame, with their neighbours in time."""
@@ -256,71 +195,6 @@ class Between(nn.Module):
         ends = [levels.rests(levels.seen(x, self.frame.coarsen(x))) for x in (pair.first, pair.second)]
         return levels.between(*ends, samples.which, samples.t, stiffness)[0]
 
-    def _minimised(self, batch: "_Batch", contacts: Contacts | None = None) -> tuple[Tensor, Solution]:
-        """The fine shapes of the frame, with what they came from. *Shape:* ``(B, V, 3)``."""
-        space, solver, problem, minimisation = self.space, self.solver, batch.problem, batch.minimisation
-        solve = solve_implicit if solver.gradient == "implicit" else solve_unrolled
-        placement = problem.placement
-        if contacts is not None:
-            modal = contacts.modal(self.mesh, space.columns.fine)
-            placement = (*placement, contacts.place(modal, problem.base, space.column(problem.difference)))
-            minimisation = minimisation._replace(step=GaussNewtonStep(SumOfEnergies(*space.energy.parts, modal)))
-        solution = solve(minimisation, placement, batch.start, batch.usable, batch.samples.t)
-        x = space.lift(solution.amplitudes, problem)
-        if len(x) and (solver.local_steps or solver.polish or contacts is not None):
-            x = self._refine(x, problem.base, batch.pair, batch.samples, batch.anchors, contacts)
-        return x, solution
-
-    def _in_contact(self, batch: "_Batch", held: Contacts | None, exact: bool) -> tuple[Tensor, Solution, Tensor]:
-        """In-betweens that do not pass through themselves, and the pairs of triangles that do all the same.
-
-        Those that would are made again with what was found held; the others stay as they are without contact. What is
-        held is found without a gradient.
-        """
-        x, solution = self._minimised(batch)
-        n_crossing = torch.zeros_like(solution.status)
-        start = None
-        if held is None:
-            with torch.no_grad():
-                search = ContactSearch(
-                    self.mesh, batch.pair.first, batch.pair.second, batch.samples.which, batch.samples.t
-                )
-                held = search(x)
-                n_crossing = search.n_far
-                if held is None:
-                    return x, solution, n_crossing
-                found = self._found(batch.rows(held.samples, solution), held, search)
-                held, start = found.held, found.start
-                n_crossing = n_crossing.index_copy(0, held.samples, found.n_far)
-        if exact or start is None:
-            again, resolved = self._minimised(batch.rows(held.samples, solution, start), held)
-        else:
-            again, resolved = found.x, found.solution
-        pairs = zip(solution[:-1], resolved[:-1], strict=True)
-        merged = Solution(*(whole.index_copy(0, held.samples, part) for whole, part in pairs))  # type: ignore[union-attr, arg-type]
-        return x.index_copy(0, held.samples, again), merged, n_crossing
-
-    @torch.no_grad()
-    def _found(self, batch: "_Batch", held: Contacts, search: ContactSearch) -> "_Apart":
-        """What to hold: it is looked again after each push; what left the fewest crossings is taken."""
-        search.keep(held.samples)
-        best: _Apart | None = None
-        for _ in range(ROUNDS):
-            x, solution = self._minimised(batch, held)
-            found = search(x)
-            if best is None or int(search.n_far.sum()) < int(best.n_far.sum()):
-                best = _Apart(x, solution, held, batch.start, search.n_far)
-            if found is None or not bool(search.n_far.any()):
-                break
-            held, batch = found.of_all(held.samples), batch._replace(start=solution.amplitudes)
-        assert best is not None
-        return best
-
-    def _restored(self, x: Tensor, solution: Solution, placed: Pair, t: Tensor) -> InBetweenResult:
-        shapes = self.frame.restore(x, placed, t)
-        valid = solution.status != Status.INVALID
-        return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
-
     def problem(self, pair: Pair, samples: Samples, anchors: Tensor | None = None) -> Any:
         """The minimisation of each sample, of key-frames that are placed."""
         stiffness = self._levelled(samples.stiffness)
@@ -336,30 +210,35 @@ class Between(nn.Module):
         """What is repeated. It has no state: registered, it would name all buffers of the energy twice."""
         return GaussNewtonStep(self.space.energy)
 
-    def _refine(
-        self,
-        x: Tensor,
-        base: Tensor,
-        pair: Pair,
-        samples: Samples,
-        anchors: Tensor | None,
-        contacts: Contacts | None = None,
-    ) -> Tensor:
+    def _refine(self, x: Tensor, batch: Batch) -> Tensor:
         """Local interpolation and polish: what the modes cannot do. *Shape:* ``(B, V, 3)``."""
-        energy, solver = self.fine, self.solver
-        in_contact = energy if contacts is None else contacts.fine(self.mesh, self.terms)
-        chunk = fine_chunk(x.shape[-2], x.device)
-        ends = pair.first, pair.second
-        if self.fused is not None and contacts is None:
-            rest = trees.picked(ends, samples.which)
-            for n_steps, n_products in ((solver.local_steps, LOCAL_PRODUCTS), (solver.polish, POLISH_PRODUCTS)):
+        solver, samples = self.solver, batch.samples
+        stages = (solver.local_steps, LOCAL_PRODUCTS), (solver.polish, POLISH_PRODUCTS)
+        if self.fused is not None:
+            rest = trees.picked((batch.pair.first, batch.pair.second), samples.which)
+            chunk = fine_chunk(x.shape[-2], x.device)
+            for n_steps, n_products in stages:
                 x = self.fused(x, *rest, samples.t, samples.stiffness, n_steps, n_products, chunk)
             return x
-        known = None if samples.which is None else [self._fine_rest(end) for end in ends]
         parts = []
-        for i in range(0, len(x), chunk):
+        for own, reference, fixed in self.fine_chunks(batch):
+            moved = x[own]
+            for n_steps, n_products in stages:
+                moved = relax(self.fine, moved, reference, n_steps, n_products, fixed)
+            parts.append(moved)
+        return torch.cat(parts)
+
+    def fine_chunks(self, batch: Batch) -> Iterator[tuple[slice, Reference, Tensor | None]]:
+        """Samples that are relaxed at a time, what they are compared with on the fine mesh, and their anchors."""
+        pair, samples = batch.pair, batch.samples
+        ends = pair.first, pair.second
+        known = None if samples.which is None else [self._fine_rest(end) for end in ends]
+        chunk = fine_chunk(self.mesh.n_vertices, samples.t.device)
+        for i in range(0, len(samples.t), chunk):
             own = slice(i, i + chunk)
-            start, course, t, stiffness, fixed = trees.rows((x, base, samples.t, samples.stiffness, anchors), own)
+            course, t, stiffness, fixed = trees.rows(
+                (batch.problem.base, samples.t, samples.stiffness, batch.anchors), own
+            )
             if pair.around is not None:
                 reference = Energy.against(self._fine_rest(course), stiffness)
             else:
@@ -367,13 +246,8 @@ class Between(nn.Module):
                     first, second = (self._fine_rest(end[own]) for end in ends)
                 else:
                     first, second = trees.rows(known, samples.which[own])
-                reference = energy.between(first, second, t, stiffness)
-            moved = relax(energy, start, reference, solver.local_steps, LOCAL_PRODUCTS, fixed)
-            if contacts is not None:
-                reference = contacts.rows(own).joined(reference)
-                moved = relax(in_contact, moved, reference, FINE_STEPS, FINE_PRODUCTS, fixed)
-            parts.append(relax(in_contact, moved, reference, solver.polish, POLISH_PRODUCTS, fixed))
-        return torch.cat(parts)
+                reference = self.fine.between(first, second, t, stiffness)
+            yield own, reference, fixed
 
     def _fine_rest(self, x: Tensor) -> Rest:
         """Shapes as rest shapes on the fine mesh. *Shape:* ``(B, V, 3)``."""
@@ -415,29 +289,3 @@ def _enclosed(x: Tensor, faces: Tensor) -> Tensor:
     rows = x.movedim(-1, 0).contiguous()
     a, b, c = (pick(rows, corner) for corner in faces.unbind(1))
     return (a * cross(b, c)).sum((0, -1))
-
-
-def report(solution: Solution, max_steps: int, forbid: bool) -> None:
-    """Say what did not converge.
-
-    Args:
-        solution: One value per sample.
-        max_steps: The limit that held.
-        forbid: Whether it is an error.
-
-    Raises:
-        ConvergenceError: Something did not converge, and that is an error.
-    """
-    missed = ~solution.usable
-    if not bool(missed.any()):
-        return
-    counts = {status.name: int((solution.status == status).sum()) for status in Status if status}
-    counts.pop(Status.ENOUGH.name)
-    message = (
-        f"{int(missed.sum())} of {missed.numel()} in-betweens did not converge in {max_steps} steps "
-        f"({', '.join(f'{n} {name}' for name, n in counts.items() if n)}): no gradient flows through their amplitudes; "
-        "solve() tells which"
-    )
-    if forbid:
-        raise ConvergenceError(message)
-    warnings.warn(message, ConvergenceWarning, stacklevel=2)

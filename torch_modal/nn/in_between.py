@@ -12,8 +12,10 @@ from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.nn.between import Between, InBetweenResult, Samples, report
+from torch_modal.nn.between import Between
+from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.frame import mean_areas
+from torch_modal.nn.samples import InBetweenResult, Samples, report
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
@@ -96,8 +98,9 @@ class InBetween(nn.Module):
         mesh = Mesh.of(self.faces, len(shapes[0]))
         # The same for all pairs: a motion through several has one course.
         weights = mean_areas(torch.stack(shapes), self.faces)
+        kind = ContactRounds if self.objective.contact else Between
         made = [
-            Between(
+            kind(
                 torch.stack([ends[i][0], ends[j][0]]),
                 [ends[i][1], ends[j][1]],
                 mesh,

@@ -5,8 +5,8 @@ from typing import Any, Literal
 
 from torch import Tensor, nn
 
-from torch_modal.nn.between import InBetweenResult
 from torch_modal.nn.in_between import InBetween
+from torch_modal.nn.samples import InBetweenResult
 from torch_modal.nn.settings import Objective, Preset, Solver, settings, with_space
 from torch_modal.precompute.basis import ModalBasis
 

@@ -19,9 +19,10 @@ from torch import Tensor
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.terms import Mesh
 from torch_modal.nn import trees
-from torch_modal.nn.between import Between, Samples, fine_chunk
+from torch_modal.nn.between import Between, fine_chunk
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.relax import STEP_LENGTHS, ConvexHessian, conjugate_gradients, inverse_of_symmetric
+from torch_modal.nn.samples import Samples
 
 KNOTS = 16
 """Intervals of the spline."""

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.hermite import Spacing, around, located
-from torch_modal.nn.between import InBetweenResult, Samples
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
+from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis

@@ -15,8 +15,9 @@ from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.nn.between import Between, Samples
+from torch_modal.nn.between import Between
 from torch_modal.nn.mid_shape import MidShape
+from torch_modal.nn.samples import Samples
 from torch_modal.nn.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import extract_bases

@@ -1,0 +1,72 @@
+"""What goes into in-betweens of one pair of bases and what comes out, as flat batches; what did not converge."""
+
+import warnings
+from typing import NamedTuple
+
+from torch import Tensor
+
+from torch_modal.geometry.hermite import Spacing
+from torch_modal.nn.adjoint import ConvergenceWarning
+from torch_modal.nn.solver import Solution, Status
+
+
+class ConvergenceError(RuntimeError):
+    """A gradient was asked for through a minimisation that did not converge."""
+
+
+class InBetweenResult(NamedTuple):
+    """Shapes with the solution that they came from."""
+
+    shapes: Tensor
+    """*Shape:* ``(..., V, 3)``; NaN where the status is ``INVALID``."""
+    solution: Solution
+    """One value per shape: energy, relative gradient norm, number of steps, status."""
+
+
+class Samples(NamedTuple):
+    """A flat batch of in-betweens."""
+
+    x_a: Tensor
+    """Key-frames at 0. *Shape:* ``(P, V, 3)``."""
+    x_b: Tensor
+    """Key-frames at 1. *Shape:* ``(P, V, 3)``."""
+    which: Tensor | None
+    """Which of the P pairs each sample lies between; each its own where None. *Shape:* ``(B,)``."""
+    t: Tensor
+    """*Shape:* ``(B,)``."""
+    mu: Tensor
+    """*Shape:* ``(B,)``."""
+    stiffness: list[Tensor]
+    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    before: Tensor | None = None
+    """The key-frames before those at 0, where the course is to be smooth in time. *Shape:* ``(P, V, 3)``."""
+    after: Tensor | None = None
+    """The key-frames after those at 1. *Shape:* ``(P, V, 3)``."""
+    spacing: Spacing | None = None
+    """Durations of the three intervals; None if the course is of the pair alone. *Shape of each:* ``(P,)``."""
+
+
+def report(solution: Solution, max_steps: int, forbid: bool) -> None:
+    """Say what did not converge.
+
+    Args:
+        solution: One value per sample.
+        max_steps: The limit that held.
+        forbid: Whether it is an error.
+
+    Raises:
+        ConvergenceError: Something did not converge, and that is an error.
+    """
+    missed = ~solution.usable
+    if not bool(missed.any()):
+        return
+    counts = {status.name: int((solution.status == status).sum()) for status in Status if status}
+    counts.pop(Status.ENOUGH.name)
+    message = (
+        f"{int(missed.sum())} of {missed.numel()} in-betweens did not converge in {max_steps} steps "
+        f"({', '.join(f'{n} {name}' for name, n in counts.items() if n)}): no gradient flows through their amplitudes; "
+        "solve() tells which"
+    )
+    if forbid:
+        raise ConvergenceError(message)
+    warnings.warn(message, ConvergenceWarning, stacklevel=2)
