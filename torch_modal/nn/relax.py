@@ -172,10 +172,12 @@ def conjugate_gradients(
     return solution
 
 
-@torch.compiler.disable  # it looks at numbers: a graph ends here, and another begins
 def _downhill(energy: Energy, before: Tensor, rows: Tensor, moves: Tensor, reference: Reference) -> Tensor:
     """The longest of the steps that goes downhill. *Shape:* ``(B,), (3, B, V), (3, B, V) -> (B,)``."""
     batched = (before, rows.transpose(0, 1), moves.transpose(0, 1), *trees.leaves(reference))
+    if torch.compiler.is_compiling():
+        # It looks at numbers: a graph ends here, and another begins. No decorator: that takes a second to import.
+        return torch.compiler.disable(_Length.apply)(energy, trees.skeleton(reference), *batched)
     return _Length.apply(energy, trees.skeleton(reference), *batched)
 
 
