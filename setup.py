@@ -98,6 +98,7 @@ setup(
             *DOCS,
             *[
                 "pytest>=8",
+                "pytest-xdist>=3.6",
                 "ruff>=0.6",
                 "mypy>=1.11",
                 "pygltflib>=1.16",

@@ -1,6 +1,7 @@
 #!/bin/sh
 # Lint, types, tests:  sh tests/run.sh [arguments for pytest, with paths from the repository's root]
-# Sets everything up first where needed. Tests marked slow run if CI=true, or with -m "" (all) or -m slow.
+# Sets everything up first where needed. Tests marked slow run if CI=true, or with -m "" (all) or -m slow. Several
+# processes share the work, a file of tests each; -n 0 is one, for a debugger.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
@@ -12,4 +13,4 @@ cd "$root"
 "$python" -m mypy
 # A later -m wins over this one.
 [ "${CI:-}" = true ] || set -- -m "not slow" "$@"
-exec "$python" -m pytest "$@"
+exec "$python" -m pytest -n auto --maxprocesses 4 --dist loadfile "$@"
