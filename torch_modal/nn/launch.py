@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -76,18 +77,43 @@ def traced(x: Tensor) -> bool:
     return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter)
 
 
-def _arrays(kernel: Any, given: Sequence[Any]) -> list[Any]:
-    """Tensors as flat arrays of the types that a kernel declares; what is no tensor stays."""
+class _Recorded(threading.local):
+    """What this thread has launched before, so that only what is new needs to be told to Warp."""
+
+    def __init__(self) -> None:
+        self.commands: dict[tuple[Any, ...], Any] = {}
+
+
+_RECORDED = _Recorded()
+
+
+@cache
+def _sizes(kernel: Any) -> list[tuple[int, int]]:
+    """Numbers and bytes in an entry of each array that a kernel takes; none of what is no array."""
     import warp as wp
 
-    found = []
-    for argument, value in zip(kernel.adj.args, given, strict=True):
+    types = [argument.type for argument in kernel.adj.args]
+    entries = [one.dtype if isinstance(one, wp.array) else None for one in types]
+    return [(0, 0) if e is None else (getattr(e, "_length_", 1), wp.types.type_size_in_bytes(e)) for e in entries]
+
+
+@cache
+def _array() -> Any:
+    """What Warp hands arrays over in: address, address of the gradient, dimensions, shape, strides in bytes."""
+    import warp as wp
+
+    return type(wp.from_torch(torch.zeros(1), return_ctype=True))
+
+
+def _values(kernel: Any, given: Sequence[Any]) -> Iterator[Any]:
+    """Tensors as flat arrays of the types that a kernel declares; what is no tensor stays."""
+    array = _array()
+    for (width, size), value in zip(_sizes(kernel), given, strict=True):
         if isinstance(value, Tensor):
-            inner = getattr(argument.type.dtype, "_length_", 1)
-            flat = value.detach().view(-1, inner) if inner > 1 else value.detach().view(-1)
-            value = wp.from_torch(flat, dtype=argument.type.dtype, return_ctype=True)
-        found.append(value)
-    return found
+            assert value.is_contiguous() and width * value.element_size() == size
+            yield array(value.data_ptr(), 0, 1, (value.numel() // width,), (size,))
+        else:
+            yield array() if width else value
 
 
 def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Sequence[Any] | None = None) -> None:
@@ -96,22 +122,32 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
     Args:
         kernel: Of :func:`kernels`.
         dim: Number of threads.
-        given: What it takes, tensors contiguous.
+        given: What it takes, tensors contiguous and of the types that it declares.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
     """
     import warp as wp
 
     device = next(value.device for value in given if isinstance(value, Tensor))
-    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
-    with wp.ScopedStream(stream):
-        wp.launch(
+    key = kernel, device, adjoints is not None
+    command = _RECORDED.commands.get(key)
+    if command is None:
+        command = _RECORDED.commands[key] = wp.launch(
             kernel,
             dim=dim,
-            inputs=_arrays(kernel, given),
-            adj_inputs=[] if adjoints is None else _arrays(kernel, adjoints),
+            inputs=list(_values(kernel, given)),
+            adj_inputs=[] if adjoints is None else list(_values(kernel, adjoints)),
             adjoint=adjoints is not None,
             device=str(device),
+            record_cmd=True,
         )
+    else:
+        command.set_dim(dim)
+        for at, value in enumerate(_values(kernel, given)):
+            command.set_param_at_index_from_ctype(at, value)
+        for at, value in enumerate([] if adjoints is None else _values(kernel, adjoints)):
+            if value is not None:
+                command.set_param_at_index_from_ctype(at, value, adjoint=True)
+    command.launch(wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None)
 
 
 Shapes = dict[int, tuple[int, ...]]
