@@ -128,7 +128,7 @@ def test_stays_where_nothing_is_lower() -> None:
 @pytest.fixture(scope="module")
 def layer(bars: Shapes) -> MidShape:
     """Between the bent and the twisted bar: 17 amplitudes."""
-    return MidShape(bars.bases[1:], bars.faces, **modal(coarse_faces=200))
+    return MidShape(bars.bases[1:], bars.faces, **modal(coarse_faces=200, backend="torch"))
 
 
 def problem(layer: MidShape, bars: Shapes, bends: list[float]) -> tuple[Placement, Tensor]:
@@ -171,7 +171,7 @@ def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes) -> None:
     )
     solution = minimise(layer.step, a, placement)
     assert solution.converged.all()
-    assert float(solution.energy) == pytest.approx(2 * truth.cost, rel=1e-10)
+    assert float(solution.energy) == pytest.approx(2 * truth.cost, rel=1e-9)
     assert float(solution.energy) < 0.95 * float(energy.value(a, placement)), "nothing was to be gained"
     np.testing.assert_allclose(solution.amplitudes[0].numpy(), truth.x, atol=1e-5 * np.abs(truth.x).max())
 

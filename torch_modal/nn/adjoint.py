@@ -123,8 +123,11 @@ def solve_implicit(
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
         times: Checked before all else. *Shape:* ``(B,)``.
     """
-    batched = (usable, times, start.detach(), *trees.leaves(placement))
-    return Solution(*_ArgMin.apply(minimisation, trees.skeleton(placement), *batched))
+    tensors = trees.leaves(placement)
+    # Kernels compute in float64, whatever goes in and comes out.
+    batched = (usable, times, start.detach().to(tensors[0].dtype), *tensors)
+    found = _ArgMin.apply(minimisation, trees.skeleton(placement), *batched)
+    return Solution(*(value.to(start.dtype) if value.is_floating_point() else value for value in found))
 
 
 def solve_unrolled(

@@ -83,7 +83,9 @@ class Between(nn.Module):
         #: Whether Eq. 5 has no company: what has no strain then stays as it is.
         self.bare = not objective.terms
         self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, weights)
-        levels = Levels(self.frame, mesh, terms)
+        # Steps that are unrolled are differentiated like any other expression: by torch.
+        modal = objective.space == "joint" and solver.gradient == "implicit"
+        levels = Levels(self.frame, mesh, terms, solver.backend if modal else "torch")
         if objective.space == "joint":
             ends = self.frame.place(*shapes[:, None])
             references = torch.cat([ends.first, ends.second])
@@ -186,13 +188,13 @@ class Between(nn.Module):
         first, second = trees.picked([rest(end) for end in (pair.first, pair.second)], samples.which)
         return energy.between(first, second, samples.t, stiffness)
 
-    def coarse_reference(self, samples: Samples, pair: Pair) -> Reference:
+    def coarse_reference(self, samples: Samples, pair: Pair) -> Any:
         """What shapes on the coarse mesh are compared with."""
         levels, stiffness = self.space.levels, self._levelled(samples.stiffness)
         if pair.around is not None:
             course = self.space.on_course(pair, samples.which, samples.t)
             return levels.against(course, self.frame.coarsen(course), stiffness)[0]
-        ends = [levels.rests(levels.seen(x, self.frame.coarsen(x))) for x in (pair.first, pair.second)]
+        ends = [levels.seen(x, self.frame.coarsen(x)) for x in (pair.first, pair.second)]
         return levels.between(*ends, samples.which, samples.t, stiffness)[0]
 
     def problem(self, pair: Pair, samples: Samples, anchors: Tensor | None = None) -> Any:

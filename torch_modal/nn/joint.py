@@ -134,10 +134,8 @@ class JointSpace(nn.Module):
             references = levels.against(base, coarse, stiffness)
             placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
             return JointProblem(placement, start, base, difference)
-        rests_a, rests_b = (
-            levels.rests(levels.seen(x, own)) for x, own in ((pair.first, coarse_first), (pair.second, coarse_second))
-        )
-        references = levels.between(rests_a, rests_b, index, t, stiffness)
+        ends = (levels.seen(x, own) for x, own in ((pair.first, coarse_first), (pair.second, coarse_second)))
+        references = levels.between(*ends, index, t, stiffness)
         first, second, coarse_first, coarse_second = trees.picked(
             (pair.first, pair.second, coarse_first, coarse_second), index
         )
@@ -152,7 +150,8 @@ class JointSpace(nn.Module):
             seen = levels.seen(blend, self.frame.coarsen(blend))
             turned = levels.place(self.energy, seen, references, extras, anchors)
             with torch.no_grad():
-                better = levels.value(turned) < levels.value(placement)
+                zeros = t.new_zeros(len(t), self.n_unknowns)
+                better = self.energy.value(zeros, turned) < self.energy.value(zeros, placement)
             base = torch.where(better[:, None, None], blend, base)
             placement = tuple(
                 straight._replace(base=torch.where(better[:, None, None], bent.base, straight.base))

@@ -28,6 +28,11 @@ stretched = wp.types.vector(length=5, dtype=real)
 bent = wp.types.vector(length=10, dtype=real)
 """A hinge: gradients of the angle in the edge and in both tips, and the stiffness."""
 
+wide = wp.types.vector(length=8, dtype=real)
+"""A row's entries of eight columns."""
+six = wp.types.vector(length=6, dtype=wp.int32)
+"""Where the blocks of an edge go, and the five of its hinge."""
+
 TINY = wp.constant(real(1.4916681462400413e-154))  # vectors.tiny of float64
 TINIEST = wp.constant(real(2.2250738585072014e-308))
 FLAT = wp.constant(real(COLLAPSED))
@@ -96,10 +101,18 @@ def angle_of(e: vec3, a: vec3, b: vec3, n1: vec3, n2: vec3):
 
 # ----------------------------------------------------------------------------------------------------------- references
 @wp.kernel(enable_backward=False)
-def total_length(x: wp.array(dtype=vec3), record: wp.array(dtype=wp.vec4i), n: int, total: wp.array(dtype=real)):
+def total_lengths(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    record: wp.array(dtype=wp.vec4i),
+    n: int,
+    total: wp.array(dtype=wp.vec2d),
+):
+    """Of the edges of both rest shapes."""
     s, k = wp.tid()
-    q = record[k]
-    wp.atomic_add(total, s, length_of(x[s * n + q[1]] - x[s * n + q[0]]))
+    i = s * n + record[k][0]
+    j = s * n + record[k][1]
+    wp.atomic_add(total, s, wp.vec2d(length_of(first[j] - first[i]), length_of(second[j] - second[i])))
 
 
 @wp.func
@@ -124,6 +137,7 @@ def rest(
     n_beta: int,
     stretch: wp.array(dtype=wp.vec2d),
     bend: wp.array(dtype=vec4),
+    constant: wp.array(dtype=real),
 ):
     """Both rest shapes as one reference: Eq. 8. Weights are doubled, for derivatives."""
     s, k = wp.tid()
@@ -147,6 +161,7 @@ def rest(
         share = w2 / whole
     own = alpha[s * n_alpha + wp.min(k, n_alpha - 1)]
     stretch[out] = wp.vec2d(real(2.0) * own * whole, l1 + share * (l2 - l1))
+    wp.atomic_add(constant, s, own * w1 * share * (l2 - l1) * (l2 - l1))
     if q[2] >= 0:
         stiffness = real(2.0) * beta[s * n_beta + wp.min(hinge[k], n_beta - 1)]
         a1 = first[v + q[2]] - first[v + q[0]]
@@ -168,6 +183,8 @@ def rest(
             p2 = stiffness * both[1] * bend_weight(e2, n1, n2)
             t2 = angle_of(e2, a2, b2, n1, n2)
         bend[out] = vec4(p1, t1, p2, t2)
+    else:
+        bend[out] = vec4()
 
 
 # --------------------------------------------------------------------------------------------------- value, derivatives
@@ -178,12 +195,14 @@ def value(
     stretch: wp.array(dtype=wp.vec2d),
     bend: wp.array(dtype=vec4),
     n: int,
+    n_references: int,
     energy: wp.array(dtype=real),
 ):
+    """The energy but for the volume's; references come round where there are fewer than shapes."""
     s, k = wp.tid()
     v = s * n
     q = record[k]
-    at = s * record.shape[0] + k
+    at = (s % n_references) * record.shape[0] + k
     origin = x[v + q[0]]
     e = x[v + q[1]] - origin
     wanted = stretch[at]
@@ -275,6 +294,8 @@ def linearise(
             wp.atomic_add(diagonal, v + q[1], stiffness * squared(ge))
             wp.atomic_add(diagonal, v + q[2], stiffness * squared(ga))
             wp.atomic_add(diagonal, v + q[3], stiffness * squared(gb))
+    else:
+        hinges[at] = bent()
 
 
 @wp.kernel
@@ -316,31 +337,6 @@ def product(
         wp.atomic_add(out, v + q[1], to_j)
 
 
-@wp.kernel
-def volume(
-    x: wp.array(dtype=vec3),
-    centre: wp.array(dtype=vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    n: int,
-    total: wp.array(dtype=real),
-    gradient: wp.array(dtype=vec3),
-):
-    """Volume of the tetrahedra from the centre to all faces, and its gradient where the centre does not move."""
-    s, k = wp.tid()
-    v = s * n
-    q = faces[k]
-    a = x[v + q[0]] - centre[s]
-    b = x[v + q[1]] - centre[s]
-    c = x[v + q[2]] - centre[s]
-    bc = wp.cross(b, c)
-    sixth = real(1.0 / 6.0)
-    wp.atomic_add(total, s, sixth * wp.dot(a, bc))
-    if gradient:
-        wp.atomic_add(gradient, v + q[0], sixth * bc)
-        wp.atomic_add(gradient, v + q[1], sixth * wp.cross(c, a))
-        wp.atomic_add(gradient, v + q[2], sixth * wp.cross(a, b))
-
-
 @wp.func
 def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
     found = centre
@@ -350,20 +346,182 @@ def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
 
 
 @wp.kernel
-def area(
+def volume(
     x: wp.array(dtype=vec3),
     centre: wp.array(dtype=vec3),
-    faces: wp.array(dtype=wp.vec3i),
+    walls: wp.array(dtype=wp.vec3i),
     n: int,
     total: wp.array(dtype=real),
+    gradient: wp.array(dtype=vec3),
+    area: wp.array(dtype=real),
 ):
-    """Area of triangles; a vertex of -1 is the centre."""
+    """Volume of the tetrahedra from the centre to triangles, its gradient where the centre does not move, and the area.
+
+    A vertex of -1 is the centre. Gradient and area are left out where there is no array for them.
+    """
     s, k = wp.tid()
-    q = faces[k]
-    a = corner(x, centre[s], s * n, q[0])
-    b = corner(x, centre[s], s * n, q[1])
-    c = corner(x, centre[s], s * n, q[2])
-    wp.atomic_add(total, s, HALF * length_of(wp.cross(b - a, c - a)))
+    v = s * n
+    q = walls[k]
+    middle = centre[s]
+    a = x[v + q[0]] - middle
+    b = x[v + q[1]] - middle
+    c = corner(x, middle, v, q[2]) - middle
+    bc = wp.cross(b, c)
+    sixth = real(1.0 / 6.0)
+    wp.atomic_add(total, s, sixth * wp.dot(a, bc))
+    if gradient:
+        wp.atomic_add(gradient, v + q[0], sixth * bc)
+        wp.atomic_add(gradient, v + q[1], sixth * wp.cross(c, a))
+        if q[2] >= 0:
+            wp.atomic_add(gradient, v + q[2], sixth * wp.cross(a, b))
+    if area:
+        wp.atomic_add(area, s, HALF * length_of(wp.cross(b - a, c - a)))
+
+
+# ---------------------------------------------------------------------------------------- through the columns of a space
+@wp.kernel(enable_backward=False)
+def jacobian(
+    record: wp.array(dtype=wp.vec4i),
+    hinge: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=stretched),
+    hinges: wp.array(dtype=bent),
+    columns: wp.array(dtype=wide),
+    extra: wp.array(dtype=vec3),
+    n: int,
+    n_columns: int,
+    n_blocks: int,
+    n_rows: int,
+    out: wp.array(dtype=wide),
+    entries: wp.array(dtype=real),
+):
+    """Change of each measure along the columns, and along one more that is the sample's own, by the root of its weight.
+
+    A component of a vertex has a row of blocks of eight columns; those of the measures are the same memory twice.
+    """
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    i = 3 * n_blocks * q[0]
+    j = 3 * n_blocks * q[1]
+    row = s * n_rows + k
+    r = edges[s * record.shape[0] + k]
+    root = wp.sqrt(r[3] + r[4])
+    g = root * vec3(r[0], r[1], r[2])
+    for c in range(n_blocks):
+        y = c + n_blocks
+        z = y + n_blocks
+        out[row * n_blocks + c] = (
+            g[0] * (columns[j + c] - columns[i + c])
+            + g[1] * (columns[j + y] - columns[i + y])
+            + g[2] * (columns[j + z] - columns[i + z])
+        )
+    if extra:
+        entries[row * n_blocks * 8 + n_columns] = wp.dot(g, extra[v + q[1]] - extra[v + q[0]])
+    if q[2] >= 0:
+        row = s * n_rows + record.shape[0] + hinge[k]
+        a = 3 * n_blocks * q[2]
+        b = 3 * n_blocks * q[3]
+        h = hinges[s * record.shape[0] + k]
+        stiff = wp.sqrt(h[9])
+        ge = stiff * vec3(h[0], h[1], h[2])
+        ga = stiff * vec3(h[3], h[4], h[5])
+        gb = stiff * vec3(h[6], h[7], h[8])
+        gi = -(ge + ga + gb)
+        for c in range(n_blocks):
+            y = c + n_blocks
+            z = y + n_blocks
+            out[row * n_blocks + c] = (
+                (gi[0] * columns[i + c] + gi[1] * columns[i + y] + gi[2] * columns[i + z])
+                + (ge[0] * columns[j + c] + ge[1] * columns[j + y] + ge[2] * columns[j + z])
+                + (ga[0] * columns[a + c] + ga[1] * columns[a + y] + ga[2] * columns[a + z])
+                + (gb[0] * columns[b + c] + gb[1] * columns[b + y] + gb[2] * columns[b + z])
+            )
+        if extra:
+            o = extra[v + q[0]]
+            along = wp.dot(ge, extra[v + q[1]] - o) + wp.dot(ga, extra[v + q[2]] - o)
+            entries[row * n_blocks * 8 + n_columns] = along + wp.dot(gb, extra[v + q[3]] - o)
+
+
+@wp.func
+def half_of_hinge(e: vec3, tip: vec3, normal: vec3, w: vec3, length: real):
+    """One triangle's part of the dihedral angle's Hessian: measures.dihedral_hessian."""
+    area = wp.dot(normal, normal)
+    half = wp.outer((length / (area * area)) * normal, w)
+    s = half + wp.transpose(half)
+    u = wp.outer(e, normal / (length * area))
+    r = wp.dot(tip, e) / (length * length)
+    across = u - r * s
+    base = length * length
+    own = (r * r + HALF * area / (base * base)) * s - r * (u + wp.transpose(u)) + across
+    return own, across, s + across
+
+
+@wp.kernel(enable_backward=False)
+def curved_edges(
+    x: wp.array(dtype=vec3),
+    record: wp.array(dtype=wp.vec4i),
+    stretch: wp.array(dtype=wp.vec2d),
+    bend: wp.array(dtype=vec4),
+    slots: wp.array(dtype=six),
+    n: int,
+    n_slots: int,
+    out: wp.array(dtype=wp.mat33d),
+):
+    """The second-order term between the pairs of vertices of edges and hinges: assembly.Curvature."""
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    at = s * record.shape[0] + k
+    to = s * n_slots
+    slot = slots[k]
+    origin = x[v + q[0]]
+    e = x[v + q[1]] - origin
+    base = wp.dot(e, e)
+    length = length_of(e)
+    wanted = stretch[at]
+    slope = wanted[0] * (length - wanted[1])
+    if base > TINY:
+        unit = e / length
+        wp.atomic_add(out, to + slot[0], (slope / length) * (wp.outer(unit, unit) - wp.identity(3, dtype=real)))
+    if q[2] >= 0:
+        a = x[v + q[2]] - origin
+        b = x[v + q[3]] - origin
+        n1 = wp.cross(e, a)
+        n2 = wp.cross(b, e)
+        if not (is_flat(e, n1) or is_flat(e, n2)):
+            w = bend[at]
+            theta = angle_of(e, a, b, n1, n2)
+            moment = w[0] * wrapped(theta - w[1]) + w[2] * wrapped(theta - w[3])
+            own1, across1, rest1 = half_of_hinge(e, a, n1, wp.cross(n1, e), length)
+            own2, across2, rest2 = half_of_hinge(e, b, n2, wp.cross(e, n2), length)
+            wp.atomic_add(out, to + slot[1], -moment * (own1 + own2))
+            wp.atomic_add(out, to + slot[2], -moment * rest1)
+            wp.atomic_add(out, to + slot[3], moment * across1)
+            wp.atomic_add(out, to + slot[4], -moment * rest2)
+            wp.atomic_add(out, to + slot[5], moment * across2)
+
+
+@wp.kernel(enable_backward=False)
+def curved_walls(
+    x: wp.array(dtype=vec3),
+    centre: wp.array(dtype=vec3),
+    walls: wp.array(dtype=wp.vec3i),
+    slope: wp.array(dtype=real),
+    slots: wp.array(dtype=wp.vec3i),
+    n: int,
+    n_slots: int,
+    out: wp.array(dtype=wp.mat33d),
+):
+    """The same of the volume."""
+    s, k = wp.tid()
+    q = walls[k]
+    v = s * n
+    middle = centre[s]
+    sixth = slope[s] / real(6.0)
+    slot = slots[k]
+    wp.atomic_add(out, s * n_slots + slot[0], -wp.skew(sixth * (corner(x, middle, v, q[2]) - middle)))
+    wp.atomic_add(out, s * n_slots + slot[1], -wp.skew(sixth * (x[v + q[0]] - middle)))
+    wp.atomic_add(out, s * n_slots + slot[2], -wp.skew(sixth * (x[v + q[1]] - middle)))
 
 
 # -------------------------------------------------------------------------------------------------- conjugate gradients

@@ -77,14 +77,14 @@ def traced(x: Tensor) -> bool:
     return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter)
 
 
-class _Recorded(threading.local):
+class _Commands(threading.local):
     """What this thread has launched before, so that only what is new needs to be told to Warp."""
 
     def __init__(self) -> None:
-        self.commands: dict[tuple[Any, ...], Any] = {}
+        self.known: dict[tuple[Any, ...], Any] = {}
 
 
-_RECORDED = _Recorded()
+_COMMANDS = _Commands()
 
 
 @cache
@@ -129,9 +129,9 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
 
     device = next(value.device for value in given if isinstance(value, Tensor))
     key = kernel, device, adjoints is not None
-    command = _RECORDED.commands.get(key)
+    command = _COMMANDS.known.get(key)
     if command is None:
-        command = _RECORDED.commands[key] = wp.launch(
+        command = _COMMANDS.known[key] = wp.launch(
             kernel,
             dim=dim,
             inputs=list(_values(kernel, given)),
@@ -154,7 +154,9 @@ Shapes = dict[int, tuple[int, ...]]
 """Of the arguments of a kernel that are its output, by their places."""
 
 
-def recorded(kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any) -> tuple[Tensor, ...]:
+def recorded(
+    kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any, written: tuple[int, ...] = ()
+) -> tuple[Tensor, ...]:
     """Run a kernel whose outputs start as zeros and are added to, so that autograd can go back through it.
 
     Args:
@@ -162,20 +164,26 @@ def recorded(kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any) -> 
         dim: Number of threads.
         shapes: Of the outputs.
         given: What it takes, tensors contiguous; anything in the places of the outputs.
+        written: The outputs whose entries are all written, so that it does not matter what they start as.
 
     Returns:
         The outputs.
     """
-    return _Recorded.apply(kernel, dim, shapes, *given)
+    return _Recorded.apply(kernel, dim, shapes, written, *given)
 
 
 class _Recorded(torch.autograd.Function):
     """With the adjoint that Warp derives."""
 
     @staticmethod
-    def forward(ctx: Any, kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, kernel: Any, dim: tuple[int, ...], shapes: Shapes, written: tuple[int, ...], *given: Any
+    ) -> tuple[Tensor, ...]:
         like = next(value for value in given if isinstance(value, Tensor) and value.is_floating_point())
-        outputs = {place: like.new_zeros(shape) for place, shape in shapes.items()}
+        outputs = {
+            place: like.new_empty(shape) if place in written else like.new_zeros(shape)
+            for place, shape in shapes.items()
+        }
         whole = [outputs.get(place, value) for place, value in enumerate(given)]
         launch(kernel, dim, whole)
         ctx.kernel, ctx.dim, ctx.places, ctx.whole = kernel, dim, list(shapes), whole
@@ -193,15 +201,18 @@ class _Recorded(torch.autograd.Function):
             else:
                 adjoints.append(None)
         launch(ctx.kernel, ctx.dim, ctx.whole, adjoints)
-        return (None,) * 3 + tuple(None if place in received else own for place, own in enumerate(adjoints))
+        return (None,) * 4 + tuple(None if place in received else own for place, own in enumerate(adjoints))
 
 
-def pulled_back(run: Any, given: Sequence[Tensor], to_output: Tensor, needed: Sequence[bool]) -> tuple[Any, ...]:
-    """Gradients of a function of tensors in those that need one."""
+def pulled_back(run: Any, given: Sequence[Tensor], to_output: Any, needed: Sequence[bool]) -> tuple[Any, ...]:
+    """Gradients of a function of tensors, of one output or a tuple of them, in those that need one."""
     if torch.is_grad_enabled():  # gradients of gradients, or a transform of torch.func
         return torch.func.vjp(run, *given)[1](to_output)
     with torch.enable_grad():
         leaves = [value.detach().requires_grad_(need) for value, need in zip(given, needed, strict=True)]
         wanted = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
-        found = iter(torch.autograd.grad(run(*leaves), wanted, to_output, allow_unused=True))
+        outputs = run(*leaves)
+        pairs = [(outputs, to_output)] if isinstance(outputs, Tensor) else zip(outputs, to_output, strict=True)
+        reached, gradients = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
+        found = iter(torch.autograd.grad(reached, wanted, gradients, allow_unused=True))
     return tuple(next(found) if need else None for need in needed)

@@ -1,7 +1,6 @@
 """Where the terms of an in-between's energy are evaluated: on the coarse mesh, or at the vertices that they name."""
 
 from collections.abc import Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -11,6 +10,9 @@ from torch_modal.energy.energy import Energy, OnMesh, Reference, Rest
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.nn import trees
 from torch_modal.nn.frame import Columns, Frame
+from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
+from torch_modal.nn.fused_shell import FusedShell
+from torch_modal.nn.launch import Backend
 from torch_modal.nn.modal_energy import ModalEnergy, Placement, SumOfEnergies
 
 
@@ -30,9 +32,10 @@ class Levels(nn.Module):
         frame: The frame of both bases.
         fine: The caller's mesh.
         terms: All terms.
+        backend: Whether kernels may take the coarse level.
     """
 
-    def __init__(self, frame: Frame, fine: Mesh, terms: Sequence[Term]) -> None:
+    def __init__(self, frame: Frame, fine: Mesh, terms: Sequence[Term], backend: Backend = "torch") -> None:
         super().__init__()
         self.mesh = Mesh.of(frame.coarse_faces, frame.n_coarse)
         numbers = range(len(terms))
@@ -42,6 +45,8 @@ class Levels(nn.Module):
         self.energies: Any = nn.ModuleList([Energy(self.mesh, coarse)])
         if sampled:
             self.energies.append(Energy(fine, sampled, sampled=True))
+        #: The kernels of the coarse level, where they can have it.
+        self.shell = FusedShell(self.energies[0], self.mesh) if FusedShell.serves(self.energies[0], backend) else None
 
     @property
     def sampled(self) -> bool:
@@ -51,37 +56,48 @@ class Levels(nn.Module):
     def modal(self, columns: Columns) -> SumOfEnergies:
         """All of them in the amplitudes of a space."""
         coarse, *sampled = self.energies
-        parts = [ModalEnergy(coarse, columns.coarse)]
+        if self.shell is None:
+            parts = [ModalEnergy(coarse, columns.coarse)]
+        else:
+            parts = [FusedModalEnergy(self.shell, self.mesh, columns.coarse)]
         return SumOfEnergies(*parts, *(ModalEnergy(energy, columns.fine[:, energy.vertices]) for energy in sampled))
 
     def seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
         """A fine shape and its coarse one as each energy sees them. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
         return [coarse, *(x[..., energy.vertices, :] for energy in list(self.energies)[1:])]
 
-    def rests(self, seen: Sequence[Tensor]) -> list[Rest]:
-        """Rest shapes of each energy. *Shape of each:* ``(B, V, 3)``."""
-        return [
-            energy.rest(energy.extend(x.movedim(-1, 0).contiguous()))
-            for energy, x in zip(self.energies, seen, strict=True)
-        ]
-
     def between(
-        self, first: list[Rest], second: list[Rest], index: Tensor | None, t: Tensor, stiffness: Stiffness
-    ) -> list[Reference]:
-        """What in-betweens at the times ``t`` are compared with, of the pairs ``index`` (each its own where None)."""
-        first, second = trees.picked((first, second), index)
-        parts = zip(self.energies, first, second, stiffness.levels, strict=True)
-        return [energy.between(a, b, t, own) for energy, a, b, own in parts]
+        self,
+        first: Sequence[Tensor],
+        second: Sequence[Tensor],
+        index: Tensor | None,
+        t: Tensor,
+        stiffness: Stiffness,
+    ) -> list[Any]:
+        """What in-betweens at the times ``t`` are compared with, of the pairs ``index`` (each its own where None).
+
+        Args:
+            first: Rest shapes as each energy sees them, of the weight ``1 - t``. *Shape of each:* ``(P, V, 3)``.
+            second: Of the weight ``t``. *Shape of each:* ``(P, V, 3)``.
+            index: *Shape:* ``(B,)``.
+            t: *Shape:* ``(B,)``.
+            stiffness: Of each sample.
+
+        Returns:
+            A :class:`Reference` of each energy, or a :class:`ShellReference` for kernels.
+        """
+        found: list[Any] = []
+        for energy, a, b, own in zip(self.energies, first, second, stiffness.levels, strict=True):
+            if self.shell is not None and not found:
+                found.append(fused_reference(self.shell, *trees.picked((a, b), index), t, *own))
+            else:
+                found.append(energy.between(*trees.picked((_rest(energy, a), _rest(energy, b)), index), t, own))
+        return found
 
     def against(self, x: Tensor, coarse: Tensor, stiffness: Stiffness) -> list[Reference]:
         """Shapes as what others are compared with. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
-        parts = zip(self.rests(self.seen(x, coarse)), stiffness.levels, strict=True)
-        return [Energy.against(rest, own) for rest, own in parts]
-
-    def value(self, placement: Sequence[Placement]) -> Tensor:
-        """The energy at amplitudes of zero. *Shape:* ``(B,)``."""
-        parts = zip(self.energies, placement, strict=True)
-        return reduce(torch.add, [energy.value(own.base.transpose(0, 1), own.reference) for energy, own in parts])
+        parts = zip(self.energies, self.seen(x, coarse), stiffness.levels, strict=True)
+        return [Energy.against(_rest(energy, own), factors) for energy, own, factors in parts]
 
     def place(
         self,
@@ -96,6 +112,11 @@ class Levels(nn.Module):
         fixed = [None, anchors][: len(bases)]
         parts = zip(modal.parts, bases, references, extras, fixed, strict=True)
         return tuple(energy.place(base, reference, extra, own) for energy, base, reference, extra, own in parts)
+
+
+def _rest(energy: Energy, x: Tensor) -> Rest:
+    """A shape at rest. *Shape:* ``(B, V, 3)``."""
+    return energy.rest(energy.extend(x.movedim(-1, 0).contiguous()))
 
 
 def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor) -> Tensor:

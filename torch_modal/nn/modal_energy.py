@@ -169,7 +169,10 @@ class ModalEnergy(nn.Module):
 
     def _curved(self, at: Sequence[Linearised], extra: Tensor | None) -> Tensor:
         """The second-order term. *Shape:* ``(B, n, n)``."""
-        blocks = self.curvature.of(self.energy, at)
+        return self._through(self.curvature.of(self.energy, at), extra)
+
+    def _through(self, blocks: Tensor, extra: Tensor | None) -> Tensor:
+        """Blocks of pairs of vertices through the columns. *Shape:* ``(3, 3, B, P), (3, B, V) -> (B, n, n)``."""
         inner = self.congruence(blocks)
         if extra is None:
             return inner
@@ -225,7 +228,7 @@ class SumOfEnergies(nn.Module):
     """Several energies of the same amplitudes.
 
     Args:
-        parts: The energies; a placement of the sum has one of each.
+        parts: The energies, of one precision or several; a placement of the sum has one of each.
     """
 
     def __init__(self, *parts: ModalEnergy) -> None:
@@ -234,21 +237,24 @@ class SumOfEnergies(nn.Module):
 
     def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
-        return reduce(torch.add, [part.value(a, own) for part, own in self._each(placement)])
+        return reduce(torch.add, [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)])
 
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
-        found = [part.derivatives(a, own, second_order) for part, own in self._each(placement)]
+        found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
         sums = (None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True))
         return Derivatives(*sums)  # type: ignore[arg-type]
 
     def second_order(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
-        return reduce(torch.add, [part.second_order(a, own) for part, own in self._each(placement)])
+        return reduce(torch.add, [part.second_order(a.to(own.base.dtype), own) for part, own in self._each(placement)])
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Sequence[Placement]) -> list[Placement]:
         """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
-        return [part.pull_back(a, direction, own) for part, own in self._each(placement)]
+        return [
+            part.pull_back(a.to(own.base.dtype), direction.to(own.base.dtype), own)
+            for part, own in self._each(placement)
+        ]
 
     def _each(self, placement: Sequence[Placement]) -> Iterator[tuple[ModalEnergy, Placement]]:
         return zip(self.parts, placement, strict=True)

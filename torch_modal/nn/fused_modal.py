@@ -1,0 +1,212 @@
+"""Eq. 5 in the amplitudes of a modal space by kernels of NVIDIA Warp, where that is installed."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.energy.terms import Mesh
+from torch_modal.nn import trees
+from torch_modal.nn.adjoint import flattened
+from torch_modal.nn.fused_shell import FusedShell, ShellReference
+from torch_modal.nn.launch import kernels, launch, pulled_back, traced
+from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement
+
+# Columns that a kernel takes at a time.
+_BLOCK = 8
+
+
+def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
+    """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
+    given = [value.double() for value in (first, second, t, *stiffness)]
+    return shell.oracle(*given) if traced(t) else ShellReference(*_Referred.apply(shell, *given))
+
+
+class _Referred(torch.autograd.Function):
+    @staticmethod
+    def forward(shell: FusedShell, *given: Tensor) -> tuple[Tensor, ...]:
+        return tuple(shell.reference(*(value.detach().contiguous() for value in given)))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.shell, *given = inputs
+        ctx.mark_non_differentiable(output[-1])
+        ctx.save_for_backward(*given)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        given = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            run = ctx.shell.oracle
+        else:
+            run, given = ctx.shell.reference, [value.detach().contiguous() for value in given]
+        return (None, *pulled_back(run, given, grads, ctx.needs_input_grad[1:]))
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], shell: FusedShell, *given: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        found = _Referred.apply(shell, *flattened(info.batch_size, in_dims[1:], given))
+        return tuple(value.unflatten(0, (info.batch_size, -1)) for value in found), (0,) * len(found)
+
+
+class FusedModalEnergy(ModalEnergy):
+    """:class:`ModalEnergy` whose values and derivatives come from kernels, in float64.
+
+    It does so for placements with a :class:`ShellReference`, which shapes are not extended for; others, and what is
+    differentiated once more, are torch's.
+
+    Args:
+        shell: The energy on the mesh that the columns live on.
+        mesh: That mesh.
+        columns: Directions of the space. *Shape:* ``(n, V, 3)``.
+    """
+
+    flat: Tensor
+    blocks: Tensor
+    slots: Tensor
+    wall_slots: Tensor
+
+    def __init__(self, shell: FusedShell, mesh: Mesh, columns: Tensor) -> None:
+        super().__init__(shell.energy, columns)
+        self._shell = (shell,)
+        places = self.curvature.places.int()
+        n_edges, n_hinges = len(shell.record), len(shell.interior)
+        slots = places.new_zeros(n_edges, 6)
+        slots[:, 0] = places[:n_edges]
+        slots[shell.interior, 1:] = places[n_edges : n_edges + 5 * n_hinges].unflatten(0, (5, -1)).T
+        self.register_buffer("slots", slots, persistent=False)
+        walls = places[n_edges + 5 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
+        self.register_buffer("wall_slots", walls, persistent=False)
+        flat = columns.flatten(1).contiguous()
+        self.register_buffer("flat", flat, persistent=False)
+        #: Columns of each component of each vertex, with room for one more, and zeros. *Shape:* ``(3 V, 8 N)``.
+        blocks = nn.functional.pad(flat.T, (0, _BLOCK - len(flat) % _BLOCK)).contiguous()
+        self.register_buffer("blocks", blocks, persistent=False)
+
+    @property
+    def shell(self) -> FusedShell:
+        """The kernels."""
+        return self._shell[0]
+
+    def place(
+        self, base: Tensor, reference: Any, extra: Tensor | None = None, anchors: Tensor | None = None
+    ) -> Placement:
+        """As the other's."""
+        if not isinstance(reference, ShellReference):
+            return super().place(base, reference, extra, anchors)
+        return Placement(base.double(), None if extra is None else extra.double(), reference)  # type: ignore[arg-type]
+
+    def _plain(self, placement: Placement) -> Placement | None:
+        """The placement for torch; None where it is for kernels."""
+        if not isinstance(placement.reference, ShellReference):
+            return placement
+        if torch.is_grad_enabled() or traced(placement.base):
+            base, extra, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
+            return super().place(base, self.shell.unpacked(reference), extra)
+        return None
+
+    # ------------------------------------------------------------------------------------------------------- the shapes
+    def _shapes(self, a: Tensor, base: Tensor, extra: Tensor | None) -> Tensor:
+        """*Shape:* ``(..., B, n) -> (D * B, V, 3)``."""
+        n = len(self.columns)
+        x = base + (a[..., :n].double() @ self.flat.double()).unflatten(-1, (-1, 3))
+        if extra is not None:
+            x = x + a[..., n, None, None] * extra
+        return x.flatten(0, -3)
+
+    def rows(self, a: Tensor, placement: Placement) -> Tensor:
+        """As the other's."""
+        if not isinstance(placement.reference, ShellReference):
+            return super().rows(a, placement)
+        x = self._shapes(a, placement.base, placement.extra).unflatten(0, a.shape[:-1])
+        return self.energy.extend(x.movedim(-1, 0))
+
+    def value(self, a: Tensor, placement: Placement) -> Tensor:
+        """As the other's."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().value(a.to(plain.base), plain)
+        to: Any = placement.reference
+        found = self.shell.value(self._shapes(a, placement.base, placement.extra), to)
+        return found.unflatten(0, a.shape[:-1]) + to.constant
+
+    def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
+        """As the other's."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().derivatives(a.to(plain.base), plain, second_order)
+        to: Any = placement.reference
+        x, extra, shell = self._shapes(a, placement.base, placement.extra), placement.extra, self.shell
+        at = shell.at(x, to)
+        b, n = len(x), len(self.columns)
+        n_all, n_rows, blocks = n + (extra is not None), len(shell.record) + len(shell.interior), self.blocks.double()
+        jacobian = x.new_empty(b, n_rows, blocks.shape[1])
+        given = [shell.record, shell.hinge, at.edges, at.hinges, blocks, extra, shell.n_vertices, n]
+        given += [blocks.shape[1] // _BLOCK, n_rows, jacobian, jacobian]
+        launch(kernels().jacobian, (b, len(shell.record)), given)
+        pushed = torch.stack([at.gradient + at.moment[:, None, None] * at.normal, at.normal], 1)
+        slopes = pushed.flatten(2) @ self.flat.double().T
+        if extra is not None:
+            slopes = torch.cat([slopes, (pushed * extra[:, None]).sum((-1, -2))[..., None]], -1)
+        gradient, swept = slopes.unbind(1)
+        inner = (jacobian.mT @ jacobian)[:, :n_all, :n_all]
+        inner = torch.baddbmm(inner, (to.stiffness[:, None] * swept)[..., None], swept[:, None])
+        stiffness = at.edges[..., 3:].sum((1, 2)) + at.hinges[..., -1].sum(1) + to.stiffness
+        stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
+        rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
+        curved = self._second(x, at.moment, placement) if second_order else None
+        return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
+
+    def second_order(self, a: Tensor, placement: Placement) -> Tensor:
+        """As the other's."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().second_order(a.to(plain.base), plain)
+        x, to = self._shapes(a, placement.base, placement.extra), placement.reference
+        volume, _ = self.shell.volume(x)
+        return self._second(x, to.stiffness * (volume - to.volume), placement)  # type: ignore[attr-defined]
+
+    def _second(self, x: Tensor, moment: Tensor, placement: Placement) -> Tensor:
+        to: Any = placement.reference
+        shell, n_pairs = self.shell, len(self.curvature.pairs)
+        found = x.new_zeros(len(x), 2 * n_pairs, 3, 3)
+        given = [x, shell.record, to.stretch, to.bend, self.slots, shell.n_vertices, 2 * n_pairs, found]
+        launch(kernels().curved_edges, (len(x), len(shell.record)), given)
+        given = [x, shell.centre(x), shell.walls, moment, self.wall_slots, shell.n_vertices, 2 * n_pairs, found]
+        launch(kernels().curved_walls, (len(x), len(shell.walls)), given)
+        ascending, descending = found.to(self.columns.dtype).split(n_pairs, 1)
+        extra = None if placement.extra is None else self.energy.extend(placement.extra.movedim(-1, 0).to(ascending))
+        curved = self._through((ascending + descending.mT).movedim((2, 3), (0, 1)), extra)
+        return curved.to(x)
+
+    def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
+        """As the other's."""
+        to: Any = placement.reference
+        if not isinstance(to, ShellReference):
+            return super().pull_back(a, direction, placement)
+        plain = self._plain(placement)
+        if plain is not None:
+            pulled = super().pull_back(a.to(plain.base), direction.to(plain.base), plain)
+            return self._repacked(pulled, placement)
+        moving = [part for part in (placement.base, placement.extra, *to[:-1]) if part is not None]
+
+        def slope(base: Tensor, *others: Tensor) -> Tensor:
+            extra = None if placement.extra is None else others[0]
+            x = self._shapes(a, base, extra)
+            moved = self._shapes(direction, torch.zeros_like(base), extra)
+            return (moved * self.shell.gradient(x, ShellReference(*others[-4:], to.constant))).sum((-1, -2))
+
+        found = list(pulled_back(slope, moving, torch.ones_like(to.constant), [True] * len(moving)))
+        to_base, *to_reference = [found[0], *found[-4:]]
+        to_extra = None if placement.extra is None else found[1]
+        return Placement(to_base, to_extra, ShellReference(*to_reference, torch.zeros_like(to.constant)))  # type: ignore[arg-type]
+
+    def _repacked(self, found: Placement, placement: Placement) -> Placement:
+        """Gradients in a placement for torch as those in the one for kernels that it was made of."""
+        given, skeleton = trees.leaves(placement), trees.skeleton(placement)
+
+        def run(*values: Tensor) -> tuple[Tensor, ...]:
+            return tuple(trees.leaves(self._plain(trees.filled(skeleton, values))))
+
+        return trees.filled(skeleton, torch.func.vjp(run, *given)[1](tuple(trees.leaves(found))))
