@@ -5,7 +5,9 @@ import math
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,9 +21,12 @@ from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
-from torch_modal.nn import launch
+from torch_modal.nn import launch, trees
+from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.fused_rotations import FusedRotations
+from torch_modal.nn.fused_shell import FusedShell
+from torch_modal.nn.modal_energy import ModalEnergy, Placement
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
@@ -33,7 +38,7 @@ class Case:
 
     def __init__(self, shapes: Shapes, faces: Tensor, roughness: float) -> None:
         generator = torch.Generator().manual_seed(0)
-        mesh = Mesh.of(faces, shapes.keyframes.shape[1])
+        mesh = self.mesh = Mesh.of(faces, shapes.keyframes.shape[1])
         self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
         self.fused = FusedRelax(self.energy, mesh)
         x = shapes.keyframes * (DIAGONAL / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
@@ -121,6 +126,58 @@ def test_vmap(small_bars: Shapes) -> None:
     found = vmap(lambda x: case.by_warp(x, *case.given[1:]))(moved)
     truth = torch.stack([case.by_warp(x, *case.given[1:]) for x in moved])
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-12 * DIAGONAL)
+
+
+class TestModal:
+    """The energy in the amplitudes of a space."""
+
+    @staticmethod
+    def both(case: Case, extra: bool) -> list[tuple[ModalEnergy, Placement]]:
+        start, first, second, t, *stiffness = case.given
+        generator = torch.Generator().manual_seed(2)
+        columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
+        own = torch.randn(start.shape, dtype=DOUBLE, generator=generator) if extra else None
+        shell = FusedShell(case.energy, case.mesh)
+        modals = FusedModalEnergy(shell, case.mesh, columns), ModalEnergy(case.energy, columns)
+        packed = fused_reference(shell, first, second, t, *stiffness)
+        return [
+            (modals[0], modals[0].place(start, packed, own)),
+            (modals[1], modals[1].place(start, shell.unpacked(shell.reference_by_torch(*case.given[1:])), own)),
+        ]
+
+    @pytest.mark.parametrize("extra", [False, True])
+    @torch.no_grad()
+    def test_values_and_derivatives(self, case: Case, extra: bool) -> None:
+        a = 0.1 * torch.randn(2, 5 + extra, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), (plain, truth) = self.both(case, extra)
+        several = torch.stack([a, 2 * a, -a])
+        torch.testing.assert_close(fused.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
+        torch.testing.assert_close(fused.rows(a, own), plain.rows(a, truth), rtol=0, atol=1e-11)
+        found, wanted = fused.derivatives(a, own), plain.derivatives(a, truth)
+        assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
+        assert_alike(found, wanted, 1e-9)
+        assert_alike((fused.second_order(a, own),), (plain.second_order(a, truth),), 1e-9)
+
+    @pytest.mark.parametrize("extra", [False, True])
+    def test_pull_back(self, case: Case, extra: bool) -> None:
+        generator = torch.Generator().manual_seed(4)
+        a, direction = torch.randn(2, 2, 5 + extra, dtype=DOUBLE, generator=generator).mul(0.1)
+        (fused, own), _ = self.both(case, extra)
+        with torch.no_grad():
+            found = trees.leaves(fused.pull_back(a, direction, own))
+        assert_alike(found, trees.leaves(fused.pull_back(a, direction, own)), 1e-10)  # by torch, to be differentiated
+
+    def test_references(self, case: Case) -> None:
+        shell, given = FusedShell(case.energy, case.mesh), case.given[1:]
+
+        def flat(run) -> Any:  # type: ignore[no-untyped-def]
+            return lambda *given: torch.cat([part.flatten() for part in run(*given)[:-1]])
+
+        by_kernels, by_torch = partial(fused_reference, shell), shell.reference_by_torch
+        for found, wanted in zip(by_kernels(*given), by_torch(*given), strict=True):
+            torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+        assert_alike(gradients(flat(by_kernels), given), gradients(flat(by_torch), given), 1e-9)
+        assert_alike(gradients(flat(by_kernels), given, True), gradients(flat(by_torch), given, True), 1e-7)
 
 
 class TestRotations:

@@ -20,7 +20,7 @@ from torch_modal.energy.shell import ShellEnergy
 from torch_modal.nn import trees
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.modal_energy import Derivatives, ModalEnergy
+from torch_modal.nn.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.nn.samples import ConvergenceError, ConvergenceWarning, Samples
 from torch_modal.nn.solver import GaussNewtonStep, Status
 
@@ -289,15 +289,15 @@ class TestGradients:
         x_a = inputs["x_a"].clone().requires_grad_()
         y = value(**{**inputs, "x_a": x_a})
         (exact,) = torch.autograd.grad(y, x_a, retain_graph=True)
-        from torch_modal.nn.modal_energy import ModalEnergy
+        from torch_modal.nn.modal_energy import SumOfEnergies
 
-        without = ModalEnergy.derivatives
+        without = SumOfEnergies.derivatives
 
         def gauss_newton_only(self, a, placement, second_order=True):  # type: ignore[no-untyped-def]
             derivatives = without(self, a, placement, second_order)
             return derivatives._replace(second_order=torch.zeros_like(derivatives.gauss_newton))
 
-        monkeypatch.setattr(ModalEnergy, "derivatives", gauss_newton_only)
+        monkeypatch.setattr(SumOfEnergies, "derivatives", gauss_newton_only)
         (wrong,) = torch.autograd.grad(y, x_a)
         assert float((wrong - exact).norm() / exact.norm()) > 1e-2
 
@@ -592,14 +592,14 @@ class TestTorch:
         x_a = torch.stack([bars.keyframes[0]] * 2).requires_grad_()
         shapes = layer(x_a, bars.keyframes[1], 0.5)
         (truth,) = torch.autograd.grad(shapes.sum(), x_a, retain_graph=True)
-        derivatives = ModalEnergy.derivatives
+        derivatives = SumOfEnergies.derivatives
 
         def singular(*args: Any, **kwargs: Any) -> Derivatives:
             found = derivatives(*args, **kwargs)
             keep = torch.tensor([1.0, 0.0], dtype=DOUBLE)[:, None, None]
             return found._replace(gauss_newton=keep * found.gauss_newton, second_order=keep * found.second_order)
 
-        monkeypatch.setattr(ModalEnergy, "derivatives", singular)
+        monkeypatch.setattr(SumOfEnergies, "derivatives", singular)
         monkeypatch.setattr(GaussNewtonStep, "ridged", lambda self, hessian: hessian)
         with pytest.warns(ConvergenceWarning, match="the Hessian of 1 in-betweens is singular"):
             (found,) = torch.autograd.grad(shapes.sum(), x_a)

@@ -9,7 +9,7 @@ from torch_modal.energy.terms import Mesh
 from torch_modal.nn import trees
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellReference
-from torch_modal.nn.launch import kernels, launch, pulled_back, traced
+from torch_modal.nn.launch import kernels, launch, pulled_back, traced, transformed
 from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement
 
 # Columns that a kernel takes at a time.
@@ -19,7 +19,7 @@ _BLOCK = 8
 def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
     """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
     given = [value.double() for value in (first, second, t, *stiffness)]
-    return shell.oracle(*given) if traced(t) else ShellReference(*_Referred.apply(shell, *given))
+    return shell.reference_by_torch(*given) if traced(t) else ShellReference(*_Referred.apply(shell, *given))
 
 
 class _Referred(torch.autograd.Function):
@@ -37,10 +37,10 @@ class _Referred(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         given = ctx.saved_tensors
         if torch.is_grad_enabled():
-            run = ctx.shell.oracle
+            run = ctx.shell.reference_by_torch
         else:
             run, given = ctx.shell.reference, [value.detach().contiguous() for value in given]
-        return (None, *pulled_back(run, given, grads, ctx.needs_input_grad[1:]))
+        return (None, *pulled_back(lambda *given: tuple(run(*given)), given, grads, ctx.needs_input_grad[1:]))
 
     @staticmethod
     def vmap(
@@ -101,7 +101,7 @@ class FusedModalEnergy(ModalEnergy):
         """The placement for torch; None where it is for kernels."""
         if not isinstance(placement.reference, ShellReference):
             return placement
-        if torch.is_grad_enabled() or traced(placement.base):
+        if torch.is_grad_enabled() or traced(placement.base) or transformed(placement.base):
             base, extra, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
             return super().place(base, self.shell.unpacked(reference), extra)
         return None
@@ -113,7 +113,7 @@ class FusedModalEnergy(ModalEnergy):
         x = base + (a[..., :n].double() @ self.flat.double()).unflatten(-1, (-1, 3))
         if extra is not None:
             x = x + a[..., n, None, None] * extra
-        return x.flatten(0, -3)
+        return x.flatten(0, -3).contiguous()
 
     def rows(self, a: Tensor, placement: Placement) -> Tensor:
         """As the other's."""
@@ -126,7 +126,7 @@ class FusedModalEnergy(ModalEnergy):
         """As the other's."""
         plain = self._plain(placement)
         if plain is not None:
-            return super().value(a.to(plain.base), plain)
+            return super().value(a.to(plain.base), plain).to(placement.base)
         to: Any = placement.reference
         found = self.shell.value(self._shapes(a, placement.base, placement.extra), to)
         return found.unflatten(0, a.shape[:-1]) + to.constant
@@ -135,7 +135,8 @@ class FusedModalEnergy(ModalEnergy):
         """As the other's."""
         plain = self._plain(placement)
         if plain is not None:
-            return super().derivatives(a.to(plain.base), plain, second_order)
+            found = super().derivatives(a.to(plain.base), plain, second_order)
+            return trees.mapped(found, lambda value: value.to(placement.base))
         to: Any = placement.reference
         x, extra, shell = self._shapes(a, placement.base, placement.extra), placement.extra, self.shell
         at = shell.at(x, to)
@@ -162,7 +163,7 @@ class FusedModalEnergy(ModalEnergy):
         """As the other's."""
         plain = self._plain(placement)
         if plain is not None:
-            return super().second_order(a.to(plain.base), plain)
+            return super().second_order(a.to(plain.base), plain).to(placement.base)
         x, to = self._shapes(a, placement.base, placement.extra), placement.reference
         volume, _ = self.shell.volume(x)
         return self._second(x, to.stiffness * (volume - to.volume), placement)  # type: ignore[attr-defined]
@@ -189,18 +190,16 @@ class FusedModalEnergy(ModalEnergy):
         if plain is not None:
             pulled = super().pull_back(a.to(plain.base), direction.to(plain.base), plain)
             return self._repacked(pulled, placement)
-        moving = [part for part in (placement.base, placement.extra, *to[:-1]) if part is not None]
+        given, skeleton = trees.leaves(placement), trees.skeleton(placement)
 
-        def slope(base: Tensor, *others: Tensor) -> Tensor:
-            extra = None if placement.extra is None else others[0]
-            x = self._shapes(a, base, extra)
+        def slope(*values: Tensor) -> Tensor:
+            base, extra, reference = trees.filled(skeleton, values)
             moved = self._shapes(direction, torch.zeros_like(base), extra)
-            return (moved * self.shell.gradient(x, ShellReference(*others[-4:], to.constant))).sum((-1, -2))
+            return (moved * self.shell.gradient(self._shapes(a, base, extra), reference)).sum((-1, -2))
 
-        found = list(pulled_back(slope, moving, torch.ones_like(to.constant), [True] * len(moving)))
-        to_base, *to_reference = [found[0], *found[-4:]]
-        to_extra = None if placement.extra is None else found[1]
-        return Placement(to_base, to_extra, ShellReference(*to_reference, torch.zeros_like(to.constant)))  # type: ignore[arg-type]
+        found = pulled_back(slope, given, torch.ones_like(to.constant), [True] * len(given))
+        pairs = zip(found, given, strict=True)
+        return trees.filled(skeleton, [torch.zeros_like(x) if to_x is None else to_x for to_x, x in pairs])  # type: ignore[no-any-return]
 
     def _repacked(self, found: Placement, placement: Placement) -> Placement:
         """Gradients in a placement for torch as those in the one for kernels that it was made of."""
@@ -209,4 +208,5 @@ class FusedModalEnergy(ModalEnergy):
         def run(*values: Tensor) -> tuple[Tensor, ...]:
             return tuple(trees.leaves(self._plain(trees.filled(skeleton, values))))
 
-        return trees.filled(skeleton, torch.func.vjp(run, *given)[1](tuple(trees.leaves(found))))
+        pulled = torch.func.vjp(run, *given)[1](tuple(trees.leaves(found)))
+        return trees.filled(skeleton, pulled)  # type: ignore[no-any-return]

@@ -4,7 +4,6 @@ Each kernel does in one pass over the elements what torch does in dozens. The to
 tested against, what runs where Warp is not, and what differentiates a gradient once more.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -121,7 +120,7 @@ class FusedShell(nn.Module):
         constant = constant + pulls[:, 0] * share * apart**2
         return ShellReference(stretch, bend, 2 * whole, volumes[:, 0] + share * apart, constant)
 
-    def oracle(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
+    def reference_by_torch(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
         """The same by torch."""
         one, other = (self.energy.rest(self.energy.extend(x.movedim(-1, 0).contiguous())) for x in (first, second))
         return self.packed(self.energy.between(one, other, t, stiffness))
@@ -173,10 +172,11 @@ class FusedShell(nn.Module):
         b, e = len(x), len(self.record)
         shapes: Shapes = {5: (b,), 6: tuple(x.shape), 7: (*x.shape[:2], 6), 8: (b, e, 5), 9: (b, e, 10)}
         given = [x, self.record, to.stretch, to.bend, self.n_vertices, *[None] * 5]
-        energy, *local = self._run(kernels().linearise, shapes, given, written=(8, 9))
+        energy, gradient, diagonal, edges, hinges = self._run(kernels().linearise, shapes, given, written=(8, 9))
         volume, normal = self.volume(x)
         moment = to.stiffness * (volume - to.volume)
-        return ShellPoint(energy + self._of_volume(volume, to), *local, normal, moment)
+        energy = energy + self._of_volume(volume, to)
+        return ShellPoint(energy, gradient, diagonal, edges, hinges, normal, moment)
 
     def gradient(self, x: Tensor, to: ShellReference) -> Tensor:
         """The gradient; recorded where gradients are. *Shape:* ``(B, V, 3)``."""
@@ -190,7 +190,8 @@ class FusedShell(nn.Module):
         launch(kernels().value, (len(x), len(self.record)), given)
         given = [x, self.centre(x), self.walls, self.n_vertices, volume, None, None]
         launch(kernels().volume, (len(x), len(self.walls)), given)
-        energy, volume = (value.unflatten(0, (-1, len(to.volume))) for value in (energy, volume))
+        sizes = len(x) // max(1, len(to.volume)), len(to.volume)
+        energy, volume = (value.unflatten(0, sizes) for value in (energy, volume))
         return (energy + self._of_volume(volume, to)).flatten()
 
     @staticmethod

@@ -134,8 +134,8 @@ class JointSpace(nn.Module):
             references = levels.against(base, coarse, stiffness)
             placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
             return JointProblem(placement, start, base, difference)
-        ends = (levels.seen(x, own) for x, own in ((pair.first, coarse_first), (pair.second, coarse_second)))
-        references = levels.between(*ends, index, t, stiffness)
+        seen_first, seen_second = levels.seen(pair.first, coarse_first), levels.seen(pair.second, coarse_second)
+        references = levels.between(seen_first, seen_second, index, t, stiffness)
         first, second, coarse_first, coarse_second = trees.picked(
             (pair.first, pair.second, coarse_first, coarse_second), index
         )

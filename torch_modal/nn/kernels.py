@@ -367,7 +367,7 @@ def volume(
     b = x[v + q[1]] - middle
     c = corner(x, middle, v, q[2]) - middle
     bc = wp.cross(b, c)
-    sixth = real(1.0 / 6.0)
+    sixth = real(1.0) / real(6.0)
     wp.atomic_add(total, s, sixth * wp.dot(a, bc))
     if gradient:
         wp.atomic_add(gradient, v + q[0], sixth * bc)
@@ -378,7 +378,7 @@ def volume(
         wp.atomic_add(area, s, HALF * length_of(wp.cross(b - a, c - a)))
 
 
-# ---------------------------------------------------------------------------------------- through the columns of a space
+# --------------------------------------------------------------------------------------- through the columns of a space
 @wp.kernel(enable_backward=False)
 def jacobian(
     record: wp.array(dtype=wp.vec4i),
@@ -753,7 +753,12 @@ def half_turn(q: vec4):
     if sine < SMALL * q[0] * q[0] and q[0] > real(0.0):
         t = sine / (q[0] * q[0])
         factor = (
-            real(1.0) - t * (real(1.0 / 3.0) - t * (real(1.0 / 5.0) - t * (real(1.0 / 7.0) - t * real(1.0 / 9.0))))
+            real(1.0)
+            - t
+            * (
+                real(1.0) / real(3.0)
+                - t * (real(1.0) / real(5.0) - t * (real(1.0) / real(7.0) - t * real(1.0) / real(9.0)))
+            )
         ) / q[0]
     else:
         root = wp.sqrt(wp.max(sine, TINIEST))

@@ -87,6 +87,11 @@ class _Commands(threading.local):
 _COMMANDS = _Commands()
 
 
+def transformed(x: Tensor) -> bool:
+    """Whether a tensor stands for others in a transform of ``torch.func``."""
+    return torch.func.debug_unwrap(x, recurse=False) is not x
+
+
 @cache
 def _sizes(kernel: Any) -> list[tuple[int, int]]:
     """Numbers and bytes in an entry of each array that a kernel takes; none of what is no array."""

@@ -42,11 +42,12 @@ class Levels(nn.Module):
         #: Which terms each level has.
         self.members = [[i for i in numbers if not terms[i].sampled], [i for i in numbers if terms[i].sampled]]
         coarse, sampled = ([terms[i] for i in members] for members in self.members)
-        self.energies: Any = nn.ModuleList([Energy(self.mesh, coarse)])
+        energy = Energy(self.mesh, coarse)
+        self.energies: Any = nn.ModuleList([energy])
         if sampled:
             self.energies.append(Energy(fine, sampled, sampled=True))
         #: The kernels of the coarse level, where they can have it.
-        self.shell = FusedShell(self.energies[0], self.mesh) if FusedShell.serves(self.energies[0], backend) else None
+        self.shell = FusedShell(energy, self.mesh) if FusedShell.serves(energy, backend) else None
 
     @property
     def sampled(self) -> bool:
