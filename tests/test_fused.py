@@ -96,7 +96,7 @@ def test_local_steps(case: Case) -> None:
     found, truth = case.by_warp(*case.given), case.by_torch(*case.given)
     assert float((truth - case.given[0]).abs().max()) > 1e-2
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-8 * DIAGONAL)
-    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-7)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
 
 
 def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
