@@ -32,6 +32,7 @@ EXTRAS = {
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
     # Parts that pass through each other; earlier versions of ipctk have another interface, and were not tried.
     "contact": ["ipctk>=1.6", "libigl>=2.6"],
+    "compress": ["constriction>=0.4"],  # small files of motions: the range coder
     "warp": ["warp-lang>=1.19"],  # kernels; earlier ones are told otherwise what not to print
     "dask": ["distributed>=2024.5"],
 }

@@ -146,6 +146,20 @@ def test_times_between_frames(encoded: tm.ModalSequence) -> None:
         encoded.decode(9.0)
 
 
+def test_other_frames_are_fitted_beside_the_same_path(encoded: tm.ModalSequence, motion: Tensor) -> None:
+    found = encoded.fit(motion[[2, 5]], [2.0, 5.0])
+    assert torch.allclose(found.amplitudes, encoded.amplitudes[[2, 5]], rtol=0, atol=0.05)
+    x = encoded.decoder(found.amplitudes, torch.tensor([2.0, 5.0]), found.motions)
+    measured = (x - motion[[2, 5]]).norm(dim=-1).mean(1) / encoded.decoder.size
+    assert torch.allclose(measured, found.errors, rtol=0, atol=1e-12)
+    at_key = encoded.fit(motion[3:4], 3.0)  # no key-frame of another motion is known
+    assert float(at_key.amplitudes.abs().max()) < 1e-6
+    with pytest.raises(ValueError, match="times"):
+        encoded.fit(motion, [0.0])
+    with pytest.raises(ValueError, match="0 and 8"):
+        encoded.fit(motion[:1], 9.0)
+
+
 def test_cycle(bars: Shapes) -> None:
     basis = bars.bases[0]
     times = torch.tensor([0.0, 2.0, 4.0, 6.0]).double()
@@ -231,7 +245,7 @@ def test_signs_and_mixtures_are_fixed(bars: Shapes, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(codec_modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values))
     here = fixed_modes(bars.keyframes[0], bars.faces, 6)
     monkeypatch.setattr(codec_modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values, modes=other))
-    there = fixed_modes(bars.keyframes[0], bars.faces, 6, here.clusters, here.pivots)
+    there = fixed_modes(bars.keyframes[0], bars.faces, 6, here.clusters, here.seed)
     assert here.clusters.tolist() == [1, 1, 2, 1, 1]
     assert torch.allclose(here.modes, there.modes, rtol=0, atol=1e-12 * float(here.modes.abs().max()))
 

@@ -110,3 +110,13 @@ def test_figures_of_the_paper_are_drawn(tmp_path: Path, capsys: pytest.CaptureFi
     said = capsys.readouterr().out
     errors = [float(line.split()[-2]) for line in said.splitlines() if "edge error" in line]
     assert errors[2] < errors[1] < errors[0]  # ours, Eq. 4, linear
+
+
+@pytest.mark.slow
+def test_train_motion_learns_more_in_amplitudes() -> None:
+    """A short run: what follows two true shapes, and the stride that is told from them."""
+    data, found = load_example("train_motion").main(n_animals=2, steps=12, n_modes=16)
+    own = found.pop("amplitudes")
+    assert own.held < 1 and own.shapes.shape == data.test[0, 2:].shape
+    assert own.stride < 0.7 * min(other.stride for other in found.values())
+    assert own.edges < 0.5 * min(other.edges for other in found.values())

@@ -15,7 +15,7 @@ from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.modal_decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.sequence.codec_file import read, write_exact
-from torch_modal.sequence.codec_fit import fit
+from torch_modal.sequence.codec_fit import Fit, fit
 from torch_modal.sequence.codec_modes import FixedModes, fixed_modes
 from torch_modal.sequence.codec_selection import select_keyframes
 from torch_modal.sequence.times import checked_times
@@ -115,6 +115,29 @@ class ModalSequence:
                 out[times == at] = shape.double()
         return out
 
+    def fit(self, frames: Any, times: Any) -> Fit:
+        """Amplitudes of other frames beside the same path, such as those of another motion of the same mesh.
+
+        Args:
+            frames: In units of their own key-frames. *Shape:* ``(N, V, 3)``.
+            times: Where along the path each is. *Shape:* ``(N,)``.
+
+        Returns:
+            ``amplitudes (N, k)``, ``motions (N, 6)`` and ``errors (N,)``, to be passed to :attr:`decoder`.
+
+        Raises:
+            MeshError: Frames that cannot be used.
+            ValueError: Times that do not fit the frames, or are outside.
+        """
+        x = check_keyframes(frames, self.faces, min_keyframes=1, warn=False)[0].detach().cpu().double()
+        t = torch.as_tensor(times, dtype=torch.float64).reshape(-1)
+        if x.shape[1:] != self.keyframes.shape[1:] or len(t) != len(x):
+            raise ValueError(
+                f"frames have the shape (N, {self.keyframes.shape[1]}, 3), and times (N,); got {tuple(x.shape)} and "
+                f"{tuple(t.shape)}"
+            )
+        return fit(self.decoder, x, t, [])
+
     def at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Amplitudes and rigid motions at any time. *Shape:* ``(N,) -> (N, k), (N, 6)``."""
         knots, values = self.times, torch.cat([self.amplitudes, self.motions], 1)
@@ -152,6 +175,7 @@ class ModalSequence:
         Raises:
             FileNotFoundError: There is no such file.
             ValueError: It is damaged, holds something else, or has another version; or this machine finds other modes.
+            MissingPackageError: :func:`torch_modal.compress` wrote it, and the extra ``compress`` is not there.
         """
         return cls(**read(FilePath(path), cache_dir, cache))
 
@@ -199,17 +223,32 @@ def encode(
     if not 0 < error < 1:
         raise ValueError(f"error is a part of the diagonal, such as 0.002; got {error!r}")
     when = checked_times(times, len(x), cyclic)
-    if isinstance(keyframes, (int, type(None))):
-        modes = fixed_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache)
-        keys = select_keyframes(x, triangles, when, modes.modes, keyframes, error, cyclic, progress)
-    else:
-        keys = _checked_keys(keyframes, len(x), cyclic)
-        modes = fixed_modes(x[keys[0]], triangles, n_modes, cache_dir=cache_dir, cache=cache)
+    kept = {"cache_dir": cache_dir, "cache": cache}
+    keys = chosen_keys(x, triangles, when, keyframes, n_modes, error, cyclic, kept, progress)
+    modes = fixed_modes(x[keys[0]], triangles, n_modes, **kept)  # type: ignore[arg-type]
     while True:
         found = fitted(x, triangles, when, x[keys], keys, cyclic, modes, progress)
         if keyframes is not None or float(found.errors.max()) <= error:
             return found
         keys = with_worst(keys, found.errors, error)
+
+
+def chosen_keys(
+    frames: Tensor,
+    faces: Tensor,
+    when: Tensor,
+    keyframes: Sequence[int] | int | None,
+    n_modes: int,
+    error: float,
+    cyclic: bool,
+    kept: dict[str, Any],
+    progress: Progress = None,
+) -> list[int]:
+    """The key-frames that a caller names, or those that are found. Arguments as for :func:`encode`."""
+    if not isinstance(keyframes, (int, type(None))):
+        return _checked_keys(keyframes, len(frames), cyclic)
+    modes = fixed_modes(frames[0], faces, n_modes, **kept)
+    return select_keyframes(frames, faces, when, modes.modes, keyframes, error, cyclic, progress)
 
 
 def with_worst(keys: Sequence[int], errors: Tensor, error: float) -> list[int]:
@@ -228,13 +267,14 @@ def fitted(
     cyclic: bool,
     modes: FixedModes,
     progress: Progress = None,
+    only: Sequence[int] | None = None,
 ) -> ModalSequence:
-    """The sequence of given key-frames, which may be rounded, and the modes of the first of them."""
+    """The sequence of given key-frames, rounded or not, with modes of the first; of all frames, or ``only`` some."""
     key_times = when[[*keys, len(frames)]] if cyclic else when[list(keys)]
     decoder = ModalDecoder(keyframes, faces, key_times, keyframes[0], modes.modes)
     times = when[: len(frames)]
-    with ProgressReport(len(frames), "encoded frames", progress) as bar:
-        found = fit(decoder, frames, times, keys, bar.update)
+    with ProgressReport(len(frames if only is None else only), "encoded frames", progress) as bar:
+        found = fit(decoder, frames, times, keys, bar.update, only)
     return ModalSequence(keyframes, faces, key_times, times, found.amplitudes, found.motions, modes, 0, found.errors)
 
 

@@ -16,14 +16,14 @@ from torch import Tensor
 
 from torch_modal.errors import MeshError
 from torch_modal.io.files import write_atomically
-from torch_modal.sequence.codec_modes import FixedModes, fixed_modes
+from torch_modal.sequence.codec_modes import N_SEEDS, FixedModes, fixed_modes
 from torch_modal.sequence.codec_packing import PACKED, unpack
 
 FORMAT = "torch_modal.sequence"
-VERSION = "1"
+VERSION = "2"
 PROBE_TOLERANCE = 1e-5
 """Over the diagonal: how far the modes of another machine may move what they move by 1 %."""
-N_PROBES = 16
+N_PROBES = 8
 
 EXACT = {
     "keyframes": (torch.float64, 3),
@@ -34,7 +34,6 @@ EXACT = {
     "motions": (torch.float64, 2),
     "errors": (torch.float64, 1),
     "clusters": (torch.int64, 1),
-    "pivots": (torch.int64, 1),
     "probe": (torch.float64, 1),
 }
 
@@ -42,16 +41,16 @@ EXACT = {
 def write_exact(fields: Mapping[str, Any], path: Path) -> None:
     """The fields of a sequence, without loss."""
     modes = fields["modes"]
-    values = {**fields, "clusters": modes.clusters, "pivots": modes.pivots, "probe": probe(modes)}
+    values = {**fields, "clusters": modes.clusters, "probe": probe(modes)}
     tensors = {name: values[name].to(kind) for name, (kind, _) in EXACT.items()}
-    write_atomically(path, to_bytes(tensors, {"coding": "exact", "reference": fields["reference"]}))
+    write_atomically(path, to_bytes(tensors, {"coding": "exact", "reference": fields["reference"], "seed": modes.seed}))
 
 
 def to_bytes(tensors: dict[str, Tensor], header: dict[str, Any]) -> bytes:
     """A file. The metadata is one entry: safetensors does not keep the order of several."""
     whole = {"format": FORMAT, "version": VERSION, **header}
     parts = {name: part.contiguous() for name, part in tensors.items()}
-    return save_tensors(parts, {"torch_modal": json.dumps(whole, sort_keys=True)})
+    return save_tensors(parts, {"torch_modal": json.dumps(whole, sort_keys=True, separators=(",", ":"))})
 
 
 def probe(modes: FixedModes) -> Tensor:
@@ -117,7 +116,7 @@ def _assembled(parts: dict[str, Tensor], header: dict[str, Any], cache_dir: str 
     """Check that all parts fit each other, and compute the modes."""
     x, faces = parts["keyframes"], parts["faces"]
     k_times, times, a, motions = (parts[name] for name in ("keyframe_times", "times", "amplitudes", "motions"))
-    clusters, pivots = parts["clusters"], parts["pivots"]
+    clusters, seed = parts["clusters"], header.get("seed")
     reference: Any = header.get("reference")
     n, v, t = len(x), x.shape[1], len(times)
     fits = (
@@ -130,21 +129,23 @@ def _assembled(parts: dict[str, Tensor], header: dict[str, Any], cache_dir: str 
         and len(k_times) in (n, n + 1)
         and len(a) == len(motions) == len(parts["errors"]) == t >= 1
         and motions.shape[1] == 6
-        and len(pivots) == a.shape[1]
         and len(clusters) > 0
         and bool((clusters > 0).all())
-        and int(clusters.sum()) == len(pivots)
+        and int(clusters.sum()) == a.shape[1]
+        and type(seed) is int
+        and 0 <= seed < N_SEEDS
+        and len(parts["probe"]) == N_PROBES
     )
     if not fits:
         raise ValueError("its parts do not fit each other")
-    if int(faces.min()) < 0 or int(faces.max()) >= v or int(pivots.min()) < 0 or int(pivots.max()) >= 3 * v:
+    if int(faces.min()) < 0 or int(faces.max()) >= v:
         raise ValueError("it names vertices that it does not have")
     finite = all(bool(part.isfinite().all()) for part in (x, k_times, times, a, motions))
     if not finite or bool((k_times.diff() <= 0).any()) or bool((times.diff() <= 0).any()):
         raise ValueError("its numbers are not finite, or its times do not ascend")
     if len(times) and (times[0] < k_times[0] or times[-1] > k_times[-1]):
         raise ValueError("it has frames before the first or after the last key-frame")
-    modes = fixed_modes(x[reference], faces, a.shape[1], clusters, pivots, cache_dir, cache)
+    modes = fixed_modes(x[reference], faces, a.shape[1], clusters, seed, cache_dir, cache)
     apart = float((probe(modes) - parts["probe"]).abs().max()) * 0.01
     if not apart <= PROBE_TOLERANCE:
         raise ValueError(

@@ -1,16 +1,17 @@
 """Modes that are the same wherever they are computed: of one key-frame, by the deterministic mesher.
 
 Two machines round differently. A mode then comes with either sign, and modes of nearly the same eigenvalue come mixed.
-What does not depend on that is the space of each cluster of eigenvalues, and in it the basis that is symmetric positive
-definite at a few chosen coordinates. Which coordinates, and where clusters end, the file says.
+What does not depend on that is the space of each cluster of eigenvalues, and in it the basis whose products with as
+many scattered directions are a symmetric positive definite matrix. Which directions, and where clusters end, the file
+says.
 """
 
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.linalg import qr
 from torch import Tensor
 
 from torch_modal.errors import MeshWarning
@@ -20,6 +21,8 @@ GAP = 1e-3
 """Relative gap between neighbouring eigenvalues that ends a cluster."""
 SPARE = 6
 """Further modes that are computed, so that the last cluster is whole."""
+N_SEEDS = 16
+"""Choices of directions, of which the clearest for all clusters is taken."""
 
 
 class FixedModes(NamedTuple):
@@ -29,8 +32,8 @@ class FixedModes(NamedTuple):
     """*Shape:* ``(k, V, 3)``."""
     clusters: Tensor
     """How many modes each cluster has. *Shape:* ``(C,)``."""
-    pivots: Tensor
-    """One coordinate, ``3 v + axis``, for each mode. *Shape:* ``(k,)``."""
+    seed: int
+    """Of the directions."""
 
 
 def fixed_modes(
@@ -38,7 +41,7 @@ def fixed_modes(
     faces: Tensor,
     n_modes: int,
     clusters: Tensor | None = None,
-    pivots: Tensor | None = None,
+    seed: int | None = None,
     cache_dir: str | None = None,
     cache: bool = True,
 ) -> FixedModes:
@@ -49,7 +52,7 @@ def fixed_modes(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: How many; a few more or fewer, if that would cut a cluster.
         clusters: As they were found elsewhere. Default: found here.
-        pivots: Likewise.
+        seed: Likewise.
         cache_dir: As for :func:`torch_modal.extract_modes`.
         cache: Likewise.
 
@@ -64,24 +67,37 @@ def fixed_modes(
         basis = extract_modes(
             reference, faces, min(n_modes + SPARE, most), mesher="lattice", cache_dir=cache_dir, cache=cache
         )
-    if clusters is None or pivots is None:
+    if clusters is None:
         clusters = _clusters(basis.eigenvalues, n_modes)
-    k = int(clusters.sum())
-    flat = basis.modes[:k].flatten(1).double()
-    parts, chosen, start = [], [], 0
-    for size in clusters.tolist():
-        own = flat[start : start + size]
-        if pivots is None:
-            rows = np.sort(qr(own.numpy(), mode="r", pivoting=True)[1][:size]).tolist()
-        else:
-            rows = pivots[start : start + size].tolist()
-        u, _, vh = torch.linalg.svd(own[:, rows].mT)
-        # own.T @ rotation has u diag(s) u^T at the chosen rows.
-        parts.append((own.mT @ (vh.mT @ u.mT)).mT)
-        chosen += rows
-        start += size
-    modes = torch.cat(parts).unflatten(1, (-1, 3))
-    return FixedModes(modes, clusters, torch.tensor(chosen))
+    sizes = clusters.tolist()
+    clusters_of_modes = basis.modes[: sum(sizes)].flatten(1).double().split(sizes)
+    if seed is None:
+        seed = max(range(N_SEEDS), key=lambda one: _clearness(clusters_of_modes, one))
+    directions = _directions(clusters_of_modes[0].shape[1], max(sizes), seed)
+    parts = []
+    for own in clusters_of_modes:
+        u, _, vh = torch.linalg.svd(own @ directions[: len(own)].mT)
+        parts.append(vh.mT @ u.mT @ own)  # of products vh.T diag(s) vh
+    return FixedModes(torch.cat(parts).unflatten(1, (-1, 3)), clusters, seed)
+
+
+def _directions(n: int, count: int, seed: int) -> Tensor:
+    """Scattered numbers from -1 to 1, by whole numbers alone. *Shape:* ``(count, n)``."""
+    found = np.arange(count * n, dtype=np.uint64) + np.uint64(seed << 40)
+    for factor in (0xBF58476D1CE4E5B9, 0x94D049BB133111EB):  # SplitMix64
+        found = (found ^ (found >> np.uint64(30))) * np.uint64(factor)
+    return torch.from_numpy((found >> np.uint64(40)).astype(np.float64) / 2**23 - 1).reshape(count, n)
+
+
+def _clearness(clusters_of_modes: Sequence[Tensor], seed: int) -> float:
+    """The smallest singular value of a cluster's products with the directions, over the sizes of its modes."""
+    sizes = [len(own) for own in clusters_of_modes]
+    directions = _directions(clusters_of_modes[0].shape[1], max(sizes), seed)
+    products = torch.cat(list(clusters_of_modes)) @ directions.mT
+    return min(
+        float(torch.linalg.svdvals(mine[:, : len(own)])[-1] / own.norm(dim=1).max())
+        for own, mine in zip(clusters_of_modes, products.split(sizes), strict=True)
+    )
 
 
 def _clusters(eigenvalues: Tensor, n_modes: int) -> Tensor:

@@ -1,19 +1,24 @@
-"""The compact coding of a motion: whole numbers, predicted, and packed by LZMA (a range coder of Python's library).
+"""The compact coding of a motion: whole numbers of key-frames, amplitudes and rigid motions, and faces.
 
-Key-frames are rounded to a grid, and predicted vertex by vertex; amplitudes and rigid motions are rounded to steps, and
-predicted from the frame before. All that is read is bounded by what the file can hold.
+Key-frames are rounded level by level (:mod:`torch_modal.sequence.codec_levels`). Amplitudes and rigid motions are zero
+at key-frames, so that what lies between two of them is a sum of sines, of which few are large; these are rounded. A
+range coder packs both, LZMA the faces. All that is read is bounded by what the file can hold.
 """
 
 import hashlib
 import lzma
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import fft
 from torch import Tensor
 
-from torch_modal.sequence.codec_prediction import WAYS, generations, residuals, restored
+from torch_modal.sequence.codec_entropy import Reader, Writer
+from torch_modal.sequence.codec_levels import DEAD, Levels
 
 PACKED = "packed"
 MOST_NUMBERS = 2**31
@@ -22,18 +27,29 @@ FREE_BYTES = 2**24
 MOST_PER_BYTE = 1000
 """And beyond that to this many for each byte."""
 FILTERS = [{"id": lzma.FILTER_LZMA1, "preset": 9, "lc": 0, "lp": 0, "pb": 0, "dict_size": 2**20}]
+FINER = 1024
+"""Steps of the grid of finished key-frames in a step of their numbers."""
+N_SHIFTS = 64
+"""Ways to lay that grid, of which one has no vertex near the boundaries of its cells."""
+BANDS = (8, 24)
+"""Modes, and sines (:data:`SINES`), whose numbers have a distribution of their own."""
+SINES = (1, 2)
+PROBE_UNIT = 8192
+"""Of the modes' probe, whole numbers in one."""
+MOST_PROBES = 64
 
 IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
 
 
+# ---------------------------------------------------------------------------------------------------------------- faces
 def squeeze(numbers: IntArray) -> Tensor:
     """Whole numbers, the smaller the better, as bytes: a plane for each byte of a number."""
     flat = numbers.reshape(-1)
     folded = np.where(flat > 0, 2 * flat - 1, -2 * flat).astype(np.uint64)
     width = max(1, (int(folded.max(initial=0)).bit_length() + 7) // 8)
     planes = b"".join(((folded >> np.uint64(8 * i)) & np.uint64(255)).astype(np.uint8).tobytes() for i in range(width))
-    data = bytes([width]) + lzma.compress(planes, lzma.FORMAT_RAW, filters=FILTERS)
-    return torch.from_numpy(np.frombuffer(data, dtype=np.uint8).copy())
+    return as_tensor(bytes([width]) + lzma.compress(planes, lzma.FORMAT_RAW, filters=FILTERS))
 
 
 def unsqueeze(packed: Tensor | None, count: int) -> IntArray:
@@ -46,15 +62,12 @@ def unsqueeze(packed: Tensor | None, count: int) -> IntArray:
     Raises:
         ValueError: There are others, or the bytes are damaged.
     """
-    if packed is None or packed.dtype != torch.uint8 or packed.dim() != 1 or len(packed) < 2:
-        raise ValueError("one of its parts is missing")
-    data = packed.numpy().tobytes()
+    data = as_bytes(packed)
     width = data[0]
     if not 1 <= width <= 8 or not 0 <= count <= MOST_NUMBERS:
         raise ValueError("one of its parts is damaged")
     size = width * count
-    if size > FREE_BYTES + MOST_PER_BYTE * len(data):
-        raise ValueError(f"it claims to hold {count} numbers in {len(data)} bytes")
+    require_room(size, len(data))
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=FILTERS)
     try:
         planes = unpacker.decompress(data[1:], max_length=size)
@@ -70,6 +83,32 @@ def unsqueeze(packed: Tensor | None, count: int) -> IntArray:
     return np.where(folded & np.uint64(1), half, -half)
 
 
+def require_room(n_bytes: int, packed: int) -> None:
+    """Refuse what claims to hold more than it can.
+
+    Raises:
+        ValueError: It does.
+    """
+    if n_bytes > FREE_BYTES + MOST_PER_BYTE * packed:
+        raise ValueError(f"it claims to hold {n_bytes} bytes in {packed}")
+
+
+def as_tensor(data: bytes) -> Tensor:
+    """Bytes of a file."""
+    return torch.from_numpy(np.frombuffer(data, dtype=np.uint8).copy())
+
+
+def as_bytes(packed: Tensor | None) -> bytes:
+    """The inverse.
+
+    Raises:
+        ValueError: They are not there, or are something else.
+    """
+    if packed is None or packed.dtype != torch.uint8 or packed.dim() != 1 or len(packed) < 2:
+        raise ValueError("one of its parts is missing")
+    return packed.numpy().tobytes()
+
+
 def pack_faces(faces: IntArray) -> Tensor:
     """Corners as differences from face to face."""
     return squeeze(np.diff(faces, axis=0, prepend=0).T)
@@ -80,66 +119,134 @@ def unpack_faces(packed: Tensor | None, n_faces: int) -> IntArray:
     return np.cumsum(unsqueeze(packed, 3 * n_faces).reshape(3, n_faces), axis=1).T
 
 
-def pack_shapes(grid: IntArray, faces: IntArray) -> tuple[Tensor, list[list[int]]]:
-    """Key-frames on a grid, each by the best way, and the best of the key-frames before as its guide.
+# ----------------------------------------------------------------------------------------------------------- key-frames
+class RoundedShapes:
+    """Key-frames that have been rounded, each with the help of an earlier one.
 
     Args:
-        grid: *Shape:* ``(K, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-
-    Returns:
-        All of them, and the way and the guide of each.
+        levels: Of their mesh.
+        shapes: In units in which their size is about one. *Shape:* ``(K, V, 3)``.
+        step: Of the numbers of their finest level.
     """
-    plan = generations(faces, grid.shape[1])
-    parts, ways = [], []
-    for n, x in enumerate(grid):
-        tried = {(0, 0): residuals(x, plan, WAYS[0], None)}
-        for guide in {0, n - 1} if n else set():
-            tried |= {(way, guide): residuals(x, plan, WAYS[way], grid[guide]) for way in (1, 2)}
-        best = min(tried, key=lambda key: len(squeeze(tried[key].T)))
-        parts.append(tried[best].T)
-        ways.append(list(best))
-    return squeeze(np.stack(parts)), ways
+
+    def __init__(self, levels: Levels, shapes: FloatArray, step: float) -> None:
+        self.step = step
+        self.numbers: list[list[IntArray]] = []
+        self.guides: list[int] = []
+        self.shifts: list[int] = []
+        grids: list[FloatArray] = []
+        for i, x in enumerate(shapes):
+            tried = []
+            for guide in sorted({0, i - 1}) if i else [-1]:
+                numbers, found = levels.rounded(x, step, grids[guide] if i else None)
+                size = sum(float(np.log2(1 + 2 * np.abs(each)).sum()) for each in numbers)
+                tried.append((size, guide, numbers, found))
+            _, guide, numbers, found = min(tried, key=lambda one: one[0])
+            shift = _quiet_shift(found, step)
+            grids.append(finished(found, step, shift))
+            self.numbers.append(numbers)
+            self.guides.append(guide)
+            self.shifts.append(shift)
+        #: What a reader will have. *Shape:* ``(K, V, 3)``.
+        self.shapes = np.stack(grids)
 
 
-def unpack_shapes(packed: Tensor | None, ways: Any, faces: IntArray, shape: tuple[int, int, int]) -> IntArray:
+def finished(x: FloatArray, step: float, shift: int) -> FloatArray:
+    """A shape on the finer grid, the same wherever it is computed."""
+    cell, offset = step / FINER, shift / N_SHIFTS
+    return (np.floor(x / cell + offset) + (0.5 - offset)) * cell
+
+
+def _quiet_shift(x: FloatArray, step: float) -> int:
+    """The grid whose boundaries are furthest from all vertices."""
+    parts = x / (step / FINER)
+
+    def margin(shift: int) -> float:
+        apart = np.mod(parts + shift / N_SHIFTS, 1)
+        return float(np.minimum(apart, 1 - apart).min())
+
+    return max(range(N_SHIFTS), key=margin)
+
+
+def _shape_kinds(levels: Levels, n_keyframes: int) -> tuple[IntArray, int]:
+    """Numbers of a level have one distribution in the first key-frame, another in all that have a guide."""
+    n = len(levels.levels)
+    one = np.concatenate([np.full(3 * len(level.vertices), i) for i, level in enumerate(levels.levels)])
+    return np.concatenate([one, np.tile(one + n, n_keyframes - 1)]), 2 * n
+
+
+def write_shapes(writer: Writer, levels: Levels, rounded: RoundedShapes) -> None:
+    """All key-frames."""
+    flat = np.concatenate([each.reshape(-1) for numbers in rounded.numbers for each in numbers])
+    writer.numbers(flat, *_shape_kinds(levels, len(rounded.numbers)))
+
+
+def read_shapes(
+    reader: Reader, levels: Levels, step: float, guides: Sequence[int], shifts: Sequence[int]
+) -> tuple[FloatArray, IntArray]:
+    """The key-frames, and their numbers."""
+    kinds, n_kinds = _shape_kinds(levels, len(guides))
+    flat = reader.numbers(kinds, n_kinds)
+    ends = np.cumsum([3 * len(level.vertices) for level in levels.levels])
+    shapes: list[FloatArray] = []
+    for own, guide, shift in zip(flat.reshape(len(guides), -1), guides, shifts, strict=True):
+        numbers = [part.reshape(-1, 3) for part in np.split(own, ends[:-1])]
+        found = levels.shape(numbers, step, shapes[guide] if shapes else None)
+        shapes.append(finished(found, step, shift))
+    return np.stack(shapes), flat
+
+
+# ----------------------------------------------------------------------------------------------------------- amplitudes
+def runs(keys: Sequence[int], n_frames: int, cyclic: bool) -> list[slice]:
+    """Frames between neighbouring key-frames."""
+    ends = [*keys, n_frames] if cyclic else list(keys)
+    return [slice(a + 1, b) for a, b in pairwise(ends) if b > a + 1]
+
+
+def to_sines(series: FloatArray, steps: FloatArray, between: list[slice]) -> IntArray:
+    """Columns over time, zero at key-frames, as rounded sines of each run. *Shape:* ``(T, n), (n,) -> (T, n)``."""
+    found = np.zeros(series.shape, dtype=np.int64)
+    for run in between:
+        parts = fft.dst(series[run], type=1, norm="ortho", axis=0) / steps
+        found[run] = (np.sign(parts) * np.floor(np.abs(parts) + 0.5 - DEAD)).astype(np.int64)
+    return found
+
+
+def from_sines(numbers: IntArray, steps: FloatArray, between: list[slice]) -> FloatArray:
+    """The inverse, of rounded numbers."""
+    found = np.zeros(numbers.shape)
+    for run in between:
+        found[run] = fft.idst(numbers[run] * steps, type=1, norm="ortho", axis=0)
+    return found
+
+
+def _series_kinds(n_modes: int, between: list[slice]) -> tuple[IntArray, int]:
+    """By bands of modes, and rigid motions, and by bands of sines. *Shape:* ``(frames between, n_modes + 6)``."""
+    columns = np.append(np.searchsorted(BANDS, np.arange(n_modes), side="right"), [len(BANDS) + 1] * 6)
+    rows = [np.searchsorted(SINES, np.arange(run.stop - run.start), side="right") for run in between]
+    n = len(SINES) + 1
+    kinds = columns * n + np.concatenate([*rows, np.zeros(0, dtype=np.int64)])[:, None]
+    return kinds.reshape(-1).astype(np.int64), n * (len(BANDS) + 2)
+
+
+def write_series(writer: Writer, numbers: IntArray, between: list[slice]) -> None:
+    """Sines of amplitudes and rigid motions. *Shape:* ``(T, k + 6)``."""
+    flat = np.concatenate([*(numbers[run].reshape(-1) for run in between), []]).astype(np.int64)
+    writer.numbers(flat, *_series_kinds(numbers.shape[1] - 6, between))
+
+
+def read_series(reader: Reader, shape: tuple[int, int], between: list[slice]) -> IntArray:
     """The inverse."""
-    n, v, _ = shape
-    left = unsqueeze(packed, n * v * 3).reshape(n, 3, v).transpose(0, 2, 1)
-    usable = isinstance(ways, list) and len(ways) == n
-    if not usable or any(w not in ([[0, 0]] + [[a, b] for a in (1, 2) for b in range(i)]) for i, w in enumerate(ways)):
-        raise ValueError("its key-frames are predicted in no known way")
-    if np.abs(left).max(initial=0) > 2**40:
-        raise ValueError("its key-frames are damaged")
-    plan = generations(faces, v)
-    grid = np.zeros(shape, dtype=np.int64)
-    for i, (way, guide) in enumerate(ways):
-        grid[i] = restored(np.ascontiguousarray(left[i]), plan, WAYS[way], grid[guide])
-    return grid
+    flat = reader.numbers(*_series_kinds(shape[1] - 6, between))
+    found, start = np.zeros(shape, dtype=np.int64), 0
+    for run in between:
+        end = start + (run.stop - run.start) * shape[1]
+        found[run] = flat[start:end].reshape(-1, shape[1])
+        start = end
+    return found
 
 
-def pack_series(numbers: IntArray) -> tuple[Tensor, int]:
-    """Columns over time, as differences of the order that packs best. *Shape:* ``(T, n)``."""
-    tried = []
-    for order in range(3):
-        left = numbers
-        for _ in range(order):
-            left = np.diff(left, axis=0, prepend=0)
-        tried.append(squeeze(left.T))
-    order = min(range(3), key=lambda i: len(tried[i]))
-    return tried[order], order
-
-
-def unpack_series(packed: Tensor | None, order: Any, shape: tuple[int, int]) -> IntArray:
-    """The inverse."""
-    numbers = unsqueeze(packed, shape[0] * shape[1]).reshape(shape[1], shape[0]).T
-    if order not in (0, 1, 2):
-        raise ValueError("its amplitudes are predicted in no known way")
-    for _ in range(order):
-        numbers = np.cumsum(numbers, axis=0)
-    return numbers
-
-
+# ---------------------------------------------------------------------------------------------------------- all of it
 def digest(*arrays: IntArray) -> str:
     """By which damage is seen, and a machine that predicts otherwise."""
     found = hashlib.sha256()
@@ -148,61 +255,90 @@ def digest(*arrays: IntArray) -> str:
     return found.hexdigest()[:16]
 
 
-def positions(grid: IntArray, low: list[float], step: float) -> Tensor:
-    """Of a grid; one multiplication and one sum, which are the same on all machines."""
-    return torch.from_numpy(np.asarray(low, dtype=np.float64) + np.float64(step) * grid.astype(np.float64))
+def exactly(x: FloatArray) -> IntArray:
+    """Floating-point numbers as the whole numbers that their bits are."""
+    return np.ascontiguousarray(x, dtype="<f8").view("<i8")
 
 
-def unpack(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, Tensor]:
+def positions(x: FloatArray, origin: Sequence[float], scale: float) -> Tensor:
+    """In the caller's units; one multiplication and one sum, which are the same on all machines."""
+    return torch.from_numpy(np.asarray(origin, dtype=np.float64) + np.float64(scale) * x)
+
+
+def unpack(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, Any]:
     """All parts of a sequence, but its modes.
 
     Raises:
         ValueError: They are damaged, or claim to hold more than they can.
     """
-    k, v, f, t, n = (header.get(name) for name in ("keyframes", "vertices", "faces", "frames", "modes"))
-    steps, low, keys = header.get("steps"), header.get("low"), header.get("keys")
-    counts = (k, v, f, t, n)
-    if any(isinstance(c, bool) or not isinstance(c, int) or not 1 <= c <= MOST_NUMBERS for c in counts):
+    counts, steps, origin, keys = (header.get(name) for name in ("counts", "steps", "origin", "keys"))
+    if not isinstance(counts, list) or len(counts) != 7:
         raise ValueError("its header is damaged")
-    if not _numbers(steps, 4) or not _numbers(low, 3) or any(s <= 0 for s in steps):  # type: ignore[union-attr]
+    if any(type(c) is not int or not 1 <= c <= MOST_NUMBERS for c in counts):
         raise ValueError("its header is damaged")
-    assert isinstance(k, int) and isinstance(v, int) and isinstance(f, int) and isinstance(t, int)
-    assert isinstance(n, int) and isinstance(steps, list) and isinstance(low, list)
-    if not isinstance(keys, list) or len(keys) != k or any(type(i) is not int or not 0 <= i < t for i in keys):
+    if not _numbers(steps, 5) or not _numbers(origin, 3) or any(s <= 0 for s in steps):  # type: ignore[union-attr]
+        raise ValueError("its header is damaged")
+    assert isinstance(steps, list) and isinstance(origin, list)
+    n_keys, v, f, t, k, n_clusters, n_probes = counts
+    if n_clusters > k or n_probes > MOST_PROBES:
+        raise ValueError("its header is damaged")
+    cyclic = bool(header.get("cyclic"))
+    if not _ascending(keys, n_keys, t, cyclic):
         raise ValueError("its header names key-frames that it does not have")
+    assert isinstance(keys, list)
+    guides, shifts = header.get("guides"), header.get("shifts")
+    if not _within(guides, [(-1, -1), *((0, i - 1) for i in range(1, n_keys))]):
+        raise ValueError("its key-frames are predicted in no known way")
+    if not _within(shifts, [(0, N_SHIFTS - 1)] * n_keys):
+        raise ValueError("its header is damaged")
     faces = unpack_faces(tensors.get("faces"), f)
     if faces.min() < 0 or faces.max() >= v or 3 * f < v // 1000:
         raise ValueError("it names vertices that it does not have")
-    grid = unpack_shapes(tensors.get("keyframes"), header.get("ways"), faces, (k, v, 3))
-    orders = header.get("orders")
-    if not isinstance(orders, list) or len(orders) != 2:
-        raise ValueError("its header is damaged")
-    a = unpack_series(tensors.get("amplitudes"), orders[0], (t, n))
-    motions = unpack_series(tensors.get("motions"), orders[1], (t, 6))
-    clusters = unsqueeze(tensors.get("clusters"), int(header.get("clusters", 0)))
-    pivots = unsqueeze(tensors.get("pivots"), n)
-    if digest(faces, grid, a, motions, clusters, pivots) != header.get("digest"):
+    data = as_bytes(tensors.get("motion"))
+    require_room(3 * n_keys * v + t * (k + 6), len(data))  # a number takes a byte, or less
+    reader, between = Reader(data), runs(keys, t, cyclic)
+    x, numbers = read_shapes(reader, Levels(faces, v), steps[0], guides, shifts)  # type: ignore[arg-type]
+    series = read_series(reader, (t, k + 6), between)
+    few = np.repeat([0, 1], [n_clusters, n_probes])
+    clusters, probe = np.split(reader.numbers(few, 2), [n_clusters])
+    if digest(faces, exactly(x), numbers, series, clusters, probe) != header.get("digest"):
         raise ValueError("its contents are not what was written: it is damaged")
-    when, probe = tensors.get("times"), tensors.get("probe")
-    cyclic = bool(header.get("cyclic"))
+    when = tensors.get("times")
     if when is None:
         when = torch.arange(t + cyclic, dtype=torch.float64)
-    if when.shape != (t + cyclic,) or when.dtype != torch.float64 or probe is None or probe.dtype != torch.float32:
-        raise ValueError("its times or its probe are damaged")
-    scale = np.array([steps[2]] * 3 + [steps[3]] * 3)
+    if when.shape != (t + cyclic,) or when.dtype != torch.float64:
+        raise ValueError("its times are damaged")
+    found = torch.from_numpy(from_sines(series, series_steps(k, *steps[1:4]), between))
     return {
-        "keyframes": positions(grid, low, steps[0]),
+        "keyframes": positions(x, origin, steps[4]),
         "faces": torch.from_numpy(np.ascontiguousarray(faces)),
         "keyframe_times": when[[*keys, t]] if cyclic else when[keys],
         "times": when[:t],
-        "amplitudes": torch.from_numpy(steps[1] * a.astype(np.float64)),
-        "motions": torch.from_numpy(scale * motions.astype(np.float64)),
+        "amplitudes": found[:, :k],
+        "motions": found[:, k:],
         "errors": torch.full((t,), torch.nan, dtype=torch.float64),
         "clusters": torch.from_numpy(clusters),
-        "pivots": torch.from_numpy(pivots),
-        "probe": probe.double(),
+        "probe": torch.from_numpy(probe / PROBE_UNIT),
     }
+
+
+def series_steps(n_modes: int, of_amplitudes: float, of_turns: float, of_moves: float) -> FloatArray:
+    """Of all columns. *Shape:* ``(k + 6,)``."""
+    return np.array([of_amplitudes] * n_modes + [of_turns] * 3 + [of_moves] * 3)
 
 
 def _numbers(found: Any, n: int) -> bool:
     return isinstance(found, list) and len(found) == n and all(type(s) is float and np.isfinite(s) for s in found)
+
+
+def _within(found: Any, limits: list[tuple[int, int]]) -> bool:
+    """Whether these are whole numbers within limits."""
+    if not isinstance(found, list) or len(found) != len(limits):
+        return False
+    return all(type(i) is int and low <= i <= high for i, (low, high) in zip(found, limits, strict=True))
+
+
+def _ascending(keys: Any, n: int, n_frames: int, cyclic: bool) -> bool:
+    if not _within(keys, [(0, n_frames - 1)] * n) or any(a >= b for a, b in pairwise(keys)):
+        return False
+    return keys[0] == 0 and (cyclic or keys[-1] == n_frames - 1)

@@ -3,36 +3,44 @@
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.extras import require_installed
 from torch_modal.io.files import write_atomically
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.progress import Progress
 from torch_modal.sequence import codec_packing as packing
-from torch_modal.sequence.codec import ERROR, ModalSequence, encode, fitted, with_worst
+from torch_modal.sequence.codec import ERROR, ModalSequence, chosen_keys, fitted, with_worst
+from torch_modal.sequence.codec_entropy import Writer
 from torch_modal.sequence.codec_file import probe, read_bytes, to_bytes
+from torch_modal.sequence.codec_levels import Levels
 from torch_modal.sequence.codec_modes import fixed_modes
 from torch_modal.sequence.times import checked_times
 
 OF_SELECTION = 0.7
 """Of the error, what is left for shapes between key-frames when these are chosen, before anything is rounded."""
-OF_KEYFRAMES = 0.85
-"""What rounding adds to key-frames."""
-MOST_OF_EDGE = 0.5
-"""Of the median edge, the step of the grid: beyond, triangles would be noise, and their modes with them."""
-OF_AMPLITUDES = 0.15
-OF_MOTIONS = 0.05
-PER_STEP = 0.48
-"""Mean length of what rounding adds to a point, in steps of the grid."""
+OF_KEYFRAMES = 0.9
+"""What rounding takes of it at key-frames, at first."""
+LESS, LEAST_OF_KEYFRAMES = 0.85, 0.5
+"""Where shapes between just fail to keep the error, it takes less, down to a limit; then key-frames are added."""
+FAR = 1.5
+"""Errors of so many times the promised one ask for more key-frames at once."""
+N_PROBES = 3
+"""Frames of an interval that are fitted to judge it."""
+OF_FIT = 0.97
+"""What it may be before amplitudes are rounded."""
+AMPLITUDES_TO_MOTIONS = 1e-3, 1e-3
+"""Steps of turns in radians, and of moves in units of the diagonal, over the step of amplitudes."""
 MAX_ROUNDS = 12
+HALVINGS = 5
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,7 @@ def compress(
     Raises:
         MeshError: Frames that cannot be used.
         ValueError: Numbers that cannot be used, or an error that could not be kept.
+        MissingPackageError: Without the extra ``compress``.
         OSError: The file cannot be written.
     """
     data, report = compressed(
@@ -119,102 +128,181 @@ def compressed(
     progress: Progress,
 ) -> tuple[bytes, Compressed]:
     """The bytes of the file. Arguments as for :func:`compress`."""
+    require_installed(("constriction",), "compress", "a small file of a motion")
     shapes, working_faces = check_keyframes(frames, faces, min_keyframes=2, warn=False)
     x, triangles = shapes.detach().cpu().double(), working_faces.cpu()
     when = checked_times(times, len(x), cyclic)
     kept = {"cache_dir": cache_dir, "cache": cache}
     with one_thread():
-        first = encode(
-            x,
-            triangles,
-            keyframes,
-            n_modes,
-            error=OF_SELECTION * error,
-            times=when,
-            cyclic=cyclic,
-            progress=progress,
-            **kept,  # type: ignore[arg-type]
-        )
-        keys = torch.nonzero(first.is_keyframe).flatten().tolist()
-        part = 1.0
+        problem = _Problem(x, triangles, when, cyclic, error, n_modes, kept, progress)
+        keys = chosen_keys(x, triangles, when, keyframes, n_modes, OF_SELECTION * error, cyclic, kept, progress)
+        part, limit = OF_KEYFRAMES, OF_FIT * error
         for _ in range(MAX_ROUNDS):
-            data, found, of_faces = _attempt(x, triangles, when, keys, cyclic, error, part, n_modes, kept, progress)
-            if float(found.max()) <= error:
-                return data, Compressed(len(data), of_faces, keys, found)
-            more = with_worst(keys, found, error)
-            # What key-frames exceed, only a finer grid can mend.
-            if more == keys or float(found[keys].max()) > error:
-                part *= 0.7
-            keys = more
-    raise ValueError(
-        f"the error of {error:g} could not be kept: the best found is {float(found.max()):.2g}; give a larger one"
-    )
+            attempt = problem.attempt(keys, part, problem.probes(keys))
+            if float(attempt.errors.max()) <= limit:
+                attempt = problem.attempt(keys, part)
+                if float(attempt.errors.max()) <= limit:
+                    return problem.packed(attempt)
+            worst = float(attempt.errors.max())
+            more = with_worst(keys, attempt.errors, limit)
+            if worst > FAR * error or part * LESS < LEAST_OF_KEYFRAMES:
+                # What key-frames exceed, only finer steps can mend.
+                part, keys = (OF_KEYFRAMES, more) if more != keys else (part * LESS, keys)
+            else:
+                part *= LESS
+    raise ValueError(f"the error of {error:g} could not be kept: the best found is {worst:.2g}; give a larger one")
 
 
-def _attempt(
-    x: Tensor,
-    faces: Tensor,
-    when: Tensor,
-    keys: list[int],
-    cyclic: bool,
-    error: float,
-    part: float,
-    n_modes: int,
-    kept: dict[str, Any],
-    progress: Progress,
-) -> tuple[bytes, Tensor, int]:
-    """The file of given key-frames, the errors of its frames, and the bytes of its connectivity."""
-    used = x[0, faces.unique()]
-    size = float((used.amax(0) - used.amin(0)).norm())
-    low = x[keys].amin((0, 1)).tolist()
-    edges = torch.from_numpy(Connectivity(faces.numpy(), x.shape[1]).edges.copy())
-    short = float(x[0, edges].diff(dim=1).norm(dim=-1).median())
-    step = part * min(OF_KEYFRAMES * error * size / PER_STEP, MOST_OF_EDGE * short)
-    grid = np.floor((x[keys].numpy() - np.asarray(low)) / step + 0.5).astype(np.int64)
-    rounded = packing.positions(grid, low, step)
-    modes = fixed_modes(rounded[0], faces, n_modes, **kept)
-    found = fitted(x, faces, when, rounded, keys, cyclic, modes, progress)
-    k = found.n_modes
-    of_amplitudes = part * OF_AMPLITUDES * error * (12 / k) ** 0.5 / 0.01
-    of_turns, of_moves = 8 * part * OF_MOTIONS * error, 2 * part * OF_MOTIONS * error
-    a = np.rint(found.amplitudes.numpy() / of_amplitudes).astype(np.int64)
-    m = np.rint(found.motions.numpy() / ([of_turns] * 3 + [of_moves] * 3)).astype(np.int64)
-    triangles = faces.numpy().astype(np.int64)
-    shapes, ways = packing.pack_shapes(grid, triangles)
-    (packed_a, order_a), (packed_m, order_m) = packing.pack_series(a), packing.pack_series(m)
-    clusters, pivots = modes.clusters.numpy(), modes.pivots.numpy()
-    tensors = {
-        "faces": packing.pack_faces(triangles),
-        "keyframes": shapes,
-        "amplitudes": packed_a,
-        "motions": packed_m,
-        "clusters": packing.squeeze(clusters),
-        "pivots": packing.squeeze(pivots),
-        "probe": probe(modes).float(),
-    }
-    if not torch.equal(when, torch.arange(len(when), dtype=torch.float64)):
-        tensors["times"] = when
-    header = {
-        "coding": packing.PACKED,
-        "reference": 0,
-        "keyframes": len(keys),
-        "vertices": x.shape[1],
-        "faces": len(triangles),
-        "frames": len(x),
-        "modes": k,
-        "clusters": len(clusters),
-        "keys": keys,
-        "cyclic": cyclic,
-        "low": low,
-        "steps": [step, of_amplitudes, of_turns, of_moves],
-        "ways": ways,
-        "orders": [order_a, order_m],
-        "digest": packing.digest(triangles, grid, a, m, clusters, pivots),
-    }
-    data = to_bytes(tensors, header)
-    read = ModalSequence(**read_bytes(data, "the file", **kept))
-    errors = (read.decode() - x).norm(dim=-1).mean(1) / size
-    return data, errors, len(tensors["faces"])
+class _Attempt(NamedTuple):
+    """Rounded key-frames, and what was fitted beside them."""
+
+    keys: list[int]
+    rounded: packing.RoundedShapes
+    motion: ModalSequence
+
+    @property
+    def errors(self) -> Tensor:
+        """Before amplitudes are rounded."""
+        return self.motion.errors
+
+
+class _Problem:
+    """Frames, and what is promised of them.
+
+    Args:
+        x: *Shape:* ``(T, V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
+        when: Of the frames; if cyclic, one more.
+        cyclic: Whether the last frame leads on to the first.
+        error: Mean distance over the diagonal of the first frame.
+        n_modes: Amplitudes of a frame.
+        kept: Where modes are kept.
+        progress: See :data:`torch_modal.progress.Progress`.
+    """
+
+    def __init__(
+        self,
+        x: Tensor,
+        faces: Tensor,
+        when: Tensor,
+        cyclic: bool,
+        error: float,
+        n_modes: int,
+        kept: dict[str, Any],
+        progress: Progress,
+    ) -> None:
+        self.x, self.faces, self.when, self.cyclic = x, faces, when, cyclic
+        self.error, self.n_modes, self.kept, self.progress = error, n_modes, kept, progress
+        used = x[0, faces.unique()]
+        self.size = float((used.amax(0) - used.amin(0)).norm())
+        #: The unit of what is rounded, and where it is counted from; short numbers.
+        self.scale = float(f"{self.size:.4g}")
+        self.origin = [float(f"{value:.4g}") for value in used.mean(0).tolist()]
+        self.triangles = faces.numpy().astype(np.int64)
+        self.levels = Levels(self.triangles, x.shape[1])
+
+    def rounded(self, keys: list[int], error: float) -> packing.RoundedShapes:
+        """Key-frames in the widest steps, about, with which none is off by more than an error."""
+        y = (self.x[keys].numpy() - np.asarray(self.origin)) / self.scale
+        best, low, high = None, error, 40 * error
+        for _ in range(HALVINGS):
+            step = float(f"{(low * high) ** 0.5:.3g}")
+            tried = packing.RoundedShapes(self.levels, y, step)
+            shapes = packing.positions(tried.shapes, self.origin, self.scale)
+            if float(self.distances(shapes, self.x[keys]).max()) <= error:
+                best, low = tried, step
+            else:
+                high = step
+        return best or packing.RoundedShapes(self.levels, y, float(f"{error:.3g}"))
+
+    def distances(self, x: Tensor, y: Tensor) -> Tensor:
+        """Mean of each frame, over the diagonal. *Shape:* ``(N, V, 3) -> (N,)``."""
+        return (x - y).norm(dim=-1).mean(1) / self.size
+
+    def errors(self, motion: ModalSequence) -> Tensor:
+        """Distances of all its frames, of which few are held at a time. *Shape:* ``(T,)``."""
+        rows = torch.arange(len(self.x)).split(64)
+        return torch.cat([self.distances(motion.decode(motion.times[part]), self.x[part]) for part in rows])
+
+    def probes(self, keys: list[int]) -> list[int]:
+        """A few frames between any two key-frames, and these."""
+        found = set(keys)
+        for run in packing.runs(keys, len(self.x), self.cyclic):
+            found |= set(np.linspace(run.start, run.stop - 1, N_PROBES + 2).round().astype(int).tolist()[1:-1])
+        return sorted(found)
+
+    def attempt(self, keys: list[int], part: float, only: list[int] | None = None) -> _Attempt:
+        """Of so much of the error at key-frames; errors of other frames than ``only`` are zero."""
+        rounded = self.rounded(keys, part * self.error)
+        shapes = packing.positions(rounded.shapes, self.origin, self.scale)
+        modes = fixed_modes(shapes[0], self.faces, self.n_modes, **self.kept)
+        motion = fitted(self.x, self.faces, self.when, shapes, keys, self.cyclic, modes, self.progress, only)
+        return _Attempt(keys, rounded, motion)
+
+    def packed(self, attempt: _Attempt) -> tuple[bytes, Compressed]:
+        """The file with the widest steps of amplitudes that keep the error, which is read again."""
+        motion, k = attempt.motion, attempt.motion.n_modes
+        between = packing.runs(attempt.keys, len(self.x), self.cyclic)
+        series = torch.cat([motion.amplitudes, motion.motions], 1).numpy()
+        decoder = motion.decoder
+
+        def tried(step: float) -> tuple[NDArray[np.int64], list[float], float]:
+            three = [step, *(float(f"{step * ratio:.3g}") for ratio in AMPLITUDES_TO_MOTIONS)]
+            steps = packing.series_steps(k, *three)
+            numbers = packing.to_sines(series, steps, between)
+            found = torch.from_numpy(packing.from_sines(numbers, steps, between))
+            new = replace(motion, amplitudes=found[:, :k], motions=found[:, k:])
+            new.__dict__["decoder"] = decoder
+            return numbers, three, float(self.errors(new).max())
+
+        low, high = 1e-3 * self.error / 0.01, 10 * self.error / 0.01
+        best = tried(float(f"{low:.3g}"))
+        for _ in range(HALVINGS + 2):
+            step = float(f"{(low * high) ** 0.5:.3g}")
+            new = tried(step)
+            if new[2] <= self.error:
+                best, low = new, step
+            else:
+                high = step
+        data, of_faces = self._file(attempt, *best[:2])
+        read = ModalSequence(**read_bytes(data, "the file", **self.kept))
+        errors = self.errors(read)
+        if float(errors.max()) > self.error:
+            raise ValueError(
+                f"the error of {self.error:g} could not be kept: the best found is {float(errors.max()):.2g}; give a "
+                "larger one"
+            )
+        return data, Compressed(len(data), of_faces, attempt.keys, errors)
+
+    def _file(self, attempt: _Attempt, series: NDArray[np.int64], steps: list[float]) -> tuple[bytes, int]:
+        """The bytes, and how many of them are the connectivity."""
+        keys, rounded, motion = attempt
+        between = packing.runs(keys, len(self.x), self.cyclic)
+        clusters = motion.modes.clusters.numpy()
+        told = np.rint(packing.PROBE_UNIT * probe(motion.modes).numpy()).astype(np.int64)
+        writer = Writer()
+        packing.write_shapes(writer, self.levels, rounded)
+        packing.write_series(writer, series, between)
+        writer.numbers(np.concatenate([clusters, told]), np.repeat([0, 1], [len(clusters), len(told)]), 2)
+        flat = np.concatenate([each.reshape(-1) for numbers in rounded.numbers for each in numbers])
+        tensors = {"faces": packing.pack_faces(self.triangles), "motion": packing.as_tensor(writer.data())}
+        if not torch.equal(self.when, torch.arange(len(self.when), dtype=torch.float64)):
+            tensors["times"] = self.when
+        counts = [len(keys), self.x.shape[1], len(self.faces), len(self.x), motion.n_modes, len(clusters), len(told)]
+        header = {
+            "coding": packing.PACKED,
+            "reference": 0,
+            "seed": motion.modes.seed,
+            "counts": counts,
+            "keys": keys,
+            "guides": rounded.guides,
+            "shifts": rounded.shifts,
+            "cyclic": self.cyclic,
+            "origin": self.origin,
+            "steps": [rounded.step, *steps, self.scale],
+            "digest": packing.digest(self.triangles, packing.exactly(rounded.shapes), flat, series, clusters, told),
+        }
+        return to_bytes(tensors, header), len(tensors["faces"])
 
 
 @contextlib.contextmanager
