@@ -10,12 +10,12 @@ motion (truth), the same fist with other vertices and faces (scan.ply; landmarks
 import argparse
 from pathlib import Path
 
-import fast_simplification
 import numpy as np
 import torch
 import trimesh
 
 from torch_modal.data.samples import load_sample
+from torch_modal.geometry.decimation import decimate
 
 
 def write(path: Path, shape: torch.Tensor, faces: torch.Tensor) -> None:
@@ -26,18 +26,16 @@ def write(path: Path, shape: torch.Tensor, faces: torch.Tensor) -> None:
 
 def write_scan(path: Path, shape: torch.Tensor, faces: torch.Tensor) -> None:
     """The same surface with half of the faces, its vertices in another order, turned and moved; and five landmarks."""
-    points, triangles = fast_simplification.simplify(
-        100 * shape.numpy(), faces.numpy().astype(np.int32), target_count=len(faces) // 2
-    )
+    points, triangles, _ = decimate(shape.numpy(), faces.numpy(), len(faces) // 2)
     order = np.random.default_rng(0).permutation(len(points))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     marks = np.linspace(0, len(shape) - 1, 5).astype(int)
-    nearest = ((100 * shape.numpy()[marks, None] - points) ** 2).sum(-1).argmin(1)
+    nearest = ((shape.numpy()[marks, None] - points) ** 2).sum(-1).argmin(1)
     lines = [f"{mark} {place[near]}\n" for mark, near in zip(marks, nearest, strict=True)]
     path.with_name("pairs.txt").write_text("".join(["# open.obj scan.ply\n", *lines]))
     turn = trimesh.transformations.rotation_matrix(0.5, (0, 1, 0))[:3, :3]
-    write(path, torch.from_numpy(points[order] / 100 @ turn.T + 0.2), torch.from_numpy(place[triangles]))
+    write(path, torch.from_numpy(points[order] @ turn.T + 0.2), torch.from_numpy(place[triangles]))
 
 
 def main(folder: Path) -> None:

@@ -16,10 +16,11 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 def load_example(name: str) -> ModuleType:
     """An example as a module, as ``python examples/name.py`` would run it."""
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    path = EXAMPLES / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(EXAMPLES))  # where it finds the examples beside it
+    sys.path.insert(0, str(path.parent))  # where it finds the examples beside it
     sys.modules[name] = module  # its named tuples look their annotations up there
     spec.loader.exec_module(module)
     return module
@@ -105,11 +106,40 @@ def test_motion_from_markers_is_nearer_than_pca_and_than_the_path() -> None:
 
 @pytest.mark.slow
 def test_figures_of_the_paper_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    load_example("paper/run").main(tmp_path)
+    """Those of the samples; the others have tests of their own."""
+    load_example("paper/run").main(tmp_path, ["1", "3", "6"])
     assert sorted(path.name for path in tmp_path.glob("*.png")) == [f"paper-figure{n}.png" for n in (1, 3, 6)]
     said = capsys.readouterr().out
-    errors = [float(line.split()[-2]) for line in said.splitlines() if "edge error" in line]
+    errors = [float(line.split()[-2]) for line in said.splitlines() if "edge error, quarters" in line]
     assert errors[2] < errors[1] < errors[0]  # ours, Eq. 4, linear
+    head, _, ours, theirs = load_example("paper/table1").main(tmp_path, names=["hand"])
+    assert head.count("|") == ours.count("|") == theirs.count("|")
+
+
+@pytest.mark.slow
+def test_local_interpolation_mends_the_worst_regions(tmp_path: Path) -> None:
+    lines = load_example("paper/figure5").main(tmp_path)
+    plain, local, own = ([float(word) for word in line.split()[-6::2]] for line in lines[1:])
+    assert local[1] < 0.5 * plain[1] and own[1] < 0.5 * local[1]  # in the regions
+    assert own[0] < 0.5 * local[0] < 0.5 * plain[0]
+    assert (tmp_path / "paper-figure5.png").stat().st_size > 50_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "cell"), [(2, 0.05), (7, 0.018)])
+def test_sculpted_figures_of_the_paper_are_drawn(tmp_path: Path, number: int, cell: float) -> None:
+    found = load_example(f"paper/figure{number}").main(tmp_path, cell=cell, levels=1)
+    errors = [float(line.split("%")[0].split()[-1]) for line in found[1:]]
+    assert errors[-1] < 0.5 * errors[-2]  # ours, and Eq. 4 before it
+    assert (tmp_path / f"paper-figure{number}.png").stat().st_size > 30_000
+
+
+@pytest.mark.slow
+def test_figure_8_keeps_the_length_of_the_tail(tmp_path: Path) -> None:
+    found = load_example("paper/figure8").main(tmp_path, cell=0.042, across=False)
+    ours = [float(word) for line in found if line.startswith("poses   torch_modal") for word in line.split()[2:]]
+    assert len(ours) == 3 and all(abs(ratio - 1) < 0.03 for ratio in ours)
+    assert (tmp_path / "paper-figure8-poses.png").stat().st_size > 30_000
 
 
 @pytest.mark.slow

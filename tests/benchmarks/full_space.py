@@ -58,6 +58,8 @@ def full_space(
     beta: float = 10.0,
     gamma: float = 1000.0,
     example_based: bool = False,
+    fixed: Tensor | None = None,
+    size: float | None = None,
     max_steps: int = 100,
     tolerance: float = 1e-8,
 ) -> FullSpaceResult:
@@ -78,6 +80,8 @@ def full_space(
         gamma: Volume stiffness.
         example_based: One reference whose lengths, angles, volume and weights are interpolated between those of the
             key-frames, in place of two (Froehlich and Botsch 2011).
+        fixed: Vertices that stay where the start has them. *Shape:* ``(V,)``, bool.
+        size: Bounding-box diagonal of the whole that these shapes are a part of. Default: that of ``x_a``.
         max_steps: Newton steps at most.
         tolerance: The energy stagnates when five steps together gain less than this part of it.
 
@@ -89,10 +93,10 @@ def full_space(
     if x_a.shape != x_b.shape or x_a.dim() != 2 or x_a.shape[-1] != 3:
         raise ValueError(f"x_a and x_b are both of shape (V, 3); got {tuple(x_a.shape)} and {tuple(x_b.shape)}")
     first, second = (x.detach().cpu().double() for x in (x_a, x_b))
-    size = (first.amax(0) - first.amin(0)).norm()
-    if not bool(torch.isfinite(size + second.sum())) or size == 0:
+    own = (first.amax(0) - first.amin(0)).norm()
+    if not bool(torch.isfinite(own + second.sum())) or own == 0:
         raise ValueError("x_a and x_b must be finite and x_a must have a size; check them for NaN and infinity")
-    scale = DIAGONAL / size
+    scale = DIAGONAL / (own if size is None else size)
     faces = torch.as_tensor(faces).cpu().long()
     weights = torch.from_numpy(connectivity.vertex_areas(first.numpy(), faces.numpy()))
     first, second = first * scale, second * scale
@@ -110,9 +114,9 @@ def full_space(
     reference = energy.between(rests[0], rests[1], at_t, stiffness)
     if example_based:
         reference = Energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
-    rows, energies, stagnated, n_held = _minimise(
-        energy, faces, x.T[:, None].contiguous(), reference, max_steps, tolerance
-    )
+    start_rows = x.T[:, None].contiguous()
+    fixed = torch.zeros(len(first), dtype=torch.bool) if fixed is None else fixed
+    rows, energies, stagnated, n_held = _minimise(energy, faces, start_rows, reference, fixed, max_steps, tolerance)
     shape = motion.apply(rows[:, 0].T) / scale
     return FullSpaceResult(shape.to(x_a), energies, stagnated, n_held)
 
@@ -127,16 +131,22 @@ def _interpolated(energy: Energy, first: Rest, second: Rest, t: float) -> Rest:
 
 
 def _minimise(
-    energy: Energy, faces: Tensor, rows: Tensor, reference: Reference, max_steps: int, tolerance: float
+    energy: Energy,
+    faces: Tensor,
+    rows: Tensor,
+    reference: Reference,
+    fixed: Tensor,
+    max_steps: int,
+    tolerance: float,
 ) -> tuple[Tensor, list[float], bool, int]:
     assembly = _Assembly(energy)
     energies = [float(energy.value(energy.extend(rows), reference))]
     held = torch.zeros(rows.shape[-1], dtype=torch.bool)
     for _ in range(max_steps):
         held = _held(faces, rows)
-        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held)
+        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held | fixed)
         for length in STEP_LENGTHS:
-            moved = rows + length * direction
+            moved = rows + length * torch.where(fixed, 0, direction)
             found = float(energy.value(energy.extend(moved), reference))
             if found < energies[-1]:
                 break

@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from cases import HALF, Case
 from full_space import full_space
+from geodesic import geodesic
+from reduced import ReducedPair, froehlich_botsch
 from timing import timed
 
 import torch_modal as tm
@@ -151,6 +153,22 @@ def full(case: Case) -> Outcome:
 def example_based(case: Case) -> Outcome:
     """One reference with interpolated lengths, angles and volume, over all vertices, from a linear start."""
     return by_full_space(case, lambda x_a, x_b, t, k: full_space(x_a, x_b, case.faces, t, example_based=True))
+
+
+@method("Froehlich-Botsch", half_only=True)
+def example_based_reduced(case: Case) -> Outcome:
+    """The same as its authors have it: on a decimated mesh, and back by deformation transfer."""
+    reduced = ReducedPair(case.x_a, case.x_b, case.faces, 1000)
+    return Outcome(*timed(lambda: torch.stack([froehlich_botsch(reduced, t) for t in case.times])))
+
+
+@method("geodesic")
+def isometric_geodesic(case: Case) -> Outcome:
+    """As-isometric-as-possible (Kilian et al. 2007): eight steps, all optimised together, from coarse to fine."""
+    begin = time.process_time()
+    found = geodesic(case.x_a, case.x_b, case.faces)
+    seconds = time.process_time() - begin
+    return Outcome(found.at(torch.tensor(case.times, dtype=case.x_a.dtype)), seconds, f"{sum(found.iterations)} steps")
 
 
 @method("morphomatics")
