@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import Shapes
@@ -14,9 +15,15 @@ from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.contact import Contact
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.terms import Mesh, Term
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.contacts import Search
+from torch_modal.geometry.crossings import Crossings
+from torch_modal.nn import trees
+from torch_modal.nn.contact import Contacts
 from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence.contact import splines
+from torch_modal.sequence.region import Region
 
 pytest.importorskip("ipctk")
 DOUBLE = torch.float64
@@ -159,6 +166,40 @@ def test_missing_extra_is_said_before_any_work(hand: Shapes, monkeypatch: pytest
             make()
 
 
+# -------------------------------------------------------------------------------------------------------------- region
+@pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
+def test_kernels_and_torch_see_the_same_region(hand: Shapes, smooth: bool, generator: torch.Generator) -> None:
+    pytest.importorskip("warp")
+    x_a = hand.keyframes[0]
+    near = x_a[:, 1] > x_a[:, 1].median()
+    t = torch.tensor([0.3, 0.6], dtype=DOUBLE)
+    three = hand.pick(0, 1, 0)
+    results = []
+    for backend in ("torch", "warp"):
+        path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
+        member = path.layer.members[0]
+        samples = path.samples(three.keyframes[None], 0, torch.zeros(2, dtype=torch.int64), t)
+        pair = member.placed(samples)
+        region = Region(member, samples, pair, near)
+        touching = torch.cat([hand.faces[:4], region.vertices[-4:, None]], 1)
+        touching[:, :3] = region.vertices[:12].reshape(4, 3)
+        weights = torch.tensor([[3.0, 0, 1, 2], [0, 2, 1, 0]], dtype=DOUBLE)
+        region.hold(Contacts(torch.arange(2), touching, weights, torch.full_like(weights, 90.0)))
+        rows = trees.picked(pair.first, samples.which)[:, region.vertices].movedim(-1, 0)
+        generator.manual_seed(0)
+        field = torch.randn(rows.shape, dtype=DOUBLE, generator=generator)
+        rows = rows + 0.05 * field
+        value, gradient, blocks, at = region.linearised(rows)
+        (exact,) = torch.autograd.grad(region.held.value(x := rows.clone().requires_grad_()), x)
+        torch.testing.assert_close(region.held.linearised(rows).gradient, exact)
+        whole = region.value(rows)
+        results.append([value, gradient, blocks, region.product(at, field), whole - region.value(rows + 0.01 * field)])
+        torch.testing.assert_close(value, whole)
+    for name, a, b in zip(["value", "gradient", "blocks", "product", "fall"], *results, strict=True):
+        if name != "value":  # kernels leave out the constant
+            torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8 * float(b.abs().max()), msg=name)
+
+
 # ------------------------------------------------------------------------------------------------------------ sequence
 def test_splines_vanish_at_the_ends_and_know_their_curvature() -> None:
     t = torch.linspace(0, 1, 4001, dtype=DOUBLE)
@@ -191,6 +232,25 @@ def test_path_takes_any_time(hand: Shapes) -> None:
     assert int(solution.n_crossing.sum()) == 0
     torch.testing.assert_close(alone, shapes[2], rtol=0, atol=1e-6)  # the time alone says what a shape is
     assert torch.equal(shapes[3], hand.keyframes[1])
+
+
+def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> None:
+    mesh = Connectivity(hand.faces.numpy(), hand.keyframes.shape[1])
+    known = hand.keyframes.numpy().copy()
+    x = hand.keyframes[0]
+    tip = x[:, 0].argmin()
+    known[0, :, 0] += (0.22 * torch.exp(-(((x - x[tip]).norm(dim=-1) / 0.12) ** 2))).numpy()
+    search = Search(Crossings(mesh, known))
+    depth = search.tolerated
+    assert depth[:, 1].max() == 0 < depth[:, 0].max() < 0.1 and depth[tip, 0] > 0
+    assert np.linalg.norm(known[0][depth[:, 0] > 0] - known[0][tip], axis=1).max() < 0.5 * search.crossings.diagonal
+    slack = np.array([[0.02, 0.0]])
+    course = [float(search.tolerance(slack, t, 10.0)[0, 0]) for t in (0.0, 0.05, 0.09, 0.11, 0.5)]
+    assert course[0] == 1 and course[3:] == [0, 0] and sorted(course, reverse=True) == course
+    # Where all else is slow it takes longer, at most half of the time.
+    assert search.tolerance(slack, 0.2, 0.1)[0, 0] > 0 == search.tolerance(slack, 0.51, 1e-6)[0, 0]
+    pairs = np.array([[int(face) for face in torch.nonzero((hand.faces == tip).any(1)).flatten()[:2]]])
+    assert search.n_left(pairs, 0.02, 10.0) == 0 and search.n_left(pairs, 0.5, 10.0) == 1
 
 
 def test_smooth_path_through_three_keyframes(hand: Shapes) -> None:

@@ -4,6 +4,7 @@ A vertex is held by a face where parts went through each other, or nearly touch 
 by a face that it was behind in a known shape: what touches or crosses itself there is left as it is.
 """
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,14 @@ NEAR = 0.015
 """How far in front of a face a vertex is watched, beside a place where parts went through each other."""
 FACING = -0.1
 """Most cosine between the normals of a vertex and of a face that face each other."""
+DEEP = 0.12
+"""Along the surface: how far from where it crosses what went in is looked for."""
+SPREAD = 0.05
+"""How far along the surface from where a key-frame passes through itself the same depth is tolerated."""
+LENIENT = 0.1, 0.5
+"""Least and largest part of the time between two key-frames over which what crosses in one of them is pushed out."""
+HURRY = 2.0
+"""The square of that time is so many times the depth over the largest acceleration."""
 _STRAIGHT = 0.7
 """Least part of the distance that lies along the face's normal; less is beside the face, not before it."""
 _BEHIND = 0.02
@@ -35,9 +44,9 @@ class Held(NamedTuple):
     faces: IntArray
     """*Shape:* ``(n,)``."""
     slack: FloatArray
-    """How far behind the face the vertex was in each known shape; 0 if in front. *Shape:* ``(n, K)``."""
-    n_far: int
-    """Pairs of triangles that went through each other."""
+    """How deep they may be beside each known shape; 0 where nothing passes through itself. *Shape:* ``(n, K)``."""
+    far: IntArray
+    """Pairs of triangles that went through each other. *Shape:* ``(P, 2)``."""
     watched: BoolArray
     """Vertices beside places where they do, or did in an earlier search. *Shape:* ``(V,)``."""
 
@@ -66,18 +75,58 @@ class Search:
         pairs = crossings.pairs(x)
         pairs = pairs[crossings.is_far(pairs)]
         seeds = np.zeros(len(x), dtype=bool) if watched is None else watched.copy()
-        inside = crossings.inside(x, pairs)
-        if len(pairs):
-            seeds |= crossings.grown(crossings.mesh.faces[pairs.reshape(-1)].reshape(-1), 2)
-            seeds |= crossings.grown(np.flatnonzero(inside))
         none = np.zeros(0, np.int64)
-        if not seeds.any():
-            return Held(none, none, np.zeros((0, len(self._known))), 0, seeds)
+        if not len(pairs) and not seeds.any():
+            return Held(none, none, np.zeros((0, len(self._known))), pairs, seeds)
+        corners = np.zeros(len(x), dtype=bool)
+        corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
+        before = crossings.known_inside
+        winds = crossings.winds(x, crossings.within(corners, DEEP) | (seeds & before))
+        inside = crossings.hanging(winds & ~before, corners)
+        seeds |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
         # What was inside in a key-frame is not to go in elsewhere.
-        asked = np.flatnonzero(seeds & crossings.known_inside)
-        stuck = np.zeros(len(x), dtype=bool)
-        stuck[asked[crossings.winding(x, asked) > 0.5]] = True
-        return Held(*self.opposite(x, seeds, inside, stuck), len(pairs), seeds)
+        stuck = winds & before & seeds
+        return Held(*self.opposite(x, seeds, inside, stuck), pairs, seeds)
+
+    def tolerance(self, slack: FloatArray, t: float, acceleration: float) -> FloatArray:
+        """How much of what crosses in both key-frames is tolerated between them: all at their times, nothing later.
+
+        Args:
+            slack: Depths in the key-frames. *Shape:* ``(..., 2)``.
+            t: The time, from 0 to 1.
+            acceleration: The largest of a vertex. Deep crossings are pushed out more slowly where all else is slow.
+
+        Returns:
+            From 0 to 1; 0 where there is no depth. *Shape:* ``(..., 2)``.
+        """
+        lasting = np.clip(np.sqrt(HURRY * slack / max(acceleration, 1e-9)), *LENIENT)
+        part = np.clip(1 - np.array([t, 1 - t]) / lasting, 0, 1)
+        return (slack > 0) * part * part * (3 - 2 * part)  # type: ignore[no-any-return]
+
+    def n_left(self, pairs: IntArray, t: float, acceleration: float) -> int:
+        """How many pairs of faces are not beside what is tolerated. *Shape:* ``(P, 2)``."""
+        if not len(pairs) or not self._known:
+            return len(pairs)
+        slack = self.tolerated[self.crossings.mesh.faces[pairs]].max((1, 2))
+        return int((self.tolerance(slack, t, acceleration) <= 0).all(1).sum())
+
+    @cached_property
+    def tolerated(self) -> FloatArray:
+        """How deep each known shape passes through itself around each vertex. *Shape:* ``(V, K)``."""
+        crossings = self.crossings
+        found = np.zeros((crossings.mesh.n_vertices, len(crossings.known)))
+        alone = Search(Crossings(crossings.mesh, crossings.known[:0], crossings.like))
+        for k, x in enumerate(crossings.known):
+            pairs = crossings.pairs(x)
+            deep = alone.depth(x, pairs[crossings.far_apart(pairs)])
+            own = np.flatnonzero(deep)
+            patch = connected_components(crossings.adjacency[own][:, own], directed=False)[1]
+            for number in np.unique(patch):
+                mine = np.zeros(len(x), dtype=bool)
+                mine[own[patch == number]] = True
+                around = crossings.within(mine, SPREAD)
+                found[around, k] = np.maximum(found[around, k], deep[mine].max())
+        return found
 
     def opposite(
         self, x: FloatArray, seeds: BoolArray, inside: BoolArray, stuck: BoolArray
@@ -127,8 +176,10 @@ class Search:
         order = np.lexsort((distance, v))
         first = order[np.flatnonzero(np.diff(v[order], prepend=-1))]
         v, f, both = v[first], f[first], np.stack(slack, 1)[first] if slack else np.zeros((len(first), 0))
+        both = np.maximum(both, np.maximum(self.tolerated[v], self.tolerated[corners[f]].max(1)))
         # Folds are inside, too, where they are in a key-frame.
-        keep = ~stuck[v] | crossings.apart(v, f)
+        keep = np.ones(len(v), dtype=bool)
+        keep[stuck[v]] = crossings.apart(v[stuck[v]], corners[f[stuck[v]]])
         return v[keep], f[keep], both[keep]
 
     def depth(self, x: FloatArray, pairs: IntArray) -> FloatArray:

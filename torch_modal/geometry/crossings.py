@@ -72,6 +72,8 @@ class Crossings:
         self.like = known[0] if like is None else like
         used = self.like[np.unique(mesh.faces)]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
+        #: Of vertices that were asked for, those within :data:`FAR`.
+        self._near: dict[int, IntArray] = {}
 
     # ------------------------------------------------------------------------------------------------- once for a mesh
     @cached_property
@@ -186,22 +188,35 @@ class Crossings:
         if self._around_known is not None and far.any():
             at = np.flatnonzero(far)
             far[at] = np.asarray(self._around_known[pairs[at, 0], pairs[at, 1]]).reshape(-1) == 0
-        at = np.flatnonzero(far)
-        first, which = np.unique(pairs[at, 0], return_inverse=True)
-        limit, faces = FAR * self.diagonal, self.mesh.faces
-        for k, face in enumerate(first):
-            mine = at[which.reshape(-1) == k]
-            reached = dijkstra(self.lengths, indices=faces[face], min_only=True, limit=limit)
-            far[mine] = (~np.isfinite(reached[faces[pairs[mine, 1]]])).all(1)
+        far[far] = self.far_apart(pairs[far])
         return far
 
+    def far_apart(self, pairs: IntArray) -> BoolArray:
+        """Which pairs are more than :data:`FAR` apart along the surface. *Shape:* ``(P, 2) -> (P,)``."""
+        faces = self.mesh.faces
+        found = [self.apart(faces[pairs[:, 0], corner], faces[pairs[:, 1]]) for corner in range(3)]
+        return np.all(found, axis=0)
+
     def apart(self, vertices: IntArray, faces: IntArray) -> BoolArray:
-        """Whether a vertex and a face are more than :data:`FAR` apart along the surface. *Shape:* ``(n,)`` each."""
-        found = np.ones(len(vertices), dtype=bool)
-        for k, (vertex, face) in enumerate(zip(vertices, faces, strict=True)):
-            reached = dijkstra(self.lengths, indices=vertex, limit=FAR * self.diagonal)
-            found[k] = not np.isfinite(reached[self.mesh.faces[face]]).any()
-        return found
+        """Whether a vertex and a face are more than :data:`FAR` apart along the surface.
+
+        Args:
+            vertices: *Shape:* ``(n,)``.
+            faces: Their corners. *Shape:* ``(n, 3)``.
+        """
+        own, which = np.unique(vertices, return_inverse=True)
+        new = [v for v in own.tolist() if v not in self._near]
+        for part in np.array_split(new, -(-len(new) // 256) or 1):
+            reached = dijkstra(self.lengths, indices=part, limit=FAR * self.diagonal) if len(part) else []
+            self._near.update((int(v), np.flatnonzero(np.isfinite(row))) for v, row in zip(part, reached, strict=True))
+        n = self.mesh.n_vertices
+        if not len(own):
+            return np.ones(0, dtype=bool)
+        # Sorted, as they are put together.
+        codes = np.concatenate([k * n + self._near[v] for k, v in enumerate(own.tolist())])
+        wanted = which.reshape(-1, 1) * n + faces
+        found = codes[np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)] == wanted
+        return ~found.any(1)  # type: ignore[no-any-return]
 
     def within(self, vertices: BoolArray, part: float) -> BoolArray:
         """Vertices within a part of the diagonal of given ones, along the surface. *Shape:* ``(V,) -> (V,)``."""
@@ -244,18 +259,24 @@ class Crossings:
             x: *Shape:* ``(V, 3)``.
             pairs: Faces that cross far from each other. *Shape:* ``(P, 2)``.
         """
-        inside = np.zeros(self.mesh.n_vertices, dtype=bool)
-        if not len(pairs):
-            return inside
-        seeds = self.grown(self.mesh.faces[pairs.reshape(-1)].reshape(-1))
-        # Nothing is nearer to the crossings than those that cross: only what could hang together with them is asked.
-        found = np.flatnonzero(self.winding(x, np.arange(len(x))) > 0.5)
-        found = found[~self.known_inside[found]]
-        if not len(found):
-            return inside
-        _, label = connected_components(self.adjacency[found][:, found], directed=False)
-        inside[found[np.isin(label, np.unique(label[seeds[found]]))]] = True
+        corners = np.zeros(self.mesh.n_vertices, dtype=bool)
+        corners[self.mesh.faces[pairs.reshape(-1)]] = True
+        inside = self.winds(x, np.ones(len(x), dtype=bool) if len(pairs) else corners)
+        return self.hanging(inside & ~self.known_inside if len(self.known) else inside, corners)
+
+    def winds(self, x: FloatArray, asked: BoolArray) -> BoolArray:
+        """Which of some vertices are inside by winding number. *Shape:* ``(V, 3), (V,) -> (V,)``."""
+        inside, asked_ = np.zeros(len(x), dtype=bool), np.flatnonzero(asked)
+        inside[asked_] = self.winding(x, asked_) > 0.5
         return inside
+
+    def hanging(self, vertices: BoolArray, seeds: BoolArray) -> BoolArray:
+        """Vertices that hang together with others, or with the ring around them. *Shape:* ``(V,), (V,) -> (V,)``."""
+        own, kept = np.flatnonzero(vertices), np.zeros(len(vertices), dtype=bool)
+        if len(own) and seeds.any():
+            label = connected_components(self.adjacency[own][:, own], directed=False)[1]
+            kept[own[np.isin(label, np.unique(label[self.grown(np.flatnonzero(seeds))[own]]))]] = True
+        return kept
 
     def grown(self, vertices: IntArray, rings: int = 1) -> BoolArray:
         """A set of vertices and the rings around it. *Shape:* ``(n,) -> (V,)``."""

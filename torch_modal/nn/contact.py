@@ -1,6 +1,8 @@
 """Contacts of a batch of in-betweens: what is held in each, as a term of the modal solve and of the fine steps."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import torch
@@ -18,9 +20,6 @@ ROUNDS = 4
 FINE_STEPS = 3
 FINE_PRODUCTS = 20
 """Newton steps of all vertices with contacts, and iterations in each: contacts are stiff."""
-
-LENIENT = 0.1
-"""Part of the time between two key-frames over which what crosses in one of them is pushed out."""
 
 
 class Contacts(NamedTuple):
@@ -89,28 +88,40 @@ class ContactSearch:
         second: Likewise.
         which: The pair of each sample; each its own where None. *Shape:* ``(B,)``.
         t: Times. *Shape:* ``(B,)``.
+        acceleration: The largest of a vertex in the course that the samples are of; the time between the key-frames is
+            the unit.
     """
 
-    def __init__(self, mesh: Mesh, first: Tensor, second: Tensor, which: Tensor | None, t: Tensor) -> None:
+    def __init__(
+        self,
+        mesh: Mesh,
+        first: Tensor,
+        second: Tensor,
+        which: Tensor | None,
+        t: Tensor,
+        acceleration: float = math.inf,
+    ) -> None:
         known = torch.stack([first, second], 1).detach().double().cpu().numpy()
         self.searches = [Search(Crossings(mesh.connectivity, both)) for both in known]
         self.which = list(range(len(t))) if which is None else which.tolist()
         self.faces = mesh.faces
         self.areas = torch.stack([_areas(x.detach(), mesh.faces) for x in first])
         self.t = t.detach()
+        self.acceleration = acceleration
         self.watched: list[Any] = [None] * len(t)
         #: Pairs of triangles that went through each other in the shapes that were searched last. *Shape:* ``(B,)``.
         self.n_far = torch.zeros_like(t, dtype=torch.int64)
+        #: Those of them that are not tolerated. *Shape:* ``(B,)``.
+        self.n_left = self.n_far
 
-    def crosses(self, x: Tensor, some: Sequence[int]) -> bool:
-        """Whether in any of some samples parts went through each other. *Shape:* ``(B, V, 3)``."""
+    def crossing(self, x: Tensor, some: Sequence[int]) -> Iterator[int]:
+        """Those of some samples in which parts went through each other. *Shape:* ``(B, V, 3)``, of all samples."""
         for i in some:
-            crossings = self.searches[self.which[i]].crossings
+            search = self._search(i)
             if bool(x[i].isfinite().all()):
-                pairs = crossings.pairs(x[i].detach().double().cpu().numpy())
-                if len(pairs) and crossings.is_far(pairs).any():
-                    return True
-        return False
+                pairs = search.crossings.pairs(x[i].detach().double().cpu().numpy())
+                if search.n_left(pairs[search.crossings.is_far(pairs)], *self._when(i)):
+                    yield i
 
     def __call__(self, x: Tensor) -> Contacts | None:
         """Contacts of the samples; None where nothing has gone through anything, now or before.
@@ -123,11 +134,13 @@ class ContactSearch:
         for i, shape in enumerate(shapes):
             held = None
             if bool(x[i].isfinite().all()):
-                held = self.searches[self.which[i]](shape, self.watched[i])
+                held = self._search(i)(shape, self.watched[i])
                 self.watched[i] = held.watched
             found.append(held)
-        n_far = [0 if held is None else held.n_far for held in found]
-        self.n_far = torch.tensor(n_far, dtype=torch.int64, device=x.device)
+        self.n_far = self._counts(x, [0 if held is None else len(held.far) for held in found])
+        self.n_left = self._counts(
+            x, [0 if held is None else self._search(i).n_left(held.far, *self._when(i)) for i, held in enumerate(found)]
+        )
         if not any(held is not None and len(held.vertices) for held in found):
             return None
         n = len(self.faces)
@@ -142,26 +155,34 @@ class ContactSearch:
             places = torch.searchsorted(every, code)
             weights[i, places] = STIFFNESS * self.areas[self.which[i]].cpu()[vertices[places]].to(x.dtype)
             if held is not None and held.slack.any():
-                t = float(self.t[i])
                 slack = torch.from_numpy(held.slack).to(x.dtype)
-                # 1 at the key-frame in which a vertex was behind its face, 0 some time later.
-                ramps = torch.tensor([max(0.0, 1 - t / LENIENT), max(0.0, 1 - (1 - t) / LENIENT)], dtype=x.dtype)
-                ramps = ramps * (slack > 0)
-                gaps[i, places] = GAP * (1 - ramps.amax(1)) - (slack * ramps).sum(1)
+                ramps = torch.from_numpy(self._search(i).tolerance(held.slack, *self._when(i))).to(x.dtype)
+                gaps[i, places] = GAP * (1 - ramps.amax(1)) - (slack * ramps).amax(1)
         some = torch.nonzero((weights > 0).any(1)).flatten()
         to = x.device
         return Contacts(some.to(to), elements.to(to), weights[some].to(to), gaps[some].to(to))
+
+    @staticmethod
+    def _counts(like: Tensor, counts: Sequence[int]) -> Tensor:
+        return torch.tensor(counts, dtype=torch.int64, device=like.device)
+
+    def _search(self, i: int) -> Search:
+        return self.searches[self.which[i]]
+
+    def _when(self, i: int) -> tuple[float, float]:
+        return float(self.t[i]), self.acceleration
 
     def near(self, part: float) -> Tensor:
         """Vertices within a part of the diagonal of those that were ever watched, of one pair. *Shape:* ``(V,)``."""
         watched = [own for own in self.watched if own is not None]
         return torch.from_numpy(self.searches[0].crossings.within(sum(watched[1:], watched[0]) > 0, part))
 
-    def keep(self, some: Tensor) -> None:
-        """Go on with some of the samples only."""
-        chosen = some.tolist()
-        self.which, self.watched = [self.which[i] for i in chosen], [self.watched[i] for i in chosen]
-        self.t = self.t[some]
+    def of(self, some: Tensor) -> "ContactSearch":
+        """A search in some of the samples, with what is known of them. *Shape:* ``(S,)``."""
+        found, chosen = copy(self), some.tolist()
+        found.which, found.watched = [self.which[i] for i in chosen], [self.watched[i] for i in chosen]
+        found.t, found.n_far, found.n_left = self.t[some], self.n_far[some], self.n_left[some]
+        return found
 
 
 def _areas(x: Tensor, faces: Tensor) -> Tensor:

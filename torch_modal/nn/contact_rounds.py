@@ -24,6 +24,8 @@ class Apart(NamedTuple):
     held: Contacts
     start: Tensor
     """Where the minimisation started. *Shape:* ``(S, n)``."""
+    n_left: Tensor
+    """Pairs of triangles that are neither kept apart nor tolerated. *Shape:* ``(S,)``."""
     n_far: Tensor
     """Pairs of triangles of parts that go through each other all the same. *Shape:* ``(S,)``."""
 
@@ -70,14 +72,14 @@ class ContactRounds(Between):
             return n_crossing, None
         some = held.samples
         batch = _rows(batch, some, solution.amplitudes[some])
-        search.keep(some)
+        search = search.of(some)
         best: Apart | None = None
         for _ in range(ROUNDS):
             pushed, resolved = self.apart(batch, held)
             found = search(pushed)
-            if best is None or int(search.n_far.sum()) < int(best.n_far.sum()):
-                best = Apart(pushed, resolved, held, batch.start, search.n_far)
-            if found is None or not bool(search.n_far.any()):
+            apart = Apart(pushed, resolved, held, batch.start, search.n_left, search.n_far)
+            best = apart if best is None else min(best, apart, key=_left)
+            if found is None or not bool(search.n_left.any()):
                 break
             held, batch = found.of_all(some), batch._replace(start=resolved.amplitudes)
         assert best is not None
@@ -101,6 +103,10 @@ class ContactRounds(Between):
             moved = relax(in_contact, moved, reference, FINE_STEPS, FINE_PRODUCTS, fixed)
             parts.append(relax(in_contact, moved, reference, solver.polish, POLISH_PRODUCTS, fixed))
         return torch.cat(parts), solution
+
+
+def _left(apart: Apart) -> tuple[int, int]:
+    return int(apart.n_left.sum()), int(apart.n_far.sum())
 
 
 def _rows(batch: Batch, some: Tensor, start: Tensor) -> Batch:

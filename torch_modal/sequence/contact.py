@@ -16,15 +16,15 @@ import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
-from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import Mesh
 from torch_modal.nn import trees
-from torch_modal.nn.between import Between, fine_chunk
+from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
-from torch_modal.nn.relax import STEP_LENGTHS, ConvexHessian, conjugate_gradients, inverse_of_symmetric
+from torch_modal.nn.frame import Pair
+from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric
 from torch_modal.nn.samples import Samples
+from torch_modal.sequence.region import Region
 
-KNOTS = 16
+KNOTS = 12
 """Intervals of the spline."""
 SMOOTHNESS = 100.0
 """``lambda``, at a diagonal of 100, with the time between two key-frames as the unit."""
@@ -32,6 +32,9 @@ REGION = 0.2
 """Of the diagonal, along the surface: how far from what is held vertices move on their own, beside the modes."""
 WIDE_REGION = 0.5
 """The same once nothing passes through anything any more, for :data:`FINAL_STEPS`."""
+LOOKED_AT = 8
+SEARCHED = 16
+""":func:`push_apart` has it."""
 ROUNDS = 5
 MODAL_STEPS = 2
 FINE_STEPS = 2
@@ -96,109 +99,84 @@ def splines(t: Tensor, n: int | None = None) -> Splines:
     return Splines(values, torch.from_numpy(second.T @ second / (2 * n)).to(t.detach()))
 
 
-class _Fine:
-    """The energy of all shapes of an interval around what is held, by chunks that fit into caches.
-
-    Vertices farther away are moved by the modes only. There the energy has no term that sees all vertices at once, such
-    as the volume: the modes keep that.
-    """
-
-    def __init__(self, member: Between, samples: Samples, pair: Any, held: Contacts, near: Tensor) -> None:
-        mesh = member.mesh
-        touched = near[mesh.faces].any(1)
-        faces = mesh.faces[touched]
-        #: The vertices of the region, and of faces that reach into it.
-        self.vertices = torch.cat([faces.flatten(), held.elements.flatten().cpu()]).unique()
-        numbers = torch.full((mesh.n_vertices,), -1).index_copy(0, self.vertices, torch.arange(len(self.vertices)))
-        #: Which of them may move.
-        self.free = near[self.vertices].to(held.weights)
-        local = Mesh.of(numbers[faces], len(self.vertices))
-        terms = [term for term in member.terms if not term.total and not term.sampled and _is_number(term.stiffness)]
-        held = held._replace(elements=numbers[held.elements.cpu()].to(held.elements.device))
-        self.held = held
-        self.energy = held.fine(local, terms)
-        own = Energy(local, terms).to(held.weights.device)
-        stiffness = [k for term, k in zip(member.terms, samples.stiffness, strict=True) if term in terms]
-        self.references = member.fine_reference(samples, pair, own, self.vertices, stiffness)
-        self.size = fine_chunk(len(self.vertices), held.weights.device)
-
-    def _parts(self, rows: Tensor) -> Any:
-        """Chunks of extended rows, with their references. *Shape:* ``(3, T, R)``."""
-        for i in range(0, rows.shape[1], self.size):
-            own = slice(i, i + self.size)
-            reference = self.held.rows(own).joined(trees.rows(self.references, own))
-            yield reference, self.energy.extend(rows[:, own].contiguous()), own
-
-    def value(self, rows: Tensor) -> Tensor:
-        """*Shape:* ``(3, T, R) -> (T,)``."""
-        return torch.cat([self.energy.value(x, reference) for reference, x, _ in self._parts(rows)])
-
-    def linearised(self, rows: Tensor) -> tuple[Tensor, list[Any], Tensor]:
-        """Gradients, *shape* ``(3, T, R)``, convex Hessians of the chunks, their blocks, *shape* ``(3, 3, T, R)``."""
-        gradients, hessians, diagonals = [], [], []
-        for reference, x, own in self._parts(rows):
-            at = self.energy.linearise(x, reference)
-            hessian = ConvexHessian(self.energy, at)
-            gradients.append(self.energy.fold(self.energy.gradient(at)))
-            diagonals.append(hessian.diagonal()[..., : rows.shape[-1]])
-            hessians.append((own, hessian))
-        return torch.cat(gradients, 1), hessians, torch.cat(diagonals, 2)
-
-    def product(self, hessians: list[Any], field: Tensor) -> Tensor:
-        """*Shape:* ``(3, T, R) -> (3, T, R)``."""
-        energy = self.energy
-        products = [energy.fold(hessian(energy.extend(field[:, own].contiguous()))) for own, hessian in hessians]
-        return torch.cat(products, 1)
-
-
-def _is_number(stiffness: Any) -> bool:
-    return not isinstance(stiffness, Tensor) or stiffness.numel() == 1
-
-
 @torch.no_grad()
-def push_apart(member: Between, samples: Samples, shapes: Tensor, every: int = 1) -> Displacement:
+def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacement:
     """Find what pushes shapes between two key-frames apart where parts went through each other.
+
+    A few of many shapes are looked at first: where parts go through each other in none of these, there is nothing to
+    do. What is found pushes about :data:`SEARCHED` of the shapes apart; the others are looked at then, and where it was
+    not enough for some, these join.
 
     Args:
         member: In-betweens of the pair.
-        samples: Of one pair of key-frames, with the times of the shapes.
+        samples: Of one pair of key-frames, with the times of the shapes, which are even.
         shapes: In the caller's coordinates. *Shape:* ``(T, V, 3)``.
-        every: Of so many shapes, one is searched first: where none of these has a crossing, the others have none that
-            lasts.
     """
     frame, t = member.frame, samples.t
     pair = member.placed(samples)
-    placed = trees.picked(pair, samples.which)
-    start = frame.bring(shapes, placed, t)
-    search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t)
-    if every > 1 and not search.crosses(start, range(every - 1, len(t), every)):
+    start = frame.bring(shapes, trees.picked(pair, samples.which), t)
+    course = torch.cat([pair.first[:1], start, pair.second[:1]])
+    bent = float((course[2:] - 2 * course[1:-1] + course[:-2]).norm(dim=-1).nan_to_num().max())
+    search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t, bent * (len(t) + 1) ** 2)
+    few = range(max(1, len(t) // LOOKED_AT) - 1, len(t), max(1, len(t) // LOOKED_AT))
+    if next(search.crossing(start, few), None) is None:
         return Displacement(None, search.n_far, search.n_far)
-    held = search(start)
-    n_before = n_far = search.n_far
-    if held is None:
-        return Displacement(None, n_far, n_far)
-    rows = start.movedim(-1, 0).contiguous()
-    solver = _Coupled(member, samples, pair, rows)
-    at = rows.new_zeros(3, solver.basis.shape[1], rows.shape[-1])
-    best: tuple[Tensor | None, Tensor] = None, n_far
-    kept = torch.arange(len(t), device=t.device)
+    stride = max(1, (len(t) + 1) // SEARCHED)
+    chosen = set(range(stride - 1, len(t), stride))
+    found = _pushed(member, samples, pair, start, search, chosen)
+    if found.coefficients is not None:
+        moved = start + (splines(t).values @ found.coefficients).movedim(0, -1)
+        more = set(search.crossing(moved, [i for i in range(len(t)) if i not in chosen]))
+        if more:
+            found = _pushed(member, samples, pair, start, search, chosen | more, found.coefficients)
+    return found
+
+
+def _pushed(
+    member: Between,
+    samples: Samples,
+    pair: Pair,
+    start: Tensor,
+    search: ContactSearch,
+    chosen: set[int],
+    before: Tensor | None = None,
+) -> Displacement:
+    """The displacement that pushes some shapes apart; where some are pushed apart already, it goes on from there."""
+    some = torch.tensor(sorted(chosen), device=start.device)
+    search, start = search.of(some), start[some]
+    samples = samples._replace(
+        which=None if samples.which is None else samples.which[some],
+        t=samples.t[some],
+        mu=samples.mu[some],
+        stiffness=[k[some] for k in samples.stiffness],
+    )
+    solver = _Coupled(member, samples, pair, start.movedim(-1, 0).contiguous())
+    at = solver.rows.new_zeros(3, solver.basis.shape[1], start.shape[1]) if before is None else before
+    found = search(solver.moved(at).movedim(0, -1))
+    n_before = search.n_far
+    best: tuple[Tensor | None, Tensor, Tensor] = before, search.n_left, search.n_far
+    if found is None or not bool(search.n_left.any()):
+        return Displacement(before, n_before, n_before)
+    kept = torch.arange(len(start), device=start.device)
     for _ in range(ROUNDS):
-        held = held.of_all(kept)
+        held = found.of_all(kept)
         at = solver.fine(solver.modal(at, held), held, search.near(REGION), FINE_STEPS)
         found = search(solver.moved(at).movedim(0, -1))
-        if int(search.n_far.sum()) < int(best[1].sum()):
-            best = at, search.n_far
-        if found is None or not bool(search.n_far.any()):
+        left = int(best[1].sum())
+        best = min(best, (at, search.n_left, search.n_far), key=_left)
+        # What does not yield by half will not go away: it is what a key-frame has.
+        if found is None or not bool(search.n_left.any()) or int(search.n_left.sum()) > left / 2:
             break
-        held = found
-    if best[0] is not None and not bool(best[1].any()):
+    if best[0] is not None:
         # What was pushed apart in a hurry is brought to rest, in a wider region.
-        held = held.of_all(kept) if len(held.samples) < len(t) else held
         rested = solver.fine(best[0], held, search.near(WIDE_REGION), FINAL_STEPS)
         search(solver.moved(rested).movedim(0, -1))
-        if not bool(search.n_far.any()):
-            best = rested, search.n_far
-    return Displacement(best[0], n_before, best[1])
+        best = min((rested, search.n_left, search.n_far), best, key=lambda found: int(found[1].sum()))
+    return Displacement(best[0], n_before, best[2])
+
+
+def _left(found: tuple[Tensor | None, Tensor, Tensor]) -> tuple[int, int]:
+    return int(found[1].sum()), int(found[2].sum())
 
 
 class _Coupled:
@@ -236,33 +214,30 @@ class _Coupled:
             near: The vertices that may move. *Shape:* ``(V,)``.
             n_steps: How many.
         """
-        local = _Fine(self.member, self.samples, self.pair, held, near)
+        local = Region(self.member, self.samples, self.pair, near).hold(held)
         chosen = local.vertices.to(at.device)
         rows, own, area = self.rows[..., chosen], at[..., chosen], self.area[chosen]
-
-        def value(own: Tensor) -> float:
-            return float(local.value(rows + self.basis @ own).sum() + (own * self.bent(own, area)).sum())
-
-        before = value(own)
         for _ in range(n_steps):
-            gradient, hessians, diagonal = local.linearised(rows + self.basis @ own)
-            right = -self.gather(gradient) - 2 * self.bent(own, area)
-            step = self._solved(local, hessians, self._preconditioner(diagonal, area), right * local.free, area)
+            value, gradient, blocks, hessians = local.linearised(rows + self.expand(own))
+            bent = self.bent(own, area)
+            before = value + (own * bent).sum()
+            right = -self.gather(gradient) - 2 * bent
+            step = self._solved(local, hessians, self._preconditioner(blocks, area), right * local.free, area)
             for length in STEP_LENGTHS:
-                after = value(own + length * step)
-                if after < before:
-                    own, before = own + length * step, after
+                there = own + length * step
+                if bool(local.value(rows + self.expand(there)) + (there * self.bent(there, area)).sum() < before):
+                    own = there
                     break
             else:
                 break
         return at.index_copy(2, chosen, own)
 
-    def _preconditioner(self, diagonal: Tensor, area: Tensor) -> Tensor:
+    def _preconditioner(self, blocks: Tensor, area: Tensor) -> Tensor:
         """Inverses of the blocks of each function of the spline at each vertex. *Shape:* ``(3, 3, J, R)``."""
-        eye = torch.eye(3).to(diagonal)[..., None, None]
-        return inverse_of_symmetric((self.basis**2).T @ diagonal + 2 * self.bend.diagonal()[:, None] * area * eye)
+        eye = torch.eye(3).to(blocks)[..., None, None]
+        return inverse_of_symmetric((self.basis**2).T @ blocks + 2 * self.bend.diagonal()[:, None] * area * eye)
 
-    def _solved(self, local: _Fine, hessians: list[Any], inverse: Tensor, right: Tensor, area: Tensor) -> Tensor:
+    def _solved(self, local: Region, hessians: Any, inverse: Tensor, right: Tensor, area: Tensor) -> Tensor:
         def product(field: Tensor) -> Tensor:
             found = self.gather(local.product(hessians, self.expand(field))) + 2 * self.bent(field, area)
             return found * local.free

@@ -30,10 +30,6 @@ logger = logging.getLogger(__name__)
 
 MAX_LEVELS = 12
 
-# Shapes between two key-frames that are searched first: where none of them passes through itself, the others are not
-# searched.
-N_SEARCHED = 8
-
 
 def subdivide(
     keyframes: Any,
@@ -256,13 +252,13 @@ class _Apart:
     """Pushes the shapes of each interval apart, and remembers what is left."""
 
     def __init__(self) -> None:
-        self.n_before = self.n_left = self.n_frames = 0
+        self.n_before = self.n_left = self.n_searched = 0
 
     def __call__(self, member: Between, samples: Samples, shapes: Tensor) -> Tensor:
         """The shapes between two key-frames, of their times. *Shape:* ``(T, V, 3)``."""
         given = shapes.to(samples.x_a)
-        found = push_apart(member, samples, given, every=max(1, len(given) // N_SEARCHED))
-        self.n_frames += len(shapes)
+        found = push_apart(member, samples, given)
+        self.n_searched += len(found.n_crossing)
         self.n_before += int((found.n_before > 0).sum())
         self.n_left += int((found.n_crossing > 0).sum())
         return found.apply(member, samples, given).to(shapes)
@@ -280,12 +276,12 @@ class _Apart:
                     MeshWarning,
                     stacklevel=3,
                 )
-        counts = (self.n_before, self.n_frames, self.n_left)
-        logger.info("parts went through each other in %d of %d in-betweens, and are left so in %d", *counts)
+        counts = (self.n_before, self.n_searched, self.n_left)
+        logger.info("parts went through each other in %d of %d in-betweens looked at, and do in %d still", *counts)
         if self.n_left:
             warnings.warn(
-                f"in {self.n_left} of {self.n_frames} in-betweens parts still go through each other (without contact "
-                f"in {self.n_before}): a key-frame between those around them may help",
+                f"in {self.n_left} of {self.n_searched} in-betweens looked at, parts still go through each other "
+                f"(without contact in {self.n_before}): a key-frame between those around them may help",
                 MeshWarning,
                 stacklevel=3,
             )

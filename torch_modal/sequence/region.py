@@ -1,0 +1,232 @@
+"""The energy of shapes at many times, around what is held apart: values, gradients and products with its Hessian."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.energy.contact import Contact
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.terms import Bend, Mesh, Stretch
+from torch_modal.geometry.vectors import pick
+from torch_modal.nn import trees
+from torch_modal.nn.between import Between, fine_chunk
+from torch_modal.nn.contact import Contacts
+from torch_modal.nn.frame import Pair
+from torch_modal.nn.fused_relax import FusedRelax
+from torch_modal.nn.launch import kernels, launch
+from torch_modal.nn.relax import ConvexHessian
+from torch_modal.nn.samples import Samples
+
+
+class Region:
+    """Vertices that move on their own, and the energy of the faces around them.
+
+    Vertices farther away are moved by the modes only. There the energy has no term that sees all vertices at once, such
+    as the volume: the modes keep that.
+
+    Args:
+        member: In-betweens of the pair of key-frames.
+        samples: Of that pair, with the times of the shapes.
+        pair: The key-frames in the frame.
+        near: The vertices that may move. *Shape:* ``(V,)``.
+    """
+
+    def __init__(self, member: Between, samples: Samples, pair: Pair, near: Tensor) -> None:
+        mesh, to = member.mesh, samples.t.device
+        faces = mesh.faces[near[mesh.faces].any(1)]
+        #: The vertices of the region, and of faces that reach into it. *Shape:* ``(R,)``.
+        self.vertices = faces.unique()
+        self.numbers = torch.full((mesh.n_vertices,), -1).index_copy(0, self.vertices, torch.arange(len(self.vertices)))
+        #: One where they may move. *Shape:* ``(R,)``.
+        self.free = near[self.vertices].to(samples.t)
+        local = Mesh.of(self.numbers[faces], len(self.vertices))
+        every = zip(member.terms, samples.stiffness, strict=True)
+        chosen = [(term, k) for term, k in every if not term.total and not term.sampled and _is_number(term.stiffness)]
+        terms, stiffness = [term for term, _ in chosen], [k for _, k in chosen]
+        energy = Energy(local, terms).to(to)
+        fused = member.fused is not None and [type(term) for term in terms] == [Stretch, Bend]
+        kind: Any = _Fused if fused else _ByTorch
+        self.energy = kind(member, samples, pair, self.vertices, local, energy, stiffness)
+        self.held: _Held | None = None
+
+    def hold(self, held: Contacts) -> "Region":
+        """Hold vertices and faces apart, of all times."""
+        self.held = _Held(held, self.numbers.to(held.elements.device), len(self.vertices))
+        return self
+
+    def value(self, rows: Tensor) -> Tensor:
+        """Summed over all times. *Shape:* ``(3, T, R) -> ()``."""
+        own = self.energy.value(rows).sum()
+        return own if self.held is None else own + self.held.value(rows)
+
+    def linearised(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Any]:
+        """At given shapes, *shape* ``(3, T, R)``.
+
+        Returns:
+            The value; the gradients, *shape* ``(3, T, R)``; the blocks of the Hessians' diagonals, *shape*
+            ``(3, 3, T, R)``; and what :meth:`product` needs.
+        """
+        value, gradient, blocks, hessian = self.energy.linearised(rows)
+        if self.held is None:
+            return value, gradient, blocks, (hessian, None)
+        at = self.held.linearised(rows)
+        return value + at.value, gradient + at.gradient, blocks + at.blocks, (hessian, at)
+
+    def product(self, hessians: Any, field: Tensor) -> Tensor:
+        """The convex Hessians times displacements. *Shape:* ``(3, T, R) -> (3, T, R)``."""
+        hessian, at = hessians
+        found: Tensor = self.energy.product(hessian, field)
+        return found if self.held is None else self.held.add_product(at, field, found)
+
+
+class _AtHeld(NamedTuple):
+    value: Tensor
+    gradient: Tensor
+    blocks: Tensor
+    on_corners: Tensor
+    """Of the distances in the vertices. *Shape:* ``(3, 4 N)``."""
+    stiffness: Tensor
+    """*Shape:* ``(N,)``."""
+    corners: Tensor
+    """Of those that are too near. *Shape:* ``(4 N,)``."""
+
+
+class _Held:
+    """The contact term at the times at which each vertex is held: pairs of a time and an element, without the rest."""
+
+    def __init__(self, held: Contacts, numbers: Tensor, n: int) -> None:
+        local = numbers[held.elements]
+        at, which = torch.nonzero((held.weights > 0) & (local >= 0).all(1), as_tuple=True)
+        #: The vertices of each, in rows of all times. *Shape:* ``(4, N)``.
+        self.corners = (local[which] + (held.samples[at] * n)[:, None]).T.contiguous()
+        self.weights, self.gaps = held.weights[at, which], held.gaps[at, which]
+        self.term = Contact(held.elements)
+
+    def _spokes(self, flat: Tensor, corners: Tensor) -> Tensor:
+        first, *others = (pick(flat, corner) for corner in corners)
+        return torch.stack([other - first for other in others])
+
+    def _missing(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        spokes = self._spokes(rows.flatten(1), self.corners)
+        return spokes, self.term.difference(self.term.measures(spokes), self.gaps)
+
+    def value(self, rows: Tensor) -> Tensor:
+        return (self.weights * self._missing(rows)[1] ** 2).sum()
+
+    def linearised(self, rows: Tensor) -> _AtHeld:
+        spokes, missing = self._missing(rows)
+        near = torch.nonzero(missing).flatten()
+        weights, missing = self.weights[near], missing[near]
+        corners = self.corners[:, near].flatten()
+        gradients = self.term.gradients(spokes[..., near])
+        on_corners = torch.cat([-gradients.sum(0), *gradients], -1)
+        stiffness = 2 * weights
+        flat = torch.zeros_like(rows).flatten(1)
+        gradient = flat.index_add(1, corners, (stiffness * missing).repeat(4) * on_corners)
+        outer = (stiffness.repeat(4) * on_corners)[:, None] * on_corners
+        blocks = flat.new_zeros(3, 3, flat.shape[1]).index_add(2, corners, outer)
+        value = (weights * missing**2).sum()
+        shape = rows.shape[1:]
+        return _AtHeld(value, gradient.unflatten(1, shape), blocks.unflatten(2, shape), on_corners, stiffness, corners)
+
+    def add_product(self, at: _AtHeld, field: Tensor, to: Tensor) -> Tensor:
+        rate = (pick(field.flatten(1), at.corners) * at.on_corners).sum(0).unflatten(0, (4, -1)).sum(0)
+        pushed = (at.stiffness * rate).repeat(4) * at.on_corners
+        return to.flatten(1).index_add(1, at.corners, pushed).unflatten(1, to.shape[1:])
+
+
+class _ByTorch:
+    """Any terms, by chunks that fit into caches."""
+
+    def __init__(
+        self,
+        member: Between,
+        samples: Samples,
+        pair: Pair,
+        vertices: Tensor,
+        local: Mesh,
+        energy: Energy,
+        stiffness: Sequence[Tensor],
+    ) -> None:
+        self.energy = energy
+        self.references = member.fine_reference(samples, pair, energy, vertices, list(stiffness))
+        self.size = fine_chunk(len(vertices), samples.t.device)
+
+    def _parts(self, rows: Tensor) -> Any:
+        for i in range(0, rows.shape[1], self.size):
+            own = slice(i, i + self.size)
+            yield trees.rows(self.references, own), self.energy.extend(rows[:, own].contiguous()), own
+
+    def value(self, rows: Tensor) -> Tensor:
+        return torch.cat([self.energy.value(x, reference) for reference, x, _ in self._parts(rows)])
+
+    def linearised(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Any]:
+        value, gradients, diagonals, hessians = rows.new_zeros(()), [], [], []
+        for reference, x, own in self._parts(rows):
+            at = self.energy.linearise(x, reference)
+            hessian = ConvexHessian(self.energy, at)
+            value = value + self.energy.value_at(at, reference).sum()
+            gradients.append(self.energy.fold(self.energy.gradient(at)))
+            diagonals.append(hessian.diagonal()[..., : rows.shape[-1]])
+            hessians.append((own, hessian))
+        return value, torch.cat(gradients, 1), torch.cat(diagonals, 2), hessians
+
+    def product(self, hessians: Any, field: Tensor) -> Tensor:
+        energy = self.energy
+        products = [energy.fold(hessian(energy.extend(field[:, own].contiguous()))) for own, hessian in hessians]
+        return torch.cat(products, 1)
+
+
+class _Fused:
+    """Stretch and bend of Eq. 5, by kernels."""
+
+    def __init__(
+        self,
+        member: Between,
+        samples: Samples,
+        pair: Pair,
+        vertices: Tensor,
+        local: Mesh,
+        energy: Energy,
+        stiffness: Sequence[Tensor],
+    ) -> None:
+        to = samples.t.device
+        self.fused = FusedRelax(energy, local).to(to)
+        chosen = vertices.to(to)
+        if pair.around is not None:
+            first = second = member.space.on_course(pair, samples.which, samples.t)[:, chosen]
+        else:
+            first, second = trees.picked((pair.first[:, chosen], pair.second[:, chosen]), samples.which)
+        given = [value.double().contiguous() for value in (first, second, samples.t, *stiffness)]
+        self.reference = self.fused.reference(*given, given[2].new_zeros(len(given[2]), 1))
+
+    def value(self, rows: Tensor) -> Tensor:
+        x = _points(rows)
+        energy = x.new_zeros(len(x))
+        record, to = self.fused.record, self.reference
+        launch(kernels().value, (len(x), len(record)), [x, record, to.stretch, to.bend, x.shape[1], energy])
+        return energy.to(rows)
+
+    def linearised(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Any]:
+        value, gradient, diagonal, edges, hinges = self.fused.linearise(_points(rows), self.reference)
+        xx, xy, xz, yy, yz, zz = diagonal.to(rows).unbind(-1)
+        blocks = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
+        return value.sum().to(rows), gradient.to(rows).movedim(-1, 0), blocks, (edges, hinges)
+
+    def product(self, hessians: Any, field: Tensor) -> Tensor:
+        x = _points(field)
+        out, form = torch.zeros_like(x), x.new_zeros(len(x))
+        record = self.fused.record
+        launch(kernels().product, (len(x), len(record)), [x, record, *hessians, x.shape[1], out, form])
+        return out.to(field).movedim(-1, 0)
+
+
+def _points(rows: Tensor) -> Tensor:
+    """*Shape:* ``(3, T, R) -> (T, R, 3)``."""
+    return rows.movedim(0, -1).double().contiguous()
+
+
+def _is_number(stiffness: Any) -> bool:
+    return not isinstance(stiffness, Tensor) or stiffness.numel() == 1
