@@ -166,6 +166,30 @@ def test_missing_extra_is_said_before_any_work(hand: Shapes, monkeypatch: pytest
             make()
 
 
+def test_what_was_pushed_out_of_reach_is_held_on() -> None:
+    first, second = torch.tensor([[0, 1, 2, 9], [3, 4, 5, 8]]), torch.tensor([[0, 1, 3, 9], [3, 4, 5, 7]])
+    samples = torch.arange(2)
+    former = Contacts(samples, first, torch.tensor([[1.0, 2], [3, 4]]), torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
+    now = Contacts(samples, second, torch.tensor([[5.0, 0], [0, 6]]), torch.tensor([[0.5, 0.15], [0.15, 0.6]]))
+    both = now.beside(former)
+    found = {
+        (s, *element): (weight, gap)
+        for s in range(2)
+        for element, weight, gap in zip(
+            both.elements.tolist(), both.weights[s].tolist(), both.gaps[s].tolist(), strict=True
+        )
+        if weight
+    }
+    values = {key: tuple(round(x, 6) for x in value) for key, value in found.items()}
+    assert values == {
+        (0, 0, 1, 3, 9): (5, 0.5),  # what holds a vertex now is all that does
+        (0, 3, 4, 5, 8): (2, 0.2),
+        (1, 3, 4, 5, 7): (6, 0.6),
+        (1, 0, 1, 2, 9): (3, 0.3),
+        (1, 3, 4, 5, 8): (4, 0.4),
+    }
+
+
 # -------------------------------------------------------------------------------------------------------------- region
 @pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
 def test_kernels_and_torch_see_the_same_region(hand: Shapes, smooth: bool, generator: torch.Generator) -> None:

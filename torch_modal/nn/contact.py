@@ -49,6 +49,25 @@ class Contacts(NamedTuple):
             (weights + GAP).index_copy(0, places, self.gaps),
         )
 
+    def beside(self, former: "Contacts") -> "Contacts":
+        """These, and of former ones of the same samples those of vertices that nothing holds any more.
+
+        What was pushed far enough not to be found again would fall back.
+        """
+        last = int(max(self.elements.max(), former.elements.max())) + 1
+        holds = torch.zeros(len(self.weights), last, dtype=torch.bool, device=self.weights.device)
+        at, which = torch.nonzero(self.weights > 0, as_tuple=True)
+        holds[at, self.elements[which, 3]] = True
+        kept = former.weights * ~holds[:, former.elements[:, 3]]
+        elements, places = torch.cat([self.elements, former.elements]).unique(dim=0, return_inverse=True)
+        own, others = places.split([len(self.elements), len(former.elements)])
+        weights = self.weights.new_zeros(len(self.weights), len(elements))
+        gaps = torch.full_like(weights, GAP).index_copy(1, own, self.gaps)
+        gaps[:, others] = torch.where(kept > 0, former.gaps, gaps[:, others])
+        return Contacts(
+            self.samples, elements, weights.index_add(1, own, self.weights).index_add(1, others, kept), gaps
+        )
+
     @property
     def term(self) -> Contact:
         """The term; its stiffness is in the weights."""

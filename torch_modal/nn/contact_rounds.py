@@ -81,7 +81,7 @@ class ContactRounds(Between):
             best = apart if best is None else min(best, apart, key=_left)
             if found is None or not bool(search.n_left.any()):
                 break
-            held, batch = found.of_all(some), batch._replace(start=resolved.amplitudes)
+            held, batch = found.of_all(some).beside(held), batch._replace(start=resolved.amplitudes)
         assert best is not None
         return n_crossing.index_copy(0, some, best.n_far), best
 

@@ -20,6 +20,7 @@ from torch_modal.nn import trees
 from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.frame import Pair
+from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence.region import Region
@@ -158,15 +159,18 @@ def _pushed(
     if found is None or not bool(search.n_left.any()):
         return Displacement(before, n_before, n_before)
     kept = torch.arange(len(start), device=start.device)
-    for _ in range(ROUNDS):
-        held = found.of_all(kept)
+    held = found.of_all(kept)
+    for k in range(ROUNDS):
         at = solver.fine(solver.modal(at, held), held, search.near(REGION), FINE_STEPS)
         found = search(solver.moved(at).movedim(0, -1))
         left = int(best[1].sum())
         best = min(best, (at, search.n_left, search.n_far), key=_left)
-        # What does not yield by half will not go away: it is what a key-frame has.
-        if found is None or not bool(search.n_left.any()) or int(search.n_left.sum()) > left / 2:
+        if found is None or not bool(search.n_left.any()):
             break
+        # What does not yield will not go away: it is what a key-frame has.
+        if k and int(search.n_left.sum()) > left / 2:
+            break
+        held = found.of_all(kept).beside(held)
     if best[0] is not None:
         # What was pushed apart in a hurry is brought to rest, in a wider region.
         rested = solver.fine(best[0], held, search.near(WIDE_REGION), FINAL_STEPS)
@@ -265,10 +269,8 @@ class _Coupled:
                 (inner, inner.place(member.frame.coarsen(x), self.coarse)),
                 (contact, held.place(contact, x, None)),
             )
-            each = [energy.derivatives(zero, place, second_order=False) for energy, place in places]
-            stiffness, slope = (
-                torch.stack(values).sum(0) for values in ([d.gauss_newton for d in each], [d.gradient for d in each])
-            )
+            found = SumOfEnergies(inner, contact).derivatives(zero, [place for _, place in places], second_order=False)
+            stiffness, slope = found.gauss_newton.to(x), found.gradient.to(x)
             hessian = torch.einsum("ti,tj,tab->iajb", self.basis, self.basis, stiffness)
             hessian = hessian + 2 * self.bend[:, None, :, None] * gram[:, None, :]
             hessian = hessian.reshape(n * j, n * j)
@@ -291,5 +293,5 @@ class _Coupled:
     def _along(self, places: Any, at: Tensor, field: Tensor, step: Tensor, length: float) -> float:
         """What is minimised after a part of a step in the modes."""
         bent = at + length * field
-        total = sum(energy.value(length * step, place).sum() for energy, place in places)
+        total = sum(energy.value((length * step).to(place.base.dtype), place).sum() for energy, place in places)
         return float(total + (bent * self.bent(bent, self.area)).sum())

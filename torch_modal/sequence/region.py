@@ -14,7 +14,7 @@ from torch_modal.nn import trees
 from torch_modal.nn.between import Between, fine_chunk
 from torch_modal.nn.contact import Contacts
 from torch_modal.nn.frame import Pair
-from torch_modal.nn.fused_relax import FusedRelax
+from torch_modal.nn.fused_shell import FusedShell
 from torch_modal.nn.launch import kernels, launch
 from torch_modal.nn.relax import ConvexHessian
 from torch_modal.nn.samples import Samples
@@ -193,32 +193,29 @@ class _Fused:
         stiffness: Sequence[Tensor],
     ) -> None:
         to = samples.t.device
-        self.fused = FusedRelax(energy, local).to(to)
+        self.shell = FusedShell(energy, local).to(to)
         chosen = vertices.to(to)
         if pair.around is not None:
             first = second = member.space.on_course(pair, samples.which, samples.t)[:, chosen]
         else:
             first, second = trees.picked((pair.first[:, chosen], pair.second[:, chosen]), samples.which)
         given = [value.double().contiguous() for value in (first, second, samples.t, *stiffness)]
-        self.reference = self.fused.reference(*given, given[2].new_zeros(len(given[2]), 1))
+        # A stiffness of nothing for the volume.
+        self.reference = self.shell.reference(*given, given[2].new_zeros(len(given[2]), 1))
 
     def value(self, rows: Tensor) -> Tensor:
-        x = _points(rows)
-        energy = x.new_zeros(len(x))
-        record, to = self.fused.record, self.reference
-        launch(kernels().value, (len(x), len(record)), [x, record, to.stretch, to.bend, x.shape[1], energy])
-        return energy.to(rows)
+        return self.shell.value(_points(rows), self.reference).to(rows)
 
     def linearised(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Any]:
-        value, gradient, diagonal, edges, hinges = self.fused.linearise(_points(rows), self.reference)
-        xx, xy, xz, yy, yz, zz = diagonal.to(rows).unbind(-1)
+        at = self.shell.at(_points(rows), self.reference)
+        xx, xy, xz, yy, yz, zz = at.diagonal.to(rows).unbind(-1)
         blocks = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
-        return value.sum().to(rows), gradient.to(rows).movedim(-1, 0), blocks, (edges, hinges)
+        return at.energy.sum().to(rows), at.gradient.to(rows).movedim(-1, 0), blocks, (at.edges, at.hinges)
 
     def product(self, hessians: Any, field: Tensor) -> Tensor:
         x = _points(field)
         out, form = torch.zeros_like(x), x.new_zeros(len(x))
-        record = self.fused.record
+        record = self.shell.record
         launch(kernels().product, (len(x), len(record)), [x, record, *hessians, x.shape[1], out, form])
         return out.to(field).movedim(-1, 0)
 
