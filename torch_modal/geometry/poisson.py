@@ -54,6 +54,7 @@ class Poisson(nn.Module):
         # The equations fix each piece up to a translation: one vertex of each is held, and the piece placed afterwards.
         held = np.unique(mesh.vertex_pieces, return_index=True)[1]
         self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), held)), persistent=False)
+        self.n_pieces = len(held)
         self._made: tuple[Tensor, SparseSolver] | None = None
 
     @property
@@ -81,17 +82,22 @@ class Poisson(nn.Module):
         """
         pulls = wanted * self.weights.to(wanted)
         both = torch.cat([-pulls, pulls], -1)
-        right = torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both)
+        return self.placed(torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both), near)
+
+    def placed(self, right: Tensor, near: Tensor) -> Tensor:
+        """The same where the pulls on each vertex are known. *Shape:* ``(3, ..., V)`` each."""
         # Once, of these weights: the backward solve may come when others are back in their place.
         solver = cache(partial(self._solver_of, self.weights))
         x = solve_by(solver, right.movedim(0, -1)).movedim(-1, 0)
         return x + self.centres(near - x)
 
     def centres(self, x: Tensor) -> Tensor:
-        """The centre of the piece of each vertex. *Shape:* ``(3, ..., V) -> (3, ..., V)``."""
+        """The centre of the piece of each vertex. *Shape:* ``(3, ..., V) -> (3, ..., V)``, or all the same."""
         piece, shares = self.piece.to(x.device), self.shares.to(x.device)
         # Thousands of float32 added one after the other would lose three digits.
         weighted = x.double() * shares.double()
+        if self.n_pieces == 1:
+            return weighted.sum(-1, keepdim=True).to(x)
         return pick(torch.zeros_like(weighted).index_add(-1, piece, weighted), piece).to(x)
 
 

@@ -10,6 +10,8 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
+from torch_modal.geometry.functions import applied
+
 # An inverse of so many unknowns takes 3.2 GB.
 MOST_DENSE = 20_000
 
@@ -81,7 +83,7 @@ def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
 
     *Shape:* ``(..., V, m) -> (..., V, m)``.
     """
-    return _Solve.apply(solver, right)
+    return applied(_Solve, solver, right)
 
 
 class _Solve(torch.autograd.Function):

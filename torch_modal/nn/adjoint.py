@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.functions import applied
 from torch_modal.nn import trees
 from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, minimise
 
@@ -126,7 +127,7 @@ def solve_implicit(
     tensors = trees.leaves(placement)
     # Kernels compute in float64, whatever goes in and comes out.
     batched = (usable, times, start.detach().to(tensors[0].dtype), *tensors)
-    found = _ArgMin.apply(minimisation, trees.skeleton(placement), *batched)
+    found = applied(_ArgMin, minimisation, trees.skeleton(placement), *batched)
     return Solution(*(value.to(start.dtype) if value.is_floating_point() else value for value in found))
 
 

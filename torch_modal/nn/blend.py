@@ -1,12 +1,17 @@
 """A shape between two key-frames by local rotations, with every vertex free: what the modes then improve."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.functions import applied, traced
 from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.geometry.poisson import Poisson
+from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_rotations import FusedRotations
+from torch_modal.nn.launch import kernels, launch
 
 
 class RotationBlend(nn.Module):
@@ -21,10 +26,14 @@ class RotationBlend(nn.Module):
         fused: Whether the edges come from kernels.
     """
 
+    ends: Tensor
+
     def __init__(self, mesh: Connectivity, references: Tensor, fused: bool = False) -> None:
         super().__init__()
         self.rotations = (FusedRotations if fused else LocalRotations)(mesh, references)
         self.poisson = Poisson(mesh, self.rotations.per_length)
+        self.fused = fused
+        self.register_buffer("ends", self.poisson.edges.int(), persistent=False)
 
     def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t``. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``."""
@@ -46,4 +55,36 @@ class RotationBlend(nn.Module):
         return self._reached(self.rotations.bent_along(course, t, bending), straight)
 
     def _reached(self, edges: Tensor, near: Tensor) -> Tensor:
-        return self.poisson(edges, near.movedim(-1, 0)).movedim(0, -1)
+        rows = near.movedim(-1, 0)
+        if not self.fused or traced(near):
+            return self.poisson(edges, rows).movedim(0, -1)
+        right = applied(_Pulls, self.ends, self.poisson.weights, edges.movedim(0, -1), near.shape[1])
+        return self.poisson.placed(right.movedim(-1, 0), rows).movedim(0, -1)
+
+
+class _Pulls(torch.autograd.Function):
+    """Each edge times its weight, taken from its start and given to its end. *Shape:* ``(B, E, 3) -> (B, V, 3)``."""
+
+    @staticmethod
+    def forward(ends: Tensor, weights: Tensor, wanted: Tensor, n: int) -> Tensor:
+        own = wanted.detach().double().contiguous()
+        out = own.new_zeros(len(own), n, 3)
+        launch(kernels().pulls, (len(own), len(ends)), [own, weights.double(), ends, n, out])
+        return out.to(wanted)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.ends, ctx.weights = inputs[:2]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        start, end = ctx.ends.unbind(1)
+        across = grads[0].index_select(-2, end) - grads[0].index_select(-2, start)
+        return None, None, ctx.weights.to(across)[:, None] * across, None
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], ends: Tensor, weights: Tensor, wanted: Tensor, n: int
+    ) -> tuple[Tensor, int]:
+        (flat,) = flattened(info.batch_size, in_dims[2:3], (wanted,))
+        return _Pulls.apply(ends, weights, flat, n).unflatten(0, (info.batch_size, -1)), 0

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.geometry.functions import applied
 from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, squared_length
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
@@ -191,7 +192,7 @@ class Frame(Alignment):
     def coarsen(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
         flat = x.reshape(-1, *x.shape[-2:])
-        means = _ClusterMeans.apply(flat, self.members, self.first_member, self.clusters, self.shares)
+        means = applied(_ClusterMeans, flat, self.members, self.first_member, self.clusters, self.shares)
         return means.reshape(*x.shape[:-2], self.n_coarse, 3)
 
     def split(self, coarse: Tensor, columns: Columns) -> tuple[Tensor, Tensor]:

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
+from torch_modal.geometry.functions import applied, traced, transformed
 from torch_modal.nn import trees
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellReference
-from torch_modal.nn.launch import kernels, launch, pulled_back, traced, transformed
+from torch_modal.nn.launch import kernels, launch, pulled_back
 from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement
 
 # Columns that a kernel takes at a time.
@@ -19,7 +20,7 @@ _BLOCK = 8
 def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
     """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
     given = [value.double() for value in (first, second, t, *stiffness)]
-    return shell.reference_by_torch(*given) if traced(t) else ShellReference(*_Referred.apply(shell, *given))
+    return shell.reference_by_torch(*given) if traced(t) else ShellReference(*applied(_Referred, shell, *given))
 
 
 class _Referred(torch.autograd.Function):

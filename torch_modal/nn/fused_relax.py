@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.functions import applied, traced
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellPoint, ShellReference
-from torch_modal.nn.launch import kernels, launch, pulled_back, traced
+from torch_modal.nn.launch import kernels, launch, pulled_back
 from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric, relax
 
 
@@ -51,7 +52,7 @@ class FusedRelax(FusedShell):
             return self.oracle(n_steps, n_products, x, first, second, t, *stiffness)
         given = [value.double() for value in (x, first, second, t, *stiffness)]
         parts = [
-            _Relaxed.apply(self, n_steps, n_products, *(value[i : i + chunk] for value in given))[0]
+            applied(_Relaxed, self, n_steps, n_products, *(value[i : i + chunk] for value in given))[0]
             for i in range(0, len(x), chunk)
         ]
         return torch.cat(parts).to(x)

@@ -6,9 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.functions import applied, traced
 from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.nn.adjoint import flattened
-from torch_modal.nn.launch import kernels, launch, pulled_back, recorded, traced
+from torch_modal.nn.launch import kernels, launch, pulled_back, recorded
 
 
 class FusedRotations(LocalRotations):
@@ -36,7 +37,7 @@ class FusedRotations(LocalRotations):
         if traced(first):
             return self.oracle(first, second, t)
         given = [value.double() for value in (first, second, t)]
-        return _Turned.apply(self, *given).to(first)
+        return applied(_Turned, self, *given).to(first)
 
     def oracle(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
         """The same by torch."""
@@ -66,7 +67,7 @@ class FusedRotations(LocalRotations):
         if traced(t):
             return super().along(course, which, t)
         packed = torch.cat([part if part.dim() > 2 else part[None] for part in course])
-        edges = _OnCourse.apply(self, packed.movedim(0, -1).double(), which, t.double())
+        edges = applied(_OnCourse, self, packed.movedim(0, -1).double(), which, t.double())
         return edges.to(course.unit)
 
     def course_oracle(self, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:

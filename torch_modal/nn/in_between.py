@@ -345,7 +345,9 @@ def with_exact_ends(shapes: Tensor, x_a: Tensor, x_b: Tensor, t: Tensor) -> Tens
     """
     shapes = shapes.to(torch.promote_types(x_a.dtype, x_b.dtype))
     for end, x in ((0, x_a), (1, x_b)):
-        exactly = x.to(shapes).detach() + (shapes - shapes.detach())
+        exactly = x.to(shapes).detach()
+        if torch.is_grad_enabled():
+            exactly = exactly + (shapes - shapes.detach())
         shapes = torch.where((t == end)[..., None, None], exactly, shapes)
     return shapes
 

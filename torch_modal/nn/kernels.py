@@ -843,3 +843,18 @@ def course_edges(
     first = one[0] * e1 + one[1] * e2 + one[2] * normal
     second = two[0] * e1 + two[1] * e2 + two[2] * normal
     add_sides(total, s * n_edges, sides[k], signs[k], area, first, second)
+
+
+@wp.kernel(enable_backward=False)
+def pulls(
+    wanted: wp.array(dtype=vec3),
+    weights: wp.array(dtype=real),
+    ends: wp.array(dtype=wp.vec2i),
+    n: int,
+    out: wp.array(dtype=vec3),
+):
+    """What edges ask of their ends: the right side of the Poisson problem."""
+    s, k = wp.tid()
+    pull = weights[k] * wanted[s * ends.shape[0] + k]
+    wp.atomic_add(out, s * n + ends[k][0], -pull)
+    wp.atomic_add(out, s * n + ends[k][1], pull)

@@ -72,11 +72,6 @@ def has_kernels(backend: Backend) -> bool:
     return backend != "torch" and _works()
 
 
-def traced(x: Tensor) -> bool:
-    """Whether a tensor only stands for one (torch.compile, export, fake tensors), so that no kernel can have it."""
-    return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter)
-
-
 class _Commands(threading.local):
     """What this thread has launched before, so that only what is new needs to be told to Warp."""
 
@@ -85,11 +80,6 @@ class _Commands(threading.local):
 
 
 _COMMANDS = _Commands()
-
-
-def transformed(x: Tensor) -> bool:
-    """Whether a tensor stands for others in a transform of ``torch.func``."""
-    return torch.func.debug_unwrap(x, recurse=False) is not x
 
 
 @cache
@@ -145,8 +135,11 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
             device=str(device),
             record_cmd=True,
         )
+        command.dim = dim
     else:
-        command.set_dim(dim)
+        if command.dim != dim:
+            command.set_dim(dim)
+            command.dim = dim
         for at, value in enumerate(_values(kernel, given)):
             command.set_param_at_index_from_ctype(at, value)
         for at, value in enumerate([] if adjoints is None else _values(kernel, adjoints)):
@@ -174,7 +167,22 @@ def recorded(
     Returns:
         The outputs.
     """
-    return _Recorded.apply(kernel, dim, shapes, written, *given)
+    if torch.is_grad_enabled():
+        return _Recorded.apply(kernel, dim, shapes, written, *given)
+    return tuple(_launched(kernel, dim, shapes, written, given)[0].values())
+
+
+def _launched(
+    kernel: Any, dim: tuple[int, ...], shapes: Shapes, written: tuple[int, ...], given: Sequence[Any]
+) -> tuple[dict[int, Tensor], list[Any]]:
+    """The outputs by their places, and all arguments."""
+    like = next(value for value in given if isinstance(value, Tensor) and value.is_floating_point())
+    outputs = {
+        place: like.new_empty(shape) if place in written else like.new_zeros(shape) for place, shape in shapes.items()
+    }
+    whole = [outputs.get(place, value) for place, value in enumerate(given)]
+    launch(kernel, dim, whole)
+    return outputs, whole
 
 
 class _Recorded(torch.autograd.Function):
@@ -184,13 +192,7 @@ class _Recorded(torch.autograd.Function):
     def forward(
         ctx: Any, kernel: Any, dim: tuple[int, ...], shapes: Shapes, written: tuple[int, ...], *given: Any
     ) -> tuple[Tensor, ...]:
-        like = next(value for value in given if isinstance(value, Tensor) and value.is_floating_point())
-        outputs = {
-            place: like.new_empty(shape) if place in written else like.new_zeros(shape)
-            for place, shape in shapes.items()
-        }
-        whole = [outputs.get(place, value) for place, value in enumerate(given)]
-        launch(kernel, dim, whole)
+        outputs, whole = _launched(kernel, dim, shapes, written, given)
         ctx.kernel, ctx.dim, ctx.places, ctx.whole = kernel, dim, list(shapes), whole
         return tuple(outputs.values())
 
