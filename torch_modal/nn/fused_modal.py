@@ -65,6 +65,7 @@ class FusedModalEnergy(ModalEnergy):
 
     flat: Tensor
     blocks: Tensor
+    pairs: Tensor
     slots: Tensor
     wall_slots: Tensor
 
@@ -79,10 +80,11 @@ class FusedModalEnergy(ModalEnergy):
         self.register_buffer("slots", slots, persistent=False)
         walls = places[n_edges + 5 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
         self.register_buffer("wall_slots", walls, persistent=False)
-        flat = columns.flatten(1).contiguous()
-        self.register_buffer("flat", flat, persistent=False)
-        #: Columns of each component of each vertex, with room for one more, and zeros. *Shape:* ``(3 V, 8 N)``.
-        blocks = nn.functional.pad(flat.T, (0, _BLOCK - len(flat) % _BLOCK)).contiguous()
+        self.register_buffer("pairs", self.curvature.pairs.int(), persistent=False)
+        self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
+        rows = self.columns.permute(2, 1, 0).flatten(0, 1)
+        blocks = nn.functional.pad(rows, (0, _BLOCK - len(columns) % _BLOCK)).contiguous()
+        #: Columns of each component of each vertex and of the centre, with room for one more, and zeros.
         self.register_buffer("blocks", blocks, persistent=False)
 
     @property
@@ -177,10 +179,18 @@ class FusedModalEnergy(ModalEnergy):
         launch(kernels().curved_edges, (len(x), len(shell.record)), given)
         given = [x, shell.centre(x), shell.walls, moment, self.wall_slots, shell.n_vertices, 2 * n_pairs, found]
         launch(kernels().curved_walls, (len(x), len(shell.walls)), given)
-        ascending, descending = found.to(self.columns.dtype).split(n_pairs, 1)
-        extra = None if placement.extra is None else self.energy.extend(placement.extra.movedim(-1, 0).to(ascending))
-        curved = self._through((ascending + descending.mT).movedim((2, 3), (0, 1)), extra)
-        return curved.to(x)
+        extra, columns, n = placement.extra, self.blocks.double(), len(self.columns)
+        if extra is not None:
+            extra = torch.cat([extra, shell.centre(extra)[:, None]], 1)
+        pushed = x.new_zeros(len(x), *columns.shape)
+        given = [self.pairs, found, columns, extra, len(columns) // 3, n, columns.shape[1] // _BLOCK, pushed, pushed]
+        launch(kernels().curved_columns, (len(x), n_pairs), given)
+        n_all = n + (extra is not None)
+        curved = (columns.mT @ pushed)[:, :n_all, :n_all]
+        if extra is not None:  # a column of zeros so far on the left side
+            curved[:, n, :n] = curved[:, :n, n]
+            curved[:, n, n] = (extra.flatten(1) * pushed[..., n]).sum(-1)
+        return curved
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
         """As the other's."""

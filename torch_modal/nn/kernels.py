@@ -502,6 +502,46 @@ def curved_edges(
 
 
 @wp.kernel(enable_backward=False)
+def curved_columns(
+    pairs: wp.array(dtype=wp.vec2i),
+    blocks: wp.array(dtype=wp.mat33d),
+    columns: wp.array(dtype=wide),
+    extra: wp.array(dtype=vec3),
+    n: int,
+    n_columns: int,
+    n_blocks: int,
+    out: wp.array(dtype=wide),
+    entries: wp.array(dtype=real),
+):
+    """The operator of pairs of vertices on all columns, and on the sample's own: assembly.PairBlocks.push.
+
+    The blocks of pairs in descending order follow the others. The results are the same memory twice.
+    """
+    s, k = wp.tid()
+    first = pairs[k][0]
+    second = pairs[k][1]
+    b = blocks[(2 * s) * pairs.shape[0] + k] + wp.transpose(blocks[(2 * s + 1) * pairs.shape[0] + k])
+    to_i = 3 * n_blocks * (s * n + first)
+    to_j = 3 * n_blocks * (s * n + second)
+    for c in range(n_blocks):
+        i = 3 * n_blocks * first + c
+        j = 3 * n_blocks * second + c
+        dx = columns[j] - columns[i]
+        dy = columns[j + n_blocks] - columns[i + n_blocks]
+        dz = columns[j + 2 * n_blocks] - columns[i + 2 * n_blocks]
+        for r in range(3):
+            wp.atomic_add(out, to_i + r * n_blocks + c, b[r, 0] * dx + b[r, 1] * dy + b[r, 2] * dz)
+            wp.atomic_add(out, to_j + r * n_blocks + c, -b[0, r] * dx - b[1, r] * dy - b[2, r] * dz)
+    if extra:
+        across = extra[s * n + second] - extra[s * n + first]
+        up = b * across
+        down = wp.transpose(b) * across
+        for r in range(3):
+            wp.atomic_add(entries, (to_i + r * n_blocks) * 8 + n_columns, up[r])
+            wp.atomic_add(entries, (to_j + r * n_blocks) * 8 + n_columns, -down[r])
+
+
+@wp.kernel(enable_backward=False)
 def curved_walls(
     x: wp.array(dtype=vec3),
     centre: wp.array(dtype=vec3),

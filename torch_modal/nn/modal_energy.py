@@ -169,10 +169,7 @@ class ModalEnergy(nn.Module):
 
     def _curved(self, at: Sequence[Linearised], extra: Tensor | None) -> Tensor:
         """The second-order term. *Shape:* ``(B, n, n)``."""
-        return self._through(self.curvature.of(self.energy, at), extra)
-
-    def _through(self, blocks: Tensor, extra: Tensor | None) -> Tensor:
-        """Blocks of pairs of vertices through the columns. *Shape:* ``(3, 3, B, P), (3, B, V) -> (B, n, n)``."""
+        blocks = self.curvature.of(self.energy, at)
         inner = self.congruence(blocks)
         if extra is None:
             return inner
