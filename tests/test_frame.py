@@ -28,17 +28,17 @@ def test_size_is_100_and_centred(frame: Frame, bars: Shapes) -> None:
     assert float((reference.amax(0) - reference.amin(0)).norm()) == pytest.approx(DIAGONAL, rel=1e-13)
     assert (frame.weights[:, None] * reference).sum(0).abs().max() < 1e-11
     assert float(frame.weights.sum()) == pytest.approx(1)
-    assert float(frame.coarse_weights.sum()) == pytest.approx(1)
+    assert float(frame.coarse.weights.sum()) == pytest.approx(1)
     straight = bars.keyframes[0]
     torch.testing.assert_close(reference / frame.scale, straight - (frame.weights[:, None] * straight).sum(0))
 
 
 def test_coarsens_as_numpy_does(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
     x = torch.randn(2, 3, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
-    clusters = frame.clusters.numpy()
-    by_hand = np.stack([x.numpy()[:, :, clusters == i].mean(2) for i in range(frame.n_coarse)], 2)
+    clusters = frame.coarse.clusters.numpy()
+    by_hand = np.stack([x.numpy()[:, :, clusters == i].mean(2) for i in range(frame.coarse.n_vertices)], 2)
     np.testing.assert_allclose(frame.coarsen(x).numpy(), by_hand, atol=1e-14)
-    assert len(frame.coarse_faces) <= 200 < len(bars.faces)
+    assert len(frame.coarse.faces) <= 200 < len(bars.faces)
 
 
 def test_collapses_are_chosen_on_aligned_keyframes(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
@@ -47,7 +47,7 @@ def test_collapses_are_chosen_on_aligned_keyframes(frame: Frame, bars: Shapes, g
     basis = bars.bases[1]
     shapes = torch.stack([bars.keyframes[0], basis.reference @ turn.mT + 9])
     other = Frame(shapes, bars.faces, coarse_faces=200)
-    assert torch.equal(other.clusters, frame.clusters)
+    assert torch.equal(other.coarse.clusters, frame.coarse.clusters)
     first = bars.bases[0].modes
     turned, straight = other.modes(first, basis.modes @ turn.mT)[1], frame.modes(first, basis.modes)[1]
     torch.testing.assert_close(turned, straight, atol=1e-11, rtol=0)
@@ -71,7 +71,7 @@ def test_orthonormal_columns(frame: Frame, bars: Shapes, generator: torch.Genera
     mixed = torch.cat([directions, 3 * directions[:2] - directions[2:4], torch.zeros_like(directions[:1])])
     columns = frame.elastic_columns(mixed)
     assert len(columns.fine) == len(columns.coarse) == 5, "three of eight are dependent"
-    weighted = columns.coarse * frame.coarse_weights[:, None]
+    weighted = columns.coarse * frame.coarse.weights[:, None]
     gram = torch.einsum("mvc,nvc->mn", weighted, columns.coarse)
     torch.testing.assert_close(gram, torch.eye(5, dtype=torch.float64), atol=1e-9, rtol=0)
     torch.testing.assert_close(frame.coarsen(columns.fine), columns.coarse, atol=1e-9, rtol=0)
@@ -87,7 +87,7 @@ def test_split_leaves_nothing_of_the_columns(frame: Frame, bars: Shapes, generat
     directions = torch.randn(3, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
     columns = frame.elastic_columns(directions[:2])
     amplitudes, left = frame.split(frame.coarsen(directions), columns)
-    inner = torch.einsum("mvc,nvc->mn", left * frame.coarse_weights[:, None], columns.coarse)
+    inner = torch.einsum("mvc,nvc->mn", left * frame.coarse.weights[:, None], columns.coarse)
     assert inner.abs().max() < 1e-12
     torch.testing.assert_close(left + frame.coarsen(columns.combine(amplitudes)), frame.coarsen(directions))
     within = torch.tensor([[2.0, -3.0]], dtype=torch.float64)
@@ -101,7 +101,7 @@ def test_elastic_columns_have_no_rigid_motion(frame: Frame, bars: Shapes) -> Non
     columns = frame.elastic_columns(modes)
     assert len(frame.rigid.fine) == 6
     both = torch.cat([frame.rigid.coarse, columns.coarse])
-    gram = torch.einsum("mvc,nvc->mn", both * frame.coarse_weights[:, None], both)
+    gram = torch.einsum("mvc,nvc->mn", both * frame.coarse.weights[:, None], both)
     torch.testing.assert_close(gram, torch.eye(len(both), dtype=torch.float64), atol=1e-8, rtol=0)
     # With the rigid motions, they span every mode.
     span = torch.cat([frame.rigid.fine, columns.fine]).flatten(1)
@@ -133,4 +133,4 @@ def test_module(frame: Frame, bars: Shapes, moved: Tensor) -> None:
 def test_keeps_what_coarsen_chose(frame: Frame, bars: Shapes) -> None:
     references = torch.stack([frame.reference, frame.place(bars.keyframes[:1], bars.keyframes[1:2]).second[0]])
     chosen = coarsen(references.numpy(), bars.faces.numpy(), 200)
-    np.testing.assert_array_equal(chosen.faces, frame.coarse_faces.numpy())
+    np.testing.assert_array_equal(chosen.faces, frame.coarse.faces.numpy())

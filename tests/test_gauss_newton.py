@@ -154,7 +154,7 @@ def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes) -> None:
     placement = placement_of(layer, pair, torch.tensor([0.5], dtype=torch.float64))
     a = torch.zeros(1, layer.space.n_unknowns, dtype=torch.float64)
     rests = [frame.coarsen(x) for x in pair[:2]]
-    shell = ShellEnergy(frame.coarse_faces)
+    shell = ShellEnergy(frame.coarse.faces)
 
     def residuals(a: Tensor) -> Tensor:
         x = energy.parts[0].rows(a[None], placement[0]).movedim(0, -1)

@@ -26,7 +26,7 @@ class Setting:
     def __init__(self, bars: Shapes, coarse_faces: int, mu: float | Tensor = MU) -> None:
         self.bars = bars
         self.frame = Frame(bars.keyframes[:2], bars.faces, coarse_faces)
-        self.shell = ShellEnergy(self.frame.coarse_faces)
+        self.shell = ShellEnergy(self.frame.coarse.faces)
         terms = [Stretch(500.0), Bend(10.0), Volume(1000.0)]
         levels = Levels(self.frame, Mesh.of(bars.faces, bars.keyframes.shape[1]), terms)
         self.space = PairedSpace(self.frame, levels, self.frame.modes(*(basis.modes for basis in bars.bases[:2])))

@@ -111,7 +111,7 @@ def speed(arguments: argparse.Namespace, modes: int, dtype_name: str) -> None:
     lost = int((~solution.usable).sum())
     mean_steps = float(solution.n_steps.double().mean())
     print(
-        f"\n{modes}+{modes} modes ({space.n_unknowns} unknowns), {len(space.frame.coarse_faces)} coarse faces, "
+        f"\n{modes}+{modes} modes ({space.n_unknowns} unknowns), {len(space.frame.coarse.faces)} coarse faces, "
         f"{dtype_name}, {device}: {mean_steps:.1f} steps a sample on average, {int(solution.n_steps.max())} at most"
         + (f", {lost} of {batches[-1]} not converged" if lost else "")
     )
@@ -175,7 +175,7 @@ def work(case: Case, most_steps: int, batch: int) -> tuple[float, float]:
     m, item = e + h + 1, case.samples[0].element_size()
     first_order = 2 * (3 * e + 9 * h) * n + 2 * m * n**2
     second_order = 144 * r * n + 6 * r * n**2
-    step = second_order + 2 * n**3 / 3 + 12 * space.frame.n_coarse * n
+    step = second_order + 2 * n**3 / 3 + 12 * space.frame.coarse.n_vertices * n
     fine = 6 * space.frame.reference.shape[0] * n
     flops = batch * ((most_steps + 1) * first_order + most_steps * step + fine)
     numbers = batch * ((most_steps + 1) * 4 * m * n + most_steps * 6 * r * n)

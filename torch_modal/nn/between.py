@@ -1,6 +1,7 @@
 """In-betweens of one pair of bases, for flat batches: what all layers share."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -54,6 +55,20 @@ class Batch(NamedTuple):
     anchors: Tensor | None
 
 
+class Fine(NamedTuple):
+    """The energy on the caller's mesh, the same for all pairs."""
+
+    energy: Energy
+    fused: FusedRelax | None
+    """Its kernels, where there are some."""
+
+    @classmethod
+    def of(cls, mesh: Mesh, terms: Sequence[Term], solver: Solver) -> "Fine":
+        """Of these terms."""
+        energy = Energy(mesh, terms)
+        return cls(energy, FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None)
+
+
 class Between(nn.Module):
     """In-betweens of one pair of bases.
 
@@ -63,7 +78,7 @@ class Between(nn.Module):
         mesh: The caller's mesh.
         objective: What is minimised.
         solver: How.
-        terms: The terms of the energy, which the layer owns.
+        fine: The energy on it, of terms that the layer owns.
         weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
     """
 
@@ -74,7 +89,7 @@ class Between(nn.Module):
         mesh: Mesh,
         objective: Objective,
         solver: Solver,
-        terms: Sequence[Term],
+        fine: "Fine",
         weights: Tensor | None = None,
     ) -> None:
         super().__init__()
@@ -82,21 +97,20 @@ class Between(nn.Module):
         self.mesh = mesh
         #: Whether Eq. 5 has no company: what has no strain then stays as it is.
         self.bare = not objective.terms
+        #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
+        self.fine, self.fused = fine
         self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, weights)
         # Steps that are unrolled are differentiated like any other expression: by torch.
         modal = objective.space == "joint" and solver.gradient == "implicit"
-        levels = Levels(self.frame, mesh, terms, solver.backend if modal else "torch")
+        levels = partial(Levels, self.frame, mesh, self.terms, solver.backend if modal else "torch")
         if objective.space == "joint":
             ends = self.frame.place(*shapes[:, None])
             references = torch.cat([ends.first, ends.second])
-            fine = mesh if objective.base == "rotations" else None
-            self.space: Any = JointSpace(self.frame, levels, modes, references, fine, has_kernels(solver.backend))
+            blended = mesh if objective.base == "rotations" else None
+            self.space: Any = JointSpace(self.frame, levels, modes, references, blended, has_kernels(solver.backend))
         else:
-            self.space = PairedSpace(self.frame, levels, modes)
+            self.space = PairedSpace(self.frame, levels(), modes)
         self.closed = len(mesh.connectivity.boundary_edges) == 0
-        #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
-        self.fine = Energy(mesh, terms)
-        self.fused = FusedRelax(self.fine, mesh) if FusedRelax.serves(self.fine, solver.backend) else None
 
     def prepare(self) -> None:
         """Make at once what would be made at the first minimisation."""
@@ -260,7 +274,9 @@ class Between(nn.Module):
         levels = self.space.levels
         coarse, *sampled = levels.energies
         parts = zip(levels.members[0], coarse.parts, strict=True)
-        found = [[coarse_values(stiffness[i], self.fine.parts[i], part, self.frame.clusters) for i, part in parts]]
+        found = [
+            [coarse_values(stiffness[i], self.fine.parts[i], part, self.frame.coarse.clusters) for i, part in parts]
+        ]
         if sampled:
             found.append([stiffness[i] for i in levels.members[1]])
         return Stiffness(stiffness, found)

@@ -1,5 +1,7 @@
 """Between the caller's coordinates and the frame in which an in-between is sought."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -137,6 +139,59 @@ class Alignment(nn.Module):
         return self._motion(pair, t).inverse().apply(pair.placed.apply(points) * self.scale)
 
 
+class Coarse(nn.Module):
+    """The coarse mesh that the energy is evaluated on, and what is restricted to it.
+
+    Args:
+        shapes: Two shapes in the frame, float64 on the CPU. *Shape:* ``(2, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_faces: Of the coarse mesh.
+        weights: Of the vertices. *Shape:* ``(V,)``.
+    """
+
+    faces: Tensor
+    weights: Tensor
+    clusters: Tensor
+    shares: Tensor
+    members: Tensor
+    first_member: Tensor
+
+    def __init__(self, shapes: Tensor, faces: Tensor, n_faces: int, weights: Tensor) -> None:
+        super().__init__()
+        coarsening = coarsen(shapes.numpy(), faces.numpy(), n_faces)
+        clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
+        member = torch.from_numpy(coarsening.clusters >= 0).double()
+        per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
+
+        self.n_vertices = coarsening.n_vertices
+        self.register_buffer("faces", torch.from_numpy(coarsening.faces), persistent=False)
+        self.register_buffer("weights", per_cluster.index_add(0, clusters, weights), persistent=False)
+        self.register_buffer("clusters", clusters, persistent=False)
+        self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters], persistent=False)
+        #: Fine vertices in the order of their clusters, and where each cluster begins there.
+        self.register_buffer("members", torch.argsort(clusters, stable=True), persistent=False)
+        sizes = torch.bincount(clusters, minlength=self.n_vertices)
+        self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
+        #: Rigid motions of the shape half-way between the two, to first order.
+        fields = _rigid_fields(shapes.mean(0))
+        coarse = self.restrict(fields)
+        mix = self.orthonormal(coarse)
+        self.rigid = Columns(torch.tensordot(mix, fields, 1), torch.tensordot(mix, coarse, 1))
+
+    def restrict(self, x: Tensor) -> Tensor:
+        """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
+        flat = x.reshape(-1, *x.shape[-2:])
+        means = applied(_ClusterMeans, flat, self.members, self.first_member, self.clusters, self.shares)
+        return means.reshape(*x.shape[:-2], self.n_vertices, 3)
+
+    def orthonormal(self, coarse: Tensor) -> Tensor:
+        """Combinations of coarse directions that are orthonormal; dependent ones are dropped. *Shape:* ``(n, m)``."""
+        weighted = (coarse * self.weights[:, None]).flatten(1)
+        values, vectors = torch.linalg.eigh(weighted @ coarse.flatten(1).mT)
+        keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
+        return (vectors[:, keep] / values[keep].sqrt()).mT
+
+
 class Frame(Alignment):
     """The scale of 100, the alignment of two bases, and the coarse mesh that the energy is evaluated on.
 
@@ -148,12 +203,6 @@ class Frame(Alignment):
     """
 
     faces: Tensor
-    coarse_faces: Tensor
-    coarse_weights: Tensor
-    clusters: Tensor
-    shares: Tensor
-    members: Tensor
-    first_member: Tensor
     turn: Tensor
 
     def __init__(self, shapes: Tensor, faces: Tensor, coarse_faces: int, weights: Tensor | None = None) -> None:
@@ -163,27 +212,30 @@ class Frame(Alignment):
         turn = best_fit(shapes[1], shapes[0], weights)
         references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale
         super().__init__(references[0].clone(), scale, weights)
-        coarsening = coarsen(references.numpy(), faces.numpy(), coarse_faces)
-        clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
-        member = torch.from_numpy(coarsening.clusters >= 0).double()
-        per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
-
-        self.n_coarse = coarsening.n_vertices
         self.register_buffer("faces", faces, persistent=False)
-        self.register_buffer("coarse_faces", torch.from_numpy(coarsening.faces), persistent=False)
-        self.register_buffer("coarse_weights", per_cluster.index_add(0, clusters, weights), persistent=False)
-        self.register_buffer("clusters", clusters, persistent=False)
-        self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters], persistent=False)
-        #: Fine vertices in the order of their clusters, and where each cluster begins there.
-        self.register_buffer("members", torch.argsort(clusters, stable=True), persistent=False)
-        sizes = torch.bincount(clusters, minlength=self.n_coarse)
-        self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
-        #: Rigid motions of the shape half-way between the references, to first order.
-        fields = _rigid_fields(references.mean(0))
-        coarse = self.coarsen(fields)
-        mix = self._orthonormal(coarse)
-        self.rigid = Columns(torch.tensordot(mix, fields, 1), torch.tensordot(mix, coarse, 1))
         self.register_buffer("turn", turn.rotation, persistent=False)
+        self._coarse: Any = None
+        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights)
+
+    @property
+    def coarse(self) -> Coarse:
+        """What a smooth path does without, made at the first use."""
+        if self._coarse is None:
+            with torch.no_grad():
+                self._coarse, self._make = self._make(), None
+        return self._coarse  # type: ignore[no-any-return]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Frame":
+        """Nothing is made in a lower precision, or on another device, than float64 on the CPU."""
+        after = fn(self.reference)
+        if (after.dtype, after.device) != (self.reference.dtype, self.reference.device):
+            self.coarse  # noqa: B018
+        return super()._apply(fn, recurse)
+
+    @property
+    def rigid(self) -> Columns:
+        """Rigid motions of the shape half-way between the references, to first order."""
+        return self.coarse.rigid
 
     def modes(self, first: Tensor, second: Tensor) -> list[Tensor]:
         """Modes of both ends, turned into this frame; their scale does not matter. *Shape of each:* ``(k, V, 3)``."""
@@ -191,13 +243,11 @@ class Frame(Alignment):
 
     def coarsen(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
-        flat = x.reshape(-1, *x.shape[-2:])
-        means = applied(_ClusterMeans, flat, self.members, self.first_member, self.clusters, self.shares)
-        return means.reshape(*x.shape[:-2], self.n_coarse, 3)
+        return self.coarse.restrict(x)
 
     def split(self, coarse: Tensor, columns: Columns) -> tuple[Tensor, Tensor]:
         """Amplitudes of columns in coarse directions, and what is left. *Shape:* ``(..., n), (..., V_coarse, 3)``."""
-        weighted = (columns.coarse * self.coarse_weights[:, None]).flatten(1)
+        weighted = (columns.coarse * self.coarse.weights[:, None]).flatten(1)
         amplitudes = coarse.flatten(-2) @ weighted.mT
         return amplitudes, coarse - (amplitudes @ columns.coarse.flatten(1)).unflatten(-1, (-1, 3))
 
@@ -215,17 +265,10 @@ class Frame(Alignment):
         """
         rigid, coarse = self.split(self.coarsen(directions), self.rigid)
         sizes = torch.linalg.norm(coarse.flatten(1), dim=1)[:, None].clamp_min(torch.finfo(coarse.dtype).tiny)
-        mix = self._orthonormal(coarse / sizes[:, None]) / sizes.T
+        mix = self.coarse.orthonormal(coarse / sizes[:, None]) / sizes.T
         # The fine columns are as large as all modes: one product makes them.
         fine = torch.tensordot(mix, directions, 1) - self.rigid.combine(mix @ rigid)
         return Columns(fine, torch.tensordot(mix, coarse, 1))
-
-    def _orthonormal(self, coarse: Tensor) -> Tensor:
-        """Combinations of coarse directions that are orthonormal; dependent ones are dropped. *Shape:* ``(n, m)``."""
-        weighted = (coarse * self.coarse_weights[:, None]).flatten(1)
-        values, vectors = torch.linalg.eigh(weighted @ coarse.flatten(1).mT)
-        keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
-        return (vectors[:, keep] / values[keep].sqrt()).mT
 
 
 class _ClusterMeans(torch.autograd.Function):

@@ -12,7 +12,7 @@ from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.nn.between import Between
+from torch_modal.nn.between import Between, Fine
 from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.frame import mean_areas
 from torch_modal.nn.samples import InBetweenResult, Samples, report
@@ -99,6 +99,7 @@ class InBetween(nn.Module):
         # The same for all pairs: a motion through several has one course.
         weights = mean_areas(torch.stack(shapes), self.faces)
         kind = ContactRounds if self.objective.contact else Between
+        fine = Fine.of(mesh, list(self.terms), self.solver)
         made = [
             kind(
                 torch.stack([ends[i][0], ends[j][0]]),
@@ -106,7 +107,7 @@ class InBetween(nn.Module):
                 mesh,
                 self.objective,
                 self.solver,
-                list(self.terms),
+                fine,
                 weights,
             )
             for i, j in self.pairs

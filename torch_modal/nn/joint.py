@@ -1,6 +1,6 @@
 """The joint space: one unknown shape in the sum of both modal spaces and the difference of the key-frames."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -46,12 +46,20 @@ class JointProblem(NamedTuple):
 class _Modal(nn.Module):
     """The modes of both ends, the energy in their amplitudes, and where to start. Arguments as for the space."""
 
-    def __init__(self, frame: Frame, levels: Levels, modes: Sequence[Tensor], references: Tensor, guess: bool) -> None:
+    def __init__(
+        self,
+        frame: Frame,
+        levels: Callable[[], Levels],
+        modes: Sequence[Tensor],
+        references: Tensor,
+        guess: bool,
+    ) -> None:
         super().__init__()
+        self.levels = levels()
         self.columns = frame.elastic_columns(torch.cat(frame.modes(*modes)))
-        self.energy = levels.modal(self.columns)
+        self.energy = self.levels.modal(self.columns)
         # With the blend as the base there is nothing left to guess.
-        self.guess = Guess(levels.mesh, self.columns.coarse, frame.coarsen(references)) if guess else None
+        self.guess = Guess(self.levels.mesh, self.columns.coarse, frame.coarsen(references)) if guess else None
 
 
 class JointSpace(nn.Module):
@@ -63,7 +71,7 @@ class JointSpace(nn.Module):
 
     Args:
         frame: Frame of the two bases.
-        levels: The energies of the modal solve.
+        levels: Makes the energies of the modal solve.
         modes: Modes of both ends. *Shape of each:* ``(k, V, 3)``.
         references: Shapes that the modes belong to, in the frame. *Shape:* ``(2, V, 3)``.
         fine: The fine mesh, if there is a blend by local rotations.
@@ -73,14 +81,14 @@ class JointSpace(nn.Module):
     def __init__(
         self,
         frame: Frame,
-        levels: Levels,
+        levels: Callable[[], Levels],
         modes: Sequence[Tensor],
         references: Tensor,
         fine: Mesh | None,
         fused: bool = False,
     ) -> None:
         super().__init__()
-        self.frame, self.levels = frame, levels
+        self.frame = frame
         self.blend = None if fine is None else RotationBlend(fine.connectivity, references, fused)
         self._modal: Any = None
         self._make: Any = partial(_Modal, frame, levels, modes, references, guess=fine is None)
@@ -92,6 +100,11 @@ class JointSpace(nn.Module):
             with torch.no_grad():
                 self._modal, self._make = self._make(), None
         return self._modal
+
+    @property
+    def levels(self) -> Levels:
+        """The energies of the modal solve."""
+        return self.modal.levels
 
     @property
     def columns(self) -> Columns:
@@ -195,7 +208,7 @@ class JointSpace(nn.Module):
         """The difference of the key-frames as a column, and that on the coarse mesh. *Shape:* ``(B, V_coarse, 3)``."""
         rigid, coarse = self.frame.split(coarse, self.frame.rigid)
         modal, coarse = self.frame.split(coarse, self.columns)
-        squared = (coarse**2 * self.frame.coarse_weights[:, None]).sum((-1, -2))
+        squared = (coarse**2 * self.frame.coarse.weights[:, None]).sum((-1, -2))
         # Coincident key-frames leave no difference: its column is then zero, not a quotient of rounding errors.
         rounding = 1e3 * torch.finfo(coarse.dtype).eps * pair.first.abs().amax((-1, -2))
         scale = (squared + rounding**2).rsqrt()

@@ -37,7 +37,7 @@ class Levels(nn.Module):
 
     def __init__(self, frame: Frame, fine: Mesh, terms: Sequence[Term], backend: Backend = "torch") -> None:
         super().__init__()
-        self.mesh = Mesh.of(frame.coarse_faces, frame.n_coarse)
+        self.mesh = Mesh.of(frame.coarse.faces, frame.coarse.n_vertices)
         numbers = range(len(terms))
         #: Which terms each level has.
         self.members = [[i for i in numbers if not terms[i].sampled], [i for i in numbers if terms[i].sampled]]
