@@ -1,15 +1,19 @@
 """A whole motion from key-frames and the noisy trajectories of 20 vertices.
 
-    python examples/motion_from_markers.py [--frames 24] [--steps 20] [--seed 0]
+    python examples/motion_from_markers.py [--frames 24] [--steps 20] [--seeds 0 1 2]
+    python examples/motion_from_markers.py --meshes frame-*.obj
 
-The sample creature gallops; known are three key-frames of the cycle, and where 20 of its vertices are in every frame,
-with noise of 1 % of the diagonal and a tenth of them lost. Amplitudes, times and rigid motions of all frames are fitted
-through the differentiable decoder (:class:`torch_modal.ModalDecoder`), with the elastic energy of the modes and
-smoothness in time as the prior. Compared with PCA of the key-frames fitted to the same markers, and with the smooth
-path through the key-frames without any marker.
+The sample creature gallops, or the meshes of a motion are given; known are three key-frames of the cycle, or the first
+and the last mesh, and where 20 vertices are in every frame, with noise of 1 % of the diagonal and a tenth of them lost.
+Amplitudes, times and rigid motions of all frames are fitted through the differentiable decoder
+(:class:`torch_modal.ModalDecoder`), with the elastic energy of the modes and smoothness in time as the prior. Compared
+with PCA of the key-frames fitted to the same markers, and with the smooth path through the key-frames without any
+marker. Errors are mean distances of all vertices, in % of the diagonal.
 """
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -27,7 +31,10 @@ NOISE, LOST = 0.01, 0.1
 STIFFEST = 3.0
 """Prior deviation of the softest mode's amplitude; a stiffer one has it less by the ratio of their frequencies."""
 JERK = 0.07
-"""Prior deviation of second differences in time, over that of the amplitude itself, at 48 frames."""
+"""Prior deviation of second differences in time, over that of the amplitude itself, at 16 frames from key-frame to
+key-frame."""
+LATE = 0.02
+"""Prior deviation of a time, over that from key-frame to key-frame."""
 
 
 class Problem(NamedTuple):
@@ -37,6 +44,7 @@ class Problem(NamedTuple):
     """The truth. *Shape:* ``(T, V, 3)``."""
     faces: Tensor
     keys: list[int]
+    cyclic: bool
     chosen: Tensor
     """Vertices that are followed. *Shape:* ``(M,)``."""
     markers: Tensor
@@ -66,19 +74,17 @@ def gallop(n_frames: int) -> tuple[Tensor, Tensor]:
     return torch.stack([posed(6 * i / n_frames) for i in range(n_frames)]), torch.from_numpy(faces)
 
 
-def problem(n_frames: int, generator: torch.Generator) -> Problem:
+def problem(frames: Tensor, faces: Tensor, keys: list[int], cyclic: bool, generator: torch.Generator) -> Problem:
     """Markers far from each other."""
-    frames, faces = gallop(n_frames)
     diagonal = float((frames[0].amax(0) - frames[0].amin(0)).norm())
     chosen = [0]
     while len(chosen) < N_MARKERS:
         apart = (frames[0][:, None] - frames[0][chosen]).norm(dim=-1).amin(1)
         chosen.append(int(apart.argmax()))
-    noise = torch.randn(n_frames, N_MARKERS, 3, generator=generator, dtype=torch.float64) / 3**0.5
-    seen = torch.rand(n_frames, N_MARKERS, generator=generator) > LOST
+    noise = torch.randn(len(frames), N_MARKERS, 3, generator=generator, dtype=torch.float64) / 3**0.5
+    seen = torch.rand(len(frames), N_MARKERS, generator=generator) > LOST
     markers = frames[:, chosen] + NOISE * diagonal * noise
-    keys = [0, n_frames // 3, 2 * n_frames // 3]
-    return Problem(frames, faces, keys, torch.tensor(chosen), markers, seen, diagonal)
+    return Problem(frames, faces, keys, cyclic, torch.tensor(chosen), markers, seen, diagonal)
 
 
 def by_amplitudes(known: Problem, steps: int) -> tuple[Tensor, Tensor]:
@@ -86,7 +92,7 @@ def by_amplitudes(known: Problem, steps: int) -> tuple[Tensor, Tensor]:
     n = len(known.frames)
     keyframes = known.frames[known.keys]
     basis = tm.extract_modes(keyframes[0], known.faces, N_MODES, mesher="lattice")
-    times = torch.tensor([*known.keys, n], dtype=torch.float64)
+    times = torch.tensor([*known.keys, n] if known.cyclic else known.keys, dtype=torch.float64)
     decoder = tm.ModalDecoder(keyframes, known.faces, times, basis.reference, basis.modes)
     t = torch.arange(n, dtype=torch.float64)
     free = torch.ones(n, 1, dtype=torch.float64)
@@ -95,18 +101,20 @@ def by_amplitudes(known: Problem, steps: int) -> tuple[Tensor, Tensor]:
     # All unknowns are in units of their prior deviation.
     unknown = torch.zeros(n, N_MODES + 7, dtype=torch.float64, requires_grad=True)
     scales = torch.cat([deviation, torch.full((7,), 0.05, dtype=torch.float64)])
-    scales[N_MODES] = 0.3 * n / 48  # frames
-    jerk = JERK * (48 / n) ** 2
+    between = float(times[-1] - times[0]) / (len(times) - 1)  # frames from key-frame to key-frame
+    scales[N_MODES] = LATE * between
+    jerk = JERK * (16 / between) ** 2
 
     def decoded(z: Tensor) -> Tensor:
         a, dt, motions = (free * z * scales).split([N_MODES, 1, 6], 1)
-        return decoder(a, t + dt[:, 0], motions)
+        late = t + dt[:, 0]
+        return decoder(a, late if known.cyclic else late.clamp(times[0], times[-1]), motions)
 
     def objective(z: Tensor) -> Tensor:
         apart = (decoded(z)[:, known.chosen] - known.markers) / (NOISE * known.diagonal / 3**0.5)
         data = (apart.square().sum(-1) * known.seen).sum()
         bent = (torch.roll(z, 1, 0) - 2 * z + torch.roll(z, -1, 0)) / jerk
-        return data + z.square().sum() + bent.square().sum()
+        return data + z.square().sum() + (bent if known.cyclic else bent[1:-1]).square().sum()
 
     solver = torch.optim.LBFGS([unknown], max_iter=1, history_size=20, line_search_fn="strong_wolfe")
 
@@ -147,9 +155,23 @@ def by_pca(known: Problem) -> Tensor:
     return torch.stack(out)
 
 
-def main(n_frames: int = 24, steps: int = 20, seed: int = 0) -> dict[str, float]:
-    """Errors of all ways, over the diagonal."""
-    known = problem(n_frames, torch.Generator().manual_seed(seed))
+def main(
+    n_frames: int = 24, steps: int = 20, seed: int = 0, meshes: Sequence[str | Path] | None = None
+) -> dict[str, float]:
+    """Errors of all ways, over the diagonal.
+
+    Args:
+        n_frames: Of the sample creature's cycle.
+        steps: Of the fit.
+        seed: Of noise and of what is lost.
+        meshes: Of a motion, in the place of the sample's.
+    """
+    if meshes is None:
+        (frames, faces), keys = gallop(n_frames), [0, n_frames // 3, 2 * n_frames // 3]
+    else:
+        frames, faces = tm.load_keyframes(meshes)
+        keys = [0, len(frames) - 1]
+    known = problem(frames, faces, keys, meshes is None, torch.Generator().manual_seed(seed))
     path, fitted = by_amplitudes(known, steps)
     return {"path": known.error(path), "PCA": known.error(by_pca(known)), "amplitudes": known.error(fitted)}
 
@@ -158,7 +180,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--steps", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--meshes", type=Path, nargs="+")
     args = parser.parse_args()
-    for name, error in main(args.frames, args.steps, args.seed).items():
-        print(f"{name:12s} {100 * error:.2f} % of the diagonal")
+    for seed in args.seeds:
+        found = main(args.frames, args.steps, seed, args.meshes)
+        print(f"seed {seed}: " + ", ".join(f"{name} {100 * error:.2f}" for name, error in found.items()), flush=True)

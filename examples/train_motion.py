@@ -247,14 +247,27 @@ def edge_lengths(x: Tensor, faces: Tensor) -> Tensor:
 
 
 def draw(data: Strides, found: dict[str, Learned], out: Path) -> None:
-    """Six shapes of the first test animal's stride in each kind of coordinates, coloured by their distance."""
-    shown = torch.linspace(1, N_FRAMES - 3, 6).long()
-    truth = data.test[0, 2:]
-    rows = {"truth": truth[shown]} | {name: each.shapes[shown] for name, each in found.items()}
-    errors = {name: 100 * (each.shapes - truth)[shown].norm(dim=-1) for name, each in found.items()}
+    """Some shapes of the first test animal's stride in each kind of coordinates, coloured by their distance."""
+    shown = torch.linspace(0, N_FRAMES - 2, 5).long()
+    given = data.test[0, 1:2]
+    truth = torch.cat([given, data.test[0, 2:]])[shown]
+    told = {name: torch.cat([given, each.shapes])[shown] for name, each in found.items()}
+    errors = {name: 100 * (x - truth).norm(dim=-1) for name, x in told.items()}
     label = "distance from the truth in % of the bounding box"
     out.parent.mkdir(parents=True, exist_ok=True)
-    tm.render_sequence(rows, data.faces, out, view=(-90.0, 0.0), colors=errors, color_label=label, up="y")
+    titles = ["given"] + [f"{step} steps" for step in shown[1:].tolist()]
+    tm.render_sequence(
+        {"truth": truth, **told},
+        data.faces,
+        out,
+        titles=titles,
+        keyframe_indices=[0],
+        view=(0.0, 8.0),
+        up="y",
+        colors=errors,
+        color_label=label,
+        overwrite=True,
+    )
 
 
 def main(
