@@ -18,7 +18,7 @@ told step by step.
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,29 +82,40 @@ class Learned(NamedTuple):
     """The stride of the first test animal. *Shape:* ``(T - 2, V, 3)``."""
 
 
-def strides(n_train: int, cell: float, generator: torch.Generator) -> Strides:
-    """Training and test animals, each with its own reach.
+def galloping(cell: float) -> tuple[Tensor, Callable[[Sequence[float], float], Tensor]]:
+    """Faces of the sample creature, and its shape of any reach at any time of a stride, which takes six.
 
     Args:
-        n_train: Number of training animals.
         cell: Of the grid that the mesh is made from.
-        generator: Of reaches.
     """
     bones, flesh = make_samples.creature()
     rest, faces = sculpt(flesh, cell)
     weights, _ = bind(flesh, bones, rest, faces, softness=1.15)
     parts = {name: _part(name, bones) for name in bones}
 
-    def posed(reach: list[float], frame: int) -> Tensor:
-        turns, shift = make_samples.gallop(bones, 6 * frame / N_FRAMES)
+    def posed(reach: Sequence[float], time: float) -> Tensor:
+        turns, shift = make_samples.gallop(bones, time)
         scaled = {name: Rotation.from_rotvec(reach[parts[name]] * turn.as_rotvec()) for name, turn in turns.items()}
         return torch.from_numpy(skin(rest, weights, *place_bones(bones, scaled, shift)))
 
+    return torch.from_numpy(faces), posed
+
+
+def strides(n_train: int, cell: float, generator: torch.Generator) -> Strides:
+    """Training and test animals, each with its own reach.
+
+    Args:
+        n_train: Number of training animals.
+        cell: As for :func:`galloping`.
+        generator: Of reaches.
+    """
+    faces, posed = galloping(cell)
     low, high = REACH
     reaches = low + (high - low) * torch.rand(n_train + N_TEST, 3, generator=generator, dtype=torch.float64)
-    x = torch.stack([torch.stack([posed(reach, i) for i in range(N_FRAMES)]) for reach in reaches.tolist()])
+    times = [6 * i / N_FRAMES for i in range(N_FRAMES)]
+    x = torch.stack([torch.stack([posed(reach, time) for time in times]) for reach in reaches.tolist()])
     x = x / (x[0, 0].amax(0) - x[0, 0].amin(0)).norm()
-    return Strides(x[:n_train], x[n_train:], torch.from_numpy(faces))
+    return Strides(x[:n_train], x[n_train:], faces)
 
 
 def _part(name: str, bones: dict[str, make_samples.Bone]) -> int:

@@ -1,6 +1,7 @@
 """A motion as key-frames and amplitudes, against a plain PCA of its frames.
 
     python tests/benchmarks/codec.py [floats selection decode] [--motions creature hand-path grip]
+    python tests/benchmarks/codec.py long
 
 Distances are means over the vertices and frames, over the diagonal; edge errors are means of ``|l - l_true| / l_true``.
 PCA keeps the mean frame, its components and their coefficients: with as many components as fit into the floats of the
@@ -10,6 +11,8 @@ encoded motion, and with one more, which takes more floats. Times are of the pro
 from __future__ import annotations
 
 import argparse
+import math
+import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +29,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.sequence.codec_modes import fixed_modes
 from torch_modal.sequence.codec_selection import Judge, select_keyframes
 
-GALLOP, GRIP = 96, 41
+GALLOP, GRIP, LONG = 96, 41, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +186,29 @@ def refined(frames: Tensor, faces: Tensor, n_vertices: int) -> tuple[Tensor, Ten
     return frames, faces
 
 
+def print_long() -> None:
+    """A row of 1,000 frames: the creature gallops ten strides, each with another reach, and is not periodic."""
+    import train_motion
+
+    faces, posed = train_motion.galloping(0.04)
+    reaches = [[1 + 0.15 * math.sin(0.011 * i + part) for part in range(3)] for i in range(LONG)]
+    frames = torch.stack([posed(reach, 6 * i / 100) for i, reach in enumerate(reaches)])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.process_time()
+    found = tm.encode(frames, faces, None, 20, error=0.01, progress=False)
+    seconds = time.process_time() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    own = frames.numel() * 8 / 2**20
+    print(
+        "| frames | vertices | key-frames | mean distance, worst, % | seconds | frames, MB | peak before, after, MB |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    print(
+        f"| {LONG} | {frames.shape[1]} | {len(found.keyframes)} | {100 * float(found.errors.mean()):.2g}, "
+        f"{100 * float(found.errors.max()):.2g} | {seconds:.0f} | {own:.0f} | {before / 1024:.0f}, {peak / 1024:.0f} |"
+    )
+
+
 TABLES = {
     "floats": (
         "| motion | key-frames | floats / 3V | path: distance, edges | + 60 amplitudes "
@@ -200,11 +226,14 @@ TABLES = {
 def main() -> None:
     """Print what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tables", nargs="*", help=f"of {', '.join(TABLES)}; default: all")
+    parser.add_argument("tables", nargs="*", help=f"of {', '.join(TABLES)}, or long; default: all but that")
     parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS))
     args = parser.parse_args()
     limit_threads()
     for name in args.tables or TABLES:
+        if name == "long":
+            print_long()
+            continue
         head, row = TABLES[name]
         print(head)
         print("|---" * (head.count("|") - 1) + "|")

@@ -250,7 +250,8 @@ def draw(found: dict[str, dict[str, list[Point]]], out: Path) -> None:
             axis.set(xscale="log", yscale="log", xlabel="bits a vertex and frame", ylabel=label, title=name)
             axis.grid(alpha=0.3)
             axis.xaxis.set_minor_formatter(NullFormatter())
-        row[0].legend(fontsize="small")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     figure.savefig(out, dpi=70)
 
 

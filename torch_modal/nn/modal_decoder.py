@@ -29,6 +29,9 @@ LEAST = 1e-4
 MOST = 30.0
 """A triangle turns and strains by at most this many times the mode's mean over the area: more is that of a sliver."""
 
+KEPT = 200_000
+"""Vertices of all intervals, between two key-frames each, that are kept for the next time; two intervals at least."""
+
 CHUNK = 40_000
 """Vertices of all shapes that are decoded at a time: more would not fit into caches."""
 
@@ -99,6 +102,7 @@ class ModalDecoder(nn.Module):
     def _forget(self) -> None:
         self._known: list[Interval | None] = [None] * self.n_intervals
         self._blends: list[RotationBlend | None] = [None] * self.n_intervals
+        self._made: list[int] = []
 
     def through(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
         """The same modes beside a path through other key-frames, of the same connectivity."""
@@ -111,12 +115,16 @@ class ModalDecoder(nn.Module):
         return other
 
     def blend(self, i: int) -> RotationBlend:
-        """Of an interval; made at the first use."""
+        """Of an interval; made at the first use, and again if many others were made since."""
         known = self._blends[i]
         if known is None:
             with torch.no_grad():
                 ends = torch.cat(self._pair(i, self.keyframes)[:2]).double().cpu()
                 known = self._blends[i] = RotationBlend(self._mesh, ends).to(self.keyframes)
+            self._made.append(i)
+            while len(self._made) > max(2, KEPT // self.keyframes.shape[1]):
+                oldest = self._made.pop(0)
+                self._blends[oldest] = self._known[oldest] = None
         return known
 
     @property
