@@ -246,11 +246,30 @@ def _vessel() -> tuple[FloatArray, IntArray]:
 
 def _limb() -> tuple[FloatArray, IntArray]:
     """A ball with a limb a tenth as thick, which ends round."""
-    ball, root = np.linspace(np.pi, np.arcsin(0.1), 40), np.linspace(np.pi / 2, 0, 4)[1:]
-    profile = [[np.cos(a), np.sin(a)] for a in ball] + [[LIMB, 0.1]]
-    profile += [[LIMB + 0.1 * np.cos(a), 0.1 * np.sin(a)] for a in root]
+    return _ball_with(0.1, 0.085)
+
+
+def _ball_with(radius: float, spacing: float) -> tuple[FloatArray, IntArray]:
+    """A ball of radius 1 with a limb of another."""
+    ball, root = np.linspace(np.pi, np.arcsin(radius), 40), np.linspace(np.pi / 2, 0, 4)[1:]
+    profile = [[np.cos(a), np.sin(a)] for a in ball] + [[LIMB, radius]]
+    profile += [[LIMB + radius * np.cos(a), radius * np.sin(a)] for a in root]
     profile[0][1] = profile[-1][1] = 0.0
-    return turned_surface(np.array(profile), 0.085)
+    return turned_surface(np.array(profile), spacing)
+
+
+def _wire() -> tuple[FloatArray, IntArray]:
+    """The same with a leg of a fortieth."""
+    return _ball_with(0.025, 0.045)
+
+
+def _rod() -> tuple[FloatArray, IntArray]:
+    """Fifty times longer than wide."""
+    root = np.linspace(np.pi / 2, 0, 4)
+    end = np.stack([BAR + 0.04 * np.cos(root), 0.04 * np.sin(root)], axis=1)
+    profile = np.concatenate([np.stack([BAR - end[::-1, 0], end[::-1, 1]], axis=1), end])
+    profile[0, 1] = profile[-1, 1] = 0.0
+    return turned_surface(profile, 0.03)
 
 
 def _sheet() -> tuple[FloatArray, IntArray]:
@@ -264,6 +283,8 @@ _BENT = {
     "vessel bent": (_vessel, bend, 0.3, 3.2),
     "limb bent": (_limb, bend, 1.5, LIMB),
     "elbow bent": (_limb, bend, 2.6, 3.4),
+    "wire bent": (_wire, bend, 1.5, LIMB),
+    "rod bent": (_rod, bend, 0.0, BAR),
     "sheet rolled": (_sheet, bend, 0.0, BAR),
     "gutter rolled": (_sheet, bend, 0.0, BAR),
 }
@@ -285,6 +306,8 @@ BODIES = (
     "gutter rolled 270",
 )
 """The bodies that are looked at by default; :func:`body` takes other angles as well."""
+SLENDER = ("wire bent 120", "rod bent 180")
+"""Bodies that are harder to fill with tetrahedra, and easy otherwise."""
 
 
 @cache

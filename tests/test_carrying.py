@@ -12,7 +12,7 @@ from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, n
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import embed_surface
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
-from torch_modal.precompute.proximity import self_proximity, thin_part
+from torch_modal.precompute.proximity import clearances, self_proximity
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tet_volumes
@@ -106,13 +106,26 @@ def test_a_degenerate_face_does_no_harm() -> None:
     assert np.isfinite(local_rotations(POINTS, POINTS @ TURN.T, faces)).all()
 
 
-def test_thin_parts() -> None:
-    """A plate of 8 by 4 by 0.4, a diagonal of 9: all of its area but that of the rims has 0.4 under it."""
+def test_clearances_of_a_plate_and_of_a_gap() -> None:
+    """A plate of 8 by 4 by 0.4, and another 0.3 above it: a diagonal of 9."""
     plate = box((40, 20, 2), (8.0, 4.0, 0.4))
     used, compact = np.unique(surface(plate), return_inverse=True)
-    whole = Surface.of(plate.vertices[used], compact.reshape(-1, 3))
-    assert thin_part(whole, 0.03) == 0
-    assert thin_part(whole, 0.1) > 0.8
+    one = plate.vertices[used]
+    whole = Surface.of(
+        np.concatenate([one, one + np.array([0, 0, 0.7])]),
+        np.concatenate([compact.reshape(-1, 3), compact.reshape(-1, 3) + len(one)]),
+    )
+    near = clearances(whole)
+    middle = whole.points[whole.faces].mean(axis=1)
+    flat = (np.ptp(whole.points[whole.faces][..., 2], axis=1) == 0) & (np.abs(middle[:, :2]) < [30.0, 12.0]).all(axis=1)
+    np.testing.assert_allclose(near.thickness[flat], 0.4 * whole.scale, rtol=0.02)
+    facing = flat & (np.abs(middle[:, 2]) < 0.2 * whole.scale)
+    np.testing.assert_allclose(near.gap[facing], 0.3 * whole.scale, rtol=0.02)
+    assert np.isinf(near.gap[flat & ~facing]).all()
+    # Corners of a box are no thin parts.
+    cube = box((20, 20, 20), (1.0, 1.0, 1.0))
+    used, compact = np.unique(surface(cube), return_inverse=True)
+    assert np.isinf(clearances(Surface.of(cube.vertices[used], compact.reshape(-1, 3))).thickness).all()
 
 
 def horseshoe(angle: float) -> np.ndarray:
@@ -144,7 +157,7 @@ def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
 
     monkeypatch.setattr(filling, "tetrahedralize", fill)
-    monkeypatch.setattr(filling, "MOST_THIN", -1.0)  # no body is left to the lattice
+    monkeypatch.setattr(filling, "is_resolved", lambda *_: False)  # no body is left to the lattice
     return asked
 
 

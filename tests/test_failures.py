@@ -184,7 +184,7 @@ def test_success_after_a_failure_lasts(
 def test_the_lattice_takes_over_at_once(
     worker: Worker, capsule: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filling, "MOST_THIN", -1.0)  # as if the capsule had thin parts
+    monkeypatch.setattr(filling, "is_resolved", lambda *_: False)  # as if the capsule had thin parts
     worker.does(CRASH)
     vertices, faces = capsule
     keyframes = np.stack([vertices, vertices * (1, 1, 1.2)])

@@ -15,7 +15,7 @@ from torch_modal.data.samples import load_sample
 from torch_modal.io.read import SUFFIXES
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
-from bodies import BODIES, body
+from bodies import BODIES, SLENDER, body
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 HALF = 0.5
@@ -147,6 +147,11 @@ def bodies(names: Iterable[str] = BODIES, jittered: bool = False) -> Iterator[Ca
         shapes = KeyframeSet(torch.stack([first, last]), torch.from_numpy(np.array(shape.faces)))
         quarters = {t: torch.from_numpy(shape.pose(t)) for t in (0.25, 0.75)}
         yield Case(name + (", irregular" if jittered else ""), shapes, 0, 1, {HALF: half, **quarters})
+
+
+def slender() -> Iterator[Case]:
+    """Bodies that are hard to fill with tetrahedra."""
+    yield from bodies(SLENDER)
 
 
 def _there(path: Path) -> bool:

@@ -1,6 +1,6 @@
 """What in-betweens lose with other tetrahedra: shell energy and edge error, over those with the reference's bases.
 
-    python tests/benchmarks/meshers.py [--samples] [--shared] [--bodies] [--only TEXT ...] [--ways coarser lattice]
+    python tests/benchmarks/meshers.py [--samples] [--shared] [--bodies] [--slender] [--only TEXT ...] [--ways coarser lattice]
 
 One line for each case: shapes at t = 1/2 from two presets, with the bases of each way of meshing, over the same with
 those of fTetWild at 3,000 faces, ``epsilon=2e-3``, ``stop_energy=50``. Edge errors need a truth. Below are the
@@ -34,6 +34,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "lattice": {"mesher": "lattice"},
     "auto": {"mesher": "auto"},
 }
+SOURCES = ("samples", "shared", "bodies", "slender")
 PRESETS: tuple[Any, ...] = ("accurate", "fast")
 
 
@@ -67,7 +68,7 @@ def measure(case: Case, ways: list[str], made: dict[Any, Any]) -> dict[tuple[str
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for name in ("samples", "shared", "bodies"):
+    for name in SOURCES:
         parser.add_argument(f"--{name}", action="store_true")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT")
     parser.add_argument("--ways", nargs="+", choices=[w for w in WAYS if w != REFERENCE], default=["coarser", "auto"])
@@ -76,7 +77,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     ratios: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
     made: dict[Any, Any] = {}
-    for source in ("samples", "shared", "bodies"):
+    for source in SOURCES:
         for case in getattr(cases, source)() if getattr(arguments, source) else ():
             if not any(text in case.name for text in arguments.only):
                 continue

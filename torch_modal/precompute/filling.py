@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
-from torch_modal.precompute.lattice import is_too_fine, lattice
-from torch_modal.precompute.proximity import self_proximity, thin_part
+from torch_modal.precompute.lattice import is_resolved, is_too_fine, lattice
+from torch_modal.precompute.proximity import clearances, self_proximity
 from torch_modal.precompute.stiffness import mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import (
+    EDGE_RANGE,
     Tetrahedra,
     TetrahedralizationError,
     TetrahedraSettings,
@@ -32,12 +33,10 @@ IntArray = NDArray[np.int64]
 Mesher = Literal["auto", "tetwild", "lattice"]
 MESHERS: tuple[Mesher, ...] = ("auto", "tetwild", "lattice")
 
+LATTICE_VERSION = "graded"
+"""Tetrahedra that other versions of the package have kept are not those of this one."""
 CUBE = 0.75
-"""Edge of the lattice's cubes, over the edge that fTetWild is asked for: as many vertices come out."""
-CUBES_ACROSS = 2.0
-MOST_THIN = 0.02
-"""The lattice takes a body by itself where no more of its area than this has fewer cubes than that under it. In bodies
-with slender limbs edge lengths are up to 6 % worse by it: they keep the tetrahedra of fTetWild."""
+"""Edge of the lattice's cubes at the surface, over the largest that fTetWild is asked for."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class Filler:
 
     Attributes:
         settings: How fine the tetrahedra are.
-        mesher: ``"tetwild"``, ``"lattice"``, or ``"auto"``: the lattice where its cubes resolve the body, and elsewhere
+        mesher: ``"tetwild"``, ``"lattice"``, or ``"auto"``: the lattice where it resolves the body, and elsewhere
             fTetWild, or the lattice again where that fails.
         timeout: Seconds that the child process of fTetWild may take.
         cache: Where tetrahedra are kept.
@@ -135,23 +134,34 @@ class Filler:
         Raises:
             TetrahedralizationError: No mesher could fill it.
         """
-        problem = None
-        if self.mesher == "tetwild" or (self.mesher == "auto" and not self._is_resolved(surface)):
-            try:
-                return Body(surface, self._kept("tetwild", surface, self._by_tetwild))
-            except TetrahedralizationError as error:
-                if self.mesher == "tetwild":
-                    raise
-                problem = str(error)
-        return Body(surface, self._kept("lattice", surface, self._by_lattice), problem)
+        if self.mesher == "lattice":
+            return Body(surface, self._by_lattice(surface)[0])
+        if self.mesher == "auto" and not is_too_fine(surface, self._cube()):
+            tetrahedra, resolved = self._by_lattice(surface)
+            if resolved:
+                return Body(surface, tetrahedra)
+        try:
+            kept = self._kept("tetwild", surface, lambda: _as_arrays(self._by_tetwild(surface)))
+            return Body(surface, Tetrahedra(**kept))
+        except TetrahedralizationError as error:
+            if self.mesher == "tetwild":
+                raise
+            return Body(surface, self._by_lattice(surface)[0], str(error))
 
-    def _is_resolved(self, surface: Surface) -> bool:
-        """Whether there are several cubes of the lattice under nearly all of the surface."""
-        cube = self._cube(surface)
-        return not is_too_fine(surface, cube) and thin_part(surface, CUBES_ACROSS * cube) <= MOST_THIN
+    def _by_lattice(self, surface: Surface) -> tuple[Tetrahedra, bool]:
+        """By the lattice, and whether that resolves the body."""
 
-    def _cube(self, surface: Surface) -> float:
-        return CUBE * self.settings.edge_length(surface.points, surface.faces)
+        def compute() -> Arrays:
+            near = clearances(surface)
+            made = lattice(surface, self._cube(), near)
+            return {**_as_arrays(made), "resolved": np.array([is_resolved(made, surface, near)])}
+
+        kept = self._kept("lattice", surface, compute)
+        resolved = kept.pop("resolved")
+        return Tetrahedra(**kept), bool(resolved[0])
+
+    def _cube(self) -> float:
+        return CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
 
     def _by_tetwild(self, surface: Surface) -> Tetrahedra:
         """By fTetWild, unless it is known to fail: nobody should wait for the same failure twice."""
@@ -180,15 +190,10 @@ class Filler:
             "--clear), or do without it"
         )
 
-    def _by_lattice(self, surface: Surface) -> Tetrahedra:
-        return lattice(surface, self._cube(surface))
-
-    def _kept(self, mesher: str, surface: Surface, make: Callable[[Surface], Tetrahedra]) -> Tetrahedra:
-        versions = _mesher_versions() if mesher == "tetwild" else {}
+    def _kept(self, mesher: str, surface: Surface, make: Callable[[], Arrays]) -> Arrays:
+        versions = _mesher_versions() if mesher == "tetwild" else {"lattice": LATTICE_VERSION}
         parameters = {**asdict(self.settings), **versions, "mesher": mesher}
-        return Tetrahedra(
-            **self.cache.get("tetrahedra", _content(surface), parameters, lambda: _as_arrays(make(surface)))
-        )
+        return dict(self.cache.get("tetrahedra", _content(surface), parameters, make))
 
     def carried(self, body: Body, surface: Surface) -> Filling | None:
         """The body in the pose of another key-frame, or None if its tetrahedra do not survive that."""

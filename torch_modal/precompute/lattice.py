@@ -1,103 +1,228 @@
-"""A surface filled with a lattice of cubes, each cut into six tetrahedra: deterministic, and never at a loss."""
+"""A surface filled with a graded lattice: cubes cut into tetrahedra, which are halved where the body is thin.
+
+Deterministic, and never at a loss.
+"""
 
 import itertools
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import connected_pieces
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.precompute.bisection import halved
+from torch_modal.precompute.proximity import Clearance, clearances
+from torch_modal.precompute.sampling import Samples, sampled
 from torch_modal.precompute.surface import DIAGONAL, Surface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, tet_volumes, without_debris
+from torch_modal.precompute.tetrahedra import (
+    Tetrahedra,
+    TetrahedralizationError,
+    pieces_by_sides,
+    solid_volumes,
+    tet_volumes,
+    without_debris,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
-SAMPLES = 4
-"""Samples of the inside along the edge of a cube."""
+ROOT = 2.0
+"""Edge of the cubes that all tetrahedra come from by halving, over that of cubes at the surface."""
+ACROSS = 2.0
+"""Tetrahedra across what is thin."""
+ACROSS_GAP = 1.0
+"""Tetrahedra across a gap."""
+SMALLEST = 1 / 12
+"""Size of the smallest tetrahedra, over the largest at the surface."""
+MOST_TETRAHEDRA = 7_000
+"""About; somewhat fewer are left once the outer vertices are on the surface. With finer cubes there may be more, as
+many as fit into the volume."""
+USUAL_EDGE = 0.03
+"""Of the cubes that this bound is for, in bounding-box diagonals."""
+MOST_CUBES = 20_000
+"""Of those that all tetrahedra come from."""
+SAMPLES_APART = 0.7
+"""Distance of the samples of the surface, over the size of tetrahedra there."""
+FEWEST_SAMPLES = 5000
+GRID_SPACING = 0.5
+"""Of the grid on which the inside is found, over the smallest tetrahedra, unless it has too many points then."""
+MOST_POINTS = 600_000
+SURELY_INSIDE = 0.9
+"""Values of the grid below are in doubt near the surface. Above, one closed part of it lies in another."""
+NEARBY = 1.5
+"""How near that is, in spacings of the grid."""
+RAMP = 0.25
+"""Over how much of the spacing the indicator falls there."""
+COARSEST = 3.0
+"""Size of a tetrahedron over the thickness of the body, from which on it does not resolve that."""
+MOST_COARSE = 0.02
+"""Part of the area where that may be."""
+WIRE = 0.01
+"""Thickness of wires, in bounding-box diagonals, and less."""
+WIRE_LENGTH = 40.0
+"""Over that thickness."""
 LEAST_INSIDE = 0.02
 """Tetrahedra with less of them inside are left out, or count as this much where the surface runs through them."""
-MAX_SAMPLES = 4_000_000
 REACH = 0.7
-"""How far vertices are moved onto the surface, in cubes."""
+"""How far vertices are moved onto the surface, over the size of the smallest tetrahedron around."""
 LEAST_VOLUME = 0.05
 """Of a tetrahedron whose vertices were moved, in its volume before; else they go back."""
 MOST_RETREATS = 8
 FITTED_INSIDE = 0.4
 """Tetrahedra with less of them inside are left out once vertices lie on the surface."""
+MOST_BRIDGES = 4
+LEAST_KEPT = 0.8
+"""Of the volume: where more is lost on the way, the body is too thin for it."""
 SPREAD = np.concatenate([np.eye(4) * 2 / 3 + 1 / 12, np.full((1, 4), 0.25)])
 """Points of a tetrahedron: from its corners a third of the way to the centroid, and the centroid."""
 
 
 class Indicator(NamedTuple):
-    """One inside a surface, zero outside, on the centres of a grid.
+    """One inside a surface, zero outside.
 
     Attributes:
-        values: *Shape:* ``(X, Y, Z)``.
+        values: On the points of a grid. *Shape:* ``(X, Y, Z)``.
         low: Corner of the grid.
         spacing: Of its points.
+        samples: Of the surface: which side of them a point is on tells more than the grid where that is in doubt.
+        has_sides: Whether that is so for each; not at the rim of an open surface. *Shape:* ``(P,)``.
     """
 
     values: FloatArray
     low: FloatArray
     spacing: float
+    samples: Samples
+    has_sides: BoolArray
 
     def inside(self, corners: FloatArray) -> FloatArray:
         """Which part of tetrahedra is inside. *Shape:* ``(T, 4, 3) -> (T,)``."""
         values = self.at(np.einsum("qa,tai->tqi", SPREAD, corners).reshape(-1, 3))
-        return np.clip(values.reshape(len(corners), -1).mean(axis=1), 0.0, 1.0)
+        return values.reshape(len(corners), -1).mean(axis=1)
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Linear between the points of the grid. *Shape:* ``(P, 3) -> (P,)``."""
-        places = (points - self.low) / self.spacing - 0.5
-        return map_coordinates(self.values, places.T, order=1, mode="nearest")
+        """Linear between the points of the grid, and sharper near the surface. *Shape:* ``(P, 3) -> (P,)``."""
+        values = self._by_grid(points)
+        doubtful = np.flatnonzero(values < SURELY_INSIDE)
+        distance, nearest = self.samples.tree.query(points[doubtful], distance_upper_bound=NEARBY * self.spacing)
+        # Beyond the rim of an open surface there are no sides.
+        near = np.isfinite(distance) & np.append(self.has_sides, False)[nearest]
+        doubtful, nearest = doubtful[near], nearest[near]
+        offset = points[doubtful] - self.samples.points[nearest]
+        height = np.einsum("vi,vi->v", offset, self.samples.normals[nearest])
+        values[doubtful] = 0.5 - height / (RAMP * self.spacing)
+        return np.clip(values, 0.0, 1.0)
+
+    def _by_grid(self, points: FloatArray) -> FloatArray:
+        place = (points - self.low) / self.spacing
+        last = np.array(self.values.shape) - 2
+        base = np.clip(place.astype(np.int64), 0, last)
+        part = np.clip(place - base, 0.0, 1.0)
+        strides = np.array(self.values.strides) // self.values.itemsize
+        index, flat = base @ strides, self.values.reshape(-1)
+        found = np.zeros(len(points))
+        for step in itertools.product((0, 1), repeat=3):
+            weight = np.where(step, part, 1 - part).prod(axis=1)
+            found += weight * flat[index + int(np.array(step) @ strides)]
+        return found
 
 
-def lattice(surface: Surface, edge_length_fac: float) -> Tetrahedra:
+def lattice(surface: Surface, edge_length_fac: float, clearance: Clearance | None = None) -> Tetrahedra:
     """Cubes around a surface, cut into tetrahedra, with the outer vertices moved onto it where that is near.
 
+    Where the body is thin, or another part of it is near, tetrahedra are halved until they are small enough.
     Tetrahedra count with the fraction of them that is inside. Needs no closed surface and no consistent one: what is
-    inside follows from the normals of all faces together. Parts closer together than a cube are fused. The same surface
-    always gives the same tetrahedra.
+    inside follows from the normals of all faces together. Parts closer together than a tetrahedron are fused. The same
+    surface always gives the same tetrahedra.
 
     Args:
         surface: What to fill.
-        edge_length_fac: Edge of a cube as a fraction of the bounding-box diagonal.
+        edge_length_fac: Edge of the cubes that are cut at the surface, where nothing is thin, as a fraction of the
+            bounding-box diagonal.
+        clearance: Of the surface, if it is known.
 
     Raises:
         TetrahedralizationError: The lattice would be too fine, or nothing is inside.
     """
-    cell = edge_length_fac * DIAGONAL
-    low, counts = _box(surface, cell)
+    largest = edge_length_fac * DIAGONAL
+    root = ROOT * largest
+    low, counts = _box(surface, root)
     if is_too_fine(surface, edge_length_fac):
         raise TetrahedralizationError(
-            f"a lattice with cubes of {cell:g} % of the diagonal needs {counts.prod()} of them; give a larger "
+            f"a lattice with cubes of {largest:g} % of the diagonal needs {counts.prod()} of them; give a larger "
             "edge_length_fac"
         )
-    points, normals = _sampled(surface, cell / SAMPLES)
-    values = _indicator(points, normals, low, cell / SAMPLES, counts * SAMPLES)
-    indicator = Indicator(values, low, cell / SAMPLES)
+    thickness, gap = clearance or clearances(surface)
+    sizes = np.clip(np.minimum(thickness / ACROSS, gap / ACROSS_GAP), SMALLEST * largest, largest)
+    samples = sampled(surface, np.minimum(SAMPLES_APART * sizes, (surface.area / FEWEST_SAMPLES) ** 0.5))
+    points, wanted = samples.points, sizes[samples.faces]
+    spacing = max(GRID_SPACING * wanted.min(), (np.prod(counts * root) / MOST_POINTS) ** (1 / 3))
+    grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
+    at_rim: BoolArray = np.isin(surface.faces, Connectivity(surface.faces).boundary_edges).any(axis=1)
+    indicator = Indicator(
+        _indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, ~at_rim[samples.faces]
+    )
 
     corner = np.stack(np.meshgrid(*(np.arange(c) for c in counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    touched = np.zeros(counts, dtype=bool)
-    touched[tuple(((points - low) / cell).astype(np.int64).T)] = True
-    steps = _paths()
-    corners = low + cell * (corner[:, None, None] + steps).astype(np.float64)
-    inside = indicator.inside(corners.reshape(-1, 4, 3)).reshape(len(corner), len(steps))
-    kept = (inside >= LEAST_INSIDE) | touched.reshape(-1, 1)
-    number = np.array([(counts[1] + 1) * (counts[2] + 1), counts[2] + 1, 1])
-    tets = ((corner[:, None, None] + steps) @ number)[kept]
-    used, compact = np.unique(tets, return_inverse=True)
-    grid = np.stack(np.unravel_index(used, tuple(counts + 1)), axis=1)
-    filled = Tetrahedra(low + cell * grid, compact.reshape(-1, 4), np.maximum(inside[kept], LEAST_INSIDE))
-    return _fitted(without_debris(filled), points, normals, indicator, cell)
+    cubes = np.zeros(counts, dtype=bool)
+    cubes[tuple(((points - low) / root).astype(np.int64).T)] = True
+    cubes[tuple(corner[indicator.at(low + root * (corner + 0.5)) >= 0.5].T)] = True
+
+    def is_inside(places: FloatArray) -> BoolArray:
+        return indicator.at(low + root * places) >= 0.5
+
+    most = int(MOST_TETRAHEDRA * max(1.0, USUAL_EDGE / edge_length_fac) ** 3)
+    mesh = halved(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    vertices = low + root * mesh.vertices
+    inside = indicator.inside(vertices[mesh.tets])
+    kept = inside >= LEAST_INSIDE
+    kept[mesh.owner] = True
+    kept = _bridged(mesh.tets, kept, np.ones(len(kept), dtype=bool))
+    used, compact = np.unique(mesh.tets[kept], return_inverse=True)
+    filled = Tetrahedra(vertices[used], compact.reshape(-1, 4), np.maximum(inside[kept], LEAST_INSIDE))
+    return _fitted(without_debris(filled), indicator)
+
+
+def is_resolved(tetrahedra: Tetrahedra, surface: Surface, clearance: Clearance) -> bool:
+    """Whether tetrahedra are small enough for nearly all of a body, and no part of it is a wire.
+
+    Of a wire, long and thinner than all else, the lowest modes are all its own.
+    """
+    if len(tetrahedra.tets) == 0:
+        return False
+    n_pieces = connected_pieces(np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]]), len(surface.points)).max()
+    if pieces_by_sides(tetrahedra.tets).max() > n_pieces:
+        return False  # parts have come off, or hang on an edge
+    sizes = _sizes_at_vertices(tetrahedra)
+    corners = surface.points[surface.faces]
+    nearest = cKDTree(tetrahedra.vertices).query(corners.mean(axis=1))[1]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    coarse = sizes[nearest] > COARSEST * clearance.thickness
+    return bool(areas[coarse].sum() <= MOST_COARSE * areas.sum()) and not _has_wire(surface, clearance)
+
+
+def _has_wire(surface: Surface, clearance: Clearance) -> bool:
+    """Whether a connected part is thin all over, and many times longer than thick."""
+    thin = surface.faces[clearance.thickness < WIRE * DIAGONAL]
+    pieces = connected_pieces(np.concatenate([thin[:, :2], thin[:, 1:]]), len(surface.points))
+    for piece in np.unique(pieces[thin[:, 0]]):
+        if np.linalg.norm(np.ptp(surface.points[pieces == piece], axis=0)) > WIRE_LENGTH * WIRE * DIAGONAL:
+            return True
+    return False
+
+
+def _sizes_at_vertices(tetrahedra: Tetrahedra) -> FloatArray:
+    """Of the smallest tetrahedron around each: the edge of the cube of which six are as large. *Shape:* ``(N,)``."""
+    sizes = np.full(len(tetrahedra.vertices), np.inf)
+    np.minimum.at(sizes, tetrahedra.tets.reshape(-1), np.repeat(np.cbrt(6 * tet_volumes(tetrahedra)), 4))
+    return sizes
 
 
 def is_too_fine(surface: Surface, edge_length_fac: float) -> bool:
     """Whether a lattice with such cubes would have too many of them."""
-    return bool(_box(surface, edge_length_fac * DIAGONAL)[1].prod() * SAMPLES**3 > MAX_SAMPLES)
+    return bool(_box(surface, ROOT * edge_length_fac * DIAGONAL)[1].prod() > MOST_CUBES)
 
 
 def _box(surface: Surface, cell: float) -> tuple[FloatArray, IntArray]:
@@ -106,24 +231,24 @@ def _box(surface: Surface, cell: float) -> tuple[FloatArray, IntArray]:
     return low, np.ceil((surface.points.max(axis=0) + 1.5 * cell - low) / cell).astype(np.int64)
 
 
-def _fitted(
-    filled: Tetrahedra, points: FloatArray, normals: FloatArray, indicator: Indicator, cell: float
-) -> Tetrahedra:
+def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     """The outer vertices moved onto the surface, along its normals, and without what is outside then.
 
-    Modes are then those of tetrahedra that follow the surface. What is thinner than a cube may fall into pieces or get
-    lost: then everything stays as it was.
+    Modes are then those of tetrahedra that follow the surface. What is thinner than a tetrahedron may fall into pieces
+    or get lost: then everything stays as it was.
     """
+    samples = indicator.samples
+    volumes, sizes = tet_volumes(filled), _sizes_at_vertices(filled)
     rim = np.unique(filled.tets[np.asarray(filled.inside) < 1 - LEAST_INSIDE])
-    distance, nearest = cKDTree(points).query(filled.vertices[rim], distance_upper_bound=REACH * cell)
-    rim, nearest = rim[np.isfinite(distance)], nearest[np.isfinite(distance)]
-    normal = normals[nearest] / np.maximum(np.linalg.norm(normals[nearest], axis=1, keepdims=True), 1e-300)
-    height = np.einsum("vi,vi->v", filled.vertices[rim] - points[nearest], normal)
+    distance, nearest = samples.tree.query(filled.vertices[rim])
+    near = distance < REACH * sizes[rim]
+    rim, nearest = rim[near], nearest[near]
+    height = np.einsum("vi,vi->v", filled.vertices[rim] - samples.points[nearest], samples.normals[nearest])
     vertices = filled.vertices.copy()
-    vertices[rim] -= height[:, None] * normal
-    least, retreated = LEAST_VOLUME * cell**3 / 6, np.zeros(len(vertices), dtype=bool)
+    vertices[rim] -= height[:, None] * samples.normals[nearest]
+    retreated = np.zeros(len(vertices), dtype=bool)
     for retreat in range(MOST_RETREATS):
-        bad = np.unique(filled.tets[tet_volumes(Tetrahedra(vertices, filled.tets)) < least])
+        bad = np.unique(filled.tets[tet_volumes(Tetrahedra(vertices, filled.tets)) < LEAST_VOLUME * volumes])
         # Half the way back at first; as no vertex is out of its cube's reach then, all the way is always right.
         part = 1.0 if retreat >= MOST_RETREATS // 2 else 0.5
         vertices[bad] += part * (filled.vertices[bad] - vertices[bad])
@@ -136,80 +261,62 @@ def _fitted(
     placed[rim[(vertices[rim] != filled.vertices[rim]).any(axis=1)]] = True
     placed[retreated] = False
     inside[placed[filled.tets].all(axis=1)] = 1.0
+    kept = _bridged(filled.tets, kept, inside > 0)
     used, compact = np.unique(filled.tets[kept], return_inverse=True)
-    fitted = without_debris(Tetrahedra(vertices[used], compact.reshape(-1, 4), inside[kept]))
-    if len(fitted.tets) == 0 or _n_pieces(fitted) != _n_pieces(filled):
+    fitted = without_debris(Tetrahedra(vertices[used], compact.reshape(-1, 4), np.maximum(inside[kept], LEAST_INSIDE)))
+    if len(fitted.tets) == 0 or pieces_by_sides(fitted.tets).max() != pieces_by_sides(filled.tets).max():
         return filled
-    is_covered = cKDTree(fitted.vertices).query(points, distance_upper_bound=1.5 * cell)[0] < np.inf
+    if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():
+        return filled
+    reach = 1.5 * sizes[filled.tets].max(axis=1).max()
+    is_covered = cKDTree(fitted.vertices).query(samples.points, distance_upper_bound=reach)[0] < np.inf
     return fitted if is_covered.all() else filled
 
 
-def _n_pieces(tetrahedra: Tetrahedra) -> int:
-    pairs = tetrahedra.tets[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2)
-    return int(connected_pieces(pairs, len(tetrahedra.vertices)).max()) + 1
+def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
+    """The kept ones, and others that join pieces of them which hang on each other by an edge or a vertex only.
 
-
-def _paths() -> IntArray:
-    """Corners of the six tetrahedra of a cube, with positive volumes. *Shape:* ``(6, 4, 3)``.
-
-    Each is a path from the corner (0, 0, 0) to (1, 1, 1), so that neighbouring cubes cut their common side alike.
+    *Shape:* ``(T, 4), (T,), (T,) -> (T,)``.
     """
-    paths = []
-    for order in itertools.permutations(range(3)):
-        path = np.zeros((4, 3), dtype=np.int64)
-        for i, axis in enumerate(order):
-            path[i + 1 :, axis] += 1
-        odd = np.linalg.det(np.diff(path, axis=0)) < 0
-        paths.append(path[[1, 0, 2, 3]] if odd else path)
-    return np.stack(paths)
+    kept = kept.copy()
+    for _ in range(MOST_BRIDGES):
+        piece = pieces_by_sides(tets[kept])
+        lowest, highest = np.full(tets.max() + 1, len(tets)), np.full(tets.max() + 1, -1)
+        np.minimum.at(lowest, tets[kept].reshape(-1), np.repeat(piece, 4))
+        np.maximum.at(highest, tets[kept].reshape(-1), np.repeat(piece, 4))
+        joining = ~kept & allowed & (lowest[tets].min(axis=1) < highest[tets].max(axis=1))
+        if not joining.any():
+            break
+        kept |= joining
+    return kept
 
 
-def _sampled(surface: Surface, spacing: float) -> tuple[FloatArray, FloatArray]:
-    """Points over all faces, about ``spacing`` apart, and their shares of the area times the normal."""
-    corners = surface.points[surface.faces]
-    sides = corners - np.roll(corners, 1, axis=1)
-    n_cuts = np.maximum(np.ceil(np.linalg.norm(sides, axis=2).max(axis=1) / spacing), 1).astype(np.int64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    points, shares = [], []
-    for n in np.unique(n_cuts):
-        chosen = n_cuts == n
-        # Centroids of the n² congruent parts of a triangle.
-        up = np.array([(3 * i + 1, 3 * j + 1) for i in range(n) for j in range(n - i)])
-        down = np.array([(3 * i + 2, 3 * j + 2) for i in range(n - 1) for j in range(n - 1 - i)]).reshape(-1, 2)
-        uv = np.concatenate([up, down]) / (3 * n)
-        weights = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)
-        points.append(np.einsum("qa,fai->fqi", weights, corners[chosen]).reshape(-1, 3))
-        shares.append(np.repeat(normals[chosen] / n**2, n**2, axis=0))
-    return np.concatenate(points), np.concatenate(shares)
-
-
-def _indicator(
-    points: FloatArray, normals: FloatArray, low: FloatArray, spacing: float, counts: IntArray
-) -> FloatArray:
-    """One inside, zero outside, on the centres of a grid.
+def _indicator(samples: Samples, low: FloatArray, spacing: float, counts: IntArray) -> FloatArray:
+    """One inside, zero outside, on the points of a grid.
 
     Its gradient is minus the normal on the surface, so it solves a Poisson equation with the divergence of the
-    normals: by Fourier transform, once. On an open surface it closes the holes smoothly.
+    normals: in trilinear finite elements, by Fourier transform, once. On an open surface it closes the holes smoothly.
     """
-    # Shares of the normals at the grid, linear between its points.
-    places = (points - low) / spacing - 0.5
+    places, normals = (samples.points - low) / spacing, samples.normals * samples.areas[:, None]
     base = np.floor(places).astype(np.int64)
     part = places - base
+    index = np.ravel_multi_index(tuple(base.T), tuple(counts))
     size = int(counts.prod())
-    field = np.zeros((3, size))
+    divergence = np.zeros(size)
     for step in itertools.product((0, 1), repeat=3):
-        weight = np.where(step, part, 1 - part).prod(axis=1)
-        index = np.ravel_multi_index(tuple((base + step).T), tuple(counts), mode="clip")
-        for axis in range(3):
-            field[axis] += np.bincount(index, weight * normals[:, axis], minlength=size)
+        share = np.where(step, part, 1 - part)
+        slope = np.where(step, 1.0, -1.0)
+        weight = sum(normals[:, a] * slope[a] * share[:, a - 1] * share[:, a - 2] for a in range(3))
+        divergence += np.bincount(index + np.ravel_multi_index(step, tuple(counts)), weight, minlength=size)
 
     waves = [2 * np.pi * np.fft.fftfreq(n) for n in counts[:2]] + [2 * np.pi * np.fft.rfftfreq(counts[2])]
-    k = np.meshgrid(*waves, indexing="ij")
-    squared = sum(axis**2 for axis in k)
-    squared[0, 0, 0] = 1.0
-    transformed = sum(1j * k[axis] * np.fft.rfftn(field[axis].reshape(counts)) for axis in range(3)) / squared
+    x, y, z = np.meshgrid(*waves, indexing="ij", sparse=True)
+    stiff, mass = [2 - 2 * np.cos(k) for k in (x, y, z)], [(2 + np.cos(k)) / 3 for k in (x, y, z)]
+    laplacian = sum(stiff[a] * mass[a - 1] * mass[a - 2] for a in range(3))
+    laplacian[0, 0, 0] = 1.0
+    transformed = rfftn(divergence.reshape(counts), overwrite_x=True) / laplacian
     transformed[0, 0, 0] = 0.0
-    solution = np.fft.irfftn(transformed, s=tuple(counts), axes=(0, 1, 2)) / spacing**2
+    solution = -irfftn(transformed, s=tuple(counts), overwrite_x=True) / spacing**2
     rim = np.ones(counts, dtype=bool)
     rim[1:-1, 1:-1, 1:-1] = False
-    return solution - solution[rim].mean()
+    return np.ascontiguousarray(solution - solution[rim].mean())

@@ -46,9 +46,9 @@ def extract_modes(
         n_modes: Number of elastic modes, k.
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
-        mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
-            than one cell; ``"auto"`` takes the second for bodies without thin parts, the first for others, and the
-            second again where the first fails.
+        mesher: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts every surface;
+            ``"tetwild"``; ``"auto"`` takes the first where it resolves the body, which is nearly always, the second
+            for wires and walls that are too thin for it, and the first again where the second fails.
         timeout: Seconds that the child process of fTetWild may take.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
@@ -103,9 +103,9 @@ def extract_bases(
         n_modes: Number of elastic modes of each, k.
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
-        mesher: ``"tetwild"``; ``"lattice"``, which is deterministic and accepts every surface, but fuses parts closer
-            than one cell; ``"auto"`` takes the second for bodies without thin parts, the first for others, and the
-            second again where the first fails.
+        mesher: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts every surface;
+            ``"tetwild"``; ``"auto"`` takes the first where it resolves the body, which is nearly always, the second
+            for wires and walls that are too thin for it, and the first again where the second fails.
         carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each has its own.
         timeout: Seconds that the child process of fTetWild may take for a key-frame.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.

@@ -1,13 +1,17 @@
 """Where a surface comes near to itself: outside, where limbs touch, and inside, where it is thin."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.precompute.sampling import Samples, sampled
 from torch_modal.precompute.surface import DIAGONAL, Surface
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 NEAR = 0.03
 """Gaps up to this width count as near, in bounding-box diagonals."""
@@ -15,6 +19,12 @@ OPPOSED = -0.3
 """Cosine between the normals of a point and of the one across, up to which that is another side."""
 SEEN_POINTS = 2000
 """About as many points of the surface are looked at, of larger ones every second, third and so on."""
+MOST = 0.06
+"""Thicknesses and gaps above are not told apart, in bounding-box diagonals."""
+N_SAMPLES = 5000
+"""At least, where these are measured, and of as many as"""
+SEEN_SAMPLES = 10_000
+MOST_SHRINKINGS = 10
 
 
 def self_proximity(surface: Surface) -> float:
@@ -26,9 +36,30 @@ def self_proximity(surface: Surface) -> float:
     return _opposed_part(surface, np.array([1 / 16, 1 / 8, 1 / 4, 1 / 2]) * NEAR * DIAGONAL)
 
 
-def thin_part(surface: Surface, width: float) -> float:
-    """Fraction of the area under which the body is thinner than a width, in bounding-box diagonals."""
-    return _opposed_part(surface, -np.array([1 / 16, 1 / 8, 1 / 4, 1 / 2]) * width * DIAGONAL)
+class Clearance(NamedTuple):
+    """How near other parts of a surface are, at each face; infinite where they are further than `MOST`.
+
+    Attributes:
+        thickness: Of the body below. *Shape:* ``(F,)``.
+        gap: In front. *Shape:* ``(F,)``.
+    """
+
+    thickness: FloatArray
+    gap: FloatArray
+
+
+def clearances(surface: Surface) -> Clearance:
+    """Diameters of the balls that touch a surface at samples and at an opposing part of it."""
+    spacing = np.sqrt(surface.area / N_SAMPLES)
+    samples = sampled(surface, np.full(len(surface.faces), spacing))
+    seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))
+    found = []
+    for side in (-1.0, 1.0):
+        radii = _opposed_radius(samples, side, seen, MOST * DIAGONAL / 2)
+        smallest = np.full(len(surface.faces), np.inf)
+        np.minimum.at(smallest, samples.faces[seen], 2 * radii)
+        found.append(smallest)
+    return Clearance(*found)
 
 
 def _opposed_part(surface: Surface, distances: FloatArray) -> float:
@@ -42,3 +73,34 @@ def _opposed_part(surface: Surface, distances: FloatArray) -> float:
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
+
+
+def _opposed_radius(samples: Samples, side: float, seen: IntArray, most: float) -> FloatArray:
+    """Radii of the balls that touch at samples and at another side.
+
+    They shrink until they are empty (Ma, Bae and Choi 2012), or touch something that is no other side, as in a corner.
+
+    Args:
+        samples: Of a surface.
+        side: 1 in front of it, -1 behind.
+        seen: Where radii are wanted. *Shape:* ``(S,)``.
+        most: Larger ones are infinite.
+
+    Returns:
+        *Shape:* ``(S,)``.
+    """
+    found = np.full(len(seen), np.inf)
+    left, radius = np.arange(len(seen)), np.full(len(seen), most)
+    for _ in range(MOST_SHRINKINGS):
+        point, direction = samples.points[seen[left]], side * samples.normals[seen[left]]
+        nearest = samples.tree.query(point + radius[:, None] * direction)[1]
+        across = samples.points[nearest] - point
+        height = np.einsum("vi,vi->v", across, direction)
+        smaller = np.einsum("vi,vi->v", across, across) / (2 * np.maximum(height, 1e-300))
+        opposed = side * np.einsum("vi,vi->v", direction, samples.normals[nearest]) < OPPOSED
+        shrinks = opposed & (height > 0) & (smaller < 0.99 * radius)
+        left, radius = left[shrinks], smaller[shrinks]
+        found[left] = radius
+        if len(left) == 0:
+            break
+    return found

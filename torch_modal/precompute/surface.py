@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
+from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.normals import vertex_normals
 
@@ -56,6 +57,11 @@ class Surface:
             )
         points = (points - (low + high) / 2) * (DIAGONAL / diagonal)
         return cls(points, outward(points, compact.reshape(-1, 3)), used, DIAGONAL / diagonal)
+
+    @cached_property
+    def area(self) -> float:
+        """Of all faces."""
+        return float(vertex_areas(self.points, self.faces).sum())
 
     @cached_property
     def normals(self) -> FloatArray:

@@ -159,8 +159,9 @@ def tetrahedralize(
 
 def tet_volumes(tetrahedra: Tetrahedra) -> FloatArray:
     """Signed volumes. *Shape:* ``(T,)``."""
-    corners = tetrahedra.vertices[tetrahedra.tets]
-    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    origin, *others = np.moveaxis(tetrahedra.vertices, 1, 0)[:, tetrahedra.tets.T].transpose(1, 0, 2)
+    (a, b, c), (d, e, f), (g, h, i) = (other - origin for other in others)
+    return (a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)) / 6
 
 
 def solid_volumes(tetrahedra: Tetrahedra) -> FloatArray:
@@ -188,18 +189,23 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     tets = tetrahedra.tets
     if len(tets) == 0:
         return tetrahedra
-    sides = np.sort(np.concatenate([tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
-    owner = np.tile(np.arange(len(tets)), 4)
-    order = np.lexsort(sides.T)
-    shared = (np.diff(sides[order], axis=0) == 0).all(axis=1)
-    pairs = np.stack([owner[order][:-1][shared], owner[order][1:][shared]], axis=1)
-    piece = connected_pieces(pairs, len(tets))
+    piece = pieces_by_sides(tets)
     volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
     users = np.unique(np.stack([tets.reshape(-1), np.repeat(piece, 4)], axis=1), axis=0)
     hinge = np.bincount(users[:, 0])[users[:, 0]] > 1  # a vertex of two pieces or more
     hangs = np.bincount(users[:, 1], hinge, len(volumes)) > 0
     debris = hangs & (volumes < DEBRIS * volumes.sum())
     return _kept(tetrahedra, ~debris[piece])
+
+
+def pieces_by_sides(tets: IntArray) -> IntArray:
+    """Which piece each tetrahedron belongs to; those that share a side are in one. *Shape:* ``(T, 4) -> (T,)``."""
+    sides = np.sort(np.concatenate([tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
+    owner = np.tile(np.arange(len(tets)), 4)
+    order = np.lexsort(sides.T)
+    shared = (np.diff(sides[order], axis=0) == 0).all(axis=1)
+    pairs = np.stack([owner[order][:-1][shared], owner[order][1:][shared]], axis=1)
+    return connected_pieces(pairs, len(tets))
 
 
 def _kept(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:

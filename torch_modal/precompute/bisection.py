@@ -1,0 +1,189 @@
+"""Cubes cut into tetrahedra that are halved where they are too large, and stay conforming."""
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+UNITS = 256
+"""Whole numbers along the edge of a cube, so that edges may be halved eight times."""
+_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+
+
+class Halved(NamedTuple):
+    """Tetrahedra of different sizes that share their sides.
+
+    Attributes:
+        vertices: In cubes. *Shape:* ``(N, 3)``.
+        tets: With positive volumes. *Shape:* ``(T, 4)``.
+        sizes: Edge of the cube of which six such tetrahedra are as large, in cubes. *Shape:* ``(T,)``.
+        owner: The tetrahedron of each point. *Shape:* ``(P,)``.
+    """
+
+    vertices: FloatArray
+    tets: IntArray
+    sizes: FloatArray
+    owner: IntArray
+
+
+def halved(
+    cubes: IntArray, points: FloatArray, wanted: FloatArray, is_inside: Callable[[FloatArray], BoolArray], most: int
+) -> Halved:
+    """Cubes cut into tetrahedra, which are halved until none is larger than a point in it wants.
+
+    Each cube is cut into six tetrahedra, the paths along its edges from its lowest corner to its highest (Kuhn 1960).
+    A tetrahedron is halved across the edge that Maubach (1995) names, and so are all that share this edge, so that
+    sides always fit. All shapes that come up are those of the first three halvings.
+
+    Args:
+        cubes: Lowest corners, none negative. *Shape:* ``(C, 3)``.
+        points: Samples of the surface, in any of the cubes. *Shape:* ``(P, 3)``.
+        wanted: The size of tetrahedra at each of them, in cubes. *Shape:* ``(P,)``.
+        is_inside: Whether points are inside. *Shape:* ``(n, 3) -> (n,)``. Tetrahedra with none of the samples are left
+            out where neither their corners nor their centroids are.
+        most: About so many tetrahedra: what is largest, compared to what is wanted, is halved first.
+    """
+    mesh = _Mesh(cubes, points)
+    while True:
+        mesh.drop(is_inside)
+        ratio = np.zeros(len(mesh.tets))
+        np.maximum.at(ratio, mesh.owner, mesh.sizes()[mesh.owner] / wanted)
+        chosen = ratio > 1.0
+        if not chosen.any() or len(mesh.tets) >= most:
+            break
+        # Halves have 0.79 of the size. The worst go first, so that the bound is shared fairly.
+        mesh.halve(chosen & (ratio > 0.8 * ratio.max()))
+    return mesh.result()
+
+
+class _Mesh:
+    """Tetrahedra as rows of vertex keys.
+
+    The key of a vertex is linear in its whole coordinates, so that the key between two is the mean of theirs.
+    """
+
+    def __init__(self, cubes: IntArray, points: FloatArray) -> None:
+        counts = cubes.max(axis=0) + 1
+        sides = (counts + 1) * UNITS
+        self.stride = np.array([sides[1] * sides[2], sides[2], 1])
+        self.tets: IntArray = (UNITS * (cubes[:, None, None] + _paths()) @ self.stride).reshape(-1, 4)
+        self.halvings = np.zeros(len(self.tets), dtype=np.int64)
+        self.inner = np.zeros(len(self.tets), dtype=bool)
+        self.vertices: IntArray = np.unique(self.tets)
+        # A point's path goes first along the axis of its largest coordinate within the cube.
+        cube = points.astype(np.int64)
+        order = np.argsort(-(points - cube), axis=1, kind="stable")
+        within = np.take_along_axis(points - cube, order, axis=1)
+        ends = np.ones((len(points), 1)), np.zeros((len(points), 1))
+        self.shares = -np.diff(np.concatenate([ends[0], within, ends[1]], axis=1), axis=1)
+        number = np.zeros((3, 3, 3), dtype=np.int64)
+        number[tuple(np.array(list(itertools.permutations(range(3)))).T)] = np.arange(6)
+        place = np.full(counts, -1)
+        place[tuple(cubes.T)] = np.arange(len(cubes))
+        self.owner = place[tuple(cube.T)] * 6 + number[tuple(order.T)]
+
+    def drop(self, is_inside: Callable[[FloatArray], BoolArray]) -> None:
+        """Leave out what is outside."""
+        touched = np.zeros(len(self.tets), dtype=bool)
+        touched[self.owner] = True
+        unsure = np.flatnonzero(~touched & ~self.inner)
+        corners, index = np.unique(self.tets[unsure], return_inverse=True)
+        inside = is_inside(self._coordinates(corners))[index.reshape(-1, 4)].any(axis=1)
+        unsure = unsure[inside | is_inside(self._coordinates(self.tets[unsure]).mean(axis=1))]
+        self.inner[unsure] = True
+        kept = touched | self.inner
+        self.owner = (np.cumsum(kept) - 1)[self.owner]
+        self.tets, self.halvings, self.inner = self.tets[kept], self.halvings[kept], self.inner[kept]
+
+    def _coordinates(self, keys: IntArray) -> FloatArray:
+        """Of vertices, in cubes. *Shape:* ``(...) -> (..., 3)``."""
+        x, rest = np.divmod(keys, self.stride[0])
+        return np.stack([x, *np.divmod(rest, self.stride[1])], axis=-1) / UNITS
+
+    def sizes(self) -> FloatArray:
+        return 2.0 ** (-self.halvings / 3)
+
+    def halve(self, chosen: BoolArray) -> None:
+        """Halve some, and what must be with them."""
+        while chosen.any():
+            added = self._halve_alone(chosen)
+            changed = np.concatenate([chosen, np.ones(int(chosen.sum()), dtype=bool)])
+            chosen = np.zeros(len(self.tets), dtype=bool)
+            # What was left alone can only have got a vertex that is new.
+            chosen[~changed] = self._hanging(self.tets[~changed], added)
+            chosen[changed] = self._hanging(self.tets[changed], self.vertices)
+
+    @staticmethod
+    def _hanging(tets: IntArray, vertices: IntArray) -> BoolArray:
+        """Whether one of the vertices lies on an edge."""
+        if len(vertices) == 0:
+            return np.zeros(len(tets), dtype=bool)
+        middles = (tets[:, _EDGES[:, 0]] + tets[:, _EDGES[:, 1]]) // 2
+        place = np.minimum(np.searchsorted(vertices, middles), len(vertices) - 1)
+        return (vertices[place] == middles).any(axis=1)
+
+    def _halve_alone(self, chosen: BoolArray) -> IntArray:
+        """Halve some; the vertices that are new."""
+        index = np.flatnonzero(chosen)
+        old, tag = self.tets[index], 3 - self.halvings[index] % 3
+        row = np.arange(len(index))
+        middle = (old[:, 0] + old[row, tag]) // 2
+        first, second = old.copy(), np.empty_like(old)
+        first[row, tag] = middle
+        for d in (1, 2, 3):
+            own = tag == d
+            second[own] = old[own][:, [*range(1, d + 1), d, *range(d + 1, 4)]]
+        second[row, tag] = middle
+        # A point has barycentric coordinates: what one end has more than the other stays, the rest is the middle's.
+        other = np.full(len(self.tets), -1)
+        other[index] = len(self.tets) + row
+        moved = np.flatnonzero(other[self.owner] >= 0)
+        owner, shares, at = self.owner[moved], self.shares[moved], np.arange(len(moved))
+        d = 3 - self.halvings[owner] % 3
+        start, end = shares[:, 0].copy(), shares[at, d].copy()
+        near = start >= end
+        shares[near, 0] -= end[near]
+        for tag_of in (1, 2, 3):
+            own = ~near & (d == tag_of)
+            shares[own] = shares[own][:, [*range(1, tag_of + 1), tag_of, *range(tag_of + 1, 4)]]
+            shares[own, tag_of - 1] = (end - start)[own]
+        shares[at, d] = 2 * np.minimum(start, end)
+        self.shares[moved] = shares
+        self.owner[moved] = np.where(near, owner, other[owner])
+
+        self.tets[index] = first
+        self.tets = np.concatenate([self.tets, second])
+        self.halvings[index] += 1
+        self.halvings = np.concatenate([self.halvings, self.halvings[index]])
+        self.inner = np.concatenate([self.inner, self.inner[index]])
+        added = np.unique(middle)
+        added = added[~np.isin(added, self.vertices)]
+        self.vertices = np.sort(np.concatenate([self.vertices, added]))
+        return added
+
+    def result(self) -> Halved:
+        used, tets = np.unique(self.tets, return_inverse=True)
+        tets = tets.reshape(-1, 4)
+        vertices = self._coordinates(used)
+        corners = vertices[tets]
+        mirrored = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+        tets[mirrored] = tets[mirrored][:, [1, 0, 2, 3]]
+        return Halved(vertices, tets, self.sizes(), self.owner)
+
+
+def _paths() -> IntArray:
+    """Corners of the six tetrahedra of a cube: each axis order is a path from its lowest to its highest corner.
+
+    Neighbouring cubes cut their common side alike. *Shape:* ``(6, 4, 3)``.
+    """
+    paths = np.zeros((6, 4, 3), dtype=np.int64)
+    for path, order in zip(paths, itertools.permutations(range(3)), strict=True):
+        for i, axis in enumerate(order):
+            path[i + 1 :, axis] += 1
+    return paths

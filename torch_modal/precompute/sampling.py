@@ -1,0 +1,61 @@
+"""Points all over a surface."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from torch_modal.precompute.surface import Surface
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MOST_SAMPLES = 60_000
+
+
+class Samples(NamedTuple):
+    """Points all over a surface.
+
+    Attributes:
+        points: *Shape:* ``(P, 3)``.
+        normals: Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``.
+        areas: What each stands for. *Shape:* ``(P,)``.
+        faces: Where each is. *Shape:* ``(P,)``.
+        tree: Of the points.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    areas: FloatArray
+    faces: IntArray
+    tree: cKDTree
+
+
+def sampled(surface: Surface, spacing: FloatArray) -> Samples:
+    """Points over all faces, about so far apart in each, and one in each at least.
+
+    Args:
+        surface: The surface.
+        spacing: *Shape:* ``(F,)``.
+    """
+    corners = surface.points[surface.faces]
+    sides = corners - np.roll(corners, 1, axis=1)
+    longest = np.linalg.norm(sides, axis=2).max(axis=1) / spacing
+    longest *= min(1.0, (MOST_SAMPLES / (longest**2).sum()) ** 0.5)
+    n_cuts = np.maximum(np.ceil(longest), 1).astype(np.int64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    points, shares, faces = [], [], []
+    for n in np.unique(n_cuts):
+        chosen = n_cuts == n
+        # Centroids of the n² congruent parts of a triangle.
+        up = np.array([(3 * i + 1, 3 * j + 1) for i in range(n) for j in range(n - i)])
+        down = np.array([(3 * i + 2, 3 * j + 2) for i in range(n - 1) for j in range(n - 1 - i)]).reshape(-1, 2)
+        uv = np.concatenate([up, down]) / (3 * n)
+        weights = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)
+        points.append(np.einsum("qa,fai->fqi", weights, corners[chosen]).reshape(-1, 3))
+        shares.append(np.repeat(normals[chosen] / n**2, n**2, axis=0))
+        faces.append(np.repeat(np.flatnonzero(chosen), n**2))
+    places, normal = np.concatenate(points), np.concatenate(shares)
+    areas = np.linalg.norm(normal, axis=1)
+    return Samples(places, normal / np.maximum(areas, 1e-300)[:, None], areas, np.concatenate(faces), cKDTree(places))
