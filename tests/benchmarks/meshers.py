@@ -1,6 +1,6 @@
 """What in-betweens lose with other tetrahedra: shell energy and edge error, over those with the reference's bases.
 
-    python tests/benchmarks/meshers.py [--samples] [--shared] [--bodies] [--slender] [--only TEXT ...] [--ways coarser lattice]
+    python tests/benchmarks/meshers.py [--samples] [--shared] [--bodies] [--slender] [--only TEXT ...]
 
 One line for each case: shapes at t = 1/2 from two presets, with the bases of each way of meshing, over the same with
 those of fTetWild at 3,000 faces, ``epsilon=2e-3``, ``stop_energy=50``. Edge errors need a truth. Below are the

@@ -160,9 +160,11 @@ def lattice(surface: Surface, edge_length_fac: float, clearance: Clearance | Non
     points, wanted = samples.points, sizes[samples.faces]
     spacing = max(GRID_SPACING * wanted.min(), (np.prod(counts * root) / MOST_POINTS) ** (1 / 3))
     grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
-    at_rim: BoolArray = np.isin(surface.faces, Connectivity(surface.faces).boundary_edges).any(axis=1)
+    at_rim = np.zeros(len(surface.points), dtype=bool)
+    at_rim[Connectivity(surface.faces).boundary_edges] = True
+    has_sides = ~np.any(at_rim[surface.faces[samples.faces]], axis=1)
     indicator = Indicator(
-        _indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, ~at_rim[samples.faces]
+        _indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, np.asarray(has_sides)
     )
 
     corner = np.stack(np.meshgrid(*(np.arange(c) for c in counts), indexing="ij"), axis=-1).reshape(-1, 3)
