@@ -182,8 +182,8 @@ class Biped(NamedTuple):
 
 
 @cache
-def biped(name: str, cell: float | None = None) -> Biped:
-    """Sculpt ``"wader"`` or ``"person"``; ``cell`` is the length of its edges."""
+def biped(name: str, cell: float | None) -> Biped:
+    """Sculpt ``"wader"`` or ``"person"``; ``cell`` is the length of its edges, None for its own."""
     kind = KINDS[name]
     bones, flesh = dict(kind.trunk), list(kind.flesh)
     for side, sign in (("right", 1), ("left", -1)):

@@ -130,7 +130,7 @@ def test_local_interpolation_mends_the_worst_regions(tmp_path: Path) -> None:
 def test_sculpted_figures_of_the_paper_are_drawn(tmp_path: Path, number: int, cell: float) -> None:
     found = load_example(f"paper/figure{number}").main(tmp_path, cell=cell, levels=1)
     errors = [float(line.split("%")[0].split()[-1]) for line in found[1:4]]
-    assert errors[2] < 0.5 * errors[1]  # ours, and Eq. 4 before it
+    assert errors[2] < 0.6 * errors[1]  # ours, and Eq. 4 before it
     assert (tmp_path / f"paper-figure{number}.png").stat().st_size > 30_000
 
 

@@ -37,7 +37,7 @@ PAPER = {
 def key_poses(name: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Key-frames and faces of a sample or of a body."""
     if name in KINDS:
-        body = biped(name)
+        body = biped(name, None)
         return torch.stack([torch.from_numpy(body.pose(t)) for t in (0.0, 1.0)]), torch.from_numpy(body.faces)
     sample = load_sample(name)
     return sample.keyframes, sample.faces
