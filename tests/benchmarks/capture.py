@@ -16,7 +16,7 @@ from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
-from torch_modal.precompute.lattice import lattice
+from torch_modal.precompute.lattice import USUAL_EDGE, lattice
 from torch_modal.precompute.modes import QUALITIES
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian, hat_gradients, lumped_mass, mass_matrix
 from torch_modal.precompute.surface import Surface
@@ -152,8 +152,7 @@ def rows(judge: Judge, runs: int) -> list[tuple[str, list[Found]]]:
         ("full: not decimated, 3 %, `stop_energy=10`", [solved(lambda: tetrahedralize(points, faces, FULL))[1]])
     )
     found.append(("fine", [solved(lambda: tetrahedralize(points, faces, fine))[1]]))
-    edge = fast.edge_length(points, faces)
-    found.append(("lattice", [solved(lambda: lattice(judge.surface, edge))[1]]))
+    found.append(("lattice", [solved(lambda: lattice(judge.surface, USUAL_EDGE))[1]]))
     return found
 
 

@@ -37,7 +37,7 @@ ACROSS_GAP = 1.0
 """Tetrahedra across a gap."""
 SMALLEST = 1 / 12
 """Size of the smallest tetrahedra, over the largest at the surface."""
-MOST_TETRAHEDRA = 7_000
+MOST_TETRAHEDRA = 12_000
 """About; somewhat fewer are left once the outer vertices are on the surface. With finer cubes there may be more, as
 many as fit into the volume."""
 USUAL_EDGE = 0.03
