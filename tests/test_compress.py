@@ -17,6 +17,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.sequence import codec_packing as packing
 from torch_modal.sequence.codec_entropy import Reader, Writer
+from torch_modal.sequence.codec_head import read_head
 from torch_modal.sequence.codec_levels import Levels
 
 pytest.importorskip("constriction")
@@ -197,13 +198,16 @@ def test_numbers_are_packed_and_unpacked(numbers: list[int]) -> None:
 
 # -------------------------------------------------------------------------------------------------- damaged and hostile
 def rewritten(path: Path, out: Path, **changes: object) -> Path:
-    """The file with other entries in its header."""
+    """The file with other entries in its header, or in the head of its numbers."""
     tensors = load_file(path)
     data = path.read_bytes()
     header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["torch_modal"])
-    if isinstance(some := changes.get("counts"), dict):
-        changes["counts"] = [some.get(i, count) for i, count in enumerate(header["counts"])]
-    save_file(tensors, out, {"torch_modal": json.dumps({**header, **changes})})
+    outer = {name: changes.pop(name) for name in list(changes) if name in header}
+    packed = tensors["packed"].numpy().tobytes()
+    head, end = read_head(packed)
+    changed = head._replace(**changes).data() + packed[end:]
+    tensors["packed"] = torch.frombuffer(bytearray(changed), dtype=torch.uint8)
+    save_file(tensors, out, {"torch_modal": json.dumps({**header, **outer})})
     return out
 
 
@@ -242,25 +246,28 @@ def test_any_changed_byte_is_an_error_or_changes_nothing(
         ({"version": "1"}, "version"),
         ({"format": "other"}, "holds no motion"),
         ({"coding": "pickle"}, "coding"),
-        ({"counts": {1: 2**31}}, "vertices that it does not have"),
-        ({"counts": {1: 10**6}}, "vertices that it does not have|claims|damaged"),
-        ({"counts": {3: 2**30}}, "claims to hold|damaged|key-frames"),
-        ({"counts": {2: 10**8}}, "claims to hold"),
-        ({"counts": {2: 10**9}}, "damaged"),
-        ({"counts": {1: 10**18}}, "header"),
-        ({"counts": {1: -1}}, "header"),
-        ({"counts": {4: 1.5}}, "header"),
-        ({"counts": {4: 10**8}}, "claims to hold"),
-        ({"counts": {5: 10**8}}, "header"),
-        ({"counts": "many"}, "header"),
-        ({"keys": [0, 99]}, "key-frames"),
-        ({"guides": [0, 9]}, "no known way"),
-        ({"shifts": [99, 0]}, "header"),
-        ({"seed": "x"}, "do not fit"),
-        ({"steps": [1e-3, 0.0, 1.0, 1.0, 1.0]}, "header"),
-        ({"origin": ["a", 0, 0]}, "header"),
-        ({"digest": "0"}, "damaged"),
-        ({"reference": 77}, "do not fit"),
+        ({"n_vertices": 2**31}, "vertices that it does not have|claims"),
+        ({"n_vertices": 10**6}, "vertices that it does not have|claims|damaged"),
+        ({"n_vertices": 10**18}, "header"),
+        ({"n_vertices": 0}, "header"),
+        ({"n_frames": 2**30}, "key-frames"),
+        ({"n_frames": 2**30, "cyclic": 1}, "claims to hold"),
+        ({"n_faces": 10**8}, "claims to hold"),
+        ({"n_faces": 10**9}, "damaged"),
+        ({"n_modes": 10**8}, "claims to hold"),
+        ({"n_clusters": 10**8}, "header"),
+        ({"n_probes": 10**8}, "header"),
+        ({"n_face_bytes": 10**8}, "damaged"),
+        ({"n_face_bytes": 0}, "damaged"),
+        ({"keys": [0, 99]}, "key-frames|header"),
+        ({"keys": [0, 11, 11]}, "header|key-frames|damaged"),
+        ({"guides": [-1, 9]}, "no known way|header|damaged"),
+        ({"shifts": [99, 0]}, "header|damaged"),
+        ({"seed": 15}, "damaged"),
+        ({"floats": [0.0, 0.0, 0.0, 1e-3, 0.0, 1.0, 1.0, 1.0]}, "header"),
+        ({"floats": [float("nan")] * 8}, "header"),
+        ({"digest": b"12345678"}, "damaged"),
+        ({"reference": 77}, "damaged"),
     ],
 )
 def test_a_header_is_not_believed(

@@ -78,7 +78,8 @@ def read_bytes(data: bytes, path: Path | str, cache_dir: str | None = None, cach
         if header.get("coding") == "exact":
             parts = _checked_exact(tensors)
         elif header.get("coding") == PACKED:
-            parts = unpack(tensors, header)
+            parts = unpack(tensors)
+            header |= {name: parts.pop(name) for name in ("reference", "seed")}
         else:
             raise ValueError(f"its coding is {header.get('coding')!r}")
         return _assembled(parts, header, cache_dir, cache)

@@ -18,10 +18,10 @@ from scipy import fft
 from torch import Tensor
 
 from torch_modal.sequence.codec_entropy import Reader, Writer
+from torch_modal.sequence.codec_head import MOST_NUMBERS, N_SHIFTS, Head, read_head
 from torch_modal.sequence.codec_levels import DEAD, Levels
 
 PACKED = "packed"
-MOST_NUMBERS = 2**31
 FREE_BYTES = 2**24
 """Anything may unpack to this many."""
 MOST_PER_BYTE = 1000
@@ -29,41 +29,37 @@ MOST_PER_BYTE = 1000
 FILTERS = [{"id": lzma.FILTER_LZMA1, "preset": 9, "lc": 0, "lp": 0, "pb": 0, "dict_size": 2**20}]
 FINER = 1024
 """Steps of the grid of finished key-frames in a step of their numbers."""
-N_SHIFTS = 64
-"""Ways to lay that grid, of which one has no vertex near the boundaries of its cells."""
 BANDS = (8, 24)
 """Modes, and sines (:data:`SINES`), whose numbers have a distribution of their own."""
 SINES = (1, 2)
 PROBE_UNIT = 8192
 """Of the modes' probe, whole numbers in one."""
-MOST_PROBES = 64
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------------------------------------------------------- faces
-def squeeze(numbers: IntArray) -> Tensor:
+def squeeze(numbers: IntArray) -> bytes:
     """Whole numbers, the smaller the better, as bytes: a plane for each byte of a number."""
     flat = numbers.reshape(-1)
     folded = np.where(flat > 0, 2 * flat - 1, -2 * flat).astype(np.uint64)
     width = max(1, (int(folded.max(initial=0)).bit_length() + 7) // 8)
     planes = b"".join(((folded >> np.uint64(8 * i)) & np.uint64(255)).astype(np.uint8).tobytes() for i in range(width))
-    return as_tensor(bytes([width]) + lzma.compress(planes, lzma.FORMAT_RAW, filters=FILTERS))
+    return bytes([width]) + lzma.compress(planes, lzma.FORMAT_RAW, filters=FILTERS)
 
 
-def unsqueeze(packed: Tensor | None, count: int) -> IntArray:
+def unsqueeze(data: bytes, count: int) -> IntArray:
     """The inverse of :func:`squeeze`.
 
     Args:
-        packed: Bytes, of a file.
+        data: Of a file.
         count: How many numbers there must be.
 
     Raises:
         ValueError: There are others, or the bytes are damaged.
     """
-    data = as_bytes(packed)
-    width = data[0]
+    width = data[0] if data else 0
     if not 1 <= width <= 8 or not 0 <= count <= MOST_NUMBERS:
         raise ValueError("one of its parts is damaged")
     size = width * count
@@ -109,14 +105,14 @@ def as_bytes(packed: Tensor | None) -> bytes:
     return packed.numpy().tobytes()
 
 
-def pack_faces(faces: IntArray) -> Tensor:
+def pack_faces(faces: IntArray) -> bytes:
     """Corners as differences from face to face."""
     return squeeze(np.diff(faces, axis=0, prepend=0).T)
 
 
-def unpack_faces(packed: Tensor | None, n_faces: int) -> IntArray:
+def unpack_faces(data: bytes, n_faces: int) -> IntArray:
     """The inverse."""
-    return np.cumsum(unsqueeze(packed, 3 * n_faces).reshape(3, n_faces), axis=1).T
+    return np.cumsum(unsqueeze(data, 3 * n_faces).reshape(3, n_faces), axis=1).T
 
 
 # ----------------------------------------------------------------------------------------------------------- key-frames
@@ -247,12 +243,12 @@ def read_series(reader: Reader, shape: tuple[int, int], between: list[slice]) ->
 
 
 # ---------------------------------------------------------------------------------------------------------- all of it
-def digest(*arrays: IntArray) -> str:
+def digest(head: Head, *arrays: IntArray) -> bytes:
     """By which damage is seen, and a machine that predicts otherwise."""
-    found = hashlib.sha256()
+    found = hashlib.sha256(head._replace(digest=b"").data())
     for array in arrays:
         found.update(np.ascontiguousarray(array, dtype="<i8").tobytes())
-    return found.hexdigest()[:16]
+    return found.digest()[:8]
 
 
 def exactly(x: FloatArray) -> IntArray:
@@ -265,52 +261,36 @@ def positions(x: FloatArray, origin: Sequence[float], scale: float) -> Tensor:
     return torch.from_numpy(np.asarray(origin, dtype=np.float64) + np.float64(scale) * x)
 
 
-def unpack(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, Any]:
-    """All parts of a sequence, but its modes.
+def unpack(tensors: dict[str, Tensor]) -> dict[str, Any]:
+    """All parts of a sequence, but its modes, with the key-frame and the directions that these belong to.
 
     Raises:
         ValueError: They are damaged, or claim to hold more than they can.
     """
-    counts, steps, origin, keys = (header.get(name) for name in ("counts", "steps", "origin", "keys"))
-    if not isinstance(counts, list) or len(counts) != 7:
-        raise ValueError("its header is damaged")
-    if any(type(c) is not int or not 1 <= c <= MOST_NUMBERS for c in counts):
-        raise ValueError("its header is damaged")
-    if not _numbers(steps, 5) or not _numbers(origin, 3) or any(s <= 0 for s in steps):  # type: ignore[union-attr]
-        raise ValueError("its header is damaged")
-    assert isinstance(steps, list) and isinstance(origin, list)
-    n_keys, v, f, t, k, n_clusters, n_probes = counts
-    if n_clusters > k or n_probes > MOST_PROBES:
-        raise ValueError("its header is damaged")
-    cyclic = bool(header.get("cyclic"))
-    if not _ascending(keys, n_keys, t, cyclic):
-        raise ValueError("its header names key-frames that it does not have")
-    assert isinstance(keys, list)
-    guides, shifts = header.get("guides"), header.get("shifts")
-    if not _within(guides, [(-1, -1), *((0, i - 1) for i in range(1, n_keys))]):
-        raise ValueError("its key-frames are predicted in no known way")
-    if not _within(shifts, [(0, N_SHIFTS - 1)] * n_keys):
-        raise ValueError("its header is damaged")
-    faces = unpack_faces(tensors.get("faces"), f)
-    if faces.min() < 0 or faces.max() >= v or 3 * f < v // 1000:
+    data = as_bytes(tensors.get("packed"))
+    head, start = read_head(data)
+    v, t, k, keys, cyclic = head.n_vertices, head.n_frames, head.n_modes, head.keys, bool(head.cyclic)
+    end = start + head.n_face_bytes
+    faces = unpack_faces(data[start:end], head.n_faces)
+    if faces.min() < 0 or faces.max() >= v or 3 * head.n_faces < v // 1000:
         raise ValueError("it names vertices that it does not have")
-    data = as_bytes(tensors.get("motion"))
-    require_room(3 * n_keys * v + t * (k + 6), len(data))  # a number takes a byte, or less
-    reader, between = Reader(data), runs(keys, t, cyclic)
-    x, numbers = read_shapes(reader, Levels(faces, v), steps[0], guides, shifts)  # type: ignore[arg-type]
+    require_room(3 * len(keys) * v + t * (k + 6), len(data))  # a number takes a byte, or less
+    origin, steps, scale = head.floats[:3], head.floats[3:7], head.floats[7]
+    reader, between = Reader(data[end:]), runs(keys, t, cyclic)
+    x, numbers = read_shapes(reader, Levels(faces, v), steps[0], head.guides, head.shifts)
     series = read_series(reader, (t, k + 6), between)
-    few = np.repeat([0, 1], [n_clusters, n_probes])
-    clusters, probe = np.split(reader.numbers(few, 2), [n_clusters])
-    if digest(faces, exactly(x), numbers, series, clusters, probe) != header.get("digest"):
+    few = np.repeat([0, 1], [head.n_clusters, head.n_probes])
+    clusters, probe = np.split(reader.numbers(few, 2), [head.n_clusters])
+    if digest(head, faces, exactly(x), numbers, series, clusters, probe) != head.digest:
         raise ValueError("its contents are not what was written: it is damaged")
     when = tensors.get("times")
     if when is None:
         when = torch.arange(t + cyclic, dtype=torch.float64)
     if when.shape != (t + cyclic,) or when.dtype != torch.float64:
         raise ValueError("its times are damaged")
-    found = torch.from_numpy(from_sines(series, series_steps(k, *steps[1:4]), between))
+    found = torch.from_numpy(from_sines(series, series_steps(k, *steps[1:]), between))
     return {
-        "keyframes": positions(x, origin, steps[4]),
+        "keyframes": positions(x, origin, scale),
         "faces": torch.from_numpy(np.ascontiguousarray(faces)),
         "keyframe_times": when[[*keys, t]] if cyclic else when[keys],
         "times": when[:t],
@@ -319,26 +299,11 @@ def unpack(tensors: dict[str, Tensor], header: dict[str, Any]) -> dict[str, Any]
         "errors": torch.full((t,), torch.nan, dtype=torch.float64),
         "clusters": torch.from_numpy(clusters),
         "probe": torch.from_numpy(probe / PROBE_UNIT),
+        "reference": head.reference,
+        "seed": head.seed,
     }
 
 
 def series_steps(n_modes: int, of_amplitudes: float, of_turns: float, of_moves: float) -> FloatArray:
     """Of all columns. *Shape:* ``(k + 6,)``."""
     return np.array([of_amplitudes] * n_modes + [of_turns] * 3 + [of_moves] * 3)
-
-
-def _numbers(found: Any, n: int) -> bool:
-    return isinstance(found, list) and len(found) == n and all(type(s) is float and np.isfinite(s) for s in found)
-
-
-def _within(found: Any, limits: list[tuple[int, int]]) -> bool:
-    """Whether these are whole numbers within limits."""
-    if not isinstance(found, list) or len(found) != len(limits):
-        return False
-    return all(type(i) is int and low <= i <= high for i, (low, high) in zip(found, limits, strict=True))
-
-
-def _ascending(keys: Any, n: int, n_frames: int, cyclic: bool) -> bool:
-    if not _within(keys, [(0, n_frames - 1)] * n) or any(a >= b for a, b in pairwise(keys)):
-        return False
-    return keys[0] == 0 and (cyclic or keys[-1] == n_frames - 1)

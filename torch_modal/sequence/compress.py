@@ -21,6 +21,7 @@ from torch_modal.sequence import codec_packing as packing
 from torch_modal.sequence.codec import ERROR, ModalSequence, chosen_keys, fitted, with_worst
 from torch_modal.sequence.codec_entropy import Writer
 from torch_modal.sequence.codec_file import probe, read_bytes, to_bytes
+from torch_modal.sequence.codec_head import Head
 from torch_modal.sequence.codec_levels import Levels
 from torch_modal.sequence.codec_modes import fixed_modes
 from torch_modal.sequence.times import checked_times
@@ -153,6 +154,11 @@ def compressed(
     raise ValueError(f"the error of {error:g} could not be kept: the best found is {worst:.2g}; give a larger one")
 
 
+def single(x: float) -> float:
+    """A number of single precision, as a file keeps it."""
+    return float(np.float32(x))
+
+
 class _Attempt(NamedTuple):
     """Rounded key-frames, and what was fitted beside them."""
 
@@ -195,9 +201,9 @@ class _Problem:
         self.error, self.n_modes, self.kept, self.progress = error, n_modes, kept, progress
         used = x[0, faces.unique()]
         self.size = float((used.amax(0) - used.amin(0)).norm())
-        #: The unit of what is rounded, and where it is counted from; short numbers.
-        self.scale = float(f"{self.size:.4g}")
-        self.origin = [float(f"{value:.4g}") for value in used.mean(0).tolist()]
+        #: The unit of what is rounded, and where it is counted from.
+        self.scale = single(self.size)
+        self.origin = [single(value) for value in used.mean(0).tolist()]
         self.triangles = faces.numpy().astype(np.int64)
         self.levels = Levels(self.triangles, x.shape[1])
 
@@ -206,14 +212,14 @@ class _Problem:
         y = (self.x[keys].numpy() - np.asarray(self.origin)) / self.scale
         best, low, high = None, error, 40 * error
         for _ in range(HALVINGS):
-            step = float(f"{(low * high) ** 0.5:.3g}")
+            step = single((low * high) ** 0.5)
             tried = packing.RoundedShapes(self.levels, y, step)
             shapes = packing.positions(tried.shapes, self.origin, self.scale)
             if float(self.distances(shapes, self.x[keys]).max()) <= error:
                 best, low = tried, step
             else:
                 high = step
-        return best or packing.RoundedShapes(self.levels, y, float(f"{error:.3g}"))
+        return best or packing.RoundedShapes(self.levels, y, single(error))
 
     def distances(self, x: Tensor, y: Tensor) -> Tensor:
         """Mean of each frame, over the diagonal. *Shape:* ``(N, V, 3) -> (N,)``."""
@@ -247,7 +253,7 @@ class _Problem:
         decoder = motion.decoder
 
         def tried(step: float) -> tuple[NDArray[np.int64], list[float], float]:
-            three = [step, *(float(f"{step * ratio:.3g}") for ratio in AMPLITUDES_TO_MOTIONS)]
+            three = [step, *(single(step * ratio) for ratio in AMPLITUDES_TO_MOTIONS)]
             steps = packing.series_steps(k, *three)
             numbers = packing.to_sines(series, steps, between)
             found = torch.from_numpy(packing.from_sines(numbers, steps, between))
@@ -256,9 +262,9 @@ class _Problem:
             return numbers, three, float(self.errors(new).max())
 
         low, high = 1e-3 * self.error / 0.01, 10 * self.error / 0.01
-        best = tried(float(f"{low:.3g}"))
+        best = tried(single(low))
         for _ in range(HALVINGS + 2):
-            step = float(f"{(low * high) ** 0.5:.3g}")
+            step = single((low * high) ** 0.5)
             new = tried(step)
             if new[2] <= self.error:
                 best, low = new, step
@@ -285,24 +291,30 @@ class _Problem:
         packing.write_series(writer, series, between)
         writer.numbers(np.concatenate([clusters, told]), np.repeat([0, 1], [len(clusters), len(told)]), 2)
         flat = np.concatenate([each.reshape(-1) for numbers in rounded.numbers for each in numbers])
-        tensors = {"faces": packing.pack_faces(self.triangles), "motion": packing.as_tensor(writer.data())}
+        faces = packing.pack_faces(self.triangles)
+        head = Head(
+            n_vertices=self.x.shape[1],
+            n_faces=len(self.faces),
+            n_frames=len(self.x),
+            n_modes=motion.n_modes,
+            n_clusters=len(clusters),
+            n_probes=len(told),
+            n_face_bytes=len(faces),
+            cyclic=int(self.cyclic),
+            reference=motion.reference,
+            seed=motion.modes.seed,
+            keys=keys,
+            guides=rounded.guides,
+            shifts=rounded.shifts,
+            floats=[*self.origin, rounded.step, *steps, self.scale],
+            digest=b"",
+        )
+        exact = packing.exactly(rounded.shapes)
+        head = head._replace(digest=packing.digest(head, self.triangles, exact, flat, series, clusters, told))
+        tensors = {"packed": packing.as_tensor(head.data() + faces + writer.data())}
         if not torch.equal(self.when, torch.arange(len(self.when), dtype=torch.float64)):
             tensors["times"] = self.when
-        counts = [len(keys), self.x.shape[1], len(self.faces), len(self.x), motion.n_modes, len(clusters), len(told)]
-        header = {
-            "coding": packing.PACKED,
-            "reference": 0,
-            "seed": motion.modes.seed,
-            "counts": counts,
-            "keys": keys,
-            "guides": rounded.guides,
-            "shifts": rounded.shifts,
-            "cyclic": self.cyclic,
-            "origin": self.origin,
-            "steps": [rounded.step, *steps, self.scale],
-            "digest": packing.digest(self.triangles, packing.exactly(rounded.shapes), flat, series, clusters, told),
-        }
-        return to_bytes(tensors, header), len(tensors["faces"])
+        return to_bytes(tensors, {"coding": packing.PACKED}), len(faces)
 
 
 @contextlib.contextmanager
