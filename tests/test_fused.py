@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import pickle
 import subprocess
 import sys
 import warnings
@@ -21,7 +22,10 @@ from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
+from torch_modal.geometry.poisson import Poisson
+from torch_modal.geometry.sparse import SparseSolver
 from torch_modal.nn import launch, trees
+from torch_modal.nn.blend import FusedSolver
 from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.fused_rotations import FusedRotations
@@ -238,6 +242,18 @@ class TestRotations:
         assert_alike(gradients(by_warp, given, True), gradients(by_torch, given, True), 1e-7)
         found = vmap(lambda t: by_warp(*given[:2], t))(torch.stack([t, 0.5 * t]))
         torch.testing.assert_close(found[1], by_warp(*given[:2], 0.5 * t), rtol=0, atol=1e-12)
+
+
+def test_substitution(small_bars: Shapes) -> None:
+    mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
+    weights = torch.rand(len(mesh.edges), dtype=DOUBLE, generator=torch.Generator().manual_seed(5)) + 0.1
+    fused, plain = (Poisson(mesh.connectivity, weights, solver=kind).solver for kind in (FusedSolver, SparseSolver))
+    right = torch.randn(2, mesh.n_vertices, 3, dtype=DOUBLE, generator=torch.Generator().manual_seed(6))
+    truth = plain(right)
+    assert float(truth.abs().max()) > 0.1
+    torch.testing.assert_close(fused(right), truth, rtol=0, atol=1e-11)
+    assert fused(right.float()).dtype == torch.float32
+    torch.testing.assert_close(pickle.loads(pickle.dumps(fused))(right), truth, rtol=0, atol=1e-11)
 
 
 class TestLayers:

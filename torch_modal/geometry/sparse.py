@@ -62,6 +62,20 @@ class SparseSolver:
         out[self.free] = self._factor.solve(right[self.free])
         return out
 
+    def factors(self) -> list[Tensor]:
+        """``L D L^T`` of the matrix of the free unknowns.
+
+        Returns:
+            Which unknown is eliminated when; starts, rows and entries of the columns of ``L`` below its diagonal;
+            ``D``. Whole numbers are int32.
+        """
+        factor = factorize(self._inner)
+        below = sparse.tril(factor.L, -1, format="csc")
+        order = np.empty_like(self.free)
+        order[factor.perm_c] = self.free
+        whole = [torch.from_numpy(part.astype(np.int32)) for part in (order, below.indptr, below.indices)]
+        return [*whole, torch.from_numpy(below.data), torch.from_numpy(factor.U.diagonal())]
+
     def has_inverse(self, device: torch.device) -> bool:
         """Whether tensors there are multiplied by the inverse."""
         return device.type != "cpu" and len(self.free) <= MOST_DENSE

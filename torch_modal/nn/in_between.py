@@ -317,7 +317,9 @@ def joined(parts: Sequence[InBetweenResult], order: Sequence[Tensor]) -> InBetwe
         parts: One or more. Where numbers of modes differ, zeros follow the amplitudes.
         order: Where the samples of each part stand in the whole. *Shape of each:* ``(B,)``.
     """
-    back = torch.argsort(torch.cat(list(order)))
+    places = torch.cat(list(order))
+    sorted_ = torch.equal(places, torch.arange(len(places), device=places.device))
+    back = slice(None) if sorted_ else torch.argsort(places)  # picking all would copy them
     widest = max(part.solution.amplitudes.shape[-1] for part in parts)
     amplitudes = torch.cat(
         [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]

@@ -898,3 +898,34 @@ def pulls(
     pull = weights[k] * wanted[s * ends.shape[0] + k]
     wp.atomic_add(out, s * n + ends[k][0], -pull)
     wp.atomic_add(out, s * n + ends[k][1], pull)
+
+
+@wp.kernel(enable_backward=False)
+def substituted(
+    right: wp.array(dtype=vec3),
+    order: wp.array(dtype=wp.int32),
+    start: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    entry: wp.array(dtype=real),
+    pivot: wp.array(dtype=real),
+    n: int,
+    work: wp.array(dtype=vec3),
+    out: wp.array(dtype=vec3),
+):
+    """Substitution with ``L D L^T``, ``L`` by its columns below the diagonal. One thread for a sample."""
+    s = wp.tid()
+    n_free = order.shape[0]
+    at = s * n_free
+    for k in range(n_free):
+        work[at + k] = right[s * n + order[k]]
+    for k in range(n_free):
+        found = work[at + k]
+        for p in range(start[k], start[k + 1]):
+            work[at + row[p]] = work[at + row[p]] - entry[p] * found
+    for j in range(n_free):
+        k = n_free - 1 - j
+        found = work[at + k] / pivot[k]
+        for p in range(start[k], start[k + 1]):
+            found = found - entry[p] * work[at + row[p]]
+        work[at + k] = found
+        out[s * n + order[k]] = found
