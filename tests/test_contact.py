@@ -19,7 +19,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import Search
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.nn import trees
-from torch_modal.nn.contact import Contacts
+from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence.contact import splines
@@ -188,6 +188,21 @@ def test_what_was_pushed_out_of_reach_is_held_on() -> None:
         (1, 0, 1, 2, 9): (3, 0.3),
         (1, 3, 4, 5, 8): (4, 0.4),
     }
+
+
+def test_counting_finds_what_searching_finds(hand: Shapes) -> None:
+    x_a, x_b = (100 * x[None] for x in hand.keyframes)
+    t = torch.tensor([0.25, 0.875], dtype=DOUBLE)
+    with torch.no_grad():
+        x = 100 * tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, t)
+    mesh = Mesh.of(hand.faces, hand.keyframes.shape[1])
+    search = ContactSearch(mesh, x_a, x_b, torch.zeros(2, dtype=torch.int64), t)
+    assert search(x) is not None
+    found = search.n_far.tolist()
+    assert found[0] == 0 < found[1] and list(search.crossing(x, [0, 1])) == [1]
+    search.count(x)
+    assert search.n_far.tolist() == search.n_left.tolist() == found
+    assert search.of(torch.tensor([1])).n_far.tolist() == found[1:]
 
 
 # -------------------------------------------------------------------------------------------------------------- region

@@ -5,9 +5,12 @@
     python tests/benchmarks/contact.py --pictures docs/images
 
 Each case is two key-frames, subdivided into 33 shapes with and without contact. *Far* pairs of triangles are those of
-parts that went through each other (docs/contact.md). Energies are those of Eq. 5 without the contact term, at each time
-between both key-frames; times are of the processor, with one thread. The legs are the sample creature's, made by
-``examples/make_samples.py``: they swing past each other in one line.
+parts that went through each other (docs/contact.md); of those that are left, *new* are the ones of which neither
+triangle has a corner that is inside in a key-frame. Energies are those of Eq. 5 without the contact term, at each time
+between both key-frames, over those without contact, and over those without contact after as many steps of all vertices
+(``steps``, the sum and the most of a shape). Times are of the processor, with one thread. The legs are the sample
+creature's, made by ``examples/make_samples.py``: they swing past each other in one line. Draws are those of
+``draws.py``; gradients are compared with central differences, with what is held kept.
 """
 
 import argparse
@@ -26,6 +29,9 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.crossings import Crossings
+from torch_modal.sequence.contact import FINAL_STEPS, FINE_STEPS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LEVELS = 5
@@ -90,6 +96,8 @@ class Run(NamedTuple):
 
     plain: Tensor
     apart: Tensor
+    polished: Tensor
+    """Without contact, after as many steps of all vertices."""
     seconds: tuple[float, float]
 
 
@@ -103,10 +111,11 @@ def subdivided(case: Case, bases: list[tm.ModalBasis], **options: Any) -> tuple[
 def run(case: Case) -> Run:
     """Both, one after the other."""
     bases = tm.extract_bases(case.keyframes, case.faces, 30, progress=False)
-    subdivided(case, bases)  # what is made once
-    plain, without = subdivided(case, bases)
+    subdivided(case, bases, contact=False)  # what is made once
+    plain, without = subdivided(case, bases, contact=False)
     apart, with_ = subdivided(case, bases, contact=True)
-    return Run(plain, apart, (without, with_))
+    polished, _ = subdivided(case, bases, solver=tm.Solver(polish=2 * FINE_STEPS + FINAL_STEPS), contact=False)
+    return Run(plain, apart, polished, (without, with_))
 
 
 def energies(frames: Tensor, case: Case) -> Tensor:
@@ -126,25 +135,34 @@ def peak(frames: Tensor) -> float:
 
 def crossings(names: list[str]) -> Iterator[tuple[Case, Run]]:
     """The main table."""
-    head = ("far, sum", "most", "left", "frames", "energy", "most", "peak", "ratio", "s", "times")
+    head = ("far, sum", "most", "left", "frames", "new", "energy", "steps", "most", "peak", "ratio", "s", "times")
     print(f"\n{'':16s}" + "".join(f"{word:>10s}" for word in head))
     for name in names:
         case = CASES[name]()
         if case is None:
             continue
         found = run(case)
-        before, after = (
-            tm.self_contacts(frames, case.faces, ignore=case.keyframes).n_far for frames in (found.plain, found.apart)
-        )
-        plain, apart = energies(found.plain, case), energies(found.apart, case)
+        contacts = [
+            tm.self_contacts(frames, case.faces, ignore=case.keyframes) for frames in (found.plain, found.apart)
+        ]
+        before, after = (each.n_far for each in contacts)
+        new = (~inside(case)[case.faces[contacts[1].pairs[contacts[1].far]]]).flatten(1).all(1)
+        plain, apart, polished = (energies(x, case) for x in (found.plain, found.apart, found.polished))
         peaks = peak(found.plain), peak(found.apart)
         line = f"{case.name:16s}{int(before.sum()):10d}{int(before.max()):10d}{int(after.sum()):10d}"
         line += (
-            f"{int((after > 0).sum()):10d}{float(apart.sum() / plain.sum()):10.4f}{float((apart / plain).max()):10.4f}"
+            f"{int((after > 0).sum()):10d}{int(new.sum()):10d}{float(apart.sum() / plain.sum()):10.4f}"
+            f"{float(apart.sum() / polished.sum()):10.4f}{float((apart / polished).max()):10.4f}"
         )
         line += f"{peaks[1]:8.3f} %{peaks[1] / peaks[0]:10.2f}{found.seconds[1]:10.2f}"
         print(line + f"{found.seconds[1] / found.seconds[0]:10.2f}", flush=True)
         yield case, found
+
+
+def inside(case: Case) -> Tensor:
+    """Vertices that are inside the surface in a key-frame. *Shape:* ``(V,)``."""
+    mesh = Connectivity(case.faces.numpy(), case.keyframes.shape[1])
+    return torch.from_numpy(Crossings(mesh, case.keyframes.double().numpy()).known_inside)
 
 
 def edges(case: Case, found: Run) -> None:
@@ -156,10 +174,12 @@ def edges(case: Case, found: Run) -> None:
         mine, its = ((y[i] - y[j]).norm(dim=-1) for y in (x, true))
         return float(100 * ((mine - its).abs() / its).mean())
 
-    print("\nedge error of the sample hand, %, without and with contact")
+    print("\nedge error of the sample hand, %, without contact, after as many steps, and with contact")
     for t, true in zip(sample.true_times, sample.truth, strict=True):
         k = round(t * 2**LEVELS)
-        print(f"  t = {t:.2f}{error(found.plain[k], true):10.3f}{error(found.apart[k], true):10.3f}")
+        print(
+            f"  t = {t:.2f}" + "".join(f"{error(x[k], true):10.3f}" for x in (found.plain, found.polished, found.apart))
+        )
 
 
 def untouched() -> None:
@@ -171,6 +191,51 @@ def untouched() -> None:
     print(f"\nnothing touches ({case.name}): {found.seconds[1] / found.seconds[0]:.2f} times, same shapes: {same}")
 
 
+def draws() -> None:
+    """How many random in-betweens have new crossings, without and with contact."""
+    import draws as drawn
+
+    print("\nrandom in-betweens, without and with contact")
+    for name, n in (("hand", 100), ("woman", 40)):
+        for contact in (False, True):
+            print(f"{name + (', contact' if contact else ''):18s}", end="")
+            drawn.measure(name, n, n, ["RandomInBetween"], contact)
+
+
+def gradients() -> None:
+    """Of a weighted sum of the sample hand's vertices at t = 7/8, against central differences."""
+    from torch_modal.nn.contact_rounds import ContactRounds
+
+    case = sample_hand()
+    layer = tm.InBetween(tm.extract_bases(case.keyframes, case.faces, 20, progress=False), case.faces, contact=True)
+    search, first = ContactRounds.found, []
+
+    def held(*given: Any) -> Any:
+        first.extend([] if first else [search(*given)])
+        return first[0]
+
+    def shape(given: list[Tensor]) -> Tensor:
+        return layer(given[0], given[1], given[2])
+
+    x_a, x_b = case.keyframes
+    weights, way = torch.cos(7 * x_a), 0.01 * torch.sin(9 * x_a + 1)
+    given = [x.clone().requires_grad_() for x in (x_a, x_b, torch.tensor(0.875, dtype=x_a.dtype))]
+    try:
+        ContactRounds.found = held  # type: ignore[method-assign]
+        found = torch.autograd.grad((shape(given) * weights).sum(), given)
+        print(f"\ngradients with {int((first[0][1].held.weights > 0).sum())} vertices held, relative difference")
+        parts = (("first key-frame", way, 1e-3), ("second", way, 1e-3), ("t", torch.ones_like(given[2]), 1e-5))
+        for i, (name, moved, size) in enumerate(parts):
+            values = []
+            for sign in (1, -1):
+                there = [x.detach() + sign * size * moved if k == i else x.detach() for k, x in enumerate(given)]
+                values.append(float((shape([x.requires_grad_() for x in there]).detach() * weights).sum()))
+            true = (values[0] - values[1]) / (2 * size)
+            print(f"  {name:16s}{abs(float((found[i] * moved).sum()) / true - 1):10.1e}", flush=True)
+    finally:
+        ContactRounds.found = search  # type: ignore[method-assign]
+
+
 def selfish(sizes: tuple[int, ...] = (10, 100, 1000)) -> None:
     """Key-frames of the hand that pass through themselves: fingertips are moved into what is beside them."""
     case = sample_hand()
@@ -180,7 +245,7 @@ def selfish(sizes: tuple[int, ...] = (10, 100, 1000)) -> None:
         keyframes = crossed(case, wanted)
         number = int(tm.self_contacts(keyframes[0], case.faces).number)
         own = Case("", keyframes, case.faces)
-        plain, _ = subdivided(own, bases)
+        plain, _ = subdivided(own, bases, contact=False)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             apart, seconds = subdivided(own, bases, contact=True)
@@ -239,7 +304,7 @@ if __name__ == "__main__":
     limit_threads()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--rows", nargs="+", default=["crossings", "cost", "keyframes"])
+    parser.add_argument("--rows", nargs="+", default=["crossings", "cost", "keyframes", "draws", "gradients"])
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the sample hand and the legs")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -253,3 +318,7 @@ if __name__ == "__main__":
         untouched()
     if "keyframes" in given.rows:
         selfish()
+    if "gradients" in given.rows:
+        gradients()
+    if "draws" in given.rows:
+        draws()

@@ -135,12 +135,21 @@ class ContactSearch:
 
     def crossing(self, x: Tensor, some: Sequence[int]) -> Iterator[int]:
         """Those of some samples in which parts went through each other. *Shape:* ``(B, V, 3)``, of all samples."""
-        for i in some:
-            search = self._search(i)
-            if bool(x[i].isfinite().all()):
-                pairs = search.crossings.pairs(x[i].detach().double().cpu().numpy())
-                if search.n_left(pairs[search.crossings.is_far(pairs)], *self._when(i)):
-                    yield i
+        return (i for i in some if self._counted(i, x[i])[1])
+
+    def count(self, x: Tensor) -> None:
+        """Count what crosses in all samples, without looking for what is to be held. *Shape:* ``(B, V, 3)``."""
+        counts = [self._counted(i, shape) for i, shape in enumerate(x)]
+        self.n_far, self.n_left = (self._counts(x, each) for each in zip(*counts, strict=True))
+
+    def _counted(self, i: int, x: Tensor) -> tuple[int, int]:
+        """Pairs of triangles that went through each other in a sample, and those of them that are not tolerated."""
+        search = self._search(i)
+        if not bool(x.isfinite().all()):
+            return 0, 0
+        pairs = search.crossings.pairs(x.detach().double().cpu().numpy())
+        pairs = pairs[search.crossings.is_far(pairs)]
+        return len(pairs), search.n_left(pairs, *self._when(i))
 
     def __call__(self, x: Tensor) -> Contacts | None:
         """Contacts of the samples; None where nothing has gone through anything, now or before.

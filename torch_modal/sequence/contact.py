@@ -119,11 +119,13 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     course = torch.cat([pair.first[:1], start, pair.second[:1]])
     bent = float((course[2:] - 2 * course[1:-1] + course[:-2]).norm(dim=-1).nan_to_num().max())
     search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t, bent * (len(t) + 1) ** 2)
-    few = range(max(1, len(t) // LOOKED_AT) - 1, len(t), max(1, len(t) // LOOKED_AT))
+    every = -(-len(t) // LOOKED_AT)
+    few = range(every - 1, len(t), every)
     if next(search.crossing(start, few), None) is None:
         return Displacement(None, search.n_far, search.n_far)
     stride = max(1, (len(t) + 1) // SEARCHED)
-    chosen = set(range(stride - 1, len(t), stride))
+    # The first and the last hardly cost energy, and would be bent by what is done to the next.
+    chosen = {0, *range(stride - 1, len(t), stride), len(t) - 1}
     found = _pushed(member, samples, pair, start, search, chosen)
     if found.coefficients is not None:
         moved = start + (splines(t).values @ found.coefficients).movedim(0, -1)
@@ -174,7 +176,7 @@ def _pushed(
     if best[0] is not None:
         # What was pushed apart in a hurry is brought to rest, in a wider region.
         rested = solver.fine(best[0], held, search.near(WIDE_REGION), FINAL_STEPS)
-        search(solver.moved(rested).movedim(0, -1))
+        search.count(solver.moved(rested).movedim(0, -1))
         best = min((rested, search.n_left, search.n_far), best, key=lambda found: int(found[1].sum()))
     return Displacement(best[0], n_before, best[2])
 
