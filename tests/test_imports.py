@@ -105,8 +105,11 @@ def test_one_lock_guards_the_decimation() -> None:
 
 def test_import_loads_nothing_heavy() -> None:
     heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch_geometric", "torch._dynamo"]
+    heavy += ["scipy.interpolate", "sympy"]
     code = (
         "import sys, torch_modal; torch_modal.extract_bases, torch_modal.subdivide, torch_modal.InBetween; "
+        "from torch_modal.geometry.functions import broadcast_shapes; "
+        "assert broadcast_shapes((2, 1), [3], ()) == (2, 3); "
         f"print([name for name in {heavy} if name in sys.modules])"
     )
     result = subprocess.run(

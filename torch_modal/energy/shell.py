@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Term, Volume
+from torch_modal.geometry.functions import broadcast_shapes
 from torch_modal.keyframes.arrays import as_faces
 
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
@@ -109,7 +110,7 @@ class ShellEnergy(nn.Module):
             (weight.sqrt() * part.term.difference(part.measures(part.spokes(rows))[..., None, :], rest)).squeeze(-2)
             for part, rest, weight in zip(self.energy.parts, reference.measures, reference.weights, strict=True)
         ]
-        lead = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        lead = broadcast_shapes(*(part.shape[:-1] for part in parts))
         return torch.cat([part.expand(*lead, -1) for part in parts], -1)
 
     def forward(self, x: Tensor, x_rest: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.crossings import require_contact
+from torch_modal.geometry.functions import broadcast_shapes
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.between import Between, Fine
@@ -168,8 +169,8 @@ class InBetween(nn.Module):
         times = self.check(x_a, x_b, t)
         chosen = self._chosen(pair)
         item = x_a.shape[-2:]
-        own = torch.broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], *([] if chosen is None else [chosen.shape]))
-        lead = torch.broadcast_shapes(own, times.shape)
+        own = broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], *([] if chosen is None else [chosen.shape]))
+        lead = broadcast_shapes(own, times.shape)
         flat_a, flat_b = (x.to(self.dtype).expand(*own, *item).reshape(-1, *item) for x in (x_a, x_b))
         index = None
         if own != lead:
@@ -254,7 +255,7 @@ class InBetween(nn.Module):
                 raise ValueError(f"{name} is on {x.device}, the layer on {reference.device}; move one with .to()")
         times = torch.as_tensor(t, dtype=reference.dtype, device=reference.device)
         try:
-            torch.broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], times.shape)
+            broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], times.shape)
         except RuntimeError:
             raise ValueError(
                 f"t of shape {tuple(times.shape)} does not broadcast against key-frames of {tuple(x_a.shape[:-2])} and "

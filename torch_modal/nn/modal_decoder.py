@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.functions import broadcast_shapes
 from torch_modal.geometry.hermite import Excess, Spacing, around, beyond, located
 from torch_modal.geometry.local_rotations import Course
 from torch_modal.geometry.rotations import exp
@@ -164,7 +165,7 @@ class ModalDecoder(nn.Module):
         if keyframes is not None and keyframes.shape != self.keyframes.shape:
             raise ValueError(f"keyframes have the shape {tuple(self.keyframes.shape)}; got {tuple(keyframes.shape)}")
         t = torch.as_tensor(t, dtype=self.times.dtype, device=amplitudes.device)
-        lead = torch.broadcast_shapes(amplitudes.shape[:-1], t.shape)
+        lead = broadcast_shapes(amplitudes.shape[:-1], t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
         segment, u = self.located(t.expand(lead).reshape(-1))
         order, parts = [], []

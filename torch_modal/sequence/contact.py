@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.interpolate import BSpline
 from torch import Tensor
 
 from torch_modal.nn import trees
@@ -87,6 +86,8 @@ def splines(t: Tensor, n: int | None = None) -> Splines:
         t: Times in [0, 1]. *Shape:* ``(T,)``.
         n: Number of their intervals, J - 1. Default: :data:`KNOTS`.
     """
+    from scipy.interpolate import BSpline  # 0.1 s, where nothing needs it
+
     n = KNOTS if n is None else n
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, n + 1), np.ones(3)])
     at = t.detach().double().cpu().numpy()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.crossings import require_contact
+from torch_modal.geometry.functions import broadcast_shapes
 from torch_modal.geometry.hermite import Spacing, around, located
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
 from torch_modal.nn.samples import InBetweenResult, Samples
@@ -156,7 +157,7 @@ class Path(nn.Module):
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         own = keyframes.shape[:-3]
         try:
-            lead = torch.broadcast_shapes(own, t.shape)
+            lead = broadcast_shapes(own, t.shape)
         except RuntimeError:
             raise ValueError(
                 f"t of shape {tuple(t.shape)} does not broadcast against motions of {tuple(own)}; for all times of all "
