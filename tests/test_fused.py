@@ -287,6 +287,14 @@ class TestLayers:
             assert member.space.blend.rotations(x, x, mode.from_tensor(torch.zeros(1, dtype=DOUBLE))).shape[0] == 3
 
 
+def test_the_first_of_a_thread_may_have_nothing_to_do() -> None:
+    """Warp gives no command for no threads, so there was none to use again."""
+    kernel = launch.kernels().value
+    launch._COMMANDS.known.clear()
+    launch.launch(kernel, (0, 5), [torch.zeros(0)])
+    assert not launch._COMMANDS.known
+
+
 class TestBackend:
     def test_no_such_backend(self) -> None:
         with pytest.raises(ValueError, match="backend is one of 'auto', 'torch', 'warp'; got 'cuda'"):

@@ -133,6 +133,24 @@ def test_thin_limbs_have_small_tetrahedra(name: str) -> None:
     assert np.median(sizes[filled.vertices[filled.tets].mean(axis=1)[:, 0] > 30]) < near.thickness.min()
 
 
+@pytest.mark.parametrize("apart, resolved", [(0.5, True), (0.2, False)])
+def test_pieces_are_not_fused(apart: float, resolved: bool) -> None:
+    """A lattice fuses what is nearer than its tetrahedra, which then moves as one: it is not for such bodies."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    points = np.concatenate([ball.vertices + np.array([i * (2 + apart), 0, 0]) for i in range(3)])
+    speck = 0.01 * ball.vertices + [0, 1.2, 0]
+    faces = np.concatenate([ball.faces + i * len(ball.vertices) for i in range(4)])
+    whole = Surface.of(np.concatenate([points, speck]), faces)
+    assert is_resolved(lattice(whole, 0.03), whole, clearances(whole)) == resolved
+
+
+def test_pieces_within_each_other_may_be_one() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    points = np.concatenate([ball.vertices, ball.vertices * 0.7 + [0.5, 0, 0]])
+    whole = Surface.of(points, np.concatenate([ball.faces, ball.faces + len(ball.vertices)]))
+    assert is_resolved(lattice(whole, 0.03), whole, clearances(whole))
+
+
 def test_lowest_mode_of_a_rod() -> None:
     """A free beam: lambda = (4.730 / L)^4 E r² / 4 with E = 2, the modulus of ``|sym ∇u|²``."""
     shape = body("rod bent 180")

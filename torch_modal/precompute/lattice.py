@@ -64,6 +64,10 @@ WIRE = 0.01
 """Thickness of wires, in bounding-box diagonals, and less."""
 WIRE_LENGTH = 40.0
 """Over that thickness."""
+SPECK = 1 / 500
+"""Area of pieces that need not be apart from others, in that of the largest."""
+MOST_APART = 1000
+"""Pieces of which that is asked, the largest."""
 LEAST_INSIDE = 0.02
 """Tetrahedra with less of them inside are left out, or count as this much where the surface runs through them."""
 REACH = 0.7
@@ -188,21 +192,43 @@ def lattice(surface: Surface, edge_length_fac: float, clearance: Clearance | Non
 
 
 def is_resolved(tetrahedra: Tetrahedra, surface: Surface, clearance: Clearance) -> bool:
-    """Whether tetrahedra are small enough for nearly all of a body, and no part of it is a wire.
+    """Whether tetrahedra are small enough for nearly all of a body, as many pieces as it has, and no part is a wire.
 
     Of a wire, long and thinner than all else, the lowest modes are all its own.
     """
     if len(tetrahedra.tets) == 0:
         return False
-    n_pieces = connected_pieces(np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]]), len(surface.points)).max()
-    if pieces_by_sides(tetrahedra.tets).max() > n_pieces:
-        return False  # parts have come off, or hang on an edge
-    sizes = _sizes_at_vertices(tetrahedra)
+    piece = connected_pieces(np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]]), len(surface.points))
     corners = surface.points[surface.faces]
-    nearest = cKDTree(tetrahedra.vertices).query(corners.mean(axis=1))[1]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    n_filled = pieces_by_sides(tetrahedra.tets).max() + 1
+    if not _n_apart(surface, piece, areas) <= n_filled <= piece.max() + 1:
+        return False  # pieces were fused, or parts have come off, or hang on an edge
+    sizes = _sizes_at_vertices(tetrahedra)
+    nearest = cKDTree(tetrahedra.vertices).query(corners.mean(axis=1))[1]
     coarse = sizes[nearest] > COARSEST * clearance.thickness
     return bool(areas[coarse].sum() <= MOST_COARSE * areas.sum()) and not _has_wire(surface, clearance)
+
+
+def _n_apart(surface: Surface, piece: IntArray, areas: FloatArray) -> int:
+    """How many pieces, or groups of them that may lie in each other, have boxes that nothing else reaches into.
+
+    Specks are left out: those are no parts of a body.
+
+    Args:
+        surface: The body.
+        piece: Of each point. *Shape:* ``(V,)``.
+        areas: Of the faces. *Shape:* ``(F,)``.
+    """
+    own = np.bincount(piece[surface.faces[:, 0]], areas, minlength=piece.max() + 1)
+    large = np.argsort(-own)[:MOST_APART]
+    large = large[own[large] > SPECK * own.max()]
+    low, high = (np.full((len(own), 3), fill) for fill in (np.inf, -np.inf))
+    np.minimum.at(low, piece, surface.points)
+    np.maximum.at(high, piece, surface.points)
+    low, high = low[large], high[large]
+    meets = ((low[:, None] <= high) & (low <= high[:, None])).all(axis=-1)
+    return int(connected_pieces(np.argwhere(meets), len(large)).max()) + 1
 
 
 def _has_wire(surface: Surface, clearance: Clearance) -> bool:
