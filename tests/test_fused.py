@@ -289,9 +289,10 @@ class TestLayers:
 
 def test_the_first_of_a_thread_may_have_nothing_to_do() -> None:
     """Warp gives no command for no threads, so there was none to use again."""
-    kernel = launch.kernels().value
+    record = torch.zeros(5, 4, dtype=torch.int32)
+    x, stretch, bend, energy = (torch.zeros(0, *shape, dtype=DOUBLE) for shape in ((4, 3), (5, 2), (5, 4), ()))
     launch._COMMANDS.known.clear()
-    launch.launch(kernel, (0, 5), [torch.zeros(0)])
+    launch.launch(launch.kernels().value, (0, 5), [x, record, stretch, bend, 4, 1, energy])
     assert not launch._COMMANDS.known
 
 
