@@ -211,10 +211,14 @@ def half_cotangents(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArra
     return halves
 
 
+def double_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
+    """Twice the area of each face. *Shape:* ``(F,)``."""
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    found: NDArray[np.float64] = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return found
+
+
 def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
     """A third of the area of the faces around each vertex. *Shape:* ``(V,)``."""
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normals, axis=1)
-    summed = np.bincount(faces.reshape(-1), np.repeat(area / 6, 3), minlength=len(vertices))
+    summed = np.bincount(faces.reshape(-1), np.repeat(double_areas(vertices, faces) / 6, 3), minlength=len(vertices))
     return summed.astype(np.float64)  # of no face at all it is of integers

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
 from torch_modal.precompute.bisection import halved
 from torch_modal.precompute.proximity import Clearance, clearances
 from torch_modal.precompute.sampling import Samples, sampled
@@ -199,13 +199,12 @@ def is_resolved(tetrahedra: Tetrahedra, surface: Surface, clearance: Clearance) 
     if len(tetrahedra.tets) == 0:
         return False
     piece = connected_pieces(np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]]), len(surface.points))
-    corners = surface.points[surface.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = double_areas(surface.points, surface.faces)
     n_filled = pieces_by_sides(tetrahedra.tets).max() + 1
     if not _n_apart(surface, piece, areas) <= n_filled <= piece.max() + 1:
         return False  # pieces were fused, or parts have come off, or hang on an edge
     sizes = _sizes_at_vertices(tetrahedra)
-    nearest = cKDTree(tetrahedra.vertices).query(corners.mean(axis=1))[1]
+    nearest = cKDTree(tetrahedra.vertices).query(surface.points[surface.faces].mean(axis=1))[1]
     coarse = sizes[nearest] > COARSEST * clearance.thickness
     return bool(areas[coarse].sum() <= MOST_COARSE * areas.sum()) and not _has_wire(surface, clearance)
 
@@ -218,7 +217,7 @@ def _n_apart(surface: Surface, piece: IntArray, areas: FloatArray) -> int:
     Args:
         surface: The body.
         piece: Of each point. *Shape:* ``(V,)``.
-        areas: Of the faces. *Shape:* ``(F,)``.
+        areas: Of the faces, up to a factor. *Shape:* ``(F,)``.
     """
     own = np.bincount(piece[surface.faces[:, 0]], areas, minlength=piece.max() + 1)
     large = np.argsort(-own)[:MOST_APART]
