@@ -292,7 +292,7 @@ def test_the_first_of_a_thread_may_have_nothing_to_do() -> None:
     record = torch.zeros(5, 4, dtype=torch.int32)
     x, stretch, bend, energy = (torch.zeros(0, *shape, dtype=DOUBLE) for shape in ((4, 3), (5, 2), (5, 4), ()))
     launch._COMMANDS.known.clear()
-    launch.launch(launch.kernels().value, (0, 5), [x, record, stretch, bend, 4, 1, energy])
+    launch.launch(launch.kernels("shell").value, (0, 5), [x, record, stretch, bend, 4, 1, energy])
     assert not launch._COMMANDS.known
 
 
@@ -313,7 +313,7 @@ class TestBackend:
             launch._works.cache_clear()
 
     def test_not_usable(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def broken() -> None:
+        def broken(name: str) -> None:
             raise OSError("the cache folder is not writable")
 
         monkeypatch.setattr(launch, "kernels", broken)
@@ -324,8 +324,11 @@ class TestBackend:
         finally:
             launch._works.cache_clear()
 
-    def test_nothing_is_printed(self) -> None:
-        code = "from torch_modal.nn.launch import kernels; kernels()"
+    def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
+        code = (
+            "import sys; from torch_modal.nn.launch import kernels; kernels('rotations'); "
+            "sys.exit(any(f'torch_modal.nn.kernels.{name}' in sys.modules for name in ('shell', 'modal', 'steps')))"
+        )
         folder = Path(tm.__file__).parents[1]
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
         assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
@@ -343,5 +346,5 @@ def test_what_warp_says_of_itself_is_left_alone() -> None:
         warnings.simplefilter("error")
         before = warp.config.log_level
         launch.kernels.cache_clear()
-        launch.kernels()
+        launch.kernels("shell")
         assert warp.config.log_level == before

@@ -86,7 +86,7 @@ class FusedSolver(SparseSolver):
             self._columns = self.factors()
         own = right.detach().double().reshape(-1, self.n, 3).contiguous()
         work, out = own.new_empty(len(own), len(self.free), 3), torch.zeros_like(own)
-        launch(kernels().substituted, (len(own),), [own, *self._columns, self.n, work, out])
+        launch(kernels("rotations").substituted, (len(own),), [own, *self._columns, self.n, work, out])
         return out.reshape(right.shape).to(right)
 
 
@@ -97,7 +97,7 @@ class _Pulls(torch.autograd.Function):
     def forward(ends: Tensor, weights: Tensor, wanted: Tensor, n: int) -> Tensor:
         own = wanted.detach().double().contiguous()
         out = own.new_zeros(len(own), n, 3)
-        launch(kernels().pulls, (len(own), len(ends)), [own, weights.double(), ends, n, out])
+        launch(kernels("rotations").pulls, (len(own), len(ends)), [own, weights.double(), ends, n, out])
         return out.to(wanted)
 
     @staticmethod

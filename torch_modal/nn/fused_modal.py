@@ -148,7 +148,7 @@ class FusedModalEnergy(ModalEnergy):
         jacobian = x.new_empty(b, n_rows, blocks.shape[1])
         given = [shell.record, shell.hinge, at.edges, at.hinges, blocks, extra, shell.n_vertices, n]
         given += [blocks.shape[1] // _BLOCK, n_rows, jacobian, jacobian]
-        launch(kernels().jacobian, (b, len(shell.record)), given)
+        launch(kernels("modal").jacobian, (b, len(shell.record)), given)
         pushed = torch.stack([at.gradient + at.moment[:, None, None] * at.normal, at.normal], 1)
         slopes = pushed.flatten(2) @ self.flat.double().T
         if extra is not None:
@@ -176,15 +176,15 @@ class FusedModalEnergy(ModalEnergy):
         shell, n_pairs = self.shell, len(self.curvature.pairs)
         found = x.new_zeros(len(x), 2 * n_pairs, 3, 3)
         given = [x, shell.record, to.stretch, to.bend, self.slots, shell.n_vertices, 2 * n_pairs, found]
-        launch(kernels().curved_edges, (len(x), len(shell.record)), given)
+        launch(kernels("modal").curved_edges, (len(x), len(shell.record)), given)
         given = [x, shell.centre(x), shell.walls, moment, self.wall_slots, shell.n_vertices, 2 * n_pairs, found]
-        launch(kernels().curved_walls, (len(x), len(shell.walls)), given)
+        launch(kernels("modal").curved_walls, (len(x), len(shell.walls)), given)
         extra, columns, n = placement.extra, self.blocks.double(), len(self.columns)
         if extra is not None:
             extra = torch.cat([extra, shell.centre(extra)[:, None]], 1)
         pushed = x.new_zeros(len(x), *columns.shape)
         given = [self.pairs, found, columns, extra, len(columns) // 3, n, columns.shape[1] // _BLOCK, pushed, pushed]
-        launch(kernels().curved_columns, (len(x), n_pairs), given)
+        launch(kernels("modal").curved_columns, (len(x), n_pairs), given)
         n_all = n + (extra is not None)
         curved = (columns.mT @ pushed)[:, :n_all, :n_all]
         if extra is not None:  # a column of zeros so far on the left side

@@ -96,7 +96,7 @@ class FusedRelax(FusedShell):
 
     def _solved(self, x: Tensor, at: ShellPoint, to: ShellReference, n_products: int) -> tuple[Tensor, Tensor]:
         """Conjugate gradients, fused. *Shape:* ``(B, V, 3)`` each: the step, and where it leads."""
-        module, (b, n) = kernels(), x.shape[:2]
+        module, (b, n) = kernels("steps"), x.shape[:2]
         _, gradient, diagonal, edges, hinges, normal, moment = at
         residual, direction, solution, product, reached = torch.empty(5, *x.shape, dtype=x.dtype, device=x.device)
         size, swept, form = torch.zeros(3, n_products + 1, b, dtype=x.dtype, device=x.device)
@@ -104,7 +104,7 @@ class FusedRelax(FusedShell):
         given = [gradient, normal, moment, diagonal, n, residual, direction, solution, product, size[0], swept[0]]
         launch(module.begin, vertices, given)
         for k in range(n_products):
-            launch(module.product, records, [direction, self.record, edges, hinges, n, product, form[k]])
+            launch(kernels("shell").product, records, [direction, self.record, edges, hinges, n, product, form[k]])
             if k == n_products - 1:
                 given = [x, direction, to.stiffness, swept[k], size[k], form[k], n, solution, reached]
                 launch(module.arrive, vertices, given)
@@ -129,7 +129,7 @@ class FusedRelax(FusedShell):
     def _product(self, at: ShellPoint, to: ShellReference, field: Tensor) -> Tensor:
         """The convex Hessian times a field. *Shape:* ``(B, V, 3)``."""
         given = [field, self.record, at.edges, at.hinges, self.n_vertices, None, None]
-        found, _ = self._run(kernels().product, {5: tuple(field.shape), 6: (len(field),)}, given)
+        found, _ = self._run(kernels("shell").product, {5: tuple(field.shape), 6: (len(field),)}, given)
         return found + to.stiffness[:, None, None] * _dot(at.normal, field) * at.normal
 
 

@@ -45,7 +45,7 @@ class FusedRotations(LocalRotations):
 
     def sense(self, first: Tensor, second: Tensor) -> Tensor:
         """The sign of the quaternion of each triangle. *Shape:* ``(B, F)``."""
-        module, (b, n), n_faces = kernels(), first.shape[:2], len(self.faces)
+        module, (b, n), n_faces = kernels("rotations"), first.shape[:2], len(self.faces)
         quaternions, areas = first.new_empty(b, n_faces, 4), first.new_empty(b, n_faces)
         launch(module.turns, (b, n_faces), [first, second, self._face, n, quaternions, areas])
         if first.device.type != "cpu":  # the walk down the tree is one thread's
@@ -60,7 +60,7 @@ class FusedRotations(LocalRotations):
         """Edge vectors where the senses are known. *Shape:* ``(3, B, E)``."""
         b, n, n_edges = len(first), first.shape[1], len(self.per_length)
         given = [first, second, t, self._face, self._edge_of, self._signs.double(), sense, n, n_edges, None]
-        return _means(*recorded(kernels().turned_edges, (b, len(self.faces)), {9: (b, n_edges, 4)}, *given))
+        return _means(*recorded(kernels("rotations").turned_edges, (b, len(self.faces)), {9: (b, n_edges, 4)}, *given))
 
     def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
         """As the other's."""
@@ -79,7 +79,7 @@ class FusedRotations(LocalRotations):
         """The same by kernels. *Shape:* ``(3, B, E)``."""
         b, n_edges = len(t), len(self.per_length)
         given = [packed, which.int(), t, self._edge_of, self._signs.double(), n_edges, None]
-        return _means(*recorded(kernels().course_edges, (b, len(self.faces)), {6: (b, n_edges, 4)}, *given))
+        return _means(*recorded(kernels("rotations").course_edges, (b, len(self.faces)), {6: (b, n_edges, 4)}, *given))
 
 
 def _means(total: Tensor) -> Tensor:

@@ -100,7 +100,7 @@ class FusedShell(nn.Module):
             t: *Shape:* ``(B,)``.
             stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
-        module, (n_samples, n), n_edges = kernels(), first.shape[:2], len(self.record)
+        module, (n_samples, n), n_edges = kernels("shell"), first.shape[:2], len(self.record)
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
         pull = torch.stack([1 - t, t], -1)
         shortest = t.new_zeros(n_samples, 2)
@@ -150,12 +150,12 @@ class FusedShell(nn.Module):
     def _size(self, x: Tensor) -> tuple[Tensor, ...]:
         """The volume about the centre, and the area of the surface, closed towards it. *Shape:* ``(B,)`` each."""
         given = [x, self.centre(x), self.walls, self.n_vertices, None, None, None]
-        return self._run(kernels().volume, {4: (len(x),), 6: (len(x),)}, given, len(self.walls))
+        return self._run(kernels("shell").volume, {4: (len(x),), 6: (len(x),)}, given, len(self.walls))
 
     def volume(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The volume about the centre, and its gradient. *Shape:* ``(B,), (B, V, 3)``."""
         given = [x, self.centre(x), self.walls, self.n_vertices, None, None, None]
-        total, normal = self._run(kernels().volume, {4: (len(x),), 5: tuple(x.shape)}, given, len(self.walls))
+        total, normal = self._run(kernels("shell").volume, {4: (len(x),), 5: tuple(x.shape)}, given, len(self.walls))
         if not self.closed:  # the centre moves with all vertices; of a closed surface it does not matter
             share = normal.sum(1, keepdim=True) / len(self.used)
             normal = normal.index_add(1, self.used, -share.expand(-1, len(self.used), -1))
@@ -172,7 +172,7 @@ class FusedShell(nn.Module):
         b, e = len(x), len(self.record)
         shapes: Shapes = {5: (b,), 6: tuple(x.shape), 7: (*x.shape[:2], 6), 8: (b, e, 5), 9: (b, e, 10)}
         given = [x, self.record, to.stretch, to.bend, self.n_vertices, *[None] * 5]
-        energy, gradient, diagonal, edges, hinges = self._run(kernels().linearise, shapes, given, written=(8, 9))
+        energy, gradient, diagonal, edges, hinges = self._run(kernels("shell").linearise, shapes, given, written=(8, 9))
         volume, normal = self.volume(x)
         moment = to.stiffness * (volume - to.volume)
         energy = energy + self._of_volume(volume, to)
@@ -187,9 +187,9 @@ class FusedShell(nn.Module):
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
         energy, volume = x.new_zeros(2, len(x)).unbind()
         given = [x, self.record, to.stretch, to.bend, self.n_vertices, len(to.volume), energy]
-        launch(kernels().value, (len(x), len(self.record)), given)
+        launch(kernels("shell").value, (len(x), len(self.record)), given)
         given = [x, self.centre(x), self.walls, self.n_vertices, volume, None, None]
-        launch(kernels().volume, (len(x), len(self.walls)), given)
+        launch(kernels("shell").volume, (len(x), len(self.walls)), given)
         sizes = len(x) // max(1, len(to.volume)), len(to.volume)
         energy, volume = (value.unflatten(0, sizes) for value in (energy, volume))
         return (energy + self._of_volume(volume, to)).flatten()

@@ -1,5 +1,6 @@
 """Whether there are kernels, and how torch runs them: what NVIDIA Warp needs to be told."""
 
+import importlib
 import importlib.util
 import os
 import threading
@@ -19,16 +20,15 @@ Backend = Literal["auto", "torch", "warp"]
 
 
 @cache
-def kernels() -> Any:
-    """The module of the kernels, compiled for this machine by the first who asks, and kept on disk by Warp."""
+def kernels(name: Literal["shell", "modal", "steps", "rotations"]) -> Any:
+    """A module of :mod:`torch_modal.nn.kernels`, compiled by the first who asks on a machine, and kept by Warp."""
     import warp as wp
 
     before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
     try:
         with nullcontext() if torch.cuda.is_available() else _silent():
             wp.init()
-        from torch_modal.nn import kernels as module
-
+        module = importlib.import_module(f"torch_modal.nn.kernels.{name}")
         with ProgressReport(1, "kernels, which are compiled once", unit="module"):
             wp.load_module(module, device="cpu")
     finally:
@@ -54,7 +54,7 @@ def _works() -> bool:
     if importlib.util.find_spec("warp") is None:
         return False
     try:
-        kernels()
+        kernels("shell")
     except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
         warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
         return False

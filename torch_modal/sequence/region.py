@@ -216,7 +216,7 @@ class _Fused:
         x = _points(field)
         out, form = torch.zeros_like(x), x.new_zeros(len(x))
         record = self.shell.record
-        launch(kernels().product, (len(x), len(record)), [x, record, *hessians, x.shape[1], out, form])
+        launch(kernels("shell").product, (len(x), len(record)), [x, record, *hessians, x.shape[1], out, form])
         return out.to(field).movedim(-1, 0)
 
 

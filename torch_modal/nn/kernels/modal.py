@@ -1,0 +1,208 @@
+"""Eq. 5 through the columns of a modal space: the Jacobian, and the second-order term."""
+
+import warp as wp
+
+from torch_modal.nn.kernels.elements import (
+    HALF,
+    TINY,
+    angle_of,
+    bent,
+    corner,
+    is_flat,
+    length_of,
+    real,
+    stretched,
+    vec3,
+    vec4,
+    wrapped,
+)
+
+wide = wp.types.vector(length=8, dtype=real)
+"""A row's entries of eight columns."""
+six = wp.types.vector(length=6, dtype=wp.int32)
+"""Where the blocks of an edge go, and the five of its hinge."""
+
+
+@wp.kernel(enable_backward=False)
+def jacobian(
+    record: wp.array(dtype=wp.vec4i),
+    hinge: wp.array(dtype=wp.int32),
+    edges: wp.array(dtype=stretched),
+    hinges: wp.array(dtype=bent),
+    columns: wp.array(dtype=wide),
+    extra: wp.array(dtype=vec3),
+    n: int,
+    n_columns: int,
+    n_blocks: int,
+    n_rows: int,
+    out: wp.array(dtype=wide),
+    entries: wp.array(dtype=real),
+):
+    """Change of each measure along the columns, and along one more that is the sample's own, by the root of its weight.
+
+    A component of a vertex has a row of blocks of eight columns; those of the measures are the same memory twice.
+    """
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    i = 3 * n_blocks * q[0]
+    j = 3 * n_blocks * q[1]
+    row = s * n_rows + k
+    r = edges[s * record.shape[0] + k]
+    root = wp.sqrt(r[3] + r[4])
+    g = root * vec3(r[0], r[1], r[2])
+    for c in range(n_blocks):
+        y = c + n_blocks
+        z = y + n_blocks
+        out[row * n_blocks + c] = (
+            g[0] * (columns[j + c] - columns[i + c])
+            + g[1] * (columns[j + y] - columns[i + y])
+            + g[2] * (columns[j + z] - columns[i + z])
+        )
+    if extra:
+        entries[row * n_blocks * 8 + n_columns] = wp.dot(g, extra[v + q[1]] - extra[v + q[0]])
+    if q[2] >= 0:
+        row = s * n_rows + record.shape[0] + hinge[k]
+        a = 3 * n_blocks * q[2]
+        b = 3 * n_blocks * q[3]
+        h = hinges[s * record.shape[0] + k]
+        stiff = wp.sqrt(h[9])
+        ge = stiff * vec3(h[0], h[1], h[2])
+        ga = stiff * vec3(h[3], h[4], h[5])
+        gb = stiff * vec3(h[6], h[7], h[8])
+        gi = -(ge + ga + gb)
+        for c in range(n_blocks):
+            y = c + n_blocks
+            z = y + n_blocks
+            out[row * n_blocks + c] = (
+                (gi[0] * columns[i + c] + gi[1] * columns[i + y] + gi[2] * columns[i + z])
+                + (ge[0] * columns[j + c] + ge[1] * columns[j + y] + ge[2] * columns[j + z])
+                + (ga[0] * columns[a + c] + ga[1] * columns[a + y] + ga[2] * columns[a + z])
+                + (gb[0] * columns[b + c] + gb[1] * columns[b + y] + gb[2] * columns[b + z])
+            )
+        if extra:
+            o = extra[v + q[0]]
+            along = wp.dot(ge, extra[v + q[1]] - o) + wp.dot(ga, extra[v + q[2]] - o)
+            entries[row * n_blocks * 8 + n_columns] = along + wp.dot(gb, extra[v + q[3]] - o)
+
+
+@wp.func
+def half_of_hinge(e: vec3, tip: vec3, normal: vec3, w: vec3, length: real):
+    """One triangle's part of the dihedral angle's Hessian: measures.dihedral_hessian."""
+    area = wp.dot(normal, normal)
+    half = wp.outer((length / (area * area)) * normal, w)
+    s = half + wp.transpose(half)
+    u = wp.outer(e, normal / (length * area))
+    r = wp.dot(tip, e) / (length * length)
+    across = u - r * s
+    base = length * length
+    own = (r * r + HALF * area / (base * base)) * s - r * (u + wp.transpose(u)) + across
+    return own, across, s + across
+
+
+@wp.kernel(enable_backward=False)
+def curved_edges(
+    x: wp.array(dtype=vec3),
+    record: wp.array(dtype=wp.vec4i),
+    stretch: wp.array(dtype=wp.vec2d),
+    bend: wp.array(dtype=vec4),
+    slots: wp.array(dtype=six),
+    n: int,
+    n_slots: int,
+    out: wp.array(dtype=wp.mat33d),
+):
+    """The second-order term between the pairs of vertices of edges and hinges: assembly.Curvature."""
+    s, k = wp.tid()
+    v = s * n
+    q = record[k]
+    at = s * record.shape[0] + k
+    to = s * n_slots
+    slot = slots[k]
+    origin = x[v + q[0]]
+    e = x[v + q[1]] - origin
+    base = wp.dot(e, e)
+    length = length_of(e)
+    wanted = stretch[at]
+    slope = wanted[0] * (length - wanted[1])
+    if base > TINY:
+        unit = e / length
+        wp.atomic_add(out, to + slot[0], (slope / length) * (wp.outer(unit, unit) - wp.identity(3, dtype=real)))
+    if q[2] >= 0:
+        a = x[v + q[2]] - origin
+        b = x[v + q[3]] - origin
+        n1 = wp.cross(e, a)
+        n2 = wp.cross(b, e)
+        if not (is_flat(e, n1) or is_flat(e, n2)):
+            w = bend[at]
+            theta = angle_of(e, a, b, n1, n2)
+            moment = w[0] * wrapped(theta - w[1]) + w[2] * wrapped(theta - w[3])
+            own1, across1, rest1 = half_of_hinge(e, a, n1, wp.cross(n1, e), length)
+            own2, across2, rest2 = half_of_hinge(e, b, n2, wp.cross(e, n2), length)
+            wp.atomic_add(out, to + slot[1], -moment * (own1 + own2))
+            wp.atomic_add(out, to + slot[2], -moment * rest1)
+            wp.atomic_add(out, to + slot[3], moment * across1)
+            wp.atomic_add(out, to + slot[4], -moment * rest2)
+            wp.atomic_add(out, to + slot[5], moment * across2)
+
+
+@wp.kernel(enable_backward=False)
+def curved_columns(
+    pairs: wp.array(dtype=wp.vec2i),
+    blocks: wp.array(dtype=wp.mat33d),
+    columns: wp.array(dtype=wide),
+    extra: wp.array(dtype=vec3),
+    n: int,
+    n_columns: int,
+    n_blocks: int,
+    out: wp.array(dtype=wide),
+    entries: wp.array(dtype=real),
+):
+    """The operator of pairs of vertices on all columns, and on the sample's own: assembly.PairBlocks.push.
+
+    The blocks of pairs in descending order follow the others. The results are the same memory twice.
+    """
+    s, k = wp.tid()
+    first = pairs[k][0]
+    second = pairs[k][1]
+    b = blocks[(2 * s) * pairs.shape[0] + k] + wp.transpose(blocks[(2 * s + 1) * pairs.shape[0] + k])
+    to_i = 3 * n_blocks * (s * n + first)
+    to_j = 3 * n_blocks * (s * n + second)
+    for c in range(n_blocks):
+        i = 3 * n_blocks * first + c
+        j = 3 * n_blocks * second + c
+        dx = columns[j] - columns[i]
+        dy = columns[j + n_blocks] - columns[i + n_blocks]
+        dz = columns[j + 2 * n_blocks] - columns[i + 2 * n_blocks]
+        for r in range(3):
+            wp.atomic_add(out, to_i + r * n_blocks + c, b[r, 0] * dx + b[r, 1] * dy + b[r, 2] * dz)
+            wp.atomic_add(out, to_j + r * n_blocks + c, -b[0, r] * dx - b[1, r] * dy - b[2, r] * dz)
+    if extra:
+        across = extra[s * n + second] - extra[s * n + first]
+        up = b * across
+        down = wp.transpose(b) * across
+        for r in range(3):
+            wp.atomic_add(entries, (to_i + r * n_blocks) * 8 + n_columns, up[r])
+            wp.atomic_add(entries, (to_j + r * n_blocks) * 8 + n_columns, -down[r])
+
+
+@wp.kernel(enable_backward=False)
+def curved_walls(
+    x: wp.array(dtype=vec3),
+    centre: wp.array(dtype=vec3),
+    walls: wp.array(dtype=wp.vec3i),
+    slope: wp.array(dtype=real),
+    slots: wp.array(dtype=wp.vec3i),
+    n: int,
+    n_slots: int,
+    out: wp.array(dtype=wp.mat33d),
+):
+    """The same of the volume."""
+    s, k = wp.tid()
+    q = walls[k]
+    v = s * n
+    middle = centre[s]
+    sixth = slope[s] / real(6.0)
+    slot = slots[k]
+    wp.atomic_add(out, s * n_slots + slot[0], -wp.skew(sixth * (corner(x, middle, v, q[2]) - middle)))
+    wp.atomic_add(out, s * n_slots + slot[1], -wp.skew(sixth * (x[v + q[0]] - middle)))
+    wp.atomic_add(out, s * n_slots + slot[2], -wp.skew(sixth * (x[v + q[1]] - middle)))

@@ -1,0 +1,277 @@
+"""Triangles that turn between shapes, and the vertices that fit them."""
+
+import warp as wp
+
+from torch_modal.geometry import rotations, triangle_frames
+from torch_modal.nn.kernels.elements import HALF, TINIEST, length_of, real, vec3, vec4
+
+packed_course = wp.types.vector(length=31, dtype=real)
+"""A row of :meth:`torch_modal.geometry.local_rotations.Course`, in the order of its parts."""
+
+NO_HEIGHT = wp.constant(real(triangle_frames.FLAT))
+SMALL = wp.constant(real(rotations.SMALL))
+
+
+# ----------------------------------------------------------------------------------------------------------- triangles
+@wp.struct
+class Triangle:
+    e1: vec3
+    e2: vec3
+    normal: vec3
+    length: real
+    along: real
+    height: real
+
+
+@wp.func
+def triangle(p: vec3, q: vec3, r: vec3):
+    t = Triangle()
+    first = q - p
+    second = r - p
+    t.length = length_of(first)
+    t.e1 = first / t.length
+    t.along = wp.dot(second, t.e1)
+    rise = second - t.along * t.e1
+    t.height = wp.max(length_of(rise), NO_HEIGHT * (t.length + wp.abs(t.along)))
+    t.e2 = rise / t.height
+    t.normal = wp.cross(t.e1, t.e2)
+    return t
+
+
+@wp.func
+def quaternion(a: Triangle, b: Triangle):
+    r = wp.outer(b.e1, a.e1) + wp.outer(b.e2, a.e2) + wp.outer(b.normal, a.normal)
+    w = real(1.0) + r[0, 0] + r[1, 1] + r[2, 2]
+    x = real(1.0) + r[0, 0] - r[1, 1] - r[2, 2]
+    y = real(1.0) - r[0, 0] + r[1, 1] - r[2, 2]
+    z = real(1.0) - r[0, 0] - r[1, 1] + r[2, 2]
+    wx = r[2, 1] - r[1, 2]
+    wy = r[0, 2] - r[2, 0]
+    wz = r[1, 0] - r[0, 1]
+    xy = r[0, 1] + r[1, 0]
+    xz = r[0, 2] + r[2, 0]
+    yz = r[1, 2] + r[2, 1]
+    largest = wp.max(wp.max(w, x), wp.max(y, z))
+    row = vec4(w, wx, wy, wz)
+    if w < largest:
+        if x == largest:
+            row = vec4(wx, x, xy, xz)
+        elif y == largest:
+            row = vec4(wy, xy, y, yz)
+        else:
+            row = vec4(wz, xz, yz, z)
+    return (HALF / wp.sqrt(wp.max(largest, real(2.220446049250313e-16)))) * row
+
+
+@wp.kernel(enable_backward=False)
+def turns(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    n: int,
+    quaternions: wp.array(dtype=vec4),
+    areas: wp.array(dtype=real),
+):
+    """Quaternions between the frames of triangles, and twice both areas."""
+    s, k = wp.tid()
+    v = s * n
+    f = faces[k]
+    a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
+    b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
+    quaternions[s * faces.shape[0] + k] = quaternion(a, b)
+    areas[s * faces.shape[0] + k] = a.length * a.height + b.length * b.height
+
+
+@wp.kernel(enable_backward=False)
+def senses(
+    quaternions: wp.array(dtype=vec4),
+    areas: wp.array(dtype=real),
+    order: wp.array(dtype=wp.int32),
+    parent: wp.array(dtype=wp.int32),
+    piece: wp.array(dtype=wp.int32),
+    n_pieces: int,
+    sign: wp.array(dtype=real),
+    vote: wp.array(dtype=real),
+):
+    """Signs passed down the tree, parents before children; then each piece votes. One thread for a sample."""
+    s = wp.tid()
+    n = order.shape[0]
+    for j in range(n):
+        k = order[j]
+        own = real(1.0)
+        if wp.dot(quaternions[s * n + k], quaternions[s * n + parent[k]]) < real(0.0):
+            own = real(-1.0)
+        if parent[k] != k:
+            own = own * sign[s * n + parent[k]]
+        sign[s * n + k] = own
+        q = quaternions[s * n + k]
+        vote[s * n_pieces + piece[k]] = vote[s * n_pieces + piece[k]] + areas[s * n + k] * own * q[0]
+    for k in range(n):
+        if vote[s * n_pieces + piece[k]] < real(0.0):
+            sign[s * n + k] = -sign[s * n + k]
+
+
+@wp.func
+def rotated(real_part: real, axis: vec3, v: vec3):
+    twice = real(2.0) * wp.cross(axis, v)
+    return v + real_part * twice + wp.cross(axis, twice)
+
+
+@wp.func
+def sinc(squared_angle: real):
+    # Of the square: with all derivatives at zero.
+    found = real(1.0) - squared_angle / real(6.0) * (
+        real(1.0) - squared_angle / real(20.0) * (real(1.0) - squared_angle / real(42.0))
+    )
+    if squared_angle >= SMALL:
+        angle = wp.sqrt(squared_angle)
+        found = wp.sin(angle) / angle
+    return found
+
+
+@wp.func
+def half_turn(q: vec4):
+    """Axis times half the angle: rotations._arc."""
+    axis = vec3(q[1], q[2], q[3])
+    sine = wp.dot(axis, axis)
+    factor = real(0.0)
+    if sine < SMALL * q[0] * q[0] and q[0] > real(0.0):
+        t = sine / (q[0] * q[0])
+        factor = (
+            real(1.0)
+            - t
+            * (
+                real(1.0) / real(3.0)
+                - t * (real(1.0) / real(5.0) - t * (real(1.0) / real(7.0) - t * real(1.0) / real(9.0)))
+            )
+        ) / q[0]
+    else:
+        root = wp.sqrt(wp.max(sine, TINIEST))
+        factor = wp.atan2(root, q[0]) / root
+    return factor * axis
+
+
+@wp.func
+def add_sides(total: wp.array(dtype=vec4), edge: int, e: wp.vec3i, g: vec3, area: real, first: vec3, second: vec3):
+    s1 = (area * g[0]) * first
+    s2 = (area * g[1]) * (second - first)
+    s3 = (-area * g[2]) * second
+    wp.atomic_add(total, edge + e[0], vec4(s1[0], s1[1], s1[2], area))
+    wp.atomic_add(total, edge + e[1], vec4(s2[0], s2[1], s2[2], area))
+    wp.atomic_add(total, edge + e[2], vec4(s3[0], s3[1], s3[2], area))
+
+
+@wp.func
+def turned(half: vec3, v: vec3):
+    """A vector turned about an axis by twice its length."""
+    angle = wp.dot(half, half)
+    return rotated(wp.cos(wp.sqrt(wp.max(angle, TINIEST))), sinc(angle) * half, v)
+
+
+@wp.kernel
+def turned_edges(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    time: wp.array(dtype=real),
+    faces: wp.array(dtype=wp.vec3i),
+    sides: wp.array(dtype=wp.vec3i),
+    signs: wp.array(dtype=vec3),
+    sense: wp.array(dtype=real),
+    n: int,
+    n_edges: int,
+    total: wp.array(dtype=vec4),
+):
+    """Sides of all triangles at their times, summed on the edges by area, and the areas."""
+    s, k = wp.tid()
+    v = s * n
+    f = faces[k]
+    a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
+    b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
+    t = time[s]
+    half = t * half_turn(sense[s * faces.shape[0] + k] * quaternion(a, b))
+    x = a.length + t * (b.length - a.length)
+    y = a.along + t * (b.along - a.along)
+    z = a.height + t * (b.height - a.height)
+    one = turned(half, x * a.e1)
+    two = turned(half, y * a.e1 + z * a.e2)
+    add_sides(total, s * n_edges, sides[k], signs[k], a.length * a.height + b.length * b.height, one, two)
+
+
+@wp.kernel
+def course_edges(
+    course: wp.array(dtype=packed_course),
+    which: wp.array(dtype=wp.int32),
+    time: wp.array(dtype=real),
+    sides: wp.array(dtype=wp.vec3i),
+    signs: wp.array(dtype=vec3),
+    n_edges: int,
+    total: wp.array(dtype=vec4),
+):
+    """The same of triangles on a smooth course."""
+    s, k = wp.tid()
+    c = course[which[s] * sides.shape[0] + k]
+    e1 = vec3(c[0], c[1], c[2])
+    e2 = vec3(c[3], c[4], c[5])
+    normal = vec3(c[6], c[7], c[8])
+    u = time[s]
+    a = u * (real(1.0) - u) * (real(1.0) - u)
+    b = -u * (real(1.0) - u) * u
+    straight = (HALF * u) * vec3(c[12], c[13], c[14])
+    bend = HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26]))
+    unit = c[30]
+    length = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
+    along = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
+    height = c[11] + unit * (u * c[17] + a * c[23] + b * c[29])
+    one = turned(straight, turned(bend, vec3(length, real(0.0), real(0.0))))
+    two = turned(straight, turned(bend, vec3(along, height, real(0.0))))
+    area = c[9] * c[11] + (c[9] + unit * c[15]) * (c[11] + unit * c[17])
+    first = one[0] * e1 + one[1] * e2 + one[2] * normal
+    second = two[0] * e1 + two[1] * e2 + two[2] * normal
+    add_sides(total, s * n_edges, sides[k], signs[k], area, first, second)
+
+
+# ---------------------------------------------------------------------------------------------------- Poisson problem
+@wp.kernel(enable_backward=False)
+def pulls(
+    wanted: wp.array(dtype=vec3),
+    weights: wp.array(dtype=real),
+    ends: wp.array(dtype=wp.vec2i),
+    n: int,
+    out: wp.array(dtype=vec3),
+):
+    """What edges ask of their ends: the right side of the Poisson problem."""
+    s, k = wp.tid()
+    pull = weights[k] * wanted[s * ends.shape[0] + k]
+    wp.atomic_add(out, s * n + ends[k][0], -pull)
+    wp.atomic_add(out, s * n + ends[k][1], pull)
+
+
+@wp.kernel(enable_backward=False)
+def substituted(
+    right: wp.array(dtype=vec3),
+    order: wp.array(dtype=wp.int32),
+    start: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    entry: wp.array(dtype=real),
+    pivot: wp.array(dtype=real),
+    n: int,
+    work: wp.array(dtype=vec3),
+    out: wp.array(dtype=vec3),
+):
+    """Substitution with ``L D L^T``, ``L`` by its columns below the diagonal. One thread for a sample."""
+    s = wp.tid()
+    n_free = order.shape[0]
+    at = s * n_free
+    for k in range(n_free):
+        work[at + k] = right[s * n + order[k]]
+    for k in range(n_free):
+        found = work[at + k]
+        for p in range(start[k], start[k + 1]):
+            work[at + row[p]] = work[at + row[p]] - entry[p] * found
+    for j in range(n_free):
+        k = n_free - 1 - j
+        found = work[at + k] / pivot[k]
+        for p in range(start[k], start[k + 1]):
+            found = found - entry[p] * work[at + row[p]]
+        work[at + k] = found
+        out[s * n + order[k]] = found
