@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from torch_modal.geometry.functions import applied, traced
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellPoint, ShellReference
 from torch_modal.nn.launch import kernels, launch, pulled_back
-from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric, relax
+from torch_modal.nn.relax import STEP_LENGTHS, relax
 
 
 class FusedRelax(FusedShell):
@@ -70,7 +70,7 @@ class FusedRelax(FusedShell):
         lengths = x.new_zeros(n_steps, len(x))
         at = self.at(x, to)
         for k in range(n_steps):
-            solution, reached = self._solved(x, at, to, n_products)
+            solution, reached = self._solved(x, at, to, n_products)[:2]
             # The whole step, linearised at once for the next one, is nearly always the one that is taken.
             if k < n_steps - 1:
                 there = self.at(reached, to)
@@ -94,60 +94,159 @@ class FusedRelax(FusedShell):
                 break
         return length
 
-    def _solved(self, x: Tensor, at: ShellPoint, to: ShellReference, n_products: int) -> tuple[Tensor, Tensor]:
-        """Conjugate gradients, fused. *Shape:* ``(B, V, 3)`` each: the step, and where it leads."""
+    def _solved(
+        self, x: Tensor, at: ShellPoint, to: ShellReference, n_products: int, keep: bool = False
+    ) -> "_Iterations":
+        """Conjugate gradients, fused.
+
+        Args:
+            x: Where the step starts. *Shape:* ``(B, V, 3)``.
+            at: The energy there; its diagonal is inverted in place.
+            to: What is compared with.
+            n_products: Iterations.
+            keep: Whether each iteration has memory of its own.
+        """
         module, (b, n) = kernels("steps"), x.shape[:2]
         _, gradient, diagonal, edges, hinges, normal, moment = at
-        residual, direction, solution, product, reached = torch.empty(5, *x.shape, dtype=x.dtype, device=x.device)
-        size, swept, form = torch.zeros(3, n_products + 1, b, dtype=x.dtype, device=x.device)
+        n_kept = n_products if keep else 1
+        kept = torch.empty(3, n_kept, *x.shape, dtype=x.dtype, device=x.device)
+        residuals, directions, products = (part.unbind() if keep else [part[0]] * n_products for part in kept)
+        solution, reached = torch.empty(2, *x.shape, dtype=x.dtype, device=x.device)
+        sizes, swept, forms = scalars = torch.zeros(3, n_products + 1, b, dtype=x.dtype, device=x.device)
+        size, sweep, form = (part.unbind() for part in (sizes, swept, forms))
         vertices, records = (b, n), (b, len(self.record))
-        given = [gradient, normal, moment, diagonal, n, residual, direction, solution, product, size[0], swept[0]]
-        launch(module.begin, vertices, given)
+        given = [gradient, normal, moment, diagonal, n, residuals[0], directions[0], solution, products[0]]
+        launch(module.begin, vertices, [*given, size[0], sweep[0]])
         for k in range(n_products):
+            direction, product = directions[k], products[k]
             launch(kernels("shell").product, records, [direction, self.record, edges, hinges, n, product, form[k]])
             if k == n_products - 1:
-                given = [x, direction, to.stiffness, swept[k], size[k], form[k], n, solution, reached]
+                given = [x, direction, to.stiffness, sweep[k], size[k], form[k], n, solution, reached]
                 launch(module.arrive, vertices, given)
                 break
-            given = [direction, product, normal, diagonal, to.stiffness, swept[k], size[k], form[k], n]
-            launch(module.advance, vertices, [*given, solution, residual, size[k + 1]])
-            given = [residual, diagonal, normal, size[k], size[k + 1], n, direction, product, swept[k + 1]]
-            launch(module.turn, vertices, given)
-        return solution, reached
+            given = [direction, product, normal, diagonal, to.stiffness, sweep[k], size[k], form[k], n, residuals[k]]
+            launch(module.advance, vertices, [*given, solution, residuals[k + 1], size[k + 1]])
+            given = [residuals[k + 1], diagonal, normal, size[k], size[k + 1], n, direction, directions[k + 1]]
+            launch(module.turn, vertices, [*given, products[k + 1], sweep[k + 1]])
+        return _Iterations(solution, reached, kept, scalars)
 
-    def recorded(self, n_products: int, lengths: Tensor, x: Tensor, *rest: Tensor) -> Tensor:
-        """The same steps of known lengths, by kernels that autograd can go back through. *Shape:* ``(B, V, 3)``."""
-        to = self.reference(*rest)
+    # -------------------------------------------------------------------------------------------------- and back again
+    def pull_back(
+        self, n_products: int, lengths: Tensor, to_x: Tensor, x: Tensor, *rest: Tensor, needed: Sequence[bool]
+    ) -> tuple[Tensor | None, ...]:
+        """Gradients in all that :meth:`steps` takes, of steps of known lengths.
+
+        Args:
+            n_products: Of each step.
+            lengths: *Shape:* ``(n_steps, B)``.
+            to_x: Gradient in the result. *Shape:* ``(B, V, 3)``.
+            x: Where the steps started. *Shape:* ``(B, V, 3)``.
+            rest: What :meth:`reference` takes.
+            needed: Which of all these need a gradient.
+        """
+        with torch.enable_grad():
+            leaves = [value.detach().requires_grad_(need) for value, need in zip(rest, needed[1:], strict=True)]
+            recorded = self.reference(*leaves)
+        to = ShellReference(*(value.detach() for value in recorded))
+        taken = []
         for length in lengths:
             at = self.at(x, to)
-            right = -(at.gradient + at.moment[:, None, None] * at.normal)
-            product, precondition = partial(self._product, at, to), partial(_applied, _inverse(at.diagonal))
-            solution = conjugate_gradients(product, precondition, _dot, right, n_products)
-            x = x + length[:, None, None] * solution
-        return x
+            done = self._solved(x, at, to, n_products, keep=True)
+            taken.append((x, at, done))
+            x = x + length[:, None, None] * done.solution
+        to_reference = ShellReference(*(torch.zeros_like(value) for value in to))
+        for length, (x, at, done) in zip(lengths.flip(0), reversed(taken), strict=True):
+            to_x = self._step_back(x, at, to, done, to_x, length, to_reference)
+        wanted = [leaf for leaf in leaves if leaf.requires_grad]
+        if wanted:
+            both = [pair for pair in zip(recorded, to_reference, strict=True) if pair[0].requires_grad]
+            outputs, received = zip(*both, strict=True)
+            found = iter(torch.autograd.grad(outputs, wanted, received))
+        return to_x, *(next(found) if leaf.requires_grad else None for leaf in leaves)
 
-    def _product(self, at: ShellPoint, to: ShellReference, field: Tensor) -> Tensor:
-        """The convex Hessian times a field. *Shape:* ``(B, V, 3)``."""
-        given = [field, self.record, at.edges, at.hinges, self.n_vertices, None, None]
-        found, _ = self._run(kernels("shell").product, {5: tuple(field.shape), 6: (len(field),)}, given)
-        return found + to.stiffness[:, None, None] * _dot(at.normal, field) * at.normal
+    def _step_back(
+        self,
+        x: Tensor,
+        at: ShellPoint,
+        to: ShellReference,
+        done: "_Iterations",
+        to_reached: Tensor,
+        length: Tensor,
+        to_reference: ShellReference,
+    ) -> Tensor:
+        """The gradient where a step started, of that where it led; what the reference receives is added to its own."""
+        module, shell, (b, n) = kernels("steps_adjoint"), kernels("shell"), x.shape[:2]
+        vertices, records = (b, n), (b, len(self.record))
+        residuals, directions, products = (part.unbind() for part in done.kept)
+        size, sweep, form = (part.unbind() for part in done.scalars)
+        n_products = len(directions)
+        fields = torch.empty_like(done.kept[0])
+        to_solution = (length[:, None, None] * to_reached).contiguous()
+        to_residual, to_direction, to_normal = torch.zeros(3, *x.shape, dtype=x.dtype, device=x.device)
+        to_diagonal = torch.zeros_like(at.diagonal)
+        backs = torch.zeros(3, n_products, b, dtype=x.dtype, device=x.device)
+        to_length, to_ratio, to_sweep = (part.unbind() for part in backs)
+        normal, inverse, stiffness = at.normal, at.diagonal, to.stiffness
+        launch(module.back_to_length, vertices, [to_solution, directions[-1], n, to_length[-1]])
+        for k in reversed(range(n_products)):
+            direction, field, last = directions[k], fields[k], k == n_products - 1
+            next_size, to_next_ratio = (None, None) if last else (size[k + 1], to_ratio[k])
+            before = (directions[k - 1], products[k - 1], sweep[k - 1], size[k - 1]) if k else [None] * 4
+            previous, previous_product, previous_sweep, previous_size = before
+            to_own_ratio, to_previous_length = (to_ratio[k - 1], to_length[k - 1]) if k else (None, None)
+            given = [to_solution, to_residual, direction, products[k], normal, stiffness, sweep[k], size[k], form[k]]
+            given += [next_size, to_length[k], n, field, to_direction, to_sweep[k]]
+            launch(module.back_to_direction, vertices, given)
+            given = [field, self.record, at.edges, at.hinges, n, to_direction, None]
+            launch(shell.product, records, given)
+            given = [direction, previous, field, normal, stiffness, sweep[k], to_sweep[k], n, to_direction, to_normal]
+            launch(module.back_to_normal, vertices, [*given, to_own_ratio])
+            given = [to_solution, to_direction, residuals[k], inverse, previous, previous_product, normal, stiffness]
+            given += [previous_sweep, sweep[k], previous_size, size[k], next_size, form[k], to_length[k]]
+            given += [to_own_ratio, to_next_ratio, n, to_residual, to_diagonal, to_previous_length]
+            launch(module.back_to_residual, vertices, given)
+        to_edges, to_hinges = torch.empty_like(at.edges), torch.empty_like(at.hinges)
+        given = [done.kept[1], fields, self.record, at.edges, at.hinges, n, b, n_products, to_edges, to_hinges]
+        launch(module.back_to_elements, records, given)
+        # The right side is the gradient's opposite.
+        to_gradient = -to_residual
+        to_x = to_reached.clone()
+        given = [x, self.record, to.stretch, to.bend, n, at.energy, at.gradient, at.diagonal, at.edges, at.hinges]
+        adjoints = [to_x, None, to_reference.stretch, to_reference.bend, None]
+        adjoints += [torch.zeros_like(at.energy), to_gradient, to_diagonal, to_edges, to_hinges]
+        launch(shell.linearise, records, given, adjoints)
+        to_normal = torch.addcmul(to_normal, at.moment[:, None, None], to_gradient)
+        to_moment = (to_gradient * normal).sum((1, 2))
+        with torch.enable_grad():
+            leaf = x.detach().requires_grad_()
+            volume, own = self.volume(leaf)
+        (through,) = torch.autograd.grad((volume, own), leaf, (stiffness * to_moment, to_normal))
+        to_reference.stiffness.add_(
+            to_moment * (volume.detach() - to.volume) + (done.scalars[1, :-1] * backs[2]).sum(0)
+        )
+        to_reference.volume.sub_(stiffness * to_moment)
+        return to_x + through
 
 
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """*Shape:* ``(B, V, 3), (B, V, 3) -> (B, 1, 1)``."""
-    return (a * b).sum((1, 2))[:, None, None]
+class _Iterations(NamedTuple):
+    """What conjugate gradients went through."""
 
+    solution: Tensor
+    """*Shape:* ``(B, V, 3)``."""
+    reached: Tensor
+    """Where the whole step leads. *Shape:* ``(B, V, 3)``."""
+    kept: Tensor
+    """Residuals, directions, and the Hessian's products with these but for the volume's part; of the last iteration
+    alone where they are not kept.
 
-def _applied(inverse: Tensor, residual: Tensor) -> Tensor:
-    """*Shape:* ``(B, V, 3, 3), (B, V, 3) -> (B, V, 3)``."""
-    return (inverse @ residual[..., None]).squeeze(-1)
+    *Shape:* ``(3, n_products, B, V, 3)``.
+    """
+    scalars: Tensor
+    """Of each iteration: inner products of residuals, volumes swept, inner products of directions with products but
+    for the volume's part.
 
-
-def _inverse(packed: Tensor) -> Tensor:
-    """Inverses of symmetric matrices, as :func:`torch_modal.nn.relax.inverse_of_symmetric`. *Shape:* ``(..., 6)``."""
-    xx, xy, xz, yy, yz, zz = packed.unbind(-1)
-    rows = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
-    return inverse_of_symmetric(rows).movedim((0, 1), (-2, -1))
+    *Shape:* ``(3, n_products + 1, B)``.
+    """
 
 
 class _Relaxed(torch.autograd.Function):
@@ -166,12 +265,13 @@ class _Relaxed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, to_shape: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         lengths, *given = ctx.saved_tensors
+        needed = ctx.needs_input_grad[3:]
         if torch.is_grad_enabled():  # torch differentiates its own code once more
             run = partial(ctx.fused.oracle, ctx.n_steps, ctx.n_products)
-        else:
-            run = partial(ctx.fused.recorded, ctx.n_products, lengths)
-            given = [value.detach().contiguous() for value in given]
-        return (None,) * 3 + pulled_back(run, given, to_shape, ctx.needs_input_grad[3:])
+            return (None,) * 3 + pulled_back(run, given, to_shape, needed)
+        given = [value.detach().contiguous() for value in given]
+        found = ctx.fused.pull_back(ctx.n_products, lengths, to_shape.contiguous(), *given, needed=needed)
+        return None, None, None, *found
 
     @staticmethod
     def vmap(

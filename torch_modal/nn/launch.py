@@ -20,7 +20,7 @@ Backend = Literal["auto", "torch", "warp"]
 
 
 @cache
-def kernels(name: Literal["shell", "modal", "steps", "rotations"]) -> Any:
+def kernels(name: Literal["shell", "modal", "steps", "steps_adjoint", "rotations"]) -> Any:
     """A module of :mod:`torch_modal.nn.kernels`, compiled by the first who asks on a machine, and kept by Warp."""
     import warp as wp
 
@@ -76,7 +76,7 @@ class _Commands(threading.local):
     """What this thread has launched before, so that only what is new needs to be told to Warp."""
 
     def __init__(self) -> None:
-        self.known: dict[tuple[Any, ...], Any] = {}
+        self.known: dict[tuple[Any, ...], _Command] = {}
 
 
 _COMMANDS = _Commands()
@@ -100,18 +100,38 @@ def _array() -> Any:
     return type(wp.from_torch(torch.zeros(1), return_ctype=True))
 
 
-def _values(kernel: Any, given: Sequence[Any]) -> Iterator[Any]:
-    """Tensors as flat arrays of the types that a kernel declares; what is no tensor stays."""
-    array = _array()
-    for (width, size), value in zip(_sizes(kernel), given, strict=True):
-        if isinstance(value, Tensor):
-            assert value.is_contiguous() and width * value.element_size() == size
-            yield array(value.data_ptr(), 0, 1, (value.numel() // width,), (size,))
-        else:
-            yield array() if width else value
+class _Command:
+    """A launch that Warp has recorded; the next ones only write over what changes, in the places that Warp reads."""
+
+    def __init__(self, kernel: Any, dim: tuple[int, ...], device: torch.device, adjoint: bool) -> None:
+        import warp as wp
+
+        def blank() -> list[Any]:
+            return [_array()(0, 0, 1, (0,), (size,)) if width else 0 for width, size in _sizes(kernel)]
+
+        adjoints = blank() if adjoint else []
+        self.dim = dim
+        self.launch = wp.launch(
+            kernel, dim, blank(), adj_inputs=adjoints, adjoint=adjoint, device=str(device), record_cmd=True
+        )
+        self.places = list(zip(_sizes(kernel) * (1 + adjoint), self.launch.params[1:], strict=True))
+
+    def __call__(self, dim: tuple[int, ...], values: Sequence[Any], stream: Any) -> None:
+        if self.dim != dim:
+            self.launch.set_dim(dim)
+            self.dim = dim
+        for ((width, size), place), value in zip(self.places, values, strict=True):
+            if not width:
+                place.value = value or 0
+            elif value is None:
+                place.data = place.shape[0] = 0
+            else:
+                assert value.is_contiguous() and width * value.element_size() == size
+                place.data, place.shape[0] = value.data_ptr(), value.numel() // width
+        self.launch.launch(stream)
 
 
-def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Sequence[Any] | None = None) -> None:
+def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Sequence[Any] = ()) -> None:
     """Run a kernel, or its adjoint, on the tensors' device and torch's stream.
 
     Args:
@@ -120,34 +140,23 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
         given: What it takes, tensors contiguous and of the types that it declares.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
     """
-    import warp as wp
-
     if 0 in dim:
         return  # Warp would not, either, but has no command to tell of it
     device = next(value.device for value in given if isinstance(value, Tensor))
-    key = kernel, device, adjoints is not None
+    key = kernel, device, bool(adjoints)
     command = _COMMANDS.known.get(key)
     if command is None:
-        command = _COMMANDS.known[key] = wp.launch(
-            kernel,
-            dim=dim,
-            inputs=list(_values(kernel, given)),
-            adj_inputs=[] if adjoints is None else list(_values(kernel, adjoints)),
-            adjoint=adjoints is not None,
-            device=str(device),
-            record_cmd=True,
-        )
-        command.dim = dim
-    else:
-        if command.dim != dim:
-            command.set_dim(dim)
-            command.dim = dim
-        for at, value in enumerate(_values(kernel, given)):
-            command.set_param_at_index_from_ctype(at, value)
-        for at, value in enumerate([] if adjoints is None else _values(kernel, adjoints)):
-            if value is not None:
-                command.set_param_at_index_from_ctype(at, value, adjoint=True)
-    command.launch(wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None)
+        command = _COMMANDS.known[key] = _Command(kernel, dim, device, bool(adjoints))
+    command(dim, [*given, *adjoints] if adjoints else given, _stream(device))
+
+
+def _stream(device: torch.device) -> Any:
+    """Torch's own, of a GPU."""
+    if device.type != "cuda":
+        return None
+    import warp as wp
+
+    return wp.stream_from_torch(torch.cuda.current_stream(device))
 
 
 Shapes = dict[int, tuple[int, ...]]

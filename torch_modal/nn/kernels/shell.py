@@ -224,7 +224,7 @@ def linearise(
         hinges[at] = bent()
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def product(
     field: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
@@ -234,7 +234,7 @@ def product(
     out: wp.array(dtype=vec3),
     form: wp.array(dtype=real),
 ):
-    """The convex Hessian times a field, and the field times that."""
+    """The convex Hessian times a field, and the field times that, where there is an array for it."""
     s, k = wp.tid()
     v = s * n
     q = record[k]
@@ -245,7 +245,8 @@ def product(
     unit = vec3(r[0], r[1], r[2])
     rate = wp.dot(unit, e)
     to_j = r[3] * e + (r[4] * rate) * unit
-    wp.atomic_add(form, s, wp.dot(to_j, e))
+    if form:
+        wp.atomic_add(form, s, wp.dot(to_j, e))
     if q[2] >= 0:
         h = hinges[at]
         ge = vec3(h[0], h[1], h[2])
@@ -253,7 +254,8 @@ def product(
         gb = vec3(h[6], h[7], h[8])
         change = wp.dot(ge, e) + wp.dot(ga, field[v + q[2]] - origin) + wp.dot(gb, field[v + q[3]] - origin)
         moment = h[9] * change
-        wp.atomic_add(form, s, moment * change)
+        if form:
+            wp.atomic_add(form, s, moment * change)
         wp.atomic_add(out, v + q[0], -moment * (ga + gb + ge) - to_j)
         wp.atomic_add(out, v + q[1], moment * ge + to_j)
         wp.atomic_add(out, v + q[2], moment * ga)

@@ -74,8 +74,9 @@ def advance(
     size: wp.array(dtype=real),
     form: wp.array(dtype=real),
     n: int,
-    solution: wp.array(dtype=vec3),
     residual: wp.array(dtype=vec3),
+    solution: wp.array(dtype=vec3),
+    next_residual: wp.array(dtype=vec3),
     next_size: wp.array(dtype=real),
 ):
     s, i = wp.tid()
@@ -84,7 +85,7 @@ def advance(
     step = quotient(size[s], form[s] + push * swept[s])
     solution[v] = solution[v] + step * direction[v]
     r = residual[v] - step * (product[v] + push * normal[v])
-    residual[v] = r
+    next_residual[v] = r
     wp.atomic_add(next_size, s, wp.dot(r, applied(inverse[v], r)))
 
 
@@ -97,13 +98,14 @@ def turn(
     next_size: wp.array(dtype=real),
     n: int,
     direction: wp.array(dtype=vec3),
+    next_direction: wp.array(dtype=vec3),
     product: wp.array(dtype=vec3),
     swept: wp.array(dtype=real),
 ):
     s, i = wp.tid()
     v = s * n + i
     d = applied(inverse[v], residual[v]) + quotient(next_size[s], size[s]) * direction[v]
-    direction[v] = d
+    next_direction[v] = d
     product[v] = vec3()
     wp.atomic_add(swept, s, wp.dot(normal[v], d))
 
