@@ -55,15 +55,19 @@ class Columns(nn.Module):
     Args:
         fine: *Shape:* ``(n, V, 3)``.
         coarse: Orthonormal under the coarse vertex weights. *Shape:* ``(n, V_coarse, 3)``.
+        weights: Of the coarse vertices. *Shape:* ``(V_coarse,)``.
     """
 
     fine: Tensor
     coarse: Tensor
+    weighted: Tensor
 
-    def __init__(self, fine: Tensor, coarse: Tensor) -> None:
+    def __init__(self, fine: Tensor, coarse: Tensor, weights: Tensor) -> None:
         super().__init__()
         self.register_buffer("fine", fine, persistent=False)
         self.register_buffer("coarse", coarse, persistent=False)
+        #: What amplitudes are told by. *Shape:* ``(3 V_coarse, n)``.
+        self.register_buffer("weighted", (coarse * weights[:, None]).flatten(1).mT.contiguous(), persistent=False)
 
     def combine(self, a: Tensor) -> Tensor:
         """Fine displacement of given amplitudes. *Shape:* ``(..., n) -> (..., V, 3)``."""
@@ -152,9 +156,9 @@ class Coarse(nn.Module):
     faces: Tensor
     weights: Tensor
     clusters: Tensor
-    shares: Tensor
     members: Tensor
     first_member: Tensor
+    shares_of_members: Tensor
 
     def __init__(self, shapes: Tensor, faces: Tensor, n_faces: int, weights: Tensor) -> None:
         super().__init__()
@@ -167,21 +171,22 @@ class Coarse(nn.Module):
         self.register_buffer("faces", torch.from_numpy(coarsening.faces), persistent=False)
         self.register_buffer("weights", per_cluster.index_add(0, clusters, weights), persistent=False)
         self.register_buffer("clusters", clusters, persistent=False)
-        self.register_buffer("shares", member / per_cluster.index_add(0, clusters, member)[clusters], persistent=False)
+        shares = member / per_cluster.index_add(0, clusters, member)[clusters]
         #: Fine vertices in the order of their clusters, and where each cluster begins there.
         self.register_buffer("members", torch.argsort(clusters, stable=True), persistent=False)
         sizes = torch.bincount(clusters, minlength=self.n_vertices)
         self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
+        self.register_buffer("shares_of_members", shares[self.members], persistent=False)
         #: Rigid motions of the shape half-way between the two, to first order.
         fields = _rigid_fields(shapes.mean(0))
         coarse = self.restrict(fields)
         mix = self.orthonormal(coarse)
-        self.rigid = Columns(torch.tensordot(mix, fields, 1), torch.tensordot(mix, coarse, 1))
+        self.rigid = Columns(torch.tensordot(mix, fields, 1), torch.tensordot(mix, coarse, 1), self.weights)
 
     def restrict(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
         flat = x.reshape(-1, *x.shape[-2:])
-        means = applied(_ClusterMeans, flat, self.members, self.first_member, self.clusters, self.shares)
+        means = applied(_ClusterMeans, flat, self.members, self.first_member, self.shares_of_members, self.clusters)
         return means.reshape(*x.shape[:-2], self.n_vertices, 3)
 
     def orthonormal(self, coarse: Tensor) -> Tensor:
@@ -247,8 +252,7 @@ class Frame(Alignment):
 
     def split(self, coarse: Tensor, columns: Columns) -> tuple[Tensor, Tensor]:
         """Amplitudes of columns in coarse directions, and what is left. *Shape:* ``(..., n), (..., V_coarse, 3)``."""
-        weighted = (columns.coarse * self.coarse.weights[:, None]).flatten(1)
-        amplitudes = coarse.flatten(-2) @ weighted.mT
+        amplitudes = coarse.flatten(-2) @ columns.weighted
         return amplitudes, coarse - (amplitudes @ columns.coarse.flatten(1)).unflatten(-1, (-1, 3))
 
     def elastic_columns(self, directions: Tensor) -> Columns:
@@ -268,18 +272,16 @@ class Frame(Alignment):
         mix = self.coarse.orthonormal(coarse / sizes[:, None]) / sizes.T
         # The fine columns are as large as all modes: one product makes them.
         fine = torch.tensordot(mix, directions, 1) - self.rigid.combine(mix @ rigid)
-        return Columns(fine, torch.tensordot(mix, coarse, 1))
+        return Columns(fine, torch.tensordot(mix, coarse, 1), self.coarse.weights)
 
 
 class _ClusterMeans(torch.autograd.Function):
     """Sums over clusters, one after the other: ten times as fast as ``index_add``. *Shape:* ``(B, V, 3)``."""
 
     @staticmethod
-    def forward(x: Tensor, members: Tensor, first_member: Tensor, clusters: Tensor, shares: Tensor) -> Tensor:
+    def forward(x: Tensor, members: Tensor, first_member: Tensor, shares: Tensor, clusters: Tensor) -> Tensor:
         rows = x.detach().movedim(0, 1).flatten(1)
-        means = nn.functional.embedding_bag(
-            members, rows, first_member, mode="sum", per_sample_weights=shares.detach()[members]
-        )
+        means = nn.functional.embedding_bag(members, rows, first_member, mode="sum", per_sample_weights=shares.detach())
         return means.unflatten(1, (len(x), 3)).movedim(1, 0).contiguous()
 
     @staticmethod
@@ -292,8 +294,9 @@ class _ClusterMeans(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        _, _, clusters, shares = ctx.given
-        return shares[:, None] * grads[0].index_select(-2, clusters), None, None, None, None
+        members, _, shares, clusters = ctx.given
+        received = shares[:, None] * grads[0].index_select(-2, clusters[members])
+        return torch.zeros_like(received).index_copy(-2, members, received), None, None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, *given: Tensor) -> tuple[Tensor, int]:

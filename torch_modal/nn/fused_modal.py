@@ -83,8 +83,8 @@ class FusedModalEnergy(ModalEnergy):
         self.register_buffer("pairs", self.curvature.pairs.int(), persistent=False)
         self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
         rows = self.columns.permute(2, 1, 0).flatten(0, 1)
-        blocks = nn.functional.pad(rows, (0, _BLOCK - len(columns) % _BLOCK)).contiguous()
-        #: Columns of each component of each vertex and of the centre, with room for one more, and zeros.
+        blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()
+        #: Columns of each component of each vertex and of the centre, with room for two more, and zeros.
         self.register_buffer("blocks", blocks, persistent=False)
 
     @property
@@ -113,10 +113,10 @@ class FusedModalEnergy(ModalEnergy):
     def _shapes(self, a: Tensor, base: Tensor, extra: Tensor | None) -> Tensor:
         """*Shape:* ``(..., B, n) -> (D * B, V, 3)``."""
         n = len(self.columns)
-        x = base + (a[..., :n].double() @ self.flat.double()).unflatten(-1, (-1, 3))
+        x = (a[..., :n].double() @ self.flat.double()).unflatten(-1, (-1, 3)) + base
         if extra is not None:
-            x = x + a[..., n, None, None] * extra
-        return x.flatten(0, -3).contiguous()
+            x = torch.addcmul(x, a[..., n, None, None].double(), extra)
+        return x.flatten(0, -3)
 
     def rows(self, a: Tensor, placement: Placement) -> Tensor:
         """As the other's."""
@@ -142,24 +142,26 @@ class FusedModalEnergy(ModalEnergy):
             return trees.mapped(found, lambda value: value.to(placement.base))
         to: Any = placement.reference
         x, extra, shell = self._shapes(a, placement.base, placement.extra), placement.extra, self.shell
-        at = shell.at(x, to)
-        b, n = len(x), len(self.columns)
-        n_all, n_rows, blocks = n + (extra is not None), len(shell.record) + len(shell.interior), self.blocks.double()
-        jacobian = x.new_empty(b, n_rows, blocks.shape[1])
-        given = [shell.record, shell.hinge, at.edges, at.hinges, blocks, extra, shell.n_vertices, n]
-        given += [blocks.shape[1] // _BLOCK, n_rows, jacobian, jacobian]
+        (b, n), blocks = (len(x), len(self.columns)), self.blocks.double()
+        n_all, n_measures = n + (extra is not None), len(shell.record) + len(shell.interior)
+        # One row for each measure, the last for the volume; the residuals are a column like the others.
+        jacobian, stiffness = x.new_empty(b, n_measures + 1, blocks.shape[1]), to.stiffness.clone()
+        given = [x, shell.record, shell.hinge, to.stretch, to.bend, blocks, extra, shell.n_vertices, n]
+        given += [blocks.shape[1] // _BLOCK, n_measures + 1, jacobian, jacobian, stiffness]
         launch(kernels("modal").jacobian, (b, len(shell.record)), given)
-        pushed = torch.stack([at.gradient + at.moment[:, None, None] * at.normal, at.normal], 1)
-        slopes = pushed.flatten(2) @ self.flat.double().T
+        volume, normal = shell.volume(x)
+        root, off, last = to.stiffness.sqrt()[:, None], volume - to.volume, jacobian[:, -1]
+        last[:, :n] = normal.flatten(1) @ self.flat.double().T
         if extra is not None:
-            slopes = torch.cat([slopes, (pushed * extra[:, None]).sum((-1, -2))[..., None]], -1)
-        gradient, swept = slopes.unbind(1)
-        inner = (jacobian.mT @ jacobian)[:, :n_all, :n_all]
-        inner = torch.baddbmm(inner, (to.stiffness[:, None] * swept)[..., None], swept[:, None])
-        stiffness = at.edges[..., 3:].sum((1, 2)) + at.hinges[..., -1].sum(1) + to.stiffness
+            last[:, n] = (normal * extra).sum((-1, -2))
+        last[:, n_all] = off
+        last *= root
+        last[:, n_all + 1 :] = 0
+        products = jacobian.mT @ jacobian
+        gradient, inner = products[:, :n_all, n_all], products[:, :n_all, :n_all]
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
-        curved = self._second(x, at.moment, placement) if second_order else None
+        curved = self._second(x, to.stiffness * off, placement) if second_order else None
         return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
@@ -181,7 +183,7 @@ class FusedModalEnergy(ModalEnergy):
         launch(kernels("modal").curved_walls, (len(x), len(shell.walls)), given)
         extra, columns, n = placement.extra, self.blocks.double(), len(self.columns)
         if extra is not None:
-            extra = torch.cat([extra, shell.centre(extra)[:, None]], 1)
+            extra = torch.cat([extra, shell.mean(extra)[:, None]], 1)
         pushed = x.new_zeros(len(x), *columns.shape)
         given = [self.pairs, found, columns, extra, len(columns) // 3, n, columns.shape[1] // _BLOCK, pushed, pushed]
         launch(kernels("modal").curved_columns, (len(x), n_pairs), given)

@@ -210,22 +210,25 @@ class FusedRelax(FusedShell):
         launch(module.back_to_elements, records, given)
         # The right side is the gradient's opposite.
         to_gradient = -to_residual
-        to_x = to_reached.clone()
-        given = [x, self.record, to.stretch, to.bend, n, at.energy, at.gradient, at.diagonal, at.edges, at.hinges]
-        adjoints = [to_x, None, to_reference.stretch, to_reference.bend, None]
-        adjoints += [torch.zeros_like(at.energy), to_gradient, to_diagonal, to_edges, to_hinges]
-        launch(shell.linearise, records, given, adjoints)
-        to_normal = torch.addcmul(to_normal, at.moment[:, None, None], to_gradient)
         to_moment = (to_gradient * normal).sum((1, 2))
-        with torch.enable_grad():
-            leaf = x.detach().requires_grad_()
-            volume, own = self.volume(leaf)
-        (through,) = torch.autograd.grad((volume, own), leaf, (stiffness * to_moment, to_normal))
-        to_reference.stiffness.add_(
-            to_moment * (volume.detach() - to.volume) + (done.scalars[1, :-1] * backs[2]).sum(0)
-        )
-        to_reference.volume.sub_(stiffness * to_moment)
-        return to_x + through
+        to_volume = stiffness * to_moment
+        to_normal = torch.addcmul(to_normal, at.moment[:, None, None], to_gradient)
+        if not self.closed:  # the adjoint of shared()
+            to_normal = to_normal - self.mean(to_normal)[:, None]
+        to_x, centre = to_reached.clone(), self.centre(x)
+        to_centre = None if centre is None else torch.zeros_like(centre)
+        given = [x, self.record, to.stretch, to.bend, centre, self.walls, n, at.energy, at.gradient, at.diagonal]
+        given += [at.edges, at.hinges, torch.empty_like(to_volume), to_direction]  # outputs may be written once more
+        adjoints = [to_x, None, to_reference.stretch, to_reference.bend, to_centre, None, None]
+        adjoints += [torch.zeros_like(at.energy), to_gradient, to_diagonal, to_edges, to_hinges, to_volume, to_normal]
+        launch(shell.linearise, (b, len(self.record) + len(self.walls)), given, adjoints)
+        if to_centre is not None:
+            share = to_centre[:, None] / len(self.used)
+            to_x.index_add_(1, self.used, share.expand(-1, len(self.used), -1))
+        off = torch.where(stiffness > 0, at.moment / torch.where(stiffness > 0, stiffness, 1), 0)
+        to_reference.stiffness.add_(to_moment * off + (done.scalars[1, :-1] * backs[2]).sum(0))
+        to_reference.volume.sub_(to_volume)
+        return to_x
 
 
 class _Iterations(NamedTuple):

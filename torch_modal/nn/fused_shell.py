@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.terms import MIN_RELATIVE_LENGTH, MIN_RELATIVE_VOLUME, Bend, Mesh, Stretch, Volume
+from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.nn.launch import Backend, Shapes, has_kernels, kernels, launch, recorded
 
 
@@ -100,25 +100,19 @@ class FusedShell(nn.Module):
             t: *Shape:* ``(B,)``.
             stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
-        module, (n_samples, n), n_edges = kernels("shell"), first.shape[:2], len(self.record)
+        module, (b, n), n_edges, n_walls = kernels("shell"), first.shape[:2], len(self.record), len(self.walls)
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
-        pull = torch.stack([1 - t, t], -1)
-        shortest = t.new_zeros(n_samples, 2)
-        launch(module.total_lengths, (n_samples, n_edges), [first, second, self.record, n, shortest])
-        shortest *= MIN_RELATIVE_LENGTH / n_edges
-        given: list[Any] = [first, second, self.record, self.hinge, pull, shortest, alpha, beta]
+        given: list[Any] = [first, second, self.centre(first), self.centre(second), self.record, self.walls, n]
+        shapes: Shapes = {7: (b, 2), 8: (b, 2), 9: (b, 2)}
+        found = recorded(module.sizes, (b, n_edges + n_walls), shapes, *given, None, None, None)
+        shapes = {6: (b, 2), 7: (b, 2), 8: (b,), 9: (b,), 10: (b,)}
+        given = [t, gamma, *found, n_edges, *[None] * 5]
+        pull, shortest, whole, volume, apart = recorded(module.weigh, (b,), shapes, *given, written=tuple(shapes))
+        given = [first, second, self.record, self.hinge, pull, shortest, alpha, beta]
         given += [n, alpha.shape[-1], beta.shape[-1], None, None, None]
-        shapes: Shapes = {11: (n_samples, n_edges, 2), 12: (n_samples, n_edges, 4), 13: (n_samples,)}
+        shapes = {11: (b, n_edges, 2), 12: (b, n_edges, 4), 13: (b,)}
         stretch, bend, constant = self._run(module.rest, shapes, given, written=(11, 12))
-        sizes = [self._size(end) for end in (first, second)]
-        volumes = torch.stack([volume for volume, _ in sizes], -1)
-        areas = torch.stack([area for _, area in sizes], -1)
-        pulls = pull * gamma / torch.maximum(volumes.abs(), MIN_RELATIVE_VOLUME * areas**1.5) ** 2
-        whole = pulls.sum(-1)
-        share = torch.where(whole > 0, pulls[:, 1] / torch.where(whole > 0, whole, 1), 0)
-        apart = volumes[:, 1] - volumes[:, 0]
-        constant = constant + pulls[:, 0] * share * apart**2
-        return ShellReference(stretch, bend, 2 * whole, volumes[:, 0] + share * apart, constant)
+        return ShellReference(stretch, bend, whole, volume, constant + apart)
 
     def reference_by_torch(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
         """The same by torch."""
@@ -143,23 +137,30 @@ class FusedShell(nn.Module):
         return Reference(measures, tuple(0.5 * weight for weight in weights), reference.constant)
 
     # ------------------------------------------------------------------------------------------------------- the energy
-    def centre(self, x: Tensor) -> Tensor:
-        """The mean of all vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
+    def centre(self, x: Tensor) -> Tensor | None:
+        """What volumes are relative to: the mean; None, any vertex, where it does not matter. *Shape:* ``(B, 3)``."""
+        return None if self.closed else self.mean(x)
+
+    def mean(self, x: Tensor) -> Tensor:
+        """Of all vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
         return x.mean(1) if len(self.used) == self.n_vertices else x[:, self.used].mean(1)
 
-    def _size(self, x: Tensor) -> tuple[Tensor, ...]:
-        """The volume about the centre, and the area of the surface, closed towards it. *Shape:* ``(B,)`` each."""
-        given = [x, self.centre(x), self.walls, self.n_vertices, None, None, None]
-        return self._run(kernels("shell").volume, {4: (len(x),), 6: (len(x),)}, given, len(self.walls))
-
     def volume(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The volume about the centre, and its gradient. *Shape:* ``(B,), (B, V, 3)``."""
-        given = [x, self.centre(x), self.walls, self.n_vertices, None, None, None]
-        total, normal = self._run(kernels("shell").volume, {4: (len(x),), 5: tuple(x.shape)}, given, len(self.walls))
-        if not self.closed:  # the centre moves with all vertices; of a closed surface it does not matter
-            share = normal.sum(1, keepdim=True) / len(self.used)
-            normal = normal.index_add(1, self.used, -share.expand(-1, len(self.used), -1))
-        return total, normal
+        """The volume about the centre, and its gradient; not recorded. *Shape:* ``(B,), (B, V, 3)``."""
+        total, normal = x.new_zeros(len(x)), torch.zeros_like(x)
+        given = [x, self.centre(x), self.walls, self.n_vertices, total, normal]
+        launch(kernels("shell").volume, (len(x), len(self.walls)), given)
+        return total, self.shared(normal)
+
+    def shared(self, normal: Tensor) -> Tensor:
+        """What vertices receive that stand still with the centre, with what they receive as it moves with them.
+
+        Of a closed surface that is nothing. *Shape:* ``(B, V, 3)``.
+        """
+        if self.closed:
+            return normal
+        share = normal.sum(1, keepdim=True) / len(self.used)
+        return normal.index_add(1, self.used, -share.expand(-1, len(self.used), -1))
 
     def _run(
         self, kernel: Any, shapes: Shapes, given: list[Any], n: int | None = None, written: tuple[int, ...] = ()
@@ -170,13 +171,15 @@ class FusedShell(nn.Module):
     def at(self, x: Tensor, to: ShellReference) -> ShellPoint:
         """Value and derivatives but for the constant; recorded where gradients are. *Shape:* ``(B, V, 3)``."""
         b, e = len(x), len(self.record)
-        shapes: Shapes = {5: (b,), 6: tuple(x.shape), 7: (*x.shape[:2], 6), 8: (b, e, 5), 9: (b, e, 10)}
-        given = [x, self.record, to.stretch, to.bend, self.n_vertices, *[None] * 5]
-        energy, gradient, diagonal, edges, hinges = self._run(kernels("shell").linearise, shapes, given, written=(8, 9))
-        volume, normal = self.volume(x)
-        moment = to.stiffness * (volume - to.volume)
-        energy = energy + self._of_volume(volume, to)
-        return ShellPoint(energy, gradient, diagonal, edges, hinges, normal, moment)
+        shapes: Shapes = {7: (b,), 8: tuple(x.shape), 9: (*x.shape[:2], 6), 10: (b, e, 5), 11: (b, e, 10)}
+        shapes |= {12: (b,), 13: tuple(x.shape)}
+        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, self.n_vertices, *[None] * 7]
+        found = self._run(kernels("shell").linearise, shapes, given, e + len(self.walls), written=(10, 11))
+        energy, gradient, diagonal, edges, hinges, volume, normal = found
+        off = volume - to.volume
+        moment = to.stiffness * off
+        energy = torch.addcmul(energy, moment, off, value=0.5)
+        return ShellPoint(energy, gradient, diagonal, edges, hinges, self.shared(normal), moment)
 
     def gradient(self, x: Tensor, to: ShellReference) -> Tensor:
         """The gradient; recorded where gradients are. *Shape:* ``(B, V, 3)``."""
@@ -186,12 +189,11 @@ class FusedShell(nn.Module):
     def value(self, x: Tensor, to: ShellReference) -> Tensor:
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
         energy, volume = x.new_zeros(2, len(x)).unbind()
-        given = [x, self.record, to.stretch, to.bend, self.n_vertices, len(to.volume), energy]
-        launch(kernels("shell").value, (len(x), len(self.record)), given)
-        given = [x, self.centre(x), self.walls, self.n_vertices, volume, None, None]
-        launch(kernels("shell").volume, (len(x), len(self.walls)), given)
-        sizes = len(x) // max(1, len(to.volume)), len(to.volume)
-        energy, volume = (value.unflatten(0, sizes) for value in (energy, volume))
+        given = [x, self.record, to.stretch, to.bend, self.n_vertices, len(to.volume), self.centre(x), self.walls]
+        launch(kernels("shell").value, (len(x), len(self.record) + len(self.walls)), [*given, energy, volume])
+        if len(x) == len(to.volume):
+            return energy + self._of_volume(volume, to)
+        energy, volume = (value.unflatten(0, (-1, len(to.volume))) for value in (energy, volume))
         return (energy + self._of_volume(volume, to)).flatten()
 
     @staticmethod

@@ -1,5 +1,6 @@
 """The damped Gauss-Newton step on modal amplitudes, and the loop that repeats it."""
 
+import math
 from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
 
@@ -142,7 +143,7 @@ class GaussNewtonStep(nn.Module):
             damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6
         size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
         ridge = damping * size.abs() + torch.finfo(size.dtype).tiny
-        return hessian + ridge[..., None, None] * torch.eye(hessian.shape[-1], dtype=size.dtype, device=size.device)
+        return hessian + torch.diag_embed(ridge[..., None].expand(hessian.shape[:-1]))
 
     def directions(self, derivatives: Derivatives) -> Tensor:
         """Directions ``-H^-1 g`` of Gauss-Newton and, where given, of the full Hessian.
@@ -282,56 +283,90 @@ def minimise(
         least_gain: Where a step promises less than this part of the energy, it is the last one. The gradient norm of
             the solution is then the one before that step.
     """
-    result = _blank_solution(a)
-    rows = torch.arange(len(a), device=a.device)
     energy = step.energy.value(a, placement)
-    start = torch.full_like(energy, torch.inf)
-    slow = torch.zeros_like(energy, dtype=torch.bool)
-    last, before = torch.zeros_like(slow), start
+    eps, tiny = torch.finfo(energy.dtype).eps, torch.finfo(energy.dtype).tiny
+    found, blank = torch.zeros_like(a), energy.new_zeros(len(a))
+    # What decides are a few numbers of each sample: on the host, where a GPU is waited for twice in a step.
+    everyone = live = [_Course(row, value) for row, value in enumerate(energy.tolist())]
     for k in range(max_steps + 1):
         derivatives = step.energy.derivatives(a, placement, second_order=False)
-        norm = derivatives.gradient.norm(dim=-1)
-        if k == 0:
-            start = norm
-        status = torch.full_like(rows, Status.OUT_OF_STEPS)
-        found = norm <= torch.maximum(tolerance * start, step.floor(derivatives))
-        status[found | (last & (norm <= GROWN * before))] = Status.CONVERGED
-        status[~(norm.isfinite() & energy.isfinite())] = Status.INVALID
-        leaving = (status != Status.OUT_OF_STEPS) | (k == max_steps)
-        if not bool(leaving.all()):
-            needing = slow & ~leaving
-            if bool(needing.any()):
+        told = torch.stack([derivatives.gradient.norm(dim=-1), step.floor(derivatives)], 1).tolist()
+        for own, (norm, floor) in zip(live, told, strict=True):
+            own.look(norm, floor, tolerance, k == 0)
+        going = [own.status == Status.OUT_OF_STEPS and k < max_steps for own in live]
+        if any(going):
+            needing = [still and own.slow for still, own in zip(going, live, strict=True)]
+            if any(needing):
                 derivatives = derivatives._replace(second_order=_second_order(step.energy, a, placement, needing))
             taken = step.take(a, energy, derivatives, placement)
-            # Where all that is left to gain drowns in the rounding of the energy, nothing compares steps any more: a
-            # whole Newton step is taken, and is the last.
-            drowned = taken.promised <= ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
-            last = slow & drowned & taken.newton.isfinite().all(-1)
-            stuck = ~leaving & slow & ~taken.moved & ~last
-            status[stuck] = torch.where(drowned, Status.CONVERGED, Status.STALLED)[stuck]
-            leaving = leaving | stuck
-            enough = ~leaving & taken.moved & (taken.promised < least_gain * energy.abs())
-            status[enough] = Status.ENOUGH
-            result.n_steps[rows[enough]] += 1
-            a, energy = torch.where(enough[:, None], taken.amplitudes, a), torch.where(enough, taken.energy, energy)
-            leaving = leaving | enough
-        relative = norm / start.clamp_min(torch.finfo(start.dtype).tiny)
-        left = Solution(a, energy, relative, result.n_steps[rows], status)
-        for whole, part in zip(result, left, strict=True):
-            if whole is not None and part is not None:
-                whole[rows[leaving]] = part[leaving]
-        if bool(leaving.all()):
-            break
-        slow = slow | ~taken.moved | (taken.energy > GOOD_DECREASE * energy)
-        result.n_steps[rows[~leaving & (taken.moved | last)]] += 1
-        a, energy = torch.where(last[:, None], taken.newton, taken.amplitudes), taken.energy
-        before = norm
-        if bool(leaving.any()):
-            stay = torch.nonzero(~leaving).flatten()
-            kept = (rows, a, energy, start, slow, last, before)
-            rows, a, energy, start, slow, last, before = (values[stay] for values in kept)
-            placement = trees.rows(placement, stay)
-    return result
+            energy, promised, moved, newton = taken.energy, taken.promised, taken.moved, taken.newton.sum(-1)
+            numbers = torch.stack([energy, promised, moved.to(energy), newton], 1).tolist()
+            pairs = zip(live, going, numbers, strict=True)
+            ways = [own.go(each, eps, least_gain) if still else _STAY for own, still, each in pairs]
+            a = _chosen(ways, [a, taken.amplitudes, taken.newton])
+            going = [still and own.status == Status.OUT_OF_STEPS for still, own in zip(going, live, strict=True)]
+        if not all(going):
+            left = torch.tensor([not still for still in going], device=a.device)
+            found[[own.row for own, still in zip(live, going, strict=True) if not still]] = a[left]
+            live = [own for own, still in zip(live, going, strict=True) if still]
+            if not live:
+                break
+            a, energy, placement = trees.rows((a, energy, placement), torch.nonzero(~left).flatten())
+    values = [[own.energy, own.norm / max(own.start, tiny)] for own in everyone]
+    counts = [[own.n_steps, own.status] for own in everyone]
+    reached, norms = blank.new_tensor(values).reshape(-1, 2).unbind(1)
+    n_steps, status = torch.tensor(counts, dtype=torch.int64, device=a.device).reshape(-1, 2).unbind(1)
+    return Solution(found, reached, norms, n_steps, status)
+
+
+# Which amplitudes a sample has next: those that it has, those of the step, those of the whole Newton step.
+_STAY, _STEP, _NEWTON = range(3)
+
+
+class _Course:
+    """What one sample has gone through."""
+
+    def __init__(self, row: int, energy: float) -> None:
+        self.row, self.energy = row, energy
+        self.norm = self.start = math.inf
+        self.n_steps = 0
+        self.status = Status.OUT_OF_STEPS
+        #: Whether it needs the full Hessian, and whether its next Newton step was to be the last.
+        self.slow = self.last = False
+
+    def look(self, norm: float, floor: float, tolerance: float, first: bool) -> None:
+        """Whether it has arrived."""
+        before, self.norm = self.norm, norm
+        if first:
+            self.start = norm
+        if not (math.isfinite(norm) and math.isfinite(self.energy)):
+            self.status = Status.INVALID
+        elif norm <= max(tolerance * self.start, floor) or (self.last and norm <= GROWN * before):
+            self.status = Status.CONVERGED
+
+    def go(self, told: list[float], eps: float, least_gain: float) -> int:
+        """Which way it goes from here, or the status with which it ends, by what is told of a step."""
+        energy, promised, moved, newton = told
+        # Where all that is left to gain drowns in the rounding of the energy, nothing compares steps any more: a whole
+        # Newton step is taken, and is the last.
+        drowned = promised <= ENERGY_ROUNDING * eps * abs(self.energy)
+        self.last = self.slow and drowned and math.isfinite(newton)
+        if self.slow and not moved and not self.last:
+            self.status = Status.CONVERGED if drowned else Status.STALLED
+            return _STAY
+        if moved and promised < least_gain * abs(self.energy):
+            self.status = Status.ENOUGH
+        self.slow = self.slow or not moved or energy > GOOD_DECREASE * self.energy
+        self.n_steps += bool(moved or self.last)
+        self.energy = energy
+        return _NEWTON if self.last and self.status != Status.ENOUGH else _STEP
+
+
+def _chosen(ways: list[int], amplitudes: list[Tensor]) -> Tensor:
+    """By sample. *Shape of each:* ``(B, n)``."""
+    if len(set(ways)) == 1:
+        return amplitudes[ways[0]]
+    return torch.stack(amplitudes)[ways, list(range(len(ways)))]
 
 
 def _blank_solution(a: Tensor) -> Solution:
@@ -346,11 +381,11 @@ def unmoved(t: Tensor, n_unknowns: int, usable: Tensor) -> Solution:
     return blank._replace(status=torch.where(usable, Status.CONVERGED, Status.INVALID))
 
 
-def _second_order(energy: AmplitudeEnergy, a: Tensor, placement: Any, where: Tensor) -> Tensor:
+def _second_order(energy: AmplitudeEnergy, a: Tensor, placement: Any, where: list[bool]) -> Tensor:
     """The second-order term of some samples; NaN, which rules its direction out, for the others."""
-    chosen = torch.nonzero(where).flatten()
-    if len(chosen) == len(a):
+    if all(where):
         return energy.second_order(a, placement)
+    chosen = torch.tensor(where, device=a.device).nonzero().flatten()
     whole = a.new_full((len(a), a.shape[-1], a.shape[-1]), torch.nan)
     whole[chosen] = energy.second_order(a[chosen], trees.rows(placement, chosen))
     return whole

@@ -62,3 +62,14 @@ def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
     if v >= 0:
         found = x[at + v]
     return found
+
+
+@wp.func
+def middle_of(
+    x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), walls: wp.array(dtype=wp.vec3i), sample: int, at: int
+):
+    """What volumes are relative to: the centre, or where the surface is closed and there is none, any vertex."""
+    found = x[at + walls[0][0]]
+    if centre:
+        found = centre[sample]
+    return found

@@ -6,12 +6,11 @@ from torch_modal.nn.kernels.elements import (
     HALF,
     TINY,
     angle_of,
-    bent,
     corner,
     is_flat,
     length_of,
+    middle_of,
     real,
-    stretched,
     vec3,
     vec4,
     wrapped,
@@ -25,10 +24,11 @@ six = wp.types.vector(length=6, dtype=wp.int32)
 
 @wp.kernel(enable_backward=False)
 def jacobian(
+    x: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
     hinge: wp.array(dtype=wp.int32),
-    edges: wp.array(dtype=stretched),
-    hinges: wp.array(dtype=bent),
+    stretch: wp.array(dtype=wp.vec2d),
+    bend: wp.array(dtype=vec4),
     columns: wp.array(dtype=wide),
     extra: wp.array(dtype=vec3),
     n: int,
@@ -37,20 +37,31 @@ def jacobian(
     n_rows: int,
     out: wp.array(dtype=wide),
     entries: wp.array(dtype=real),
+    stiffness: wp.array(dtype=real),
 ):
-    """Change of each measure along the columns, and along one more that is the sample's own, by the root of its weight.
+    """Change of each measure along the columns and along one more that is the sample's own, and the measure's residual.
 
-    A component of a vertex has a row of blocks of eight columns; those of the measures are the same memory twice.
+    All by the root of its weight. The residual comes in the column after the last. A component of a vertex has a row of
+    blocks of eight columns; those of the measures are the same memory twice.
     """
     s, k = wp.tid()
     v = s * n
     q = record[k]
+    at = s * record.shape[0] + k
     i = 3 * n_blocks * q[0]
     j = 3 * n_blocks * q[1]
     row = s * n_rows + k
-    r = edges[s * record.shape[0] + k]
-    root = wp.sqrt(r[3] + r[4])
-    g = root * vec3(r[0], r[1], r[2])
+    residual = n_columns
+    if extra:
+        residual += 1
+    origin = x[v + q[0]]
+    e = x[v + q[1]] - origin
+    length = length_of(e)
+    wanted = stretch[at]
+    root = wp.sqrt(wanted[0])
+    g = vec3()
+    if wp.dot(e, e) > TINY:
+        g = (root / length) * e
     for c in range(n_blocks):
         y = c + n_blocks
         z = y + n_blocks
@@ -61,15 +72,30 @@ def jacobian(
         )
     if extra:
         entries[row * n_blocks * 8 + n_columns] = wp.dot(g, extra[v + q[1]] - extra[v + q[0]])
+    entries[row * n_blocks * 8 + residual] = root * (length - wanted[1])
+    total = wanted[0]
     if q[2] >= 0:
         row = s * n_rows + record.shape[0] + hinge[k]
         a = 3 * n_blocks * q[2]
         b = 3 * n_blocks * q[3]
-        h = hinges[s * record.shape[0] + k]
-        stiff = wp.sqrt(h[9])
-        ge = stiff * vec3(h[0], h[1], h[2])
-        ga = stiff * vec3(h[3], h[4], h[5])
-        gb = stiff * vec3(h[6], h[7], h[8])
+        tip_a = x[v + q[2]] - origin
+        tip_b = x[v + q[3]] - origin
+        n1 = wp.cross(e, tip_a)
+        n2 = wp.cross(tip_b, e)
+        w = bend[at]
+        ge = vec3()
+        ga = vec3()
+        gb = vec3()
+        off = real(0.0)
+        if not (is_flat(e, n1) or is_flat(e, n2)):
+            theta = angle_of(e, tip_a, tip_b, n1, n2)
+            stiff = wp.sqrt(w[0] + w[2])
+            if stiff > real(0.0):
+                off = (w[0] * wrapped(theta - w[1]) + w[2] * wrapped(theta - w[3])) / stiff
+            ga = (-stiff * length / wp.dot(n1, n1)) * n1
+            gb = (-stiff * length / wp.dot(n2, n2)) * n2
+            ge = (real(-1.0) / wp.dot(e, e)) * (wp.dot(tip_a, e) * ga + wp.dot(tip_b, e) * gb)
+            total += w[0] + w[2]
         gi = -(ge + ga + gb)
         for c in range(n_blocks):
             y = c + n_blocks
@@ -84,6 +110,8 @@ def jacobian(
             o = extra[v + q[0]]
             along = wp.dot(ge, extra[v + q[1]] - o) + wp.dot(ga, extra[v + q[2]] - o)
             entries[row * n_blocks * 8 + n_columns] = along + wp.dot(gb, extra[v + q[3]] - o)
+        entries[row * n_blocks * 8 + residual] = off
+    wp.atomic_add(stiffness, s, total)
 
 
 @wp.func
@@ -200,7 +228,7 @@ def curved_walls(
     s, k = wp.tid()
     q = walls[k]
     v = s * n
-    middle = centre[s]
+    middle = middle_of(x, centre, walls, s, v)
     sixth = slope[s] / real(6.0)
     slot = slots[k]
     wp.atomic_add(out, s * n_slots + slot[0], -wp.skew(sixth * (corner(x, middle, v, q[2]) - middle)))

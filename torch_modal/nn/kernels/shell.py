@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from torch_modal.energy.terms import MAX_BENDING_RATIO, SLACK
+from torch_modal.energy.terms import MAX_BENDING_RATIO, MIN_RELATIVE_LENGTH, MIN_RELATIVE_VOLUME, SLACK
 from torch_modal.nn.kernels.elements import (
     HALF,
     TINIEST,
@@ -12,6 +12,7 @@ from torch_modal.nn.kernels.elements import (
     corner,
     is_flat,
     length_of,
+    middle_of,
     real,
     squared,
     stretched,
@@ -22,23 +23,85 @@ from torch_modal.nn.kernels.elements import (
 )
 
 RATIO = wp.constant(real(MAX_BENDING_RATIO))
+SHORT = wp.constant(real(MIN_RELATIVE_LENGTH))
+THIN = wp.constant(real(MIN_RELATIVE_VOLUME))
 SLACKNESS = wp.constant(real(SLACK))
 
 
 # ----------------------------------------------------------------------------------------------------------- references
-@wp.kernel(enable_backward=False)
-def total_lengths(
+@wp.kernel
+def sizes(
     first: wp.array(dtype=vec3),
     second: wp.array(dtype=vec3),
+    first_centre: wp.array(dtype=vec3),
+    second_centre: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
+    walls: wp.array(dtype=wp.vec3i),
     n: int,
-    total: wp.array(dtype=wp.vec2d),
+    length: wp.array(dtype=wp.vec2d),
+    volume: wp.array(dtype=wp.vec2d),
+    area: wp.array(dtype=wp.vec2d),
 ):
-    """Of the edges of both rest shapes."""
+    """Of both rest shapes: all edges together, the volume about the centre, the surface, closed towards the centre."""
     s, k = wp.tid()
-    i = s * n + record[k][0]
-    j = s * n + record[k][1]
-    wp.atomic_add(total, s, wp.vec2d(length_of(first[j] - first[i]), length_of(second[j] - second[i])))
+    v = s * n
+    if k < record.shape[0]:
+        i = v + record[k][0]
+        j = v + record[k][1]
+        wp.atomic_add(length, s, wp.vec2d(length_of(first[j] - first[i]), length_of(second[j] - second[i])))
+    else:
+        wall = walls[k - record.shape[0]]
+        middle1 = middle_of(first, first_centre, walls, s, v)
+        a1 = first[v + wall[0]] - middle1
+        b1 = first[v + wall[1]] - middle1
+        c1 = corner(first, middle1, v, wall[2]) - middle1
+        middle2 = middle_of(second, second_centre, walls, s, v)
+        a2 = second[v + wall[0]] - middle2
+        b2 = second[v + wall[1]] - middle2
+        c2 = corner(second, middle2, v, wall[2]) - middle2
+        sixth = real(1.0) / real(6.0)
+        wp.atomic_add(volume, s, sixth * wp.vec2d(wp.dot(a1, wp.cross(b1, c1)), wp.dot(a2, wp.cross(b2, c2))))
+        s1 = length_of(wp.cross(b1 - a1, c1 - a1))
+        s2 = length_of(wp.cross(b2 - a2, c2 - a2))
+        wp.atomic_add(area, s, wp.vec2d(HALF * s1, HALF * s2))
+
+
+@wp.func
+def own_size(volume: real, area: real):
+    return wp.max(wp.abs(volume), THIN * wp.pow(area, real(1.5)))
+
+
+@wp.kernel
+def weigh(
+    time: wp.array(dtype=real),
+    gamma: wp.array(dtype=real),
+    lengths: wp.array(dtype=wp.vec2d),
+    volumes: wp.array(dtype=wp.vec2d),
+    areas: wp.array(dtype=wp.vec2d),
+    n_edges: int,
+    pull: wp.array(dtype=wp.vec2d),
+    shortest: wp.array(dtype=wp.vec2d),
+    stiffness: wp.array(dtype=real),
+    volume: wp.array(dtype=real),
+    constant: wp.array(dtype=real),
+):
+    """What both rest shapes weigh, which edges count, and both volumes as one: Eq. 8. The stiffness is doubled."""
+    s = wp.tid()
+    t = time[s]
+    pull[s] = wp.vec2d(real(1.0) - t, t)
+    shortest[s] = (SHORT / real(n_edges)) * lengths[s]
+    v1 = volumes[s][0]
+    v2 = volumes[s][1]
+    size1 = own_size(v1, areas[s][0])
+    size2 = own_size(v2, areas[s][1])
+    w1 = (real(1.0) - t) * gamma[s] / (size1 * size1)
+    w2 = t * gamma[s] / (size2 * size2)
+    share = real(0.0)
+    if w1 + w2 > real(0.0):
+        share = w2 / (w1 + w2)
+    stiffness[s] = real(2.0) * (w1 + w2)
+    volume[s] = v1 + share * (v2 - v1)
+    constant[s] = w1 * share * (v2 - v1) * (v2 - v1)
 
 
 @wp.func
@@ -122,11 +185,20 @@ def value(
     bend: wp.array(dtype=vec4),
     n: int,
     n_references: int,
+    centre: wp.array(dtype=vec3),
+    walls: wp.array(dtype=wp.vec3i),
     energy: wp.array(dtype=real),
+    total: wp.array(dtype=real),
 ):
-    """The energy but for the volume's; references come round where there are fewer than shapes."""
+    """The energy but for the volume's, and the volume; references come round where there are fewer than shapes."""
     s, k = wp.tid()
     v = s * n
+    if k >= record.shape[0]:
+        wall = walls[k - record.shape[0]]
+        middle = middle_of(x, centre, walls, s, v)
+        c = corner(x, middle, v, wall[2]) - middle
+        wp.atomic_add(total, s, wp.dot(x[v + wall[0]] - middle, wp.cross(x[v + wall[1]] - middle, c)) / real(6.0))
+        return
     q = record[k]
     at = (s % n_references) * record.shape[0] + k
     origin = x[v + q[0]]
@@ -149,22 +221,72 @@ def value(
     wp.atomic_add(energy, s, HALF * found)
 
 
+@wp.func
+def add_wall(
+    x: wp.array(dtype=vec3),
+    centre: wp.array(dtype=vec3),
+    walls: wp.array(dtype=wp.vec3i),
+    sample: int,
+    wall: int,
+    at: int,
+    total: wp.array(dtype=real),
+    gradient: wp.array(dtype=vec3),
+):
+    """Volume of the tetrahedron from the centre, a vertex of -1, to a triangle; its gradient where that stays."""
+    q = walls[wall]
+    middle = middle_of(x, centre, walls, sample, at)
+    a = x[at + q[0]] - middle
+    b = x[at + q[1]] - middle
+    c = corner(x, middle, at, q[2]) - middle
+    bc = wp.cross(b, c)
+    sixth = real(1.0) / real(6.0)
+    wp.atomic_add(total, sample, sixth * wp.dot(a, bc))
+    wp.atomic_add(gradient, at + q[0], sixth * bc)
+    wp.atomic_add(gradient, at + q[1], sixth * wp.cross(c, a))
+    if q[2] >= 0:
+        wp.atomic_add(gradient, at + q[2], sixth * wp.cross(a, b))
+
+
+@wp.kernel(enable_backward=False)
+def volume(
+    x: wp.array(dtype=vec3),
+    centre: wp.array(dtype=vec3),
+    walls: wp.array(dtype=wp.vec3i),
+    n: int,
+    total: wp.array(dtype=real),
+    gradient: wp.array(dtype=vec3),
+):
+    """The volume and its gradient alone."""
+    s, k = wp.tid()
+    add_wall(x, centre, walls, s, k, s * n, total, gradient)
+
+
 @wp.kernel
 def linearise(
     x: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
     stretch: wp.array(dtype=wp.vec2d),
     bend: wp.array(dtype=vec4),
+    centre: wp.array(dtype=vec3),
+    walls: wp.array(dtype=wp.vec3i),
     n: int,
     energy: wp.array(dtype=real),
     gradient: wp.array(dtype=vec3),
     diagonal: wp.array(dtype=symmetric),
     edges: wp.array(dtype=stretched),
     hinges: wp.array(dtype=bent),
+    total: wp.array(dtype=real),
+    normal: wp.array(dtype=vec3),
 ):
-    """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and what a product with it needs."""
+    """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and what a product with it needs.
+
+    The volume's are apart: the volume and its gradient, see there.
+    """
     s, k = wp.tid()
     v = s * n
+    if k >= record.shape[0]:
+        add_wall(x, centre, walls, s, k - record.shape[0], v, total, normal)
+        return
     q = record[k]
     at = s * record.shape[0] + k
     origin = x[v + q[0]]
@@ -263,36 +385,3 @@ def product(
     else:
         wp.atomic_add(out, v + q[0], -to_j)
         wp.atomic_add(out, v + q[1], to_j)
-
-
-@wp.kernel
-def volume(
-    x: wp.array(dtype=vec3),
-    centre: wp.array(dtype=vec3),
-    walls: wp.array(dtype=wp.vec3i),
-    n: int,
-    total: wp.array(dtype=real),
-    gradient: wp.array(dtype=vec3),
-    area: wp.array(dtype=real),
-):
-    """Volume of the tetrahedra from the centre to triangles, its gradient where the centre does not move, and the area.
-
-    A vertex of -1 is the centre. Gradient and area are left out where there is no array for them.
-    """
-    s, k = wp.tid()
-    v = s * n
-    q = walls[k]
-    middle = centre[s]
-    a = x[v + q[0]] - middle
-    b = x[v + q[1]] - middle
-    c = corner(x, middle, v, q[2]) - middle
-    bc = wp.cross(b, c)
-    sixth = real(1.0) / real(6.0)
-    wp.atomic_add(total, s, sixth * wp.dot(a, bc))
-    if gradient:
-        wp.atomic_add(gradient, v + q[0], sixth * bc)
-        wp.atomic_add(gradient, v + q[1], sixth * wp.cross(c, a))
-        if q[2] >= 0:
-            wp.atomic_add(gradient, v + q[2], sixth * wp.cross(a, b))
-    if area:
-        wp.atomic_add(area, s, HALF * length_of(wp.cross(b - a, c - a)))
