@@ -23,9 +23,11 @@ from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.poisson import Poisson
+from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.sparse import SparseSolver
-from torch_modal.nn import launch, trees
+from torch_modal.nn import fused_alignment, launch, trees
 from torch_modal.nn.blend import FusedSolver
+from torch_modal.nn.frame import Frame
 from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.fused_rotations import FusedRotations
@@ -242,6 +244,27 @@ class TestRotations:
         assert_alike(gradients(by_warp, given, True), gradients(by_torch, given, True), 1e-7)
         found = vmap(lambda t: by_warp(*given[:2], t))(torch.stack([t, 0.5 * t]))
         torch.testing.assert_close(found[1], by_warp(*given[:2], 0.5 * t), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.0, math.pi])
+def test_alignment(small_bars: Shapes, turn: float) -> None:
+    """Into the frame and back; at half a turn the same sense is taken."""
+    shapes = small_bars.keyframes
+    frame = Frame(shapes[:2], small_bars.faces, 20)
+    x = shapes[1:3] + torch.tensor([5.0, -2.0, 1.0], dtype=DOUBLE)
+    y = shapes[:2] @ exp(turn * torch.tensor([0.6, 0.0, -0.8], dtype=DOUBLE)).mT
+    t = torch.tensor([0.3, 0.9], dtype=DOUBLE)
+    with torch.no_grad():
+        assert fused_alignment.serves(x, y, t)
+        pair, sizes = fused_alignment.place(frame, x, y)
+        truth = frame.place(x, y)
+        for got, wanted in zip(trees.leaves(tuple(pair[:4])), trees.leaves(tuple(truth[:4])), strict=True):
+            torch.testing.assert_close(got, wanted, rtol=0, atol=1e-11)
+        extents = [(end.amax(1) - end.amin(1)).norm(dim=1) for end in truth[:2]]
+        torch.testing.assert_close(sizes, torch.minimum(*extents))
+        back = fused_alignment.restore(frame, truth.first, truth, t)
+        torch.testing.assert_close(back, frame.restore(truth.first, truth, t), rtol=0, atol=1e-11)
+        assert fused_alignment.place(frame, x, y.index_fill(1, torch.tensor(3), torch.inf)) is None
 
 
 def test_substitution(small_bars: Shapes) -> None:

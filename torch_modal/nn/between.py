@@ -11,9 +11,9 @@ from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.vectors import cross, pick
-from torch_modal.nn import trees
+from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
-from torch_modal.nn.frame import Frame, Pair
+from torch_modal.nn.frame import Alignment, Frame, Pair
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
@@ -134,8 +134,8 @@ class Between(nn.Module):
             report: Told how it went.
         """
         space, t = self.space, samples.t
-        pair, finite = self._placed(samples)
-        usable, placed = trees.picked((finite & self._solvable(pair), pair), samples.which)
+        pair, usable, fused = self._placed_by_kernels(samples) or self._placed_by_torch(samples)
+        usable, placed = trees.picked((usable, pair), samples.which)
         usable = usable & (t >= 0) & (t <= 1)
         if pair.around is not None and self.bare:
             # The course is a shape at rest: there is nothing to minimise.
@@ -146,7 +146,7 @@ class Between(nn.Module):
             start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
             minimisation = self._minimisation(exact, problem.start is not None, report)
             x, solution = self.solved(Batch(problem, minimisation, start, usable, pair, samples, anchors))
-        shapes = self.frame.restore(x, placed, t)
+        shapes = (fused_alignment.restore if fused else Alignment.restore)(self.frame, x, placed, t)
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
 
@@ -287,6 +287,26 @@ class Between(nn.Module):
         if not points:
             return None
         return self.frame.bring(torch.cat(points).to(t).expand(len(t), -1, -1), placed, t)
+
+    def _placed_by_torch(self, samples: Samples) -> tuple[Pair, Tensor, bool]:
+        """The pairs in the frame, whether there is something between them, and that no kernel has placed them."""
+        pair, finite = self._placed(samples)
+        return pair, finite & self._solvable(pair), False
+
+    def _placed_by_kernels(self, samples: Samples) -> tuple[Pair, Tensor, bool] | None:
+        """The same by kernels; None where they cannot."""
+        x_a, x_b = samples.x_a, samples.x_b
+        if self.fused is None or samples.spacing is not None or not fused_alignment.serves(x_a, x_b, samples.t):
+            return None
+        found = fused_alignment.place(self.frame, x_a, x_b)
+        if found is None:
+            return None
+        pair, sizes = found
+        usable = sizes > SMALLEST_SIZE * DIAGONAL
+        if self.closed:
+            _, volumes, _ = self.fused.sizes(pair.first, pair.second)
+            usable = usable & ~(volumes.prod(-1) < 0)
+        return pair, usable, True
 
     def _solvable(self, pair: Pair) -> Tensor:
         """Whether both ends have a size, and, where closed, the same side out: else the volume would vanish on the way.

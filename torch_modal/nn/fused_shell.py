@@ -100,13 +100,11 @@ class FusedShell(nn.Module):
             t: *Shape:* ``(B,)``.
             stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
-        module, (b, n), n_edges, n_walls = kernels("shell"), first.shape[:2], len(self.record), len(self.walls)
+        module, (b, n), n_edges = kernels("shell"), first.shape[:2], len(self.record)
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
-        given: list[Any] = [first, second, self.centre(first), self.centre(second), self.record, self.walls, n]
-        shapes: Shapes = {7: (b, 2), 8: (b, 2), 9: (b, 2)}
-        found = recorded(module.sizes, (b, n_edges + n_walls), shapes, *given, None, None, None)
-        shapes = {6: (b, 2), 7: (b, 2), 8: (b,), 9: (b,), 10: (b,)}
-        given = [t, gamma, *found, n_edges, *[None] * 5]
+        found = self.sizes(first, second)
+        shapes: Shapes = {6: (b, 2), 7: (b, 2), 8: (b,), 9: (b,), 10: (b,)}
+        given: list[Any] = [t, gamma, *found, n_edges, *[None] * 5]
         pull, shortest, whole, volume, apart = recorded(module.weigh, (b,), shapes, *given, written=tuple(shapes))
         given = [first, second, self.record, self.hinge, pull, shortest, alpha, beta]
         given += [n, alpha.shape[-1], beta.shape[-1], None, None, None]
@@ -137,6 +135,13 @@ class FusedShell(nn.Module):
         return Reference(measures, tuple(0.5 * weight for weight in weights), reference.constant)
 
     # ------------------------------------------------------------------------------------------------------- the energy
+    def sizes(self, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
+        """Lengths of all edges together, volume and area of both ends. *Shape of each:* ``(B, 2)``."""
+        given = [first, second, self.centre(first), self.centre(second), self.record, self.walls, self.n_vertices]
+        shapes: Shapes = dict.fromkeys((7, 8, 9), (len(first), 2))
+        n = len(self.record) + len(self.walls)
+        return self._run(kernels("shell").sizes, shapes, [*given, None, None, None], n)
+
     def centre(self, x: Tensor) -> Tensor | None:
         """What volumes are relative to: the mean; None, any vertex, where it does not matter. *Shape:* ``(B, 3)``."""
         return None if self.closed else self.mean(x)

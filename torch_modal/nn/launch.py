@@ -20,7 +20,7 @@ Backend = Literal["auto", "torch", "warp"]
 
 
 @cache
-def kernels(name: Literal["shell", "modal", "steps", "steps_adjoint", "rotations"]) -> Any:
+def kernels(name: Literal["alignment", "shell", "modal", "steps", "steps_adjoint", "rotations"]) -> Any:
     """A module of :mod:`torch_modal.nn.kernels`, compiled by the first who asks on a machine, and kept by Warp."""
     import warp as wp
 

@@ -39,8 +39,7 @@ def triangle(p: vec3, q: vec3, r: vec3):
 
 
 @wp.func
-def quaternion(a: Triangle, b: Triangle):
-    r = wp.outer(b.e1, a.e1) + wp.outer(b.e2, a.e2) + wp.outer(b.normal, a.normal)
+def quaternion_of(r: wp.mat33d):
     w = real(1.0) + r[0, 0] + r[1, 1] + r[2, 2]
     x = real(1.0) + r[0, 0] - r[1, 1] - r[2, 2]
     y = real(1.0) - r[0, 0] + r[1, 1] - r[2, 2]
@@ -61,6 +60,11 @@ def quaternion(a: Triangle, b: Triangle):
         else:
             row = vec4(wz, xz, yz, z)
     return (HALF / wp.sqrt(wp.max(largest, real(2.220446049250313e-16)))) * row
+
+
+@wp.func
+def quaternion(a: Triangle, b: Triangle):
+    return quaternion_of(wp.outer(b.e1, a.e1) + wp.outer(b.e2, a.e2) + wp.outer(b.normal, a.normal))
 
 
 @wp.kernel(enable_backward=False)

@@ -1,0 +1,98 @@
+"""Key-frames brought into the frame, and shapes back on the course of the rigid motion."""
+
+import warp as wp
+
+from torch_modal.geometry import rotations
+from torch_modal.nn.kernels.elements import real, vec3
+from torch_modal.nn.kernels.rotations import half_turn, quaternion_of, turned
+
+SIDE = wp.constant(vec3(*rotations.HALF_TURN_SIDE))
+WITHIN = wp.constant(real(rotations.HALF_TURN * 2.220446049250313e-16))
+
+
+@wp.kernel(enable_backward=False)
+def moments(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    weights: wp.array(dtype=real),
+    n: int,
+    a: wp.array(dtype=vec3),
+    b: wp.array(dtype=vec3),
+):
+    """Weighted sums of the vertices of both ends."""
+    s, i = wp.tid()
+    wp.atomic_add(a, s, weights[i] * first[s * n + i])
+    wp.atomic_add(b, s, weights[i] * second[s * n + i])
+
+
+@wp.kernel(enable_backward=False)
+def covariances(
+    first: wp.array(dtype=vec3),
+    second: wp.array(dtype=vec3),
+    reference: wp.array(dtype=vec3),
+    weights: wp.array(dtype=real),
+    a: wp.array(dtype=vec3),
+    b: wp.array(dtype=vec3),
+    n: int,
+    found: wp.array(dtype=wp.mat33d),
+):
+    """Of the reference with the first end, and of the first with the second, about their centroids."""
+    s, i = wp.tid()
+    x = weights[i] * (first[s * n + i] - a[s])
+    wp.atomic_add(found, 2 * s, wp.outer(reference[i], x))
+    wp.atomic_add(found, 2 * s + 1, wp.outer(x, second[s * n + i] - b[s]))
+
+
+@wp.kernel(enable_backward=False)
+def carried(
+    x: wp.array(dtype=vec3),
+    centre: wp.array(dtype=vec3),
+    turn: wp.array(dtype=wp.mat33d),
+    target: wp.array(dtype=vec3),
+    n: int,
+    out: wp.array(dtype=vec3),
+    highest: wp.array(dtype=vec3),
+    lowest: wp.array(dtype=vec3),
+):
+    """``turn (x - centre) + target``, and how far that reaches, where there is room for it."""
+    s, i = wp.tid()
+    found = turn[s] * (x[s * n + i] - centre[s]) + target[s]
+    out[s * n + i] = found
+    if highest:
+        wp.atomic_max(highest, s, found)
+        wp.atomic_min(lowest, s, found)
+
+
+@wp.kernel(enable_backward=False)
+def course(
+    time: wp.array(dtype=real),
+    rotation: wp.array(dtype=wp.mat33d),
+    source: wp.array(dtype=vec3),
+    target: wp.array(dtype=vec3),
+    placed: wp.array(dtype=wp.mat33d),
+    placed_source: wp.array(dtype=vec3),
+    placed_target: wp.array(dtype=vec3),
+    scale: wp.array(dtype=real),
+    turn: wp.array(dtype=wp.mat33d),
+    moved: wp.array(dtype=vec3),
+):
+    """The way back to the caller at a time of the geodesic: see frame.Alignment.restore and rotations.log."""
+    s = wp.tid()
+    t = time[s]
+    q = quaternion_of(rotation[s])
+    axis = vec3(q[1], q[2], q[3])
+    side = q[0]
+    if wp.abs(q[0]) <= WITHIN:
+        side = wp.dot(SIDE, axis)
+    if side < real(0.0):
+        q = -q
+    half = t * half_turn(q)
+    columns = wp.matrix_from_cols(
+        turned(half, vec3(real(1.0), real(0.0), real(0.0))),
+        turned(half, vec3(real(0.0), real(1.0), real(0.0))),
+        turned(half, vec3(real(0.0), real(0.0), real(1.0))),
+    )
+    back = wp.transpose(placed[s])
+    turn[s] = (back * columns) / scale[0]
+    there = (source[s] + t * (target[s] - source[s])) / scale[0]
+    moved[s] = back * (there - placed_target[s]) + placed_source[s]
