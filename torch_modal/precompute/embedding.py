@@ -7,6 +7,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
@@ -134,7 +135,7 @@ def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
         n_candidates = min(n_candidates, len(centroids))
         outside = []
         for chunk in _chunks(left):
-            tets = tree.query(points[chunk], k=n_candidates)[1].reshape(len(chunk), n_candidates)
+            tets = closest_in(tree, points[chunk], n_candidates)[1].reshape(len(chunk), n_candidates)
             offset = points[chunk, None] - centroids[tets]
             barycentric = 0.25 + (gradients[tets] @ offset[..., None])[..., 0]
             inside = (barycentric * heights[tets]).min(axis=2)  # signed distance to the face it is most outside of
@@ -179,7 +180,10 @@ def _nearest_reached(
     padded[np.arange(width) < sizes[:, None]] = around.indices
 
     index = padded[row_of_point.reshape(-1)]
-    squared = ((points[:, None] - tetrahedra.vertices[index]) ** 2).sum(axis=2)
+    # Coordinate by coordinate: a third of the time of sums over three neighbours in memory.
+    squared = np.zeros(index.shape)
+    for place, vertex in zip(points.T, tetrahedra.vertices.T.copy(), strict=True):
+        squared += (place[:, None] - vertex[index]) ** 2
     squared[index < 0] = np.inf
     order = np.argpartition(squared, N_NEIGHBOURS, axis=1)[:, : N_NEIGHBOURS + 1]
     squared = np.take_along_axis(squared, order, axis=1)

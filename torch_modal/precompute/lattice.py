@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
 from torch_modal.precompute.bisection import halved
+from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.proximity import Clearance, clearances
 from torch_modal.precompute.sampling import Samples, sampled
 from torch_modal.precompute.surface import DIAGONAL, Surface
@@ -110,7 +111,7 @@ class Indicator(NamedTuple):
         """Linear between the points of the grid, and sharper near the surface. *Shape:* ``(P, 3) -> (P,)``."""
         values = self._by_grid(points)
         doubtful = np.flatnonzero(values < SURELY_INSIDE)
-        distance, nearest = self.samples.tree.query(points[doubtful], distance_upper_bound=NEARBY * self.spacing)
+        distance, nearest = closest_in(self.samples.tree, points[doubtful], within=NEARBY * self.spacing)
         # Beyond the rim of an open surface there are no sides.
         near = np.isfinite(distance) & np.append(self.has_sides, False)[nearest]
         doubtful, nearest = doubtful[near], nearest[near]
@@ -204,7 +205,7 @@ def is_resolved(tetrahedra: Tetrahedra, surface: Surface, clearance: Clearance) 
     if not _n_apart(surface, piece, areas) <= n_filled <= piece.max() + 1:
         return False  # pieces were fused, or parts have come off, or hang on an edge
     sizes = _sizes_at_vertices(tetrahedra)
-    nearest = cKDTree(tetrahedra.vertices).query(surface.points[surface.faces].mean(axis=1))[1]
+    nearest = closest_in(cKDTree(tetrahedra.vertices), surface.points[surface.faces].mean(axis=1))[1]
     coarse = sizes[nearest] > COARSEST * clearance.thickness
     return bool(areas[coarse].sum() <= MOST_COARSE * areas.sum()) and not _has_wire(surface, clearance)
 
@@ -267,7 +268,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     samples = indicator.samples
     volumes, sizes = tet_volumes(filled), _sizes_at_vertices(filled)
     rim = np.unique(filled.tets[np.asarray(filled.inside) < 1 - LEAST_INSIDE])
-    distance, nearest = samples.tree.query(filled.vertices[rim])
+    distance, nearest = closest_in(samples.tree, filled.vertices[rim])
     near = distance < REACH * sizes[rim]
     rim, nearest = rim[near], nearest[near]
     height = np.einsum("vi,vi->v", filled.vertices[rim] - samples.points[nearest], samples.normals[nearest])
@@ -280,11 +281,11 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
         part = 1.0 if retreat >= MOST_RETREATS // 2 else 0.5
         vertices[bad] += part * (filled.vertices[bad] - vertices[bad])
         retreated[bad] = True
-    retreated &= indicator.at(vertices) < 0.5
+    placed = indicator.at(vertices) >= 0.5
+    retreated &= ~placed
     inside = indicator.inside(vertices[filled.tets])
     kept = inside >= FITTED_INSIDE
     # The indicator rises over a cube's fraction. Of a tetrahedron with no corner outside, all is inside.
-    placed = indicator.at(vertices) >= 0.5
     placed[rim[(vertices[rim] != filled.vertices[rim]).any(axis=1)]] = True
     placed[retreated] = False
     inside[placed[filled.tets].all(axis=1)] = 1.0
@@ -296,7 +297,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():
         return filled
     reach = 1.5 * sizes[filled.tets].max(axis=1).max()
-    is_covered = cKDTree(fitted.vertices).query(samples.points, distance_upper_bound=reach)[0] < np.inf
+    is_covered = closest_in(cKDTree(fitted.vertices), samples.points, within=reach)[0] < np.inf
     return fitted if is_covered.all() else filled
 
 

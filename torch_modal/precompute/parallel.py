@@ -7,9 +7,15 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
 Result = TypeVar("Result")
+
+MANY = 500
+"""Points from which on a search of a tree is worth threads."""
 
 
 class StoppedError(Exception):
@@ -86,6 +92,18 @@ def one_blas_thread() -> Iterator[None]:
                 # Later versions of threadpoolctl obey the thread alone that came first, unless it is told off.
                 getattr(OpenBLASController, "clear_controlling_thread", lambda **_: None)(force=True)
                 _Inside.limits.__exit__(None, None, None)
+
+
+def closest_in(
+    tree: cKDTree, points: NDArray[np.float64], k: int = 1, within: float = np.inf
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Distances and indices of what is nearest in a tree, by all processors where there are many points.
+
+    *Shape:* ``(n, 3) -> (n,), (n,)``, or ``(n, k), (n, k)``. What is not within the distance has the index ``tree.n``.
+    """
+    n_threads = n_cpus() if len(points) >= MANY else 1
+    distance, index = tree.query(points, k=k, distance_upper_bound=within, workers=n_threads)
+    return distance, index
 
 
 class Budget:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.sampling import Samples, sampled
 from torch_modal.precompute.surface import DIAGONAL, Surface
 
@@ -69,7 +70,7 @@ def _opposed_part(surface: Surface, distances: FloatArray) -> float:
     tree = cKDTree(points)
     opposed = np.zeros(len(points), dtype=bool)
     for distance in distances:
-        nearest = tree.query(points + distance * normals)[1]
+        nearest = closest_in(tree, points + distance * normals)[1]
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
@@ -93,7 +94,7 @@ def _opposed_radius(samples: Samples, side: float, seen: IntArray, most: float) 
     left, radius = np.arange(len(seen)), np.full(len(seen), most)
     for _ in range(MOST_SHRINKINGS):
         point, direction = samples.points[seen[left]], side * samples.normals[seen[left]]
-        nearest = samples.tree.query(point + radius[:, None] * direction)[1]
+        nearest = closest_in(samples.tree, point + radius[:, None] * direction)[1]
         across = samples.points[nearest] - point
         height = np.einsum("vi,vi->v", across, direction)
         smaller = np.einsum("vi,vi->v", across, across) / (2 * np.maximum(height, 1e-300))

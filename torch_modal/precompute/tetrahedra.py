@@ -191,21 +191,23 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
         return tetrahedra
     piece = pieces_by_sides(tets)
     volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
-    users = np.unique(np.stack([tets.reshape(-1), np.repeat(piece, 4)], axis=1), axis=0)
-    hinge = np.bincount(users[:, 0])[users[:, 0]] > 1  # a vertex of two pieces or more
-    hangs = np.bincount(users[:, 1], hinge, len(volumes)) > 0
+    vertex, user = np.divmod(np.unique(tets.reshape(-1) * len(volumes) + np.repeat(piece, 4)), len(volumes))
+    hinge = np.bincount(vertex)[vertex] > 1  # a vertex of two pieces or more
+    hangs = np.bincount(user, hinge, len(volumes)) > 0
     debris = hangs & (volumes < DEBRIS * volumes.sum())
     return _kept(tetrahedra, ~debris[piece])
 
 
 def pieces_by_sides(tets: IntArray) -> IntArray:
     """Which piece each tetrahedron belongs to; those that share a side are in one. *Shape:* ``(T, 4) -> (T,)``."""
-    sides = np.sort(np.concatenate([tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
-    owner = np.tile(np.arange(len(tets)), 4)
-    order = np.lexsort(sides.T)
-    shared = (np.diff(sides[order], axis=0) == 0).all(axis=1)
-    pairs = np.stack([owner[order][:-1][shared], owner[order][1:][shared]], axis=1)
-    return connected_pieces(pairs, len(tets))
+    a, b, c, d = np.sort(tets, axis=1).T
+    n = tets.max(initial=0) + 1
+    # Three vertices as one number, which two million of them do not overflow.
+    sides = np.concatenate([(p * n + q) * n + r for p, q, r in ((b, c, d), (a, c, d), (a, b, d), (a, b, c))])
+    order = np.argsort(sides)
+    shared = np.diff(sides[order]) == 0
+    owner = order % max(len(tets), 1)
+    return connected_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
 
 
 def _kept(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:
