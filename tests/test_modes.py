@@ -3,6 +3,7 @@
 import threading
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from solids import box, surface, together
 
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.precompute import filling, lanczos, parallel, solving
-from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
+from torch_modal.precompute.eigen import ENOUGH, EXACT, ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, lumped_mass, mass_matrix
@@ -48,7 +49,7 @@ def test_modes_of_a_meshed_surface(form: str, capsule_tetrahedra: Tetrahedra) ->
     np.testing.assert_allclose(phi.T @ (m @ phi), np.eye(20), atol=1e-12)
     force = (m @ phi) * lam
     residual = np.linalg.norm(k @ phi - force, axis=0) / np.linalg.norm(force, axis=0)
-    assert residual.max() < 1e-8
+    assert residual.max() < EXACT
     assert result.residual == pytest.approx(residual.max(), rel=0.1)
     assert (np.diff(lam) >= 0).all()
     x = capsule_tetrahedra.vertices
@@ -56,6 +57,34 @@ def test_modes_of_a_meshed_surface(form: str, capsule_tetrahedra: Tetrahedra) ->
         for motion in (np.broadcast_to(axis, x.shape), np.cross(axis, x)):
             momentum = m @ motion.reshape(-1)
             assert np.abs(momentum @ phi).max() < 1e-12 * np.sqrt(momentum @ motion.reshape(-1))
+
+
+def test_what_in_betweens_need_costs_fewer_steps(
+    capsule_tetrahedra: Tetrahedra, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Modes of a residual of 1e-3 lie within 1e-4 of the space of the exact ones."""
+    solves = []
+    factored = lanczos.factored
+
+    def counted(*args: Any) -> Any:
+        vertices, solve = factored(*args)
+        solves.append(0)
+
+        def one(columns: np.ndarray) -> np.ndarray:
+            solves[-1] += 1
+            return solve(columns)
+
+        return vertices, one
+
+    monkeypatch.setattr(lanczos, "factored", counted)
+    k, mass = arap_hessian(capsule_tetrahedra), mass_matrix(capsule_tetrahedra)
+    exact, found = (lowest_modes(k, mass, capsule_tetrahedra.vertices, 30, tolerance) for tolerance in (EXACT, ENOUGH))
+    assert solves[1] < solves[0]
+    assert exact.residual < EXACT < found.residual < ENOUGH
+    np.testing.assert_allclose(found.eigenvalues, exact.eigenvalues, rtol=1e-6)
+    # The capsule's modes come in pairs: as a space, up to the last pair that may have been cut.
+    shares = np.linalg.svd(exact.modes.T @ (inertia(capsule_tetrahedra) @ found.modes[:, :29]))[1]
+    assert 1 - shares.min() ** 2 < 1e-8
 
 
 @pytest.mark.parametrize("form", HESSIAN_FORMS)
@@ -348,6 +377,12 @@ def test_impossible_numbers_of_modes(boxed: Mesh, n_modes: float) -> None:
 def test_unknown_form(boxed: Mesh) -> None:
     with pytest.raises(ValueError, match="'spokes'"):
         extract_modes(*boxed, 4, form="spokes")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1e-3, float("nan"), float("inf")])
+def test_impossible_tolerances(boxed: Mesh, tolerance: float) -> None:
+    with pytest.raises(ValueError, match=r"the tolerance is .*; give a positive number"):
+        extract_modes(*boxed, 4, tolerance=tolerance, cache=False)
 
 
 def test_the_bar_shows_only_on_request(boxed: Mesh, capsys: pytest.CaptureFixture[str]) -> None:

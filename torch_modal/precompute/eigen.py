@@ -19,10 +19,14 @@ GUARD = 4
 RIGID_TOLERANCE = 1e-5
 """Largest eigenvalue of a rigid motion, beside the first elastic one: 1e-13 as a rule, 1e-7 in a wire that is 300 times
 longer than wide."""
-RESIDUAL_TOLERANCE = 1e-6
-ROUNDED_TOLERANCE = 1e-3
-"""Accepted where further steps do not help: of wires and of flat tetrahedra that is the rounding of ``K phi``. It is of
-the highest frequencies, which ``K`` magnifies, and there is next to none of it in the modes."""
+EXACT = 1e-6
+"""Residual at which modes are as good as exact."""
+ENOUGH = 1e-3
+"""Residual that in-betweens do not notice. It is of the highest frequencies, which ``K`` magnifies, and there is next
+to none of it in the modes: they lie within 1e-4 of the space of the exact ones. It is accepted whatever was asked for
+where further steps do not help: of wires and of flat tetrahedra it is the rounding of ``K phi``."""
+INVERTED = 0.3
+"""Residual of the inverted problem, over that of the modes, from which on it is worth a look at these."""
 SHIFT = 1.0
 """Negative shift in units of 1 / (bounding-box diagonal)²; the lowest modes of slender bodies lie near it."""
 ZERO = 1e-9
@@ -72,7 +76,13 @@ def rigid_motions(positions: FloatArray, mass: Mass) -> FloatArray:
 
 
 @one_blas_thread()
-def lowest_modes(k: sp.csc_matrix, mass: FloatArray | sp.spmatrix, positions: FloatArray, n_modes: int) -> VolumeModes:
+def lowest_modes(
+    k: sp.csc_matrix,
+    mass: FloatArray | sp.spmatrix,
+    positions: FloatArray,
+    n_modes: int,
+    tolerance: float = EXACT,
+) -> VolumeModes:
     """Lowest elastic modes of ``K phi = lambda M phi``.
 
     Shift-invert block Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are
@@ -86,6 +96,7 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray | sp.spmatrix, positions: Fl
         mass: Mass of each vertex, positive, or a mass matrix for vertices. *Shape:* ``(N,)`` or ``(N, N)``.
         positions: Rest positions. *Shape:* ``(N, 3)``.
         n_modes: Number of elastic modes.
+        tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` at which Lanczos ends.
 
     Returns:
         The modes. Zero modes beyond the six (loose components) stay in as the first of them.
@@ -105,16 +116,22 @@ def lowest_modes(k: sp.csc_matrix, mass: FloatArray | sp.spmatrix, positions: Fl
     if not (has_mass := inertia.lumped() > 0).all():
         raise ModalAnalysisError(f"{int((~has_mass).sum())} vertices have no mass; remove unused vertices first")
     n_pairs = min(n_modes + N_RIGID + GUARD, k.shape[0])
-    spans = lowest_spans(k, inertia, n_pairs, SHIFT / _squared_diagonal(positions))
+    spans = lowest_spans(k, inertia, n_pairs, SHIFT / _squared_diagonal(positions), INVERTED * tolerance)
     rigid = rigid_motions(positions, inertia)
     while (span := _next_of(spans)) is not None:
-        found = _modes_in_span(k, inertia, positions, span, rigid, n_modes)
-        if found.residual < RESIDUAL_TOLERANCE:
+        found, first_elastic = _modes_in_span(k, inertia, positions, span, rigid, n_modes)
+        not_rigid = float(np.abs(found.rigid_eigenvalues).max())
+        if found.residual < tolerance and not_rigid < RIGID_TOLERANCE * first_elastic:
             return found
-    if found.residual < ROUNDED_TOLERANCE:
+    if not not_rigid < RIGID_TOLERANCE * first_elastic:
+        raise ModalAnalysisError(
+            f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero beside the first elastic "
+            f"one, {first_elastic:.2e}; the tetrahedra are degenerate"
+        )
+    if found.residual < ENOUGH:
         return found
     raise ModalAnalysisError(
-        f"the modes leave a relative residual of {found.residual:.2e} (allowed: {RESIDUAL_TOLERANCE:g}), and further "
+        f"the modes leave a relative residual of {found.residual:.2e} (allowed: {ENOUGH:g}), and further "
         "steps do not help; the tetrahedra are likely degenerate"
     )
 
@@ -129,9 +146,9 @@ def _next_of(spans: Iterator[FloatArray]) -> FloatArray | None:
 
 def _modes_in_span(
     k: sp.csc_matrix, mass: Mass, positions: FloatArray, span: FloatArray, rigid: FloatArray, n_modes: int
-) -> VolumeModes:
-    """The lowest elastic modes that a span holds, and their residual."""
-    rigid_eigenvalues = _rayleigh_ritz(k, span)[0][:N_RIGID]
+) -> tuple[VolumeModes, float]:
+    """The lowest elastic modes that a span holds, and the first eigenvalue that is not zero."""
+    rigid_eigenvalues = _rayleigh_ritz(span, k @ span)[0][:N_RIGID]
 
     # The rigid part is taken out exactly: six directions of the span lose all their length, and are left
     # behind.
@@ -140,29 +157,31 @@ def _modes_in_span(
     lengths, directions = np.linalg.eigh(elastic.T @ (mass @ elastic))
     elastic = elastic @ (directions / np.sqrt(np.maximum(lengths, np.finfo(np.float64).tiny)))[:, N_RIGID:]
     elastic -= rigid @ (moved.T @ elastic)
-    eigenvalues, modes = _rayleigh_ritz(k, mass.orthonormal(elastic)[0])
+    elastic = mass.orthonormal(elastic)[0]
+    forces = k @ elastic
+    eigenvalues, rotation = _rayleigh_ritz(elastic, forces)
 
     first_elastic, n_zero = _count_zeros(eigenvalues, positions)
-    if not np.abs(rigid_eigenvalues).max() < RIGID_TOLERANCE * first_elastic:
-        raise ModalAnalysisError(
-            f"the six rigid motions have eigenvalues up to {np.abs(rigid_eigenvalues).max():.2e}, which is "
-            f"not zero beside the first elastic one, {first_elastic:.2e}; the tetrahedra are degenerate"
-        )
-    eigenvalues, modes = eigenvalues[:n_modes], modes[:, :n_modes]
-    residual = relative_residual(k, mass, eigenvalues, modes, first_elastic)
+    eigenvalues, rotation = eigenvalues[:n_modes], rotation[:, :n_modes]
+    modes = elastic @ rotation
+    residual = relative_residual(forces @ rotation, mass @ modes, eigenvalues, first_elastic)
     # Zero modes of loose pieces come out as -1e-13 as well as 1e-13; nobody should meet the root of that.
-    return VolumeModes(np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, n_zero, residual)
+    found = VolumeModes(np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, n_zero, residual)
+    return found, first_elastic
 
 
-def relative_residual(
-    k: sp.csc_matrix, mass: Mass, eigenvalues: FloatArray, modes: FloatArray, smallest: float
-) -> float:
+def relative_residual(forces: FloatArray, inertia: FloatArray, eigenvalues: FloatArray, smallest: float) -> float:
     """Largest ``|K phi - lambda M phi| / (lambda |M phi|)``, Euclidean norms.
 
     A zero mode counts as if its eigenvalue were ``smallest``, the first that is not zero.
+
+    Args:
+        forces: ``K phi`` of each mode. *Shape:* ``(3N, k)``.
+        inertia: ``M phi``. *Shape:* ``(3N, k)``.
+        eigenvalues: *Shape:* ``(k,)``.
+        smallest: Above zero.
     """
-    inertia = mass @ modes
-    difference = np.linalg.norm(k @ modes - inertia * eigenvalues, axis=0)
+    difference = np.linalg.norm(forces - inertia * eigenvalues, axis=0)
     return float((difference / (np.maximum(eigenvalues, smallest) * np.linalg.norm(inertia, axis=0))).max())
 
 
@@ -199,8 +218,11 @@ def _squared_diagonal(positions: FloatArray) -> float:
     return float(((positions.max(axis=0) - positions.min(axis=0)) ** 2).sum())
 
 
-def _rayleigh_ritz(k: sp.csc_matrix, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues and eigenvectors of ``K`` within the span of an M-orthonormal basis."""
-    restricted = basis.T @ (k @ basis)
+def _rayleigh_ritz(basis: FloatArray, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues of ``K`` within the span of an M-orthonormal basis, and its eigenvectors in that basis.
+
+    *Shape:* ``(3N, k), (3N, k) -> (k,), (k, k)``; the second is ``K`` times the first.
+    """
+    restricted = basis.T @ forces
     values, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
-    return values, basis @ rotation
+    return values, rotation

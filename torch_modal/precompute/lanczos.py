@@ -21,17 +21,15 @@ DENSE_BELOW = 600
 BLOCK = 8
 """Vectors in one step. Solves for several at once are three times as fast, and an eigenvalue may have as many equal
 ones; a single starting vector meets only one of each (and the rest by rounding)."""
-TOLERANCE = 1e-8
-"""Residual of the inverted problem, relative to its eigenvalue, at which a span is first handed out."""
 FLOOR = 1e-14
-"""The same where nothing is left to gain."""
+"""Residual of the inverted problem, relative to its eigenvalue, where nothing is left to gain."""
 
 
 class NoConvergenceError(RuntimeError):
     """The iteration has used up its steps."""
 
 
-def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> Iterator[FloatArray]:
+def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, tolerance: float) -> Iterator[FloatArray]:
     """M-orthonormal bases of about the ``n_pairs`` lowest eigenvectors, each nearer to them than the one before.
 
     The iteration sees residuals of the inverted problem. What they amount to in ``K phi - lambda M phi`` depends on the
@@ -45,6 +43,7 @@ def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> It
         mass: M.
         n_pairs: How many.
         shift: Positive; ``K + shift M`` is factored, which is positive definite, where ``K`` is singular.
+        tolerance: Residual of the inverted problem, relative to its eigenvalue, at which the first is handed out.
 
     Yields:
         In ascending order of the eigenvalues; none after the one that rounding lets no further step improve.
@@ -56,7 +55,7 @@ def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> It
     graph = _vertex_graph(k)
     n_pieces, piece = connected_components(graph, directed=False)
     if n_pieces == 1:
-        yield from (vectors for _, vectors in _of_piece(k, graph, mass, n_pairs, shift))
+        yield from (vectors for _, vectors in _of_piece(k, graph, mass, n_pairs, shift, tolerance))
         return
     owned = [_of_coordinates(np.flatnonzero(piece == index)) for index in range(n_pieces)]
     rounds = [
@@ -66,6 +65,7 @@ def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> It
             mass.of_vertices(own[::3] // 3),
             min(n_pairs, len(own)),
             shift,
+            tolerance,
         )
         for own in owned
     ]
@@ -90,7 +90,9 @@ def _merged(found: list[Pairs], owned: list[IntArray], n: int, n_pairs: int) -> 
     return whole[:, order]
 
 
-def _of_piece(k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> Iterator[Pairs]:
+def _of_piece(
+    k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, tolerance: float
+) -> Iterator[Pairs]:
     """Ever better eigenvalues, ascending, and eigenvectors of a connected piece."""
     n = k.shape[0]
     if n < DENSE_BELOW or 2 * n_pairs > n:
@@ -98,7 +100,7 @@ def _of_piece(k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, 
         return
     vertices, solve = factored(k, graph, mass, shift)
     order = _of_coordinates(vertices)
-    for inverse, vectors in _block_lanczos(solve, mass.of_vertices(vertices), n_pairs):
+    for inverse, vectors in _block_lanczos(solve, mass.of_vertices(vertices), n_pairs, tolerance):
         restored = np.empty_like(vectors)
         restored[order] = vectors
         yield 1 / inverse - shift, restored
@@ -123,7 +125,9 @@ def _of_coordinates(vertices: IntArray) -> IntArray:
     return (3 * vertices[:, None] + np.arange(3)).reshape(-1)
 
 
-def _block_lanczos(solve: Callable[[FloatArray], FloatArray], mass: Mass, n_pairs: int) -> Iterator[Pairs]:
+def _block_lanczos(
+    solve: Callable[[FloatArray], FloatArray], mass: Mass, n_pairs: int, tolerance: float
+) -> Iterator[Pairs]:
     """Largest eigenvalues of ``A⁻¹ M``, descending, and their M-orthonormal eigenvectors, ever better.
 
     All vectors are kept, and each block is made M-orthogonal to all before it: a few hundred of them cost less than
@@ -133,6 +137,7 @@ def _block_lanczos(solve: Callable[[FloatArray], FloatArray], mass: Mass, n_pair
         solve: ``A⁻¹`` of several columns; ``A`` is symmetric positive definite.
         mass: M.
         n_pairs: How many.
+        tolerance: Residual, relative to the eigenvalue, at which the first are handed out.
     """
     n = 3 * mass.matrix.shape[0]
     most = min(n // BLOCK, 40 + n_pairs) * BLOCK
@@ -156,12 +161,12 @@ def _block_lanczos(solve: Callable[[FloatArray], FloatArray], mass: Mass, n_pair
         values, rotation = np.linalg.eigh(projected[:stop, :stop], UPLO="U")
         values, rotation = values[::-1][:n_pairs], rotation[:, ::-1][:, :n_pairs]
         worst = (np.linalg.norm(coupling @ rotation[start:stop], axis=0) / np.abs(values)).max()
-        if worst <= TOLERANCE:
+        if worst <= tolerance:
             yield values, basis[:, :stop] @ rotation
         if worst <= FLOOR:
             return
-        check_at = stop + 2 * BLOCK
-    if worst > TOLERANCE:
+        check_at = stop + BLOCK
+    if worst > tolerance:
         raise NoConvergenceError(
             f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns"
         )

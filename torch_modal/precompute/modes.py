@@ -10,7 +10,7 @@ from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.io.cache import Cache
 from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.eigen import N_RIGID
+from torch_modal.precompute.eigen import ENOUGH, N_RIGID
 from torch_modal.precompute.filling import MESHERS, Filler, Mesher
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
@@ -34,6 +34,7 @@ def extract_modes(
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
     mesher: Mesher = "auto",
+    tolerance: float = ENOUGH,
     timeout: float = 600.0,
     cache_dir: str | None = None,
     cache: bool = True,
@@ -49,6 +50,8 @@ def extract_modes(
         mesher: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts every surface;
             ``"tetwild"``; ``"auto"`` takes the first where it resolves the body, which is nearly always, the second
             for wires and walls that are too thin for it, and the first again where the second fails.
+        tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
+            more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
         timeout: Seconds that the child process of fTetWild may take.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
@@ -69,6 +72,7 @@ def extract_modes(
         form=form,
         settings=settings,
         mesher=mesher,
+        tolerance=tolerance,
         timeout=timeout,
         cache_dir=cache_dir,
         cache=cache,
@@ -84,6 +88,7 @@ def extract_bases(
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
     mesher: Mesher = "auto",
+    tolerance: float = ENOUGH,
     carry: bool = True,
     timeout: float = 600.0,
     cache_dir: str | None = None,
@@ -106,6 +111,8 @@ def extract_bases(
         mesher: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts every surface;
             ``"tetwild"``; ``"auto"`` takes the first where it resolves the body, which is nearly always, the second
             for wires and walls that are too thin for it, and the first again where the second fails.
+        tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
+            more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
         carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each has its own.
         timeout: Seconds that the child process of fTetWild may take for a key-frame.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
@@ -130,6 +137,8 @@ def extract_bases(
         raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
     if mesher not in MESHERS:
         raise ValueError(f"the mesher is {mesher!r}; give one of {MESHERS}")
+    if not 0 < tolerance < np.inf:
+        raise ValueError(f"the tolerance is {tolerance!r}; give a positive number, {ENOUGH:g} by default")
     positions, working_faces = check_keyframes(keyframes, faces)
     shapes = positions.detach().cpu().double().numpy()
     triangles = working_faces.cpu().numpy()
@@ -148,7 +157,7 @@ def extract_bases(
                 raise StoppedError
             bar.describe(f"key-frame {index + 1}/{len(shapes)}: {stage}")
 
-        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, report, bar.update)
+        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, report, bar.update)
         solved = work.solve_carried() if carry and len(shapes) > 1 else work.solve_each()
     for index, one in enumerate(solved):
         _warn(f"key-frame {index}: " if len(shapes) > 1 else "", one)

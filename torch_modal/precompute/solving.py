@@ -52,6 +52,7 @@ class KeyframeSet:
         filler: Gives them tetrahedra.
         n_modes: Number of elastic modes of each.
         form: Form of the Hessian.
+        tolerance: Residual of the modes.
         report: Called with the index of a key-frame and the stage that it enters.
         done: Called twice for each key-frame: when it has its tetrahedra, and when it has its modes.
     """
@@ -61,6 +62,7 @@ class KeyframeSet:
     filler: Filler
     n_modes: int
     form: HessianForm
+    tolerance: float
     report: Callable[[int, str], None]
     done: Callable[[], object]
     _memory: Budget = field(default_factory=lambda: Budget(VERTICES_AT_ONCE))
@@ -101,7 +103,7 @@ class KeyframeSet:
         """The modes of a key-frame."""
         with self._naming(index), self._memory.part(len(filling.tetrahedra.vertices)):
             self.report(index, "modes")
-            solved = solve(self.n_vertices, filling, self.n_modes, self.form, self.filler.cache)
+            solved = solve(self.n_vertices, filling, self.n_modes, self.form, self.tolerance, self.filler.cache)
         self.done()
         return solved
 
@@ -120,7 +122,7 @@ def naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
         raise type(error)(f"key-frame {index}: {error}") from error
 
 
-def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, cache: Cache) -> Solved:
+def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, tolerance: float, cache: Cache) -> Solved:
     """Modes of the tetrahedra, restricted to the surface, in the caller's units.
 
     Args:
@@ -128,6 +130,7 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, ca
         filling: Its tetrahedra.
         n_modes: Number of elastic modes.
         form: Form of the Hessian.
+        tolerance: Residual of the modes, see :func:`~torch_modal.precompute.eigen.lowest_modes`.
         cache: Where modes are kept.
 
     Raises:
@@ -136,7 +139,7 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, ca
     tetrahedra, surface = filling.tetrahedra, filling.surface
 
     def compute() -> dict[str, NDArray[Any]]:
-        solid = lowest_modes(arap_hessian(tetrahedra, form), filling.mass(), tetrahedra.vertices, n_modes)
+        solid = lowest_modes(arap_hessian(tetrahedra, form), filling.mass(), tetrahedra.vertices, n_modes, tolerance)
         return {
             "eigenvalues": solid.eigenvalues,
             "modes": _restrict(filling.weights(), solid),
@@ -144,7 +147,9 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, ca
             "n_zero": np.array([solid.n_zero]),
         }
 
-    result = cache.get("modes", filling.content(), {"n_modes": int(n_modes), "form": form}, compute)
+    result = cache.get(
+        "modes", filling.content(), {"n_modes": int(n_modes), "form": form, "tolerance": float(tolerance)}, compute
+    )
     modes = np.zeros((n_modes, n_vertices, 3))
     # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
     modes[:, surface.used] = result["modes"] * surface.scale**1.5

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.errors import MeshWarning
+from torch_modal.precompute.eigen import EXACT
 from torch_modal.precompute.modes import extract_modes
 
 GAP = 1e-3
@@ -65,7 +66,13 @@ def fixed_modes(
         # Rounding makes faces without area of small ones.
         warnings.simplefilter("ignore", MeshWarning)
         basis = extract_modes(
-            reference, faces, min(n_modes + SPARE, most), mesher="lattice", cache_dir=cache_dir, cache=cache
+            reference,
+            faces,
+            min(n_modes + SPARE, most),
+            mesher="lattice",
+            tolerance=EXACT,
+            cache_dir=cache_dir,
+            cache=cache,
         )
     if clusters is None:
         clusters = _clusters(basis.eigenvalues, n_modes)
