@@ -118,6 +118,24 @@ def test_import_loads_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
+def test_nothing_searches_for_garbage_while_names_are_loaded() -> None:
+    """Each search takes a tenth of a second with torch there; afterwards it is as it was before."""
+    code = (
+        "import gc, sys, torch, torch_modal as tm;"
+        "known, searches, during = len(sys.modules), [], [];"
+        "gc.callbacks.append(lambda phase, info: searches.append(len(sys.modules)));"
+        "gc.set_threshold(50);"
+        "tm.subdivide;"
+        "during = [n for n in searches if known < n < len(sys.modules)];"
+        "on = gc.isenabled(); gc.disable(); tm.ShapeDataset;"
+        "print(len(sys.modules) > known + 50, during, on, gc.isenabled())"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120, cwd=PACKAGE.parent
+    )
+    assert result.stdout.split() == ["True", "[]", "True", "False"]
+
+
 def test_public_names_are_there() -> None:
     import torch_modal
 

@@ -1,10 +1,28 @@
-"""Packages that only some of the work needs: each belongs to an extra of this one."""
+"""Packages that are imported when they are needed: some of them belong to an extra of this one."""
 
+import gc
 import importlib
 import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from torch_modal.errors import MissingPackageError
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """No search for garbage inside: imports leave next to none, and a search goes through all that torch is made of.
+
+    That is a tenth of a second for each, and large packages bring it about once or twice.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def require(module: str, extra: str, what: str) -> Any:

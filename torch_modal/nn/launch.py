@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_modal.extras import require_installed
+from torch_modal.extras import require_installed, uncollected
 from torch_modal.progress import ProgressReport
 
 Backend = Literal["auto", "torch", "warp"]
@@ -22,13 +22,15 @@ Backend = Literal["auto", "torch", "warp"]
 @cache
 def kernels(name: Literal["alignment", "shell", "modal", "steps", "steps_adjoint", "rotations"]) -> Any:
     """A module of :mod:`torch_modal.nn.kernels`, compiled by the first who asks on a machine, and kept by Warp."""
-    import warp as wp
+    with uncollected():
+        import warp as wp
+
+        module = importlib.import_module(f"torch_modal.nn.kernels.{name}")
 
     before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
     try:
         with nullcontext() if torch.cuda.is_available() else _silent():
             wp.init()
-        module = importlib.import_module(f"torch_modal.nn.kernels.{name}")
         with ProgressReport(1, "kernels, which are compiled once", unit="module"):
             wp.load_module(module, device="cpu")
     finally:
