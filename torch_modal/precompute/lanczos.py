@@ -115,8 +115,9 @@ def factored(
     """
     vertices = _elimination_order(graph)
     order = _of_coordinates(vertices)
-    shifted = k[order][:, order] + shift * mass.of_vertices(vertices).for_coordinates()
-    factors = factorize(shifted, "NATURAL")
+    # Symmetric, so it may be turned over: that sorts it, in a fraction of the time of sorting.
+    permuted = k[order][:, order].tocsr().T
+    factors = factorize(permuted + shift * mass.of_vertices(vertices).for_coordinates(), "NATURAL")
     return vertices, factors.solve
 
 
@@ -174,10 +175,9 @@ def _block_lanczos(
 
 def _vertex_graph(k: sp.csc_matrix) -> sp.csc_matrix:
     """Which vertices ``K`` couples, from its three unknowns for each. *Shape:* ``(N, N)``."""
-    entries = k.tocoo()
+    blocks = k.T.tobsr((3, 3))
     n = k.shape[0] // 3
-    graph = sp.coo_matrix((np.ones(len(entries.row)), (entries.row // 3, entries.col // 3)), shape=(n, n))
-    return sp.csc_matrix(graph)
+    return sp.csc_matrix((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr), shape=(n, n))
 
 
 def _elimination_order(graph: sp.csc_matrix) -> IntArray:

@@ -101,22 +101,17 @@ def _element_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
 
 
 _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-_STRAINS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 
 
 def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
-    """``K = 2 (A B)ᵀ (A B)``: strains ``B`` of the tetrahedra, and their means ``A`` around each edge."""
+    """Blocks ``K_ab = sum_e vol_e ((g_a · g_b) I + g_b g_aᵀ)`` with the mean gradients ``g`` around each edge.
+
+    As in the element form; all ``g_a g_bᵀ`` at once are a product of a sparse matrix with itself.
+    """
     n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
-    g = hat_gradients(tetrahedra)
-    # Six components, of which the sum of squares is |sym ∇u|².
-    strains = np.zeros((t, 6, 4, 3))
-    for row, (i, j) in enumerate(_STRAINS):
-        strains[:, row, :, j] += np.sqrt(0.5) * g[:, :, i] if i != j else g[:, :, i]
-        if i != j:
-            strains[:, row, :, i] += np.sqrt(0.5) * g[:, :, j]
-    columns = np.broadcast_to(3 * tetrahedra.tets[:, None, :, None] + np.arange(3), strains.shape)
-    starts = 12 * np.arange(6 * t + 1)
-    b = sp.csr_matrix((strains.reshape(-1), columns.reshape(-1), starts), shape=(6 * t, 3 * n))
+    columns = 3 * tetrahedra.tets[:, :, None] + np.arange(3)
+    starts = 12 * np.arange(t + 1)
+    gradients = sp.csr_matrix((hat_gradients(tetrahedra).reshape(-1), columns.reshape(-1), starts), shape=(t, 3 * n))
 
     ends = np.sort(np.concatenate([tetrahedra.tets[:, pair] for pair in _EDGES]), axis=1)
     edge = np.unique(ends[:, 0] * n + ends[:, 1], return_inverse=True)[1].reshape(-1)
@@ -124,9 +119,13 @@ def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     volumes = np.bincount(edge, shares)
     # Scaled by the root of the edge's volume, so that the product below needs no further weights.
     means = sp.csr_matrix((shares / np.sqrt(volumes[edge]), (edge, np.tile(np.arange(t), 6))), shape=(len(volumes), t))
-    averaged = sp.kron(means, sp.identity(6), format="csr") @ b
-    k = 2 * (averaged.T @ averaged)
-    return sp.csc_matrix((k + k.T) / 2)  # symmetric to the last bit
+    averaged = means @ gradients
+    averaged.sort_indices()  # so that sums have one order, and the product is symmetric to the last bit
+    products = (averaged.T @ averaged).tobsr((3, 3))
+    blocks = products.data.transpose(0, 2, 1) + np.trace(products.data, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    k = sp.bsr_matrix((blocks, products.indices, products.indptr), shape=products.shape).tocsr()
+    k.sort_indices()
+    return k.T  # as columns, which it is equal to
 
 
 def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
