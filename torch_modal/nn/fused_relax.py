@@ -51,8 +51,10 @@ class FusedRelax(FusedShell):
         if traced(x):
             return self.oracle(n_steps, n_products, x, first, second, t, *stiffness)
         given = [value.double() for value in (x, first, second, t, *stiffness)]
+        # What fits into a cache is kept for the way back; of more, the steps are taken once more.
+        keep = torch.is_grad_enabled() and len(x) <= chunk
         parts = [
-            applied(_Relaxed, self, n_steps, n_products, *(value[i : i + chunk] for value in given))[0]
+            applied(_Relaxed, self, n_steps, n_products, [] if keep else None, *(v[i : i + chunk] for v in given))[0]
             for i in range(0, len(x), chunk)
         ]
         return torch.cat(parts).to(x)
@@ -64,13 +66,26 @@ class FusedRelax(FusedShell):
         return relax(self.energy, x, self.energy.between(one, other, t, stiffness), n_steps, n_products)
 
     # -------------------------------------------------------------------------------------------------------- the steps
-    def steps(self, n_steps: int, n_products: int, x: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
-        """The steps, and the length of each: nothing is recorded. *Shape:* ``(B, V, 3), (n_steps, B)``."""
+    def steps(
+        self, n_steps: int, n_products: int, x: Tensor, *rest: Tensor, kept: "list[_Taken] | None" = None
+    ) -> tuple[Tensor, Tensor]:
+        """The steps, and the length of each: nothing is recorded. *Shape:* ``(B, V, 3), (n_steps, B)``.
+
+        Args:
+            n_steps: How many.
+            n_products: Of each.
+            x: Where they start. *Shape:* ``(B, V, 3)``.
+            rest: What :meth:`reference` takes.
+            kept: Receives what the way back needs.
+        """
         to = self.reference(*rest)
         lengths = x.new_zeros(n_steps, len(x))
         at = self.at(x, to)
         for k in range(n_steps):
-            solution, reached = self._solved(x, at, to, n_products)[:2]
+            done = self._solved(x, at, to, n_products, keep=kept is not None)
+            solution, reached = done.solution, done.reached
+            if kept is not None:
+                kept.append(_Taken(x, at, done))
             # The whole step, linearised at once for the next one, is nearly always the one that is taken.
             if k < n_steps - 1:
                 there = self.at(reached, to)
@@ -132,7 +147,14 @@ class FusedRelax(FusedShell):
 
     # -------------------------------------------------------------------------------------------------- and back again
     def pull_back(
-        self, n_products: int, lengths: Tensor, to_x: Tensor, x: Tensor, *rest: Tensor, needed: Sequence[bool]
+        self,
+        n_products: int,
+        lengths: Tensor,
+        to_x: Tensor,
+        x: Tensor,
+        *rest: Tensor,
+        needed: Sequence[bool],
+        kept: "list[_Taken]",
     ) -> tuple[Tensor | None, ...]:
         """Gradients in all that :meth:`steps` takes, of steps of known lengths.
 
@@ -143,20 +165,19 @@ class FusedRelax(FusedShell):
             x: Where the steps started. *Shape:* ``(B, V, 3)``.
             rest: What :meth:`reference` takes.
             needed: Which of all these need a gradient.
+            kept: What :meth:`steps` kept; if nothing, they are taken once more.
         """
         with torch.enable_grad():
             leaves = [value.detach().requires_grad_(need) for value, need in zip(rest, needed[1:], strict=True)]
             recorded = self.reference(*leaves)
         to = ShellReference(*(value.detach() for value in recorded))
-        taken = []
-        for length in lengths:
+        for length in [] if kept else lengths:
             at = self.at(x, to)
-            done = self._solved(x, at, to, n_products, keep=True)
-            taken.append((x, at, done))
-            x = x + length[:, None, None] * done.solution
+            kept = [*kept, _Taken(x, at, self._solved(x, at, to, n_products, keep=True))]
+            x = x + length[:, None, None] * kept[-1].done.solution
         to_reference = ShellReference(*(torch.zeros_like(value) for value in to))
-        for length, (x, at, done) in zip(lengths.flip(0), reversed(taken), strict=True):
-            to_x = self._step_back(x, at, to, done, to_x, length, to_reference)
+        for length, taken in zip(lengths.flip(0), reversed(kept), strict=True):
+            to_x = self._step_back(taken, to, to_x, length, to_reference)
         wanted = [leaf for leaf in leaves if leaf.requires_grad]
         if wanted:
             both = [pair for pair in zip(recorded, to_reference, strict=True) if pair[0].requires_grad]
@@ -166,15 +187,14 @@ class FusedRelax(FusedShell):
 
     def _step_back(
         self,
-        x: Tensor,
-        at: ShellPoint,
+        taken: "_Taken",
         to: ShellReference,
-        done: "_Iterations",
         to_reached: Tensor,
         length: Tensor,
         to_reference: ShellReference,
     ) -> Tensor:
         """The gradient where a step started, of that where it led; what the reference receives is added to its own."""
+        x, at, done = taken
         module, shell, (b, n) = kernels("steps_adjoint"), kernels("shell"), x.shape[:2]
         vertices, records = (b, n), (b, len(self.record))
         residuals, directions, products = (part.unbind() for part in done.kept)
@@ -252,35 +272,46 @@ class _Iterations(NamedTuple):
     """
 
 
+class _Taken(NamedTuple):
+    """A step."""
+
+    x: Tensor
+    """Where it started. *Shape:* ``(B, V, 3)``."""
+    at: ShellPoint
+    """The energy there, its diagonal inverted."""
+    done: _Iterations
+
+
 class _Relaxed(torch.autograd.Function):
-    """Fused steps. Backward takes them once more, recorded: nothing is kept in between but the input."""
+    """Fused steps. Where they are not kept (None), backward takes them once more."""
 
     @staticmethod
-    def forward(fused: FusedRelax, n_steps: int, n_products: int, *given: Tensor) -> tuple[Tensor, Tensor]:
-        return fused.steps(n_steps, n_products, *(value.detach().contiguous() for value in given))
+    def forward(
+        fused: FusedRelax, n_steps: int, n_products: int, kept: list[_Taken] | None, *given: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        return fused.steps(n_steps, n_products, *(value.detach().contiguous() for value in given), kept=kept)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        ctx.fused, ctx.n_steps, ctx.n_products, *given = inputs
+        ctx.fused, ctx.n_steps, ctx.n_products, ctx.kept, *given = inputs
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(output[1], *given)
 
     @staticmethod
     def backward(ctx: Any, to_shape: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         lengths, *given = ctx.saved_tensors
-        needed = ctx.needs_input_grad[3:]
+        needed = ctx.needs_input_grad[4:]
         if torch.is_grad_enabled():  # torch differentiates its own code once more
             run = partial(ctx.fused.oracle, ctx.n_steps, ctx.n_products)
-            return (None,) * 3 + pulled_back(run, given, to_shape, needed)
-        given = [value.detach().contiguous() for value in given]
-        found = ctx.fused.pull_back(ctx.n_products, lengths, to_shape.contiguous(), *given, needed=needed)
-        return None, None, None, *found
+            return (None,) * 4 + pulled_back(run, given, to_shape, needed)
+        given = [lengths, to_shape.contiguous(), *(value.detach().contiguous() for value in given)]
+        return (None,) * 4 + ctx.fused.pull_back(ctx.n_products, *given, needed=needed, kept=ctx.kept or [])
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], fused: FusedRelax, n_steps: int, n_products: int, *given: Tensor
+        info: Any, in_dims: tuple[Any, ...], fused: FusedRelax, n_steps: int, n_products: int, kept: Any, *given: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        flat = flattened(info.batch_size, in_dims[3:], given)
-        x, lengths = _Relaxed.apply(fused, n_steps, n_products, *flat)
+        flat = flattened(info.batch_size, in_dims[4:], given)
+        x, lengths = _Relaxed.apply(fused, n_steps, n_products, None, *flat)
         lengths = lengths.unflatten(1, (info.batch_size, -1))
         return (x.unflatten(0, (info.batch_size, -1)), lengths), (0, 1)
