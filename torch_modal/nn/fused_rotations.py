@@ -37,7 +37,7 @@ class FusedRotations(LocalRotations):
         if traced(first):
             return self.oracle(first, second, t)
         given = [value.double() for value in (first, second, t)]
-        return applied(_Turned, self, *given).to(first)
+        return applied(_Turned, self, *given)[0].to(first)
 
     def oracle(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
         """The same by torch."""
@@ -56,11 +56,28 @@ class FusedRotations(LocalRotations):
         launch(module.senses, (b,), given)
         return sign
 
-    def edges(self, sense: Tensor, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """Edge vectors where the senses are known. *Shape:* ``(3, B, E)``."""
-        b, n, n_edges = len(first), first.shape[1], len(self.per_length)
-        given = [first, second, t, self._face, self._edge_of, self._signs.double(), sense, n, n_edges, None]
-        return _means(*recorded(kernels("rotations").turned_edges, (b, len(self.faces)), {9: (b, n_edges, 4)}, *given))
+    def sums(self, sense: Tensor, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+        """Sides by area, summed on the edges, and areas, where the senses are known. *Shape:* ``(B, E, 4)``."""
+        total = first.new_zeros(len(first), len(self.per_length), 4)
+        launch(
+            kernels("rotations").turned_edges,
+            (len(first), len(self.faces)),
+            self._given(sense, first, second, t, total),
+        )
+        return total
+
+    def pull_back(self, to_total: Tensor, total: Tensor, sense: Tensor, *given: Tensor) -> list[Tensor]:
+        """Gradients in both shapes and the times, of that in the sums, which are spoilt."""
+        found = [torch.zeros_like(value) for value in given]
+        adjoints = [*found, *[None] * 6, to_total]
+        first, second, t = given
+        taken = self._given(sense, first, second, t, total)
+        launch(kernels("rotations").turned_edges, (len(sense), len(self.faces)), taken, adjoints)
+        return found
+
+    def _given(self, sense: Tensor, first: Tensor, second: Tensor, t: Tensor, total: Tensor) -> list[Any]:
+        signs, n, n_edges = self._signs.double(), first.shape[1], len(self.per_length)
+        return [first, second, t, self._face, self._edge_of, signs, sense, n, n_edges, total]
 
     def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
         """As the other's."""
@@ -122,27 +139,37 @@ class _OnCourse(torch.autograd.Function):
 
 
 class _Turned(torch.autograd.Function):
+    """Edges, and what the way back needs: the senses and the sums."""
+
     @staticmethod
-    def forward(fused: FusedRotations, *given: Tensor) -> Tensor:
+    def forward(fused: FusedRotations, *given: Tensor) -> tuple[Tensor, ...]:
         first, second, t = (value.detach().contiguous() for value in given)
-        return fused.edges(fused.sense(first, second), first, second, t)
+        sense = fused.sense(first, second)
+        total = fused.sums(sense, first, second, t)
+        return _means(total), sense, total
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.fused, *given = inputs
-        ctx.save_for_backward(*given)
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(*output[1:], *given)
 
     @staticmethod
-    def backward(ctx: Any, to_edges: Tensor) -> tuple[Tensor | None, ...]:
-        given = ctx.saved_tensors
+    def backward(ctx: Any, to_edges: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        sense, total, *given = ctx.saved_tensors
         if torch.is_grad_enabled():
-            run = ctx.fused.oracle
-        else:
-            given = [value.detach().contiguous() for value in given]
-            run = partial(ctx.fused.edges, ctx.fused.sense(*given[:2]))
-        return (None, *pulled_back(run, given, to_edges, ctx.needs_input_grad[1:]))
+            return (None, *pulled_back(ctx.fused.oracle, given, to_edges, ctx.needs_input_grad[1:]))
+        (to_total,) = pulled_back(_means, [total], to_edges, [True])
+        given = [value.detach().contiguous() for value in given]
+        return (None, *ctx.fused.pull_back(to_total.contiguous(), total.clone(), sense, *given))
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, *given: Tensor) -> tuple[Tensor, int]:
-        flat = flattened(info.batch_size, in_dims[1:], given)
-        return _Turned.apply(fused, *flat).unflatten(1, (info.batch_size, -1)), 1
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, *given: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        edges, sense, total = _Turned.apply(fused, *flattened(info.batch_size, in_dims[1:], given))
+        found = (
+            edges.unflatten(1, (info.batch_size, -1)),
+            *(x.unflatten(0, (info.batch_size, -1)) for x in (sense, total)),
+        )
+        return found, (1, 0, 0)
