@@ -134,7 +134,7 @@ class Between(nn.Module):
             report: Told how it went.
         """
         space, t = self.space, samples.t
-        pair, usable, fused = self._placed_by_kernels(samples) or self._placed_by_torch(samples)
+        pair, usable = self._placed_by_kernels(samples) or self._placed_by_torch(samples)
         usable, placed = trees.picked((usable, pair), samples.which)
         usable = usable & (t >= 0) & (t <= 1)
         if pair.around is not None and self.bare:
@@ -146,6 +146,7 @@ class Between(nn.Module):
             start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
             minimisation = self._minimisation(exact, problem.start is not None, report)
             x, solution = self.solved(Batch(problem, minimisation, start, usable, pair, samples, anchors))
+        fused = self.fused is not None and fused_alignment.serves(x, placed.first, t)
         shapes = (fused_alignment.restore if fused else Alignment.restore)(self.frame, x, placed, t)
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
@@ -288,12 +289,12 @@ class Between(nn.Module):
             return None
         return self.frame.bring(torch.cat(points).to(t).expand(len(t), -1, -1), placed, t)
 
-    def _placed_by_torch(self, samples: Samples) -> tuple[Pair, Tensor, bool]:
-        """The pairs in the frame, whether there is something between them, and that no kernel has placed them."""
+    def _placed_by_torch(self, samples: Samples) -> tuple[Pair, Tensor]:
+        """The pairs in the frame, and whether there is something between them."""
         pair, finite = self._placed(samples)
-        return pair, finite & self._solvable(pair), False
+        return pair, finite & self._solvable(pair)
 
-    def _placed_by_kernels(self, samples: Samples) -> tuple[Pair, Tensor, bool] | None:
+    def _placed_by_kernels(self, samples: Samples) -> tuple[Pair, Tensor] | None:
         """The same by kernels; None where they cannot."""
         x_a, x_b = samples.x_a, samples.x_b
         if self.fused is None or samples.spacing is not None or not fused_alignment.serves(x_a, x_b, samples.t):
@@ -306,7 +307,7 @@ class Between(nn.Module):
         if self.closed:
             _, volumes, _ = self.fused.sizes(pair.first, pair.second)
             usable = usable & ~(volumes.prod(-1) < 0)
-        return pair, usable, True
+        return pair, usable
 
     def _solvable(self, pair: Pair) -> Tensor:
         """Whether both ends have a size, and, where closed, the same side out: else the volume would vanish on the way.

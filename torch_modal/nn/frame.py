@@ -119,7 +119,7 @@ class Alignment(nn.Module):
         move = excess(pair.between.target - pair.between.source, moves[0], moves[1], wide, squared_length)
         return pair._replace(around=Around(before, after, spacing, turn, move))
 
-    def _motion(self, pair: Pair, t: Tensor) -> RigidMotion:
+    def motion(self, pair: Pair, t: Tensor) -> RigidMotion:
         """From the frame to the pose at the time ``t``, in its units."""
         straight = pair.between.fraction(t)
         if pair.around is None:
@@ -136,11 +136,11 @@ class Alignment(nn.Module):
             pair: The key-frames that they lie between.
             t: *Shape:* ``(B,)``.
         """
-        return pair.placed.inverse().apply(self._motion(pair, t).apply(x) / self.scale)
+        return pair.placed.inverse().apply(self.motion(pair, t).apply(x) / self.scale)
 
     def bring(self, points: Tensor, pair: Pair, t: Tensor) -> Tensor:
         """The inverse of :meth:`restore`, of points of the caller's. *Shape:* ``(B, P, 3), (B,) -> (B, P, 3)``."""
-        return self._motion(pair, t).inverse().apply(pair.placed.apply(points) * self.scale)
+        return self.motion(pair, t).inverse().apply(pair.placed.apply(points) * self.scale)
 
 
 class Coarse(nn.Module):

@@ -54,10 +54,17 @@ def place(frame: Alignment, x_a: Tensor, x_b: Tensor) -> tuple[Pair, Tensor] | N
 
 
 def restore(frame: Alignment, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
-    """As :meth:`torch_modal.nn.frame.Alignment.restore`, along the geodesic. *Shape:* ``(B, V, 3)``."""
+    """As :meth:`torch_modal.nn.frame.Alignment.restore`. *Shape:* ``(B, V, 3)``."""
     module, (b, n) = kernels("alignment"), x.shape[:2]
-    turn, moved, out = x.new_empty(b, 3, 3), x.new_empty(b, 3), torch.empty_like(x)
-    motions = [part.contiguous() for motion in (pair.between, pair.placed) for part in motion]
-    launch(module.course, (b,), [t.contiguous(), *motions, frame.scale.reshape(1), turn, moved])
-    launch(module.carried, (b, n), [x.contiguous(), motions[1], turn, moved, n, out, None, None])
+    out, placed = torch.empty_like(x, memory_format=torch.contiguous_format), pair.placed
+    if pair.around is None:
+        turn, moved, centre = x.new_empty(b, 3, 3), x.new_empty(b, 3), pair.between.source.contiguous()
+        motions = [part.contiguous() for motion in (pair.between, placed) for part in motion]
+        launch(module.course, (b,), [t.contiguous(), *motions, frame.scale.reshape(1), turn, moved])
+    else:
+        motion, back = frame.motion(pair, t), placed.rotation.mT
+        turn, centre = ((back @ motion.rotation) / frame.scale).contiguous(), motion.source.contiguous()
+        reached = motion.target / frame.scale - placed.target
+        moved = (back @ reached[..., None]).squeeze(-1) + placed.source
+    launch(module.carried, (b, n), [x.contiguous(), centre, turn, moved, n, out, None, None])
     return out

@@ -4,7 +4,7 @@ import warp as wp
 
 from torch_modal.geometry import rotations
 from torch_modal.nn.kernels.elements import real, vec3
-from torch_modal.nn.kernels.rotations import half_turn, quaternion_of, turned
+from torch_modal.nn.kernels.rotations import about, half_turn, quaternion_of, turned
 
 SIDE = wp.constant(vec3(*rotations.HALF_TURN_SIDE))
 WITHIN = wp.constant(real(rotations.HALF_TURN * 2.220446049250313e-16))
@@ -86,13 +86,13 @@ def course(
         side = wp.dot(SIDE, axis)
     if side < real(0.0):
         q = -q
-    half = t * half_turn(q)
+    there = about(t * half_turn(q))
     columns = wp.matrix_from_cols(
-        turned(half, vec3(real(1.0), real(0.0), real(0.0))),
-        turned(half, vec3(real(0.0), real(1.0), real(0.0))),
-        turned(half, vec3(real(0.0), real(0.0), real(1.0))),
+        turned(there, vec3(real(1.0), real(0.0), real(0.0))),
+        turned(there, vec3(real(0.0), real(1.0), real(0.0))),
+        turned(there, vec3(real(0.0), real(0.0), real(1.0))),
     )
     back = wp.transpose(placed[s])
     turn[s] = (back * columns) / scale[0]
-    there = (source[s] + t * (target[s] - source[s])) / scale[0]
-    moved[s] = back * (there - placed_target[s]) + placed_source[s]
+    reached = (source[s] + t * (target[s] - source[s])) / scale[0]
+    moved[s] = back * (reached - placed_target[s]) + placed_source[s]

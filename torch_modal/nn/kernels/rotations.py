@@ -166,10 +166,16 @@ def add_sides(total: wp.array(dtype=vec4), edge: int, e: wp.vec3i, g: vec3, area
 
 
 @wp.func
-def turned(half: vec3, v: vec3):
-    """A vector turned about an axis by twice its length."""
+def about(half: vec3):
+    """The quaternion that turns about an axis by twice its length."""
     angle = wp.dot(half, half)
-    return rotated(wp.cos(wp.sqrt(wp.max(angle, TINIEST))), sinc(angle) * half, v)
+    axis = sinc(angle) * half
+    return vec4(wp.cos(wp.sqrt(wp.max(angle, TINIEST))), axis[0], axis[1], axis[2])
+
+
+@wp.func
+def turned(q: vec4, v: vec3):
+    return rotated(q[0], vec3(q[1], q[2], q[3]), v)
 
 
 @wp.kernel
@@ -192,12 +198,12 @@ def turned_edges(
     a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
     b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
     t = time[s]
-    half = t * half_turn(sense[s * faces.shape[0] + k] * quaternion(a, b))
+    turn = about(t * half_turn(sense[s * faces.shape[0] + k] * quaternion(a, b)))
     x = a.length + t * (b.length - a.length)
     y = a.along + t * (b.along - a.along)
     z = a.height + t * (b.height - a.height)
-    one = turned(half, x * a.e1)
-    two = turned(half, y * a.e1 + z * a.e2)
+    one = turned(turn, x * a.e1)
+    two = turned(turn, y * a.e1 + z * a.e2)
     add_sides(total, s * n_edges, sides[k], signs[k], a.length * a.height + b.length * b.height, one, two)
 
 
@@ -220,8 +226,8 @@ def course_edges(
     u = time[s]
     a = u * (real(1.0) - u) * (real(1.0) - u)
     b = -u * (real(1.0) - u) * u
-    straight = (HALF * u) * vec3(c[12], c[13], c[14])
-    bend = HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26]))
+    straight = about((HALF * u) * vec3(c[12], c[13], c[14]))
+    bend = about(HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26])))
     unit = c[30]
     length = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
     along = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
