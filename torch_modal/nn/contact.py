@@ -107,8 +107,9 @@ class ContactSearch:
         second: Likewise.
         which: The pair of each sample; each its own where None. *Shape:* ``(B,)``.
         t: Times. *Shape:* ``(B,)``.
-        acceleration: The largest of a vertex in the course that the samples are of; the time between the key-frames is
-            the unit.
+        acceleration: The largest that a vertex may have in the course that the samples are of; the time between the
+            key-frames is the unit.
+        free: Whether the course starts at the first key-frame, and ends at the second.
     """
 
     def __init__(
@@ -119,6 +120,7 @@ class ContactSearch:
         which: Tensor | None,
         t: Tensor,
         acceleration: float = math.inf,
+        free: tuple[bool, bool] = (True, True),
     ) -> None:
         known = torch.stack([first, second], 1).detach().double().cpu().numpy()
         self.searches = [Search(Crossings(mesh.connectivity, both)) for both in known]
@@ -126,7 +128,7 @@ class ContactSearch:
         self.faces = mesh.faces
         self.areas = torch.stack([_areas(x.detach(), mesh.faces) for x in first])
         self.t = t.detach()
-        self.acceleration = acceleration
+        self.acceleration, self.free = acceleration, free
         self.watched: list[Any] = [None] * len(t)
         #: Pairs of triangles that went through each other in the shapes that were searched last. *Shape:* ``(B,)``.
         self.n_far = torch.zeros_like(t, dtype=torch.int64)
@@ -194,11 +196,16 @@ class ContactSearch:
     def _counts(like: Tensor, counts: Sequence[int]) -> Tensor:
         return torch.tensor(counts, dtype=torch.int64, device=like.device)
 
+    @property
+    def is_tolerant(self) -> bool:
+        """Whether a key-frame has parts that went through each other, which is tolerated beside it."""
+        return any(bool(search.tolerated.any()) for search in self.searches)
+
     def _search(self, i: int) -> Search:
         return self.searches[self.which[i]]
 
-    def _when(self, i: int) -> tuple[float, float]:
-        return float(self.t[i]), self.acceleration
+    def _when(self, i: int) -> tuple[float, float, tuple[bool, bool]]:
+        return float(self.t[i]), self.acceleration, self.free
 
     def near(self, part: float) -> Tensor:
         """Vertices within a part of the diagonal of those that were ever watched, of one pair. *Shape:* ``(V,)``."""

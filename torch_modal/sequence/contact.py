@@ -6,6 +6,8 @@ key-frames. What is minimised is the sum of the energies of all shapes, with the
 accelerations of the displacement:
 
 .. math:: \sum_i E_i(x_i + d(t_i)) + \lambda \sum_v A_v \int |\ddot d_v|^2 dt
+
+and of what is beyond the largest acceleration that a vertex may have (``sequence/acceleration.py``).
 """
 
 from functools import partial
@@ -22,12 +24,17 @@ from torch_modal.nn.frame import Pair
 from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric
 from torch_modal.nn.samples import Samples
+from torch_modal.sequence.acceleration import AccelerationLimit, Excess
 from torch_modal.sequence.region import Region
 
 KNOTS = 12
 """Intervals of the spline."""
 SMOOTHNESS = 100.0
 """``lambda``, at a diagonal of 100, with the time between two key-frames as the unit."""
+ROOM = 1.15
+"""A vertex may be accelerated so many times as much as the one that is most without contact."""
+LEAST_LIMIT = 30.0
+"""That is never less than this, at a diagonal of 100: a straight course has to be left, too."""
 REGION = 0.2
 """Of the diagonal, along the surface: how far from what is held vertices move on their own, beside the modes."""
 WIDE_REGION = 0.5
@@ -35,11 +42,12 @@ WIDE_REGION = 0.5
 LOOKED_AT = 8
 SEARCHED = 16
 """:func:`push_apart` has it."""
-ROUNDS = 5
+BESIDE = 0.125
+ROUNDS = 4
 MODAL_STEPS = 2
 FINE_STEPS = 2
 FINAL_STEPS = 2
-FINE_PRODUCTS = 15
+FINE_PRODUCTS = 40
 
 
 class Displacement(NamedTuple):
@@ -117,9 +125,9 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     frame, t = member.frame, samples.t
     pair = member.placed(samples)
     start = frame.bring(shapes, trees.picked(pair, samples.which), t)
-    course = torch.cat([pair.first[:1], start, pair.second[:1]])
-    bent = float((course[2:] - 2 * course[1:-1] + course[:-2]).norm(dim=-1).nan_to_num().max())
-    search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t, bent * (len(t) + 1) ** 2)
+    limit = _limit(member, samples, pair, shapes, start)
+    free = samples.before is None, samples.after is None
+    search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t, limit.most, free)
     every = -(-len(t) // LOOKED_AT)
     few = range(every - 1, len(t), every)
     if next(search.crossing(start, few), None) is None:
@@ -127,73 +135,116 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     stride = max(1, (len(t) + 1) // SEARCHED)
     # The first and the last hardly cost energy, and would be bent by what is done to the next.
     chosen = {0, *range(stride - 1, len(t), stride), len(t) - 1}
-    found = _pushed(member, samples, pair, start, search, chosen)
-    if found.coefficients is not None:
-        moved = start + (splines(t).values @ found.coefficients).movedim(0, -1)
+    if search.is_tolerant:
+        # What a key-frame has comes out beside it.
+        chosen |= set(torch.nonzero((t < BESIDE) | (t > 1 - BESIDE)).flatten().tolist())
+    course = _Course(member, samples, pair, start, limit, search)
+    course.push(chosen)
+    if course.at is not None:
+        moved = start + (splines(t).values @ course.at).movedim(0, -1)
         more = set(search.crossing(moved, [i for i in range(len(t)) if i not in chosen]))
         if more:
-            found = _pushed(member, samples, pair, start, search, chosen | more, found.coefficients)
-    return found
+            course.push(chosen | more)
+    return Displacement(course.at, course.n_before, course.n_crossing)
 
 
-def _pushed(
-    member: Between,
-    samples: Samples,
-    pair: Pair,
-    start: Tensor,
-    search: ContactSearch,
-    chosen: set[int],
-    before: Tensor | None = None,
-) -> Displacement:
-    """The displacement that pushes some shapes apart; where some are pushed apart already, it goes on from there."""
-    some = torch.tensor(sorted(chosen), device=start.device)
-    search, start = search.of(some), start[some]
-    samples = samples._replace(
-        which=None if samples.which is None else samples.which[some],
-        t=samples.t[some],
-        mu=samples.mu[some],
-        stiffness=[k[some] for k in samples.stiffness],
-    )
-    solver = _Coupled(member, samples, pair, start.movedim(-1, 0).contiguous())
-    at = solver.rows.new_zeros(3, solver.basis.shape[1], start.shape[1]) if before is None else before
-    found = search(solver.moved(at).movedim(0, -1))
-    n_before = search.n_far
-    best: tuple[Tensor | None, Tensor, Tensor] = before, search.n_left, search.n_far
-    if found is None or not bool(search.n_left.any()):
-        return Displacement(before, n_before, n_before)
-    kept = torch.arange(len(start), device=start.device)
-    held = found.of_all(kept)
-    for k in range(ROUNDS):
-        at = solver.fine(solver.modal(at, held), held, search.near(REGION), FINE_STEPS)
+def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor, start: Tensor) -> AccelerationLimit:
+    """Of the accelerations between shapes that follow each other, as the caller sees them, turned into the frame.
+
+    At a key-frame at which the course goes on, either side has half of the room: it is not to be bounced off.
+    """
+    t = samples.t
+    n = len(t) + 1
+    given = torch.cat([samples.x_a[:1], shapes, samples.x_b[:1]])
+    bent = n**2 * (given[2:] - 2 * given[1:-1] + given[:-2])
+    placed = trees.picked(pair, samples.which)
+    own = (member.frame.bring(shapes + bent, placed, t) - start).nan_to_num()
+    values = splines(torch.linspace(0, 1, n + 1).to(t)).values
+    second = n**2 * (values[2:] - 2 * values[1:-1] + values[:-2])
+    ends = [i for i, beside in ((0, samples.before), (-1, samples.after)) if beside is not None]
+    rows = torch.cat([own, *(own[i][None] for i in ends)])
+    second = torch.cat([second, *(2 * n**2 * values[1:-1][i][None] for i in ends)])
+    area = member.frame.weights / member.frame.weights.sum()
+    most = max(ROOM * float(own.norm(dim=-1).max()), LEAST_LIMIT)
+    return AccelerationLimit(rows.movedim(-1, 0).contiguous(), second, area, most)
+
+
+class _Course:
+    """Shapes between two key-frames, the displacement that was found so far, and what is held with it."""
+
+    def __init__(
+        self,
+        member: Between,
+        samples: Samples,
+        pair: Pair,
+        start: Tensor,
+        limit: AccelerationLimit,
+        search: ContactSearch,
+    ) -> None:
+        self.member, self.samples, self.pair, self.start = member, samples, pair, start
+        self.limit, self.search = limit, search
+        #: Coefficients of the splines; None as long as nothing has to move. *Shape:* ``(3, J, V)``.
+        self.at: Tensor | None = None
+        #: With the numbers of the shapes that hold something.
+        self.held: Contacts | None = None
+        self.n_before = self.n_crossing = search.n_far
+
+    def push(self, chosen: set[int]) -> None:
+        """Push some of the shapes apart, from what was found for others; what leaves the fewest crossings is kept."""
+        some = torch.tensor(sorted(chosen), device=self.start.device)
+        search, start, samples = self.search.of(some), self.start[some], self.samples
+        samples = samples._replace(
+            which=None if samples.which is None else samples.which[some],
+            t=samples.t[some],
+            mu=samples.mu[some],
+            stiffness=[k[some] for k in samples.stiffness],
+        )
+        solver = _Coupled(self.member, samples, self.pair, start.movedim(-1, 0).contiguous(), self.limit)
+        if self.at is None:
+            at = start.new_zeros(3, solver.basis.shape[1], start.shape[1])
+        else:
+            at = self.at
+            search.count(start)
+            self.n_before = search.n_far
         found = search(solver.moved(at).movedim(0, -1))
-        left = int(best[1].sum())
-        best = min(best, (at, search.n_left, search.n_far), key=_left)
+        self.n_crossing = search.n_far
+        if self.at is None:
+            self.n_before = search.n_far
         if found is None or not bool(search.n_left.any()):
-            break
-        # What does not yield will not go away: it is what a key-frame has.
-        if k and int(search.n_left.sum()) > left / 2:
-            break
-        held = found.of_all(kept).beside(held)
-    if best[0] is not None:
-        # What was pushed apart in a hurry is brought to rest, in a wider region.
-        rested = solver.fine(best[0], held, search.near(WIDE_REGION), FINAL_STEPS)
-        search.count(solver.moved(rested).movedim(0, -1))
-        best = min((rested, search.n_left, search.n_far), best, key=lambda found: int(found[1].sum()))
-    return Displacement(best[0], n_before, best[2])
+            return
+        best = self.at, search.n_left, search.n_far
+        kept = torch.arange(len(start), device=start.device)
+        held = found.of_all(kept)
+        if self.held is not None:
+            held = held.beside(self.held._replace(samples=torch.searchsorted(some, self.held.samples)).of_all(kept))
+        for _ in range(ROUNDS):
+            at = solver.fine(solver.modal(at, held), held, search.near(REGION), FINE_STEPS)
+            found = search(solver.moved(at).movedim(0, -1))
+            best = min(best, (at, search.n_left, search.n_far), key=_left)
+            if found is None or not bool(search.n_left.any()):
+                break
+            held = found.of_all(kept).beside(held)
+        if best[0] is not None:
+            # What was pushed apart in a hurry is brought to rest, in a wider region.
+            rested = solver.fine(best[0], held, search.near(WIDE_REGION), FINAL_STEPS)
+            search.count(solver.moved(rested).movedim(0, -1))
+            best = min((rested, search.n_left, search.n_far), best, key=_left)
+        self.at, _, self.n_crossing = best
+        self.held = held._replace(samples=some)
 
 
 def _left(found: tuple[Tensor | None, Tensor, Tensor]) -> tuple[int, int]:
-    return int(found[1].sum()), int(found[2].sum())
+    return int(found[2].sum()), int(found[1].sum())
 
 
 class _Coupled:
     """Steps of the displacement of all times."""
 
-    def __init__(self, member: Between, samples: Samples, pair: Any, rows: Tensor) -> None:
-        self.member, self.samples, self.pair, self.rows = member, samples, pair, rows
+    def __init__(self, member: Between, samples: Samples, pair: Any, rows: Tensor, limit: AccelerationLimit) -> None:
+        self.member, self.samples, self.pair, self.rows, self.limit = member, samples, pair, rows, limit
         self.basis, bend = splines(samples.t)
         self.bend = SMOOTHNESS * bend
-        self.area = member.frame.weights / member.frame.weights.sum()
+        self.area = limit.area
         self.coarse = member.coarse_reference(samples, pair)
 
     def moved(self, at: Tensor) -> Tensor:
@@ -223,31 +274,40 @@ class _Coupled:
         """
         local = Region(self.member, self.samples, self.pair, near).hold(held)
         chosen = local.vertices.to(at.device)
-        rows, own, area = self.rows[..., chosen], at[..., chosen], self.area[chosen]
+        rows, own, limit = self.rows[..., chosen], at[..., chosen], self.limit.of(chosen)
         for _ in range(n_steps):
             value, gradient, blocks, hessians = local.linearised(rows + self.expand(own))
-            bent = self.bent(own, area)
-            before = value + (own * bent).sum()
-            right = -self.gather(gradient) - 2 * bent
-            step = self._solved(local, hessians, self._preconditioner(blocks, area), right * local.free, area)
+            bent, excess = self.bent(own, limit.area), limit.linearised(own)
+            before = value + (own * bent).sum() + excess.value
+            right = -self.gather(gradient) - 2 * bent - excess.gradient
+            step = self._solved(local, hessians, limit, excess, blocks, right * local.free)
             for length in STEP_LENGTHS:
                 there = own + length * step
-                if bool(local.value(rows + self.expand(there)) + (there * self.bent(there, area)).sum() < before):
+                smooth = (there * self.bent(there, limit.area)).sum() + limit.value(there)
+                if bool(local.value(rows + self.expand(there)) + smooth < before):
                     own = there
                     break
             else:
                 break
         return at.index_copy(2, chosen, own)
 
-    def _preconditioner(self, blocks: Tensor, area: Tensor) -> Tensor:
-        """Inverses of the blocks of each function of the spline at each vertex. *Shape:* ``(3, 3, J, R)``."""
+    def _solved(
+        self,
+        local: Region,
+        hessians: Any,
+        limit: AccelerationLimit,
+        excess: Excess,
+        blocks: Tensor,
+        right: Tensor,
+    ) -> Tensor:
+        # Of each function of the spline at each vertex.
         eye = torch.eye(3).to(blocks)[..., None, None]
-        return inverse_of_symmetric((self.basis**2).T @ blocks + 2 * self.bend.diagonal()[:, None] * area * eye)
+        own = (self.basis**2).T @ blocks + 2 * self.bend.diagonal()[:, None] * limit.area * eye
+        inverse = inverse_of_symmetric(limit.add_diagonal(excess, own))
 
-    def _solved(self, local: Region, hessians: Any, inverse: Tensor, right: Tensor, area: Tensor) -> Tensor:
         def product(field: Tensor) -> Tensor:
-            found = self.gather(local.product(hessians, self.expand(field))) + 2 * self.bent(field, area)
-            return found * local.free
+            found = self.gather(local.product(hessians, self.expand(field))) + 2 * self.bent(field, limit.area)
+            return limit.add_product(excess, field, found) * local.free
 
         def precondition(residual: Tensor) -> Tensor:
             return (inverse * residual).sum(1)
@@ -276,8 +336,10 @@ class _Coupled:
             stiffness, slope = found.gauss_newton.to(x), found.gradient.to(x)
             hessian = torch.einsum("ti,tj,tab->iajb", self.basis, self.basis, stiffness)
             hessian = hessian + 2 * self.bend[:, None, :, None] * gram[:, None, :]
-            hessian = hessian.reshape(n * j, n * j)
-            pulled = (2 * self.bent(at, self.area)).permute(1, 2, 0).flatten(1) @ columns.fine.flatten(1).T
+            excess = self.limit.linearised(at)
+            hessian = (hessian + self.limit.in_columns(excess, columns.fine)).reshape(n * j, n * j)
+            pulled = (2 * self.bent(at, self.area) + excess.gradient).permute(1, 2, 0).flatten(1)
+            pulled = pulled @ columns.fine.flatten(1).T
             gradient = (self.basis.T @ slope + pulled).reshape(-1)
             ridge = 1e-9 * hessian.diagonal().mean()
             factor, info = torch.linalg.cholesky_ex(hessian + ridge * torch.eye(n * j).to(hessian))
@@ -297,4 +359,4 @@ class _Coupled:
         """What is minimised after a part of a step in the modes."""
         bent = at + length * field
         total = sum(energy.value((length * step).to(place.base.dtype), place).sum() for energy, place in places)
-        return float(total + (bent * self.bent(bent, self.area)).sum())
+        return float(total + (bent * self.bent(bent, self.area)).sum() + self.limit.value(bent))

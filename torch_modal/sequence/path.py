@@ -24,7 +24,7 @@ from torch_modal.sequence.contact import push_apart
 from torch_modal.sequence.times import checked_times
 
 # Even times between two key-frames at which a path looks for contacts.
-N_SEARCHED = 15
+N_SEARCHED = 31
 
 
 class _Lazy(InBetween):
@@ -51,8 +51,9 @@ class Path(nn.Module):
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
         contact: Whether parts are kept from passing through each other, in the place of what the objective says
-            (docs/contact.md; extra ``contact``). Shapes are searched at 15 times between any two key-frames, and
-            pushed apart by one displacement that is smooth in time. It is a constant of the graph.
+            (docs/contact.md; extra ``contact``). Shapes are searched at 31 times between any two key-frames, and
+            pushed apart by one displacement that is smooth in time. It is a constant of the graph: gradients are those
+            of the shapes without contact, and not exact where something touches. Those of ``InBetween`` are.
 
     Raises:
         ValueError: An argument is not usable.
