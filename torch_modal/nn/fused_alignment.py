@@ -12,7 +12,7 @@ from torch_modal.nn.launch import kernels, launch
 def serves(*given: Tensor) -> bool:
     """Whether tensors are plain numbers in float64, and nothing is recorded."""
     plain = all(x.dtype == torch.float64 and not traced(x) and not transformed(x) for x in given)
-    return plain and not torch.is_grad_enabled()
+    return plain and not (torch.is_grad_enabled() and any(x.requires_grad for x in given))
 
 
 def place(frame: Alignment, x_a: Tensor, x_b: Tensor) -> tuple[Pair, Tensor] | None:
