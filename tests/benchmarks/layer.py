@@ -171,7 +171,7 @@ def work(case: Case, most_steps: int, batch: int) -> tuple[float, float]:
     space: Any = case.layer.members[0].space
     modal, n = space.energy.parts[0], space.n_unknowns
     e, h = (part.corners.shape[1] for part in list(modal.energy.parts)[:2])
-    r = len(modal.congruence.slots)
+    r = len(modal.tables.congruence.slots)
     m, item = e + h + 1, case.samples[0].element_size()
     first_order = 2 * (3 * e + 9 * h) * n + 2 * m * n**2
     second_order = 144 * r * n + 6 * r * n**2

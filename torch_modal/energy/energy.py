@@ -134,7 +134,8 @@ class Energy(nn.Module):
         self.n_vertices = len(vertices)
         self.n_extended = len(vertices) + 1 + n_anchors
         self.register_buffer("vertices", vertices, persistent=False)
-        self.register_buffer("used", torch.arange(len(vertices)) if sampled else mesh.faces.unique(), persistent=False)
+        used = torch.arange(len(vertices)) if sampled else torch.tensor(mesh.connectivity.used)
+        self.register_buffer("used", used, persistent=False)
         local = [part.corners.flatten() for part in parts if not part.term.total]
         corners = torch.cat(local) if local else torch.zeros(0, dtype=torch.int64)
         #: The vertices of all elements of terms that are not totals.

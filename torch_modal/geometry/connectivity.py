@@ -49,6 +49,11 @@ class Connectivity:
         return _shared(self.faces[:, [2, 0, 1]].T.reshape(-1))
 
     @cached_property
+    def used(self) -> IntArray:
+        """The vertices of all faces, ascending. *Shape:* ``(·,)``."""
+        return _shared(np.flatnonzero(np.bincount(self.faces.reshape(-1), minlength=self.n_vertices)))
+
+    @cached_property
     def _runs(self) -> tuple[IntArray, IntArray, IntArray]:
         """Sides in the order of their edges, ``(3F,)``; where each edge starts there, and its packed ends, ``(E,)``."""
         key = self._pack(self.start, self.end)
@@ -188,17 +193,20 @@ def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tupl
     Returns:
         The parent of each node, its own for a root; the connected piece of each. *Shape:* ``(n,)`` each.
     """
-    # Two nodes may be connected twice: entries of a sparse matrix would add up.
-    key = pairs[:, 0] * n + pairs[:, 1]
-    order = np.lexsort((costs, key))
-    order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
-    tree = minimum_spanning_tree(sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr())
-    piece = connected_pieces(pairs, n)
-    parents = np.arange(n)
-    for root in np.unique(piece, return_index=True)[1]:
-        found, before = breadth_first_order(tree, root, directed=False)
-        parents[found[1:]] = before[found[1:]]
-    return parents.astype(np.int64), piece
+    graph = sparse.coo_matrix((costs, pairs.T), shape=(n, n)).tocsr()
+    if graph.nnz < len(pairs):  # two nodes that are connected twice: costs were added up
+        key = pairs[:, 0] * n + pairs[:, 1]
+        order = np.lexsort((costs, key))
+        order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
+        graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
+    tree = minimum_spanning_tree(graph).tocoo()
+    piece = connected_components(tree, directed=False)[1].astype(np.int64)
+    # One more node above all roots: one walk then sees all pieces.
+    roots = np.unique(piece, return_index=True)[1]
+    ends = np.append(tree.row, np.full(len(roots), n)), np.append(tree.col, roots)
+    whole = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
+    parents = breadth_first_order(whole, n, directed=False)[1][:n]
+    return np.where(parents == n, np.arange(n), parents).astype(np.int64), piece
 
 
 def half_cotangents(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
@@ -213,8 +221,9 @@ def half_cotangents(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArra
 
 def double_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
     """Twice the area of each face. *Shape:* ``(F,)``."""
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    found: NDArray[np.float64] = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    a, b, c = (np.stack([x[corner] for x in vertices.T]) for corner in faces.T)
+    (ux, uy, uz), (vx, vy, vz) = b - a, c - a
+    found: NDArray[np.float64] = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
     return found
 
 

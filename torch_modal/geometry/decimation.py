@@ -37,7 +37,7 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> Decimation:
         n_faces: How many are wanted. There may remain more: some edges cannot be collapsed.
     """
     centre = vertices.mean(0)
-    factor = _WORKING_DIAGONAL / np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0))
+    factor = _WORKING_DIAGONAL / np.linalg.norm(np.ptp(np.stack([x[faces] for x in vertices.T]), axis=(1, 2)))
     with _NOT_THREAD_SAFE:
         points, triangles, collapses = fast_simplification.simplify(
             np.ascontiguousarray((vertices - centre) * factor),

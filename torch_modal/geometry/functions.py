@@ -1,10 +1,12 @@
 """What torch does too, at less: functions with a derivative of their own where none is recorded, shapes together."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+
+Made = TypeVar("Made")
 
 
 def traced(x: Tensor) -> bool:
@@ -15,6 +17,39 @@ def traced(x: Tensor) -> bool:
 def transformed(x: Tensor) -> bool:
     """Whether a tensor stands for others in a transform of ``torch.func``."""
     return torch.func.debug_unwrap(x, recurse=False) is not x
+
+
+def made_outside(make: Callable[[], Made]) -> Made:
+    """What is made at its first use and kept: of numbers, whatever ``torch.compile`` or ``torch.func`` do around it."""
+    if torch.compiler.is_compiling():
+        return torch.compiler.disable(make)()
+    found: list[Made] = []
+    _Outside.apply(lambda: found.append(make()), torch.empty(0))
+    return found[0]
+
+
+class _Outside(torch.autograd.Function):
+    """Its ``forward`` is called below all transforms, which tensors that are made within them would not outlive."""
+
+    @staticmethod
+    def forward(work: Callable[[], None], nothing: Tensor) -> Tensor:
+        with torch.no_grad():
+            work()
+        return nothing.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Nothing is remembered."""
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, None]:
+        return None, None
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], work: Callable[[], None], nothing: Tensor
+    ) -> tuple[Tensor, int | None]:
+        return _Outside.apply(work, nothing), in_dims[1]
 
 
 def applied(function: Any, *given: Any) -> Any:

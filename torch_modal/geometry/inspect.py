@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -33,10 +33,18 @@ def degenerate_faces(faces: IntArray) -> BoolArray:
 
 def repeated_faces(faces: IntArray) -> BoolArray:
     """Faces whose three vertices have been used by an earlier face, in any order. *Shape:* ``(F,)``."""
-    corners = np.sort(faces, axis=1)
-    order = np.lexsort(corners.T)  # stable: among equal faces the earliest comes first
+    a, b, c = faces.T
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    middle = a + b + c - low - high
     repeated = np.zeros(len(faces), dtype=bool)
-    repeated[order[1:]] = (corners[order[1:]] == corners[order[:-1]]).all(axis=1)
+    n = int(high.max(initial=0)) + 1
+    if n < 2**21:  # as one integer each, which is sorted a hundred times as fast, and nearly always all that it takes
+        keys = np.sort((low * n + middle) * n + high)
+        if (keys[1:] != keys[:-1]).all():
+            return repeated
+    corners = np.stack([high, middle, low])
+    order = np.lexsort(corners)  # stable: among equal faces the earliest comes first
+    repeated[order[1:]] = (corners[:, order[1:]] == corners[:, order[:-1]]).all(axis=0)
     return repeated
 
 
@@ -51,6 +59,9 @@ def consistent_winding(mesh: Connectivity) -> Winding:
     one, two = mesh.hinge_sides.T % n_faces
     signs = mesh.signs[mesh.hinge_sides]
     crossed = (signs[:, 0] == signs[:, 1]) * n_faces
+    if not crossed.any():
+        none = np.zeros(0, dtype=np.int64)
+        return Winding(faces, none, none)
     pairs = np.stack([np.append(one, one + n_faces), np.append(two + crossed, two + n_faces - crossed)], axis=1)
     label = connected_pieces(pairs, 2 * n_faces)
     as_is, turned = label[:n_faces], label[n_faces:]
@@ -71,7 +82,8 @@ def unreferenced_vertices(faces: IntArray, n_vertices: int) -> IntArray:
 
 def diagonals(keyframes: FloatArray) -> FloatArray:
     """Bounding-box diagonal of each shape. *Shape:* ``(K, V, 3)`` to ``(K,)``."""
-    extent = keyframes.max(axis=1) - keyframes.min(axis=1)
+    rows = np.moveaxis(keyframes, 2, 0).copy()  # looked through ten times as fast where they lie together
+    extent = (rows.max(axis=2) - rows.min(axis=2)).T
     largest = extent.max(axis=1)
     # The largest extent is taken out first, so that no square of it leaves the number range.
     return largest * np.linalg.norm(extent / np.where(largest > 0, largest, 1)[:, None], axis=1)
@@ -80,9 +92,9 @@ def diagonals(keyframes: FloatArray) -> FloatArray:
 def flat_faces(vertices: FloatArray, faces: IntArray, tolerance: float) -> BoolArray:
     """Faces with an altitude below ``tolerance`` times their longest edge. *Shape:* ``(F,)``."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
-    double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    longest = np.max([np.einsum("fi,fi->f", e, e) for e in (b - a, c - b, a - c)], axis=0)
-    return double_area <= tolerance * longest
+    first, second, third = (np.einsum("fi,fi->f", e, e) for e in (b - a, c - b, a - c))
+    longest = np.maximum(np.maximum(first, second), third)
+    return double_areas(vertices, faces) <= tolerance * longest
 
 
 def signed_volume(vertices: FloatArray, faces: IntArray) -> float:

@@ -83,11 +83,12 @@ class LocalRotations(nn.Module):
     @staticmethod
     def _tree(a: Frames, b: Frames, mesh: Connectivity) -> tuple[Tensor, Tensor]:
         """The parent of each triangle, and its piece. *Shape:* ``(F,)`` each."""
-        pairs = torch.tensor(mesh.face_neighbours)
+        one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         turns = _turn_between(a, b).squeeze(1)
-        slenderness = torch.cat([a.slenderness, b.slenderness]).amin(0)
-        alike = (turns[:, pairs[:, 0]] * turns[:, pairs[:, 1]]).sum(0).abs().clamp_max(1)
-        costs = 2 * torch.arccos(alike) + SLIVER / slenderness[pairs].amin(-1).clamp_min(SLIVER / 1e3)
+        alike = (pick(turns, one) * pick(turns, other)).sum(0).abs().clamp_max(1)
+        slenderness = torch.minimum(a.slenderness, b.slenderness).squeeze(0)
+        slenderness = torch.minimum(pick(slenderness, one), pick(slenderness, other))
+        costs = 2 * torch.arccos(alike) + SLIVER / slenderness.clamp_min(SLIVER / 1e3)
         parents, piece = spanning_forest(len(mesh.faces), mesh.face_neighbours, costs.numpy())
         return torch.from_numpy(parents), torch.from_numpy(piece)
 

@@ -57,6 +57,15 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
     Warns:
         MeshWarning: At most once per kind of flaw, with the number of places and the first one.
     """
+    positions, mesh, found = checked_surface(keyframes, faces, min_keyframes)
+    if warn:
+        for message in found:
+            warnings.warn(message, MeshWarning, stacklevel=2)
+    return Keyframes(positions, torch.tensor(mesh.faces, device=positions.device))
+
+
+def checked_surface(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, Connectivity, list[str]]:
+    """The same for who goes on with the connectivity, and what there would be to warn of."""
     positions = as_positions(keyframes)
     indices = as_faces(faces)
     found: list[str] = []
@@ -64,13 +73,10 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
     _check_shapes(positions, indices, min_keyframes)
     shapes = positions.detach().cpu().double().resolve_neg().numpy()
     _check_values(shapes, indices)
-    mesh, indices, orientable = _repair_faces(indices, note)
-    scaled = _check_sizes(shapes, indices, positions.dtype, note)
-    _check_surface(scaled, mesh, indices, orientable, _RESOLUTION[positions.dtype], note)
-    if warn:
-        for message in found:
-            warnings.warn(message, MeshWarning, stacklevel=2)
-    return Keyframes(positions, torch.from_numpy(indices).to(positions.device))
+    mesh, orientable = _repaired(indices, shapes.shape[1], note)
+    scaled = _check_sizes(shapes, mesh, positions.dtype, note)
+    _check_surface(scaled, mesh, orientable, _RESOLUTION[positions.dtype], note)
+    return positions, mesh, found
 
 
 def require_solid(vertices: Any, faces: Any) -> None:
@@ -119,15 +125,16 @@ def _check_shapes(positions: torch.Tensor, faces: NDArray[np.int64], min_keyfram
 
 
 def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
-    bad = ~np.isfinite(shapes).all(axis=2)
-    if bad.any():
+    finite = np.isfinite(shapes)
+    if not finite.all():
+        bad = ~finite.all(axis=2)
         k, v = np.argwhere(bad)[0]
         raise MeshError(
             f"{bad.sum()} vertices have NaN or infinite positions; the first is vertex {v} of key-frame {k}: "
             f"{shapes[k, v].tolist()}"
         )
-    wrong = ((faces < 0) | (faces >= shapes.shape[1])).any(axis=1)
-    if wrong.any():
+    if faces.min() < 0 or faces.max() >= shapes.shape[1]:
+        wrong = ((faces < 0) | (faces >= shapes.shape[1])).any(axis=1)
         face = int(np.flatnonzero(wrong)[0])
         hint = "; indices count from 0, not from 1" if faces.min() == 1 and faces.max() == shapes.shape[1] else ""
         raise MeshError(
@@ -136,13 +143,8 @@ def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None
         )
 
 
-def _repair_faces(
-    faces: NDArray[np.int64], note: Callable[[str], None]
-) -> tuple[Connectivity, NDArray[np.int64], bool]:
-    """Drop faces that are none or are there twice, wind the rest consistently; say whether that went.
-
-    The connectivity is that before the winding was changed, which its edges do not see.
-    """
+def _repaired(faces: NDArray[np.int64], n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
+    """Drop faces that are none or are there twice, wind the rest consistently; say whether that went."""
     kept = np.arange(len(faces))
     for flaw, what in (
         (inspect.degenerate_faces, "use a vertex twice"),
@@ -155,7 +157,7 @@ def _repair_faces(
             kept = kept[~bad]
         if len(kept) == 0:
             raise MeshError("all faces use a vertex twice, so none is a triangle")
-    mesh = Connectivity(faces[kept])
+    mesh = Connectivity(faces[kept], n_vertices)
     winding = inspect.consistent_winding(mesh)
     if len(winding.flipped):
         first = kept[winding.flipped[0]]
@@ -170,17 +172,19 @@ def _repair_faces(
             "Moebius strip) and were left as they are, so some dihedral angles have the wrong sign and the "
             f"volume means nothing; the first is face {first}, {faces[first].tolist()}"
         )
-    return mesh, np.ascontiguousarray(winding.faces), not len(winding.non_orientable)
+    if len(winding.flipped):
+        mesh = Connectivity(winding.faces, n_vertices)
+    return mesh, not len(winding.non_orientable)
 
 
 def _check_sizes(
     shapes: NDArray[np.float64],
-    faces: NDArray[np.int64],
+    mesh: Connectivity,
     dtype: torch.dtype,
     note: Callable[[str], None],
 ) -> NDArray[np.float64]:
     """Refuse sizes that cannot work; return the shapes around the origin, each with a diagonal of 1."""
-    surface = shapes[:, np.unique(faces)]
+    surface = shapes[:, mesh.used]
     with np.errstate(over="ignore", invalid="ignore"):
         diagonals = inspect.diagonals(surface)
     low, high = _DIAGONAL_RANGE[dtype]
@@ -220,15 +224,14 @@ def _check_sizes(
 def _check_surface(
     scaled: NDArray[np.float64],
     mesh: Connectivity,
-    faces: NDArray[np.int64],
     orientable: bool,
     resolution: float,
     note: Callable[[str], None],
 ) -> None:
     """Note what the solver survives; refuse closed meshes that were turned inside out."""
-    n_vertices = scaled.shape[1]
-    edges, counts = mesh.edges, mesh.counts
-    vanishing = np.linalg.norm(scaled[:, edges[:, 0]] - scaled[:, edges[:, 1]], axis=2) <= resolution
+    faces, edges, counts = mesh.faces, mesh.edges, mesh.counts
+    along = scaled[:, edges[:, 0]] - scaled[:, edges[:, 1]]
+    vanishing = np.einsum("kei,kei->ke", along, along) <= resolution**2
     if vanishing.any():
         k, e = np.argwhere(vanishing)[0]
         note(
@@ -248,7 +251,7 @@ def _check_surface(
             f"{len(overfull)} edges join three or more faces (non-manifold): they resist stretching but not "
             f"bending; the first is edge {overfull[0].tolist()}"
         )
-    loose = inspect.unreferenced_vertices(faces, n_vertices)
+    loose = inspect.unreferenced_vertices(faces, mesh.n_vertices)
     if len(loose):
         note(
             f"{len(loose)} vertices belong to no face: they follow the interpolation of the key-frames; the "

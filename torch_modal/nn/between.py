@@ -13,7 +13,8 @@ from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.vectors import cross, pick
 from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
-from torch_modal.nn.frame import Alignment, Frame, Pair
+from torch_modal.nn.blend import RotationBlend
+from torch_modal.nn.frame import Alignment, Frame, Pair, mean_areas
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
@@ -55,18 +56,22 @@ class Batch(NamedTuple):
     anchors: Tensor | None
 
 
-class Fine(NamedTuple):
-    """The energy on the caller's mesh, the same for all pairs."""
+class Shared(NamedTuple):
+    """What is the same for all pairs of a layer."""
 
     energy: Energy
+    """On the caller's mesh."""
     fused: FusedRelax | None
     """Its kernels, where there are some."""
+    weights: Tensor
+    """Of the vertices in alignments, so that a motion through several has one course. *Shape:* ``(V,)``."""
 
     @classmethod
-    def of(cls, mesh: Mesh, terms: Sequence[Term], solver: Solver) -> "Fine":
-        """Of these terms."""
+    def of(cls, mesh: Mesh, shapes: Tensor, terms: Sequence[Term], solver: Solver) -> "Shared":
+        """Of these terms and the references of all bases, float64 on the CPU. *Shape:* ``(K, V, 3)``."""
         energy = Energy(mesh, terms)
-        return cls(energy, FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None)
+        fused = FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None
+        return cls(energy, fused, mean_areas(shapes, mesh.faces))
 
 
 class Between(nn.Module):
@@ -78,8 +83,7 @@ class Between(nn.Module):
         mesh: The caller's mesh.
         objective: What is minimised.
         solver: How.
-        fine: The energy on it, of terms that the layer owns.
-        weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
+        shared: What all pairs have, of terms that the layer owns.
     """
 
     def __init__(
@@ -89,8 +93,7 @@ class Between(nn.Module):
         mesh: Mesh,
         objective: Objective,
         solver: Solver,
-        fine: "Fine",
-        weights: Tensor | None = None,
+        shared: Shared,
     ) -> None:
         super().__init__()
         self.solver = solver
@@ -98,16 +101,18 @@ class Between(nn.Module):
         #: Whether Eq. 5 has no company: what has no strain then stays as it is.
         self.bare = not objective.terms
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
-        self.fine, self.fused = fine
-        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, weights)
+        self.fine, self.fused = shared.energy, shared.fused
+        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights)
         # Steps that are unrolled are differentiated like any other expression: by torch.
         modal = objective.space == "joint" and solver.gradient == "implicit"
         levels = partial(Levels, self.frame, mesh, self.terms, solver.backend if modal else "torch")
         if objective.space == "joint":
             ends = self.frame.place(*shapes[:, None])
             references = torch.cat([ends.first, ends.second])
-            blended = mesh if objective.base == "rotations" else None
-            self.space: Any = JointSpace(self.frame, levels, modes, references, blended, has_kernels(solver.backend))
+            blend = None
+            if objective.base == "rotations":
+                blend = RotationBlend(mesh.connectivity, references, has_kernels(solver.backend))
+            self.space: Any = JointSpace(self.frame, levels, modes, references, blend)
         else:
             self.space = PairedSpace(self.frame, levels(), modes)
         self.closed = len(mesh.connectivity.boundary_edges) == 0

@@ -211,7 +211,7 @@ class Frame(Alignment):
     turn: Tensor
 
     def __init__(self, shapes: Tensor, faces: Tensor, coarse_faces: int, weights: Tensor | None = None) -> None:
-        used = shapes[0][faces.unique()]
+        used = shapes[0][faces.flatten()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
         weights = mean_areas(shapes, faces) if weights is None else weights
         turn = best_fit(shapes[1], shapes[0], weights)
@@ -255,23 +255,26 @@ class Frame(Alignment):
         amplitudes = coarse.flatten(-2) @ columns.weighted
         return amplitudes, coarse - (amplitudes @ columns.coarse.flatten(1)).unflatten(-1, (-1, 3))
 
-    def elastic_columns(self, directions: Tensor) -> Columns:
+    def elastic_columns(self, *directions: Tensor) -> Columns:
         """Independent combinations of directions, without rigid motions, orthonormal on the coarse mesh.
 
         The energy does not see translations, and rotations only to second order: left in, they are null directions of
         its Hessian. Modes of two key-frames are partly the same: what is dependent is dropped here, explicitly.
 
         Args:
-            directions: Displacements of the fine vertices, of any scale. *Shape:* ``(m, V, 3)``.
+            directions: Displacements of the fine vertices, of any scale. *Shape of each:* ``(m, V, 3)``.
 
         Returns:
-            ``n <= m`` columns.
+            No more columns than there are directions.
         """
-        rigid, coarse = self.split(self.coarsen(directions), self.rigid)
+        rigid, coarse = self.split(torch.cat([self.coarsen(part) for part in directions]), self.rigid)
         sizes = torch.linalg.norm(coarse.flatten(1), dim=1)[:, None].clamp_min(torch.finfo(coarse.dtype).tiny)
         mix = self.coarse.orthonormal(coarse / sizes[:, None]) / sizes.T
-        # The fine columns are as large as all modes: one product makes them.
-        fine = torch.tensordot(mix, directions, 1) - self.rigid.combine(mix @ rigid)
+        # The fine columns are as large as all modes: nothing else of their size is made.
+        fine = -(mix @ rigid) @ self.rigid.fine.flatten(1)
+        for part, own in zip(directions, mix.split([len(part) for part in directions], 1), strict=True):
+            fine.addmm_(own, part.flatten(1))
+        fine = fine.view(-1, *directions[0].shape[1:])
         return Columns(fine, torch.tensordot(mix, coarse, 1), self.coarse.weights)
 
 
@@ -280,9 +283,10 @@ class _ClusterMeans(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, members: Tensor, first_member: Tensor, shares: Tensor, clusters: Tensor) -> Tensor:
-        rows = x.detach().movedim(0, 1).flatten(1)
+        # As a matrix it is transposed in blocks, several times as fast as by its dimensions.
+        rows = x.detach().flatten(1).T.contiguous().view(x.shape[1], -1)
         means = nn.functional.embedding_bag(members, rows, first_member, mode="sum", per_sample_weights=shares.detach())
-        return means.unflatten(1, (len(x), 3)).movedim(1, 0).contiguous()
+        return means.unflatten(1, (3, len(x))).permute(2, 0, 1).contiguous()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:

@@ -1,12 +1,13 @@
 """Eq. 5 in the amplitudes of a modal space by kernels of NVIDIA Warp, where that is installed."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
-from torch_modal.geometry.functions import applied, traced, transformed
+from torch_modal.geometry.functions import applied, made_outside, traced, transformed
 from torch_modal.nn import trees
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellReference
@@ -86,6 +87,27 @@ class FusedModalEnergy(ModalEnergy):
         blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()
         #: Columns of each component of each vertex and of the centre, with room for two more, and zeros.
         self.register_buffer("blocks", blocks, persistent=False)
+
+    def _prepare(self) -> None:
+        """Kernels have tables of their own: torch's are made where torch takes over."""
+        self._kept: tuple[Tensor, Any] | None = None
+
+    @property
+    def tables(self) -> Any:
+        """As the other's, of what the columns are now: others may stand in for them, as in functional_call."""
+        if self._kept is None or self._kept[0] is not self.columns:
+            self._kept = self.columns, made_outside(self._made_tables)
+        return self._kept[1]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "FusedModalEnergy":
+        """Nothing is made in a lower precision, or on another device, than the columns came in."""
+        after = fn(self.columns)
+        if (after.dtype, after.device) == (self.columns.dtype, self.columns.device):
+            return super()._apply(fn, recurse)
+        tables = self.tables
+        super()._apply(fn, recurse)
+        self._kept = self.columns, tables._apply(fn)
+        return self
 
     @property
     def shell(self) -> FusedShell:

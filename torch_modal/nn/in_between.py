@@ -12,10 +12,9 @@ from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.functions import broadcast_shapes
 from torch_modal.keyframes.arrays import as_faces
-from torch_modal.keyframes.check import check_keyframes
-from torch_modal.nn.between import Between, Fine
+from torch_modal.keyframes.check import checked_surface
+from torch_modal.nn.between import Between, Shared
 from torch_modal.nn.contact_rounds import ContactRounds
-from torch_modal.nn.frame import mean_areas
 from torch_modal.nn.samples import InBetweenResult, Samples, report
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
@@ -94,13 +93,12 @@ class InBetween(nn.Module):
         """What follows from the bases, on their device and in their dtype."""
         like = self.bases[0].reference
         shapes = [basis.reference.double().cpu() for basis in self.bases]
-        _, self.faces = check_keyframes(shapes, self.faces.cpu(), warn=False)
+        connectivity = checked_surface(shapes, self.faces.cpu())[1]
+        self.faces = torch.tensor(connectivity.faces)
         ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
-        mesh = Mesh.of(self.faces, len(shapes[0]))
-        # The same for all pairs: a motion through several has one course.
-        weights = mean_areas(torch.stack(shapes), self.faces)
+        mesh = Mesh(connectivity)
         kind = ContactRounds if self.objective.contact else Between
-        fine = Fine.of(mesh, list(self.terms), self.solver)
+        shared = Shared.of(mesh, torch.stack(shapes), list(self.terms), self.solver)
         made = [
             kind(
                 torch.stack([ends[i][0], ends[j][0]]),
@@ -108,8 +106,7 @@ class InBetween(nn.Module):
                 mesh,
                 self.objective,
                 self.solver,
-                fine,
-                weights,
+                shared,
             )
             for i, j in self.pairs
         ]

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.hermite import beyond
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
@@ -56,7 +55,7 @@ class _Modal(nn.Module):
     ) -> None:
         super().__init__()
         self.levels = levels()
-        self.columns = frame.elastic_columns(torch.cat(frame.modes(*modes)))
+        self.columns = frame.elastic_columns(*frame.modes(*modes))
         self.energy = self.levels.modal(self.columns)
         # With the blend as the base there is nothing left to guess.
         self.guess = Guess(self.levels.mesh, self.columns.coarse, frame.coarsen(references)) if guess else None
@@ -74,8 +73,7 @@ class JointSpace(nn.Module):
         levels: Makes the energies of the modal solve.
         modes: Modes of both ends. *Shape of each:* ``(k, V, 3)``.
         references: Shapes that the modes belong to, in the frame. *Shape:* ``(2, V, 3)``.
-        fine: The fine mesh, if there is a blend by local rotations.
-        fused: Whether that is by kernels.
+        blend: By local rotations, if the base is to be one.
     """
 
     def __init__(
@@ -84,14 +82,13 @@ class JointSpace(nn.Module):
         levels: Callable[[], Levels],
         modes: Sequence[Tensor],
         references: Tensor,
-        fine: Mesh | None,
-        fused: bool = False,
+        blend: RotationBlend | None,
     ) -> None:
         super().__init__()
         self.frame = frame
-        self.blend = None if fine is None else RotationBlend(fine.connectivity, references, fused)
+        self.blend = blend
         self._modal: Any = None
-        self._make: Any = partial(_Modal, frame, levels, modes, references, guess=fine is None)
+        self._make: Any = partial(_Modal, frame, levels, modes, references, guess=blend is None)
 
     @property
     def modal(self) -> "_Modal":

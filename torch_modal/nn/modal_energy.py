@@ -40,6 +40,24 @@ class Placement(NamedTuple):
     reference: Reference
 
 
+class _Tables(nn.Module):
+    """The columns as elements and as pairs of vertices see them. *Shape:* ``(P, 2), (n, 3, V)``."""
+
+    def __init__(self, energy: Energy, pairs: Tensor, columns: Tensor) -> None:
+        super().__init__()
+        self.congruence = Congruence(pairs, columns.transpose(0, 1))
+        of_vertices = columns.permute(2, 1, 0).contiguous()
+        self.n_terms = len(energy.parts)
+        for i, part in enumerate(energy.parts):
+            spokes = None if part.term.total else _spokes_of_rows(of_vertices, part.corners)
+            self.register_buffer(f"spokes_{i}", spokes, persistent=False)
+
+    @property
+    def spokes(self) -> list[Tensor | None]:
+        """Of each term's elements in each direction; None of a total. *Shape of each:* ``(M, 3(n-1), n)``."""
+        return [getattr(self, f"spokes_{i}") for i in range(self.n_terms)]
+
+
 class ModalEnergy(nn.Module):
     """An energy in the amplitudes of an affine space.
 
@@ -57,17 +75,19 @@ class ModalEnergy(nn.Module):
         self.energy = energy.energy if isinstance(energy, ShellEnergy) else energy
         rows = self.energy.extend(columns.movedim(-1, 0))
         self.curvature = Curvature(self.energy)
-        self.congruence = Congruence(self.curvature.pairs, rows)
         self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
-        of_vertices = rows.permute(2, 0, 1).contiguous()
-        for i, part in enumerate(self.energy.parts):
-            spokes = None if part.term.total else _spokes_of_rows(of_vertices, part.corners)
-            self.register_buffer(f"spoke_columns_{i}", spokes, persistent=False)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        self._tables = self._made_tables()
+
+    def _made_tables(self) -> "_Tables":
+        return _Tables(self.energy, self.curvature.pairs, self.columns)
 
     @property
-    def spoke_columns(self) -> list[Tensor | None]:
-        """Spokes of each term's elements in each direction; None of a total. *Shape of each:* ``(M, 3(n-1), n)``."""
-        return [getattr(self, f"spoke_columns_{i}") for i in range(len(self.energy.parts))]
+    def tables(self) -> "_Tables":
+        """What the derivatives are gathered by."""
+        return self._tables
 
     def place(
         self, base: Tensor, reference: Reference, extra: Tensor | None = None, anchors: Tensor | None = None
@@ -111,7 +131,7 @@ class ModalEnergy(nn.Module):
         at = energy.linearise(x, placement.reference)
         extra = None if placement.extra is None else placement.extra.transpose(0, 1)
         gradient, gauss_newton = [], []
-        for part, one, columns in zip(energy.parts, at, self.spoke_columns, strict=True):
+        for part, one, columns in zip(energy.parts, at, self.tables.spokes, strict=True):
             if columns is None:
                 slope, product = self._of_total(one, extra)
             else:
@@ -170,7 +190,7 @@ class ModalEnergy(nn.Module):
     def _curved(self, at: Sequence[Linearised], extra: Tensor | None) -> Tensor:
         """The second-order term. *Shape:* ``(B, n, n)``."""
         blocks = self.curvature.of(self.energy, at)
-        inner = self.congruence(blocks)
+        inner = self.tables.congruence(blocks)
         if extra is None:
             return inner
         pushed = self.curvature.push(blocks, extra)
