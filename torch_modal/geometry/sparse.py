@@ -97,6 +97,8 @@ def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
 
     *Shape:* ``(..., V, m) -> (..., V, m)``.
     """
+    if torch.compiler.is_compiling():  # it would go on into SciPy
+        return torch.compiler.disable(_Solve.apply)(solver, right)
     return applied(_Solve, solver, right)
 
 
