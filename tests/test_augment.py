@@ -303,7 +303,7 @@ def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     amplitudes = torch.zeros(1, 8, dtype=F64)
     amplitudes[0, 0] = 1.0
     amplitudes = amplitudes * (0.5 / linear_strain(amplitudes, reference, space.edges))
-    bent = deform(x, amplitudes, reference, space.reconstruction)
+    bent = deform(x, amplitudes, reference, space.reconstruction())
     straight = x + (amplitudes @ reference.modes).reshape(3, -1).mT
     initial = volume(x, bars.faces)
     assert float(volume(straight, bars.faces) / initial) > 1.35
@@ -316,7 +316,7 @@ def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     angle = torch.arccos(((turns[0].T @ turns[1]).trace() - 1) / 2)
     assert float(angle) > 1.5
     # And small ones are the modes themselves, up to the rigid motion that they are aligned by.
-    small = deform(x, 1e-4 * amplitudes, reference, space.reconstruction)
+    small = deform(x, 1e-4 * amplitudes, reference, space.reconstruction())
     rigid = bars.bases[0].rigid_modes.flatten(1)
     difference = ((small - x) * 1e4 - (straight - x)).flatten()
     difference = difference - rigid.T @ (rigid @ difference)
@@ -332,7 +332,7 @@ def test_deformation_moves_along_with_the_shape(bars: Shapes, space: tm.ShapeSpa
         turned = augment(x @ rotation.T + move, augment.params)
         torch.testing.assert_close(turned, y @ rotation.T + move)
         # It deforms only: the best rigid motion back to where it came from is none.
-        back = best_fit(y, x, space.reconstruction.areas)
+        back = best_fit(y, x, space.reconstruction().areas)
         torch.testing.assert_close(back.rotation, torch.eye(3, dtype=F64).expand(3, 3, 3), rtol=0, atol=1e-9)
         torch.testing.assert_close(back.source, back.target)
 

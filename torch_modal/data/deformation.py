@@ -88,7 +88,7 @@ class RandomModalDeformation(ShapeAugmentation):
     def _deformed(self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, index: int) -> Tensor:
         """Shapes that are nearest to one key-frame. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
         reference = space.reference(index, x)
-        reconstruction = space.reconstruction
+        reconstruction = space.reconstruction(x.device)
         with torch.no_grad():
             scale, deformed = self._bounded(x.detach(), amplitudes.detach(), space, reference, reconstruction)
         if not (torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)):
@@ -104,7 +104,7 @@ class RandomModalDeformation(ShapeAugmentation):
     ) -> tuple[Tensor, Tensor]:
         """How far each draw may go, ``(B,)``, and the shapes that this gives; where nothing helps, those that came."""
         bound = (1 - _ROUNDING) * self.max_strain
-        expected = linear_strain(amplitudes, reference, space.edges.to(x.device))
+        expected = linear_strain(amplitudes, reference, reconstruction.edges)
         scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
         shapes = x.clone()
         rows = torch.arange(len(x), device=x.device)
@@ -136,7 +136,7 @@ def deform(x: Tensor, amplitudes: Tensor, reference: Reference, reconstruction: 
     Returns:
         Aligned with ``x``. *Shape:* ``(B, V, 3)``.
     """
-    faces, weights = reconstruction.faces.to(x.device), reconstruction.areas.to(x)
+    faces, weights = reconstruction.faces, reconstruction.areas.to(x)
     displacement = _displacement(amplitudes, reference)
     turn, strain = bend(sides(displacement, faces), reference.frames)
     pose = best_fit(reference.shape.expand_as(x), x, weights).rotation

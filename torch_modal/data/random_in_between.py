@@ -187,7 +187,7 @@ class RandomExtrapolation(_Pairwise):
         after = t > 0.5
         before_end = pair.at(torch.where(after, 2 - t, -t))
         ends = torch.where(after[:, None, None], pair.x_b, pair.x_a)
-        return mirror(ends, before_end, pair.space.reconstruction)
+        return mirror(ends, before_end, pair.space.reconstruction(ends.device))
 
     def extra_repr(self) -> str:
         """Settings."""
@@ -199,7 +199,7 @@ def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Ten
 
     *Shape:* ``(B, V, 3), (B, V, 3) -> (B, V, 3)``.
     """
-    weights, faces = reconstruction.areas.to(centre), reconstruction.faces.to(centre.device)
+    weights, faces = reconstruction.areas.to(centre), reconstruction.faces
     motion = best_fit(centre, other, weights)
     last, aligned = (y.movedim(-1, 0).contiguous() for y in (centre, motion.inverse().apply(other)))
     wanted = mirrored_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))

@@ -15,7 +15,6 @@ from torch_modal.data.motion import Motion, Span
 from torch_modal.data.recent import Recent
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
-from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
@@ -37,6 +36,8 @@ _NOT_ELASTIC = 1e-8
 # What one space keeps of each kind; the rest is made again when it is needed. Fewer than a batch needs would make all
 # of them again for each batch.
 _N_LAYERS, _N_TABLES, _N_REFERENCES = 32, 64, 16
+# Dtypes and devices that it keeps key-frames in.
+_N_PLACES = 4
 
 
 class Reference(NamedTuple):
@@ -54,8 +55,8 @@ class Reference(NamedTuple):
 class ShapeSpace:
     """Key-frames of one connectivity with their modes: what a random shape is drawn from.
 
-    Layers, factorisations and tables are made when they are first needed, in the process that needs them, and only the
-    most recent are kept. Pickling leaves them out, so that a space can be handed to worker processes.
+    Layers, factorisations and tables are made when they are first needed, in the process and on the device that need
+    them, and only the most recent are kept. Pickling leaves them out: a space can be handed to worker processes.
 
     Args:
         bases: The basis of each key-frame (:func:`torch_modal.extract_bases`).
@@ -123,11 +124,10 @@ class ShapeSpace:
 
     def _forget(self) -> None:
         self._layers, self._tables, self._references = Recent(_N_LAYERS), Recent(_N_TABLES), Recent(_N_REFERENCES)
-        self._edges: Tensor | None = None
-        self._reconstruction: Reconstruction | None = None
+        self._keyframes, self._reconstructions = Recent(_N_PLACES), Recent(_N_PLACES)
 
     def __getstate__(self) -> dict[str, Any]:
-        made = ("_layers", "_tables", "_references", "_reconstruction", "_edges")
+        made = ("_layers", "_tables", "_references", "_reconstructions", "_keyframes")
         return {name: value for name, value in self.__dict__.items() if name not in made}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -151,14 +151,17 @@ class ShapeSpace:
     @property
     def edges(self) -> Tensor:
         """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
-        if self._edges is None:
-            self._edges = torch.tensor(Connectivity(self.faces.numpy()).edges)
-        return self._edges
+        return self.reconstruction().edges
 
     def keyframes(self, like: Tensor | None = None) -> Tensor:
-        """The key-frames, in the dtype and on the device of another tensor. *Shape:* ``(K, V, 3)``."""
-        shapes = torch.stack([basis.reference for basis in self.bases])
-        return shapes.to(self.dtype) if like is None else shapes.to(like)
+        """A copy of the key-frames, in the dtype and on the device of another tensor. *Shape:* ``(K, V, 3)``."""
+        return self._keyframes_like(torch.empty(0, dtype=self.dtype) if like is None else like).clone()
+
+    def _keyframes_like(self, like: Tensor) -> Tensor:
+        def make() -> Tensor:
+            return torch.stack([basis.reference for basis in self.bases]).to(like)
+
+        return self._keyframes.get((like.dtype, like.device), make)
 
     def nearest(self, x: Tensor) -> Tensor:
         """Which key-frame each shape is closest to, apart from a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
@@ -166,27 +169,28 @@ class ShapeSpace:
             return torch.zeros(len(x), dtype=torch.int64)
         with torch.no_grad():
             x = x.detach()
-            weights = self.reconstruction.areas.to(x)
+            weights = self.reconstruction(x.device).areas.to(x)
             distances = [
                 ((best_fit(key.expand_as(x), x, weights).apply(key) - x) ** 2).sum(-1) @ weights
-                for key in self.keyframes(x)
+                for key in self._keyframes_like(x)
             ]
         return torch.stack(distances).argmin(0).cpu()
 
     def strain(self, x: Tensor, rest: Tensor) -> Tensor:
         """Relative change of length of each edge. *Shape:* ``(B, V, 3), (B, V, 3) -> (B, E)``."""
-        i, j = self.edges.to(x.device).unbind(1)
+        i, j = self.reconstruction(x.device).edges.unbind(1)
         rows = (y.movedim(-1, 0).contiguous() for y in (x, rest))
         after, before = (norm(pick(y, j) - pick(y, i)) for y in rows)
         return after / before - 1
 
     # ------------------------------------------------------------------------------------------- made when needed
-    @property
-    def reconstruction(self) -> Reconstruction:
+    def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
         """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
-        if self._reconstruction is None:
-            self._reconstruction = Reconstruction(self.bases[0].reference, self.faces)
-        return self._reconstruction
+
+        def make() -> Reconstruction:
+            return Reconstruction(self.bases[0].reference, self.faces).to(device)
+
+        return self._reconstructions.get(torch.device(device), make)
 
     def reference(self, index: int, like: Tensor) -> Reference:
         """A key-frame for modal deformation, in the dtype and on the device of another tensor."""
@@ -230,13 +234,13 @@ class ShapeSpace:
         if span is None and objective.contact:
             # Pushed apart the same way at all times, so that tables are smooth.
             pair = MotionPath([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver).to(like)
-            return partial(pair.solve, self.keyframes(like)[[i, j]])
+            return partial(pair.solve, self._keyframes_like(like)[[i, j]])
         if span is None:
-            return partial(self._layer(i, j).to(like).solve, *self.keyframes(like)[[i, j]])
+            return partial(self._layer(i, j).to(like).solve, *self._keyframes_like(like)[[i, j]])
         bases = [self.bases[key] for key in span.keyframes]
         # The neighbours are all that it depends on; a path of all key-frames would be made anew for each table.
         course = MotionPath(bases, self.faces, span.times, objective=objective, solver=solver).to(like)
-        return partial(course.solve, self.keyframes(like)[span.keyframes])
+        return partial(course.solve, self._keyframes_like(like)[span.keyframes])
 
     def table(self, i: int, j: int) -> Tensor:
         """In-betweens of two key-frames at even times, from disk where they are. *Shape:* ``(T, V, 3)``."""

@@ -109,7 +109,7 @@ class Poisson(nn.Module):
         return pick(torch.zeros_like(weighted).index_add(-1, piece, weighted), piece).to(x)
 
 
-class Reconstruction:
+class Reconstruction(nn.Module):
     r"""The shape whose sides come closest to those wanted, :math:`\min_x \sum w_{ij} |x_j - x_i - s_{ij}|^2`.
 
     The weights are cotangents of a reference, so that one factorisation serves all shapes of the connectivity.
@@ -119,27 +119,48 @@ class Reconstruction:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
     """
 
+    faces: Tensor
+    sides: Tensor
+    signs: Tensor
+    weights: Tensor
+    areas: Tensor
+
     def __init__(self, reference: Tensor, faces: Tensor) -> None:
+        super().__init__()
         shape = reference.detach().cpu().double().numpy()
-        self.mesh = mesh = Connectivity(faces.cpu().numpy(), len(shape))
-        self.faces = faces.cpu()
-        self.sides, self.signs = torch.tensor(mesh.sides), torch.tensor(mesh.signs)
+        mesh = Connectivity(faces.cpu().numpy(), len(shape))
+        self.register_buffer("faces", faces.cpu().clone(), persistent=False)
+        self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
+        self.register_buffer("signs", torch.tensor(mesh.signs), persistent=False)
         #: Of the sides. *Shape:* ``(3F,)``.
-        self.weights = torch.from_numpy(_side_weights(shape, mesh))
-        self.areas = torch.from_numpy(vertex_areas(shape, mesh.faces))
+        self.register_buffer("weights", torch.from_numpy(_side_weights(shape, mesh)), persistent=False)
+        #: Of the vertices. *Shape:* ``(V,)``.
+        self.register_buffer("areas", torch.from_numpy(vertex_areas(shape, mesh.faces)), persistent=False)
         weights = torch.zeros(len(mesh.edges), dtype=torch.float64).index_add(0, self.sides, self.weights)
         self.poisson = Poisson(mesh, weights, self.areas)
-        self.loose = [tuple(torch.from_numpy(part) for part in pair) for pair in self._loose(shape)]
+        loose = self._loose(shape, mesh)
+        self.n_loose = len(loose)
+        for i, (piece, anchors) in enumerate(loose):
+            self.register_buffer(f"piece_{i}", torch.from_numpy(piece), persistent=False)
+            self.register_buffer(f"anchors_{i}", torch.from_numpy(anchors), persistent=False)
 
-    def _loose(self, shape: NDArray[np.float64]) -> list[tuple[IntArray, IntArray]]:
+    @property
+    def edges(self) -> Tensor:
+        """Vertex indices of each edge. *Shape:* ``(E, 2)``."""
+        return self.poisson.edges
+
+    @property
+    def loose(self) -> list[tuple[Tensor, Tensor]]:
         """The vertices of all pieces but the largest, and those of the largest that they follow."""
-        labels, areas = self.mesh.vertex_pieces, self.areas.numpy()
-        used = np.unique(self.mesh.faces)
-        pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[used])]
+        return [(getattr(self, f"piece_{i}"), getattr(self, f"anchors_{i}")) for i in range(self.n_loose)]
+
+    def _loose(self, shape: NDArray[np.float64], mesh: Connectivity) -> list[tuple[IntArray, IntArray]]:
+        labels, areas = mesh.vertex_pieces, self.areas.numpy()
+        pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[mesh.used])]
         pieces.sort(key=lambda piece: -float(areas[piece].sum()))
         return [(piece, pieces[0][_nearest(shape[pieces[0]], shape[piece])]) for piece in pieces[1:]]
 
-    def __call__(self, wanted: Sides, rest: Tensor) -> Tensor:
+    def forward(self, wanted: Sides, rest: Tensor) -> Tensor:
         """The shape, its centroid where that of ``rest`` is. Vertices that no face uses stay.
 
         Args:
@@ -149,11 +170,9 @@ class Reconstruction:
         Returns:
             *Shape:* ``(3, B, V)``.
         """
-        sides, signs, weights = self.sides.to(rest.device), self.signs.to(rest), self.weights.to(rest)
-        edges = edge_means(wanted, weights, sides, signs, len(self.mesh.edges))
+        edges = edge_means(wanted, self.weights.to(rest), self.sides, self.signs.to(rest), len(self.edges))
         out = placed = self.poisson(edges, rest)
         for piece, anchors in self.loose:
-            piece, anchors = piece.to(rest.device), anchors.to(rest.device)
             before, after = (x[..., anchors].movedim(0, -1) for x in (rest, placed))
             motion = best_fit(before, after, torch.ones_like(before[0, :, 0]))
             centre = (rest[..., piece] * self.poisson.shares.to(rest)[piece]).sum(-1).T[:, None]
