@@ -296,6 +296,15 @@ def test_strain_is_bounded_and_the_bound_reached(bars: Shapes, space: tm.ShapeSp
         assert float(largest.min()) > 0.75 * bound
 
 
+def test_what_a_space_keeps_is_made_once_and_is_its_own(bars: Shapes, space: tm.ShapeSpace) -> None:
+    assert space.reconstruction() is space.reconstruction("cpu")
+    like = torch.empty(0, dtype=torch.float32)
+    given = space.keyframes(like)
+    assert given.dtype == torch.float32
+    given.zero_()
+    assert torch.equal(space.keyframes(like), bars.keyframes.float())
+
+
 def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     """The straight bar along its softest mode: strains stay those of the linear estimate, which itself shears."""
     x = bars.keyframes[:1]

@@ -22,6 +22,7 @@ from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.nn.samples import ConvergenceError, ConvergenceWarning, Samples
+from torch_modal.nn.settings import Solver
 from torch_modal.nn.solver import GaussNewtonStep, Status
 
 DOUBLE = torch.float64
@@ -536,6 +537,15 @@ class TestTorch:
         with torch.no_grad():
             compiled = torch.compile(layer, backend="eager")(batch, x_b, 0.5)
             torch.testing.assert_close(compiled, layer(batch, x_b, 0.5), rtol=0, atol=1e-9)
+
+    @pytest.mark.parametrize("backend", ["torch", "auto"])
+    def test_a_layer_that_was_never_called_is_compiled(self, small_bars: Shapes, backend: str) -> None:
+        """What is made at its first use is made outside of the trace: SciPy cannot be traced."""
+        solver = Solver(backend=backend)
+        x_a, x_b = small_bars.keyframes[0].clone().requires_grad_(), small_bars.keyframes[1]
+        compiled, plain = (InBetween(small_bars.bases[:2], small_bars.faces, solver=solver) for _ in range(2))
+        shape = torch.compile(compiled, backend="eager")(x_a, x_b, 0.5)
+        torch.testing.assert_close(shape, plain(x_a, x_b, 0.5), rtol=0, atol=1e-9)
 
     def test_least_gain_never_limits_a_gradient(self, bars: Shapes) -> None:
         layer = InBetween(bars.bases[:2], bars.faces)
