@@ -75,7 +75,7 @@ setup(
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
     package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply", "view/page_assets/*"]},
     install_requires=[
-        "torch>=2.4",
+        "torch>=2.7",  # earlier ones do not say whether torch.func transforms a tensor
         "numpy>=1.24",
         "scipy>=1.11",
         "trimesh>=4.6.13",  # earlier ones lose the mesh of some files
