@@ -23,8 +23,8 @@ def description_for_pypi() -> str:
 
 
 EXTRAS = {
-    "view": ["viser>=1.0"],  # a session in which key-frames are deformed by hand
-    "pictures": ["pyvista>=0.43"],  # pictures and videos in better light, on the graphics card
+    "view": ["viser>=1.0.20"],  # a session in which key-frames are deformed by hand
+    "pictures": ["pyvista>=0.46"],  # pictures and videos in better light, on the graphics card
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],
     "pyg": ["torch_geometric>=2.4"],
@@ -75,7 +75,7 @@ setup(
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
     package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply", "view/page_assets/*"]},
     install_requires=[
-        "torch>=2.7",  # earlier ones do not say whether torch.func transforms a tensor
+        "torch>=2.8",  # earlier ones lack what tells transforms of torch.func apart, or cannot gather by int32 in them
         "numpy>=1.24",
         "scipy>=1.11",
         "trimesh>=4.6.13",  # earlier ones lose the mesh of some files

@@ -538,6 +538,7 @@ class TestTorch:
             compiled = torch.compile(layer, backend="eager")(batch, x_b, 0.5)
             torch.testing.assert_close(compiled, layer(batch, x_b, 0.5), rtol=0, atol=1e-9)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("backend", ["torch", "auto"])
     def test_a_layer_that_was_never_called_is_compiled(self, small_bars: Shapes, backend: str) -> None:
         """What is made at its first use is made outside of the trace: SciPy cannot be traced."""
