@@ -13,6 +13,7 @@ from torch.func import jacfwd
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.modal_energy import Derivatives, Placement
+from torch_modal.nn.samples import ConvergenceError, report
 from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, minimise
 
 
@@ -52,6 +53,14 @@ class Circle(LeastSquares):
 
     def residuals(self, a: Tensor) -> Tensor:
         return torch.stack([a[..., 0], a[..., 0] ** 2 + 5.0], -1)
+
+
+class Uphill(Circle):
+    """Its derivatives are those of another function: no step goes downhill."""
+
+    def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
+        found = super().derivatives(a, placement, second_order)
+        return found._replace(gradient=-found.gradient)
 
 
 def start(*rows: list[float]) -> Tensor:
@@ -187,6 +196,17 @@ def test_least_gain_ends_it_early(layer: MidShape, bars: Shapes) -> None:
     torch.testing.assert_close(layer.step.energy.value(short.amplitudes, placed), short.energy)
     one = minimise(layer.step, a, placed, least_gain=1.0 - 1e-9)  # a step cannot promise more than there is
     assert one.n_steps.tolist() == [1, 1, 1]
+
+
+def test_what_cannot_go_on_says_why() -> None:
+    """Neither what stalls nor what runs out of steps counts as converged; what is at its optimum does."""
+    stalled = minimise(GaussNewtonStep(Uphill()), start([0.5], [2.0]), None)
+    assert (stalled.status == Status.STALLED).all() and not stalled.usable.any()
+    assert stalled.amplitudes.tolist() == [[0.5], [2.0]] and stalled.n_steps.tolist() == [0, 0]
+    short = minimise(GaussNewtonStep(Rosenbrock()), start([-1.2, 1.0], [1.0, 1.0]), None, max_steps=2)
+    assert short.status.tolist() == [Status.OUT_OF_STEPS, Status.CONVERGED] and short.n_steps.tolist() == [2, 0]
+    with pytest.raises(ConvergenceError, match="did not converge"):
+        report(stalled, max_steps=40, forbid=True)
 
 
 def test_converges_and_says_so(layer: MidShape, bars: Shapes) -> None:

@@ -92,6 +92,7 @@ def test_columns_and_keyframes_are_chosen(tmp_path):
         ({"columns": 3, "keyframe_indices": [4]}, [0, 4, 8], [1]),
         ({"columns": [1, 4], "keyframe_indices": [0, 4, 8]}, [1, 4], [1]),
         ({"columns": 1}, [0], [0]),
+        ({"columns": 3, "keyframe_indices": []}, [0, 4, 8], []),
     ]:
         sizes, warm_found = radii(**more)
         expected = 1 + np.array(frames) / 8
@@ -247,6 +248,7 @@ def test_pdf(tmp_path):
         ({"columns": 0}, "columns must be at least 1"),
         ({"titles": ["first"]}, "titles stand above 3 columns, got 1"),
         ({"columns": [0, 3]}, r"columns.*0 to 2.*\[0, 3\]"),
+        ({"columns": []}, "columns.*one or more"),
         ({"keyframe_indices": [3]}, "keyframe_indices.*0 to 2"),
         ({"view": (0,)}, "azimuth and elevation"),
         ({"view": (0, float("inf"))}, "azimuth and elevation"),

@@ -21,8 +21,6 @@ def transformed(x: Tensor) -> bool:
 
 def made_outside(make: Callable[[], Made]) -> Made:
     """What is made at its first use and kept: of numbers, whatever ``torch.compile`` or ``torch.func`` do around it."""
-    if torch.compiler.is_compiling():
-        return torch.compiler.disable(make)()
     found: list[Made] = []
     _Outside.apply(lambda: found.append(make()), torch.empty(0))
     return found[0]

@@ -81,10 +81,8 @@ def check_frames(frames: Array, faces: Array, name: str = "frames") -> tuple[Flo
 def check_indices(indices: Sequence[int], n_frames: int, name: str) -> list[int]:
     """Frame numbers, each once and in order; negative ones are refused, not wrapped."""
     numbers = sorted({int(index) for index in indices})
-    if not numbers or numbers[0] < 0 or numbers[-1] >= n_frames:
-        raise ValueError(
-            f"{name} must be numbers of frames, from 0 to {n_frames - 1}, at least one; got {list(indices)}."
-        )
+    if numbers and (numbers[0] < 0 or numbers[-1] >= n_frames):
+        raise ValueError(f"{name} must be numbers of frames, from 0 to {n_frames - 1}; got {list(indices)}.")
     return numbers
 
 

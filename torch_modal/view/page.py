@@ -49,8 +49,8 @@ def show(
         sequences: Shapes, or several sequences under their names, for example ``{"torch_modal": x, "linear": y}``,
             shown side by side or overlaid. *Shape of each:* ``(N, V, 3)``, the same for all.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        keyframe_indices: Frames that are key-frames: drawn in the other colour and marked on the time line. The first
-            and the last by default.
+        keyframe_indices: Frames that are key-frames: drawn in the other colour and marked on the time line; an empty
+            list is none. The first and the last by default.
         times: The time of each frame, rising; shown beside its number, and the time line keeps their distances. Evenly
             spaced by default. *Shape:* ``(N,)``.
         fps: Frames a second, on average if ``times`` are given.

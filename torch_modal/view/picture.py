@@ -171,8 +171,8 @@ def render_sequence(
         columns: How many frames to show, evenly chosen with the first and the last, or their numbers. By
             default all up to seven, and of more a number from four to seven that gives equal steps.
         titles: What stands above the columns. Default: when they are, from 0 to 1.
-        keyframe_indices: Frames that are key-frames, drawn in the other colour. The first and the last by
-            default.
+        keyframe_indices: Frames that are key-frames, drawn in the other colour; an empty list is none. The first
+            and the last by default.
         view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is
             up, -Y where Z is), a positive azimuth moves the camera to the right. By default chosen from the
             shape.
@@ -219,6 +219,8 @@ def render_sequence(
         chosen = np.unique(np.linspace(0, n_frames - 1, count).round().astype(int)).tolist()
     else:
         chosen = check_indices(columns, n_frames, "columns")
+        if not chosen:
+            raise ValueError("columns are the frames to show, one or more; got none.")
     titles = [f"t = {n / max(n_frames - 1, 1):.3g}" for n in chosen] if titles is None else titles
     if len(titles) != len(chosen):
         raise ValueError(f"titles stand above {len(chosen)} columns, got {len(titles)}.")
