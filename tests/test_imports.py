@@ -136,6 +136,22 @@ def test_nothing_searches_for_garbage_while_names_are_loaded() -> None:
     assert result.stdout.split() == ["True", "[]", "True", "False"]
 
 
+def test_what_was_loaded_is_old() -> None:
+    """The next search, of what is young, does not go through all of it; what callers have frozen stays so."""
+    code = (
+        "import gc, torch, torch_modal as tm;"
+        "old = len(gc.get_objects(2));"
+        "tm.subdivide;"
+        "young = len(gc.get_objects(0)) + len(gc.get_objects(1));"
+        "print(len(gc.get_objects(2)) > old + 10_000, young < 2_000);"
+        "gc.freeze(); frozen = gc.get_freeze_count(); tm.ShapeDataset; print(gc.get_freeze_count() > 0.9 * frozen)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120, cwd=PACKAGE.parent
+    )
+    assert result.stdout.split() == ["True", "True", "True"]
+
+
 def test_public_names_are_there() -> None:
     import torch_modal
 

@@ -14,7 +14,8 @@ from torch_modal.errors import MissingPackageError
 def uncollected() -> Iterator[None]:
     """No search for garbage inside: imports leave next to none, and a search goes through all that torch is made of.
 
-    That is a tenth of a second for each, and large packages bring it about once or twice.
+    That is a tenth of a second for each, and large packages bring it about once or twice. What they have made counts as
+    old afterwards, or the next searches, of what is young, would go through all of it.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -22,6 +23,9 @@ def uncollected() -> Iterator[None]:
         yield
     finally:
         if was_on:
+            if gc.get_freeze_count() == 0:  # nothing of anyone else's is let go
+                gc.freeze()
+                gc.unfreeze()
             gc.enable()
 
 
