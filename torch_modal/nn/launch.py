@@ -1,11 +1,12 @@
 """Whether there are kernels, and how torch runs them: what NVIDIA Warp needs to be told."""
 
+import ctypes
 import importlib
 import importlib.util
 import os
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any, Literal
@@ -85,13 +86,15 @@ _COMMANDS = _Commands()
 
 
 @cache
-def _sizes(kernel: Any) -> list[tuple[int, int]]:
-    """Numbers and bytes in an entry of each array that a kernel takes; none of what is no array."""
+def _kinds(kernel: Any) -> list[tuple[int, torch.dtype] | None]:
+    """Numbers in an entry of each array that a kernel takes, and of what; None of what is no array, but an integer."""
     import warp as wp
 
     types = [argument.type for argument in kernel.adj.args]
     entries = [one.dtype if isinstance(one, wp.array) else None for one in types]
-    return [(0, 0) if e is None else (getattr(e, "_length_", 1), wp.types.type_size_in_bytes(e)) for e in entries]
+    numbers = [getattr(entry, "_wp_scalar_type_", entry) for entry in entries]
+    pairs = zip(entries, numbers, strict=True)
+    return [None if e is None else (getattr(e, "_length_", 1), wp.dtype_to_torch(own)) for e, own in pairs]
 
 
 @cache
@@ -102,35 +105,67 @@ def _array() -> Any:
     return type(wp.from_torch(torch.zeros(1), return_ctype=True))
 
 
+def _slot(kind: tuple[int, torch.dtype] | None, memory: Any, offset: int = 0) -> tuple[Any, ...]:
+    """What :func:`_kinds` says, and where an argument is written: address and length of an array, or an integer."""
+    if kind is None:
+        return 0, None, None, ctypes.c_int32.from_buffer(memory, offset)
+    places = offset + _array().data.offset, offset + _array().shape.offset
+    return *kind, ctypes.c_uint64.from_buffer(memory, places[0]), ctypes.c_int32.from_buffer(memory, places[1])
+
+
 class _Command:
-    """A launch that Warp has recorded; the next ones only write over what changes, in the places that Warp reads."""
+    """A launch that Warp has recorded; the next ones only write over what changes, in the places that are read."""
 
     def __init__(self, kernel: Any, dim: tuple[int, ...], device: torch.device, adjoint: bool) -> None:
         import warp as wp
 
+        kinds = _kinds(kernel)
+
         def blank() -> list[Any]:
-            return [_array()(0, 0, 1, (0,), (size,)) if width else 0 for width, size in _sizes(kernel)]
+            return [0 if k is None else _array()(0, 0, 1, (0,), (k[0] * k[1].itemsize,)) for k in kinds]
 
-        adjoints = blank() if adjoint else []
-        self.dim = dim
-        self.launch = wp.launch(
-            kernel, dim, blank(), adj_inputs=adjoints, adjoint=adjoint, device=str(device), record_cmd=True
+        recorded = wp.launch(
+            kernel,
+            dim,
+            blank(),
+            adj_inputs=blank() if adjoint else [],
+            adjoint=adjoint,
+            device=str(device),
+            record_cmd=True,
         )
-        self.places = list(zip(_sizes(kernel) * (1 + adjoint), self.launch.params[1:], strict=True))
+        bounds, *values = recorded.params
+        self.run: Callable[[Any], None]
+        if device.type != "cpu":
+            self.run = recorded.launch
+            self.slots = [_slot(*both) for both in zip(kinds * (1 + adjoint), values, strict=True)]
+            return
+        # Warp would put the arguments together at each launch, which takes longer than a small kernel.
+        fields = [(f"_{i}", type(value)) for i, value in enumerate(values[: len(kinds)])]
+        packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        given = [packed(*values[i : i + len(kinds)]) for i in range(0, len(values), len(kinds))]
+        hook = recorded.hooks.backward if adjoint else recorded.hooks.forward
+        arguments = [ctypes.byref(part) for part in (bounds, *given)]
+        self.run = lambda stream: hook(*arguments)
+        offsets = [getattr(packed, name).offset for name, _ in fields]
+        self.slots = [_slot(kind, part, at) for part in given for kind, at in zip(kinds, offsets, strict=True)]
+        self.kept = recorded  # and with it the module
 
-    def __call__(self, dim: tuple[int, ...], values: Sequence[Any], stream: Any) -> None:
-        if self.dim != dim:
-            self.launch.set_dim(dim)
-            self.dim = dim
-        for ((width, size), place), value in zip(self.places, values, strict=True):
+    def __call__(self, values: Sequence[Any], stream: Any) -> None:
+        for (width, dtype, address, number), value in zip(self.slots, values, strict=True):
             if not width:
-                place.value = value or 0
+                number.value = value or 0
             elif value is None:
-                place.data = place.shape[0] = 0
+                address.value = number.value = 0
             else:
-                assert value.is_contiguous() and width * value.element_size() == size
-                place.data, place.shape[0] = value.data_ptr(), value.numel() // width
-        self.launch.launch(stream)
+                assert value.dtype is dtype and value.is_contiguous()
+                address.value, number.value = value.data_ptr(), value.numel() // width
+        self.run(stream)
+
+
+_CPU = torch.device("cpu")
+
+# Sizes of batches come and go: commands that are made for them are kept up to this many.
+_MOST_COMMANDS = 1000
 
 
 def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Sequence[Any] = ()) -> None:
@@ -139,22 +174,24 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
     Args:
         kernel: Of :func:`kernels`.
         dim: Number of threads.
-        given: What it takes, tensors contiguous and of the types that it declares.
+        given: What it takes, a tensor first; tensors are contiguous and of the types that it declares.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
     """
     if 0 in dim:
         return  # Warp would not, either, but has no command to tell of it
-    device = next(value.device for value in given if isinstance(value, Tensor))
-    key = kernel, device, bool(adjoints)
-    command = _COMMANDS.known.get(key)
+    device = given[0].device
+    key, known = (kernel, dim, device, bool(adjoints)), _COMMANDS.known
+    command = known.get(key)
     if command is None:
-        command = _COMMANDS.known[key] = _Command(kernel, dim, device, bool(adjoints))
-    command(dim, [*given, *adjoints] if adjoints else given, _stream(device))
+        if len(known) == _MOST_COMMANDS:
+            known.clear()
+        command = known[key] = _Command(kernel, dim, device, bool(adjoints))
+    command([*given, *adjoints] if adjoints else given, _stream(device))
 
 
 def _stream(device: torch.device) -> Any:
     """Torch's own, of a GPU."""
-    if device.type != "cuda":
+    if device == _CPU:  # which is told sooner than its type
         return None
     import warp as wp
 
