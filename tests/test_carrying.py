@@ -7,12 +7,13 @@ from bodies import bend
 from solids import box, surface
 
 from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling, modes
+from torch_modal.precompute import filling, modes, solving
 from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, nearest_rotations
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.embedding import embed_surface
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
-from torch_modal.precompute.proximity import clearances, self_proximity
+from torch_modal.precompute.proximity import clearances, parting, self_proximity
+from torch_modal.precompute.solving import Solved
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tet_volumes
@@ -143,6 +144,19 @@ def test_self_proximity_grows_as_the_ends_meet() -> None:
     assert meshing_order(surfaces)[-1] == 0
 
 
+def test_parting_is_of_what_touched_and_came_apart() -> None:
+    fine = box((48, 6, 6), (16.0, 1.0, 1.0))
+    faces = np.unique(surface(fine), return_inverse=True)[1].reshape(-1, 3)
+    closed, ajar, opened = (Surface.of(horseshoe(angle), faces) for angle in (1.995 * np.pi, 1.9 * np.pi, 0.5))
+    # Both ends, of 1 by 1 and of 66 in all, part by most of the length of 16, and half of that is counted for each.
+    expected = np.linalg.norm(opened.points[0] - opened.points[-1]) / 2 * np.sqrt(2 / 66) / 100
+    assert parting(closed, opened) == pytest.approx(expected, rel=0.4)
+    assert parting(closed, ajar) < 0.3 * parting(closed, opened)
+    assert parting(opened, closed) < 0.001
+    turned = Surface.of(horseshoe(1.995 * np.pi) @ TURN.T * 7.0 + 3.0, faces)
+    assert parting(closed, turned) < 1e-9
+
+
 # --------------------------------------------------------------------------------------- a set of key-frames
 
 
@@ -177,6 +191,27 @@ def test_a_keyframe_that_cannot_be_carried_to_has_its_own(
     monkeypatch.setattr("torch_modal.precompute.carrying.MAX_FIT", -1.0)
     modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, cache=False)
     assert len(meshed) == 2
+
+
+def test_what_is_known_to_tear_is_not_carried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ring whose ends touch, and come apart: both poses are meshed; the other way round they are not."""
+    poses = np.stack([bent(POINTS, 1.995 * np.pi), bent(POINTS, 0.5)])
+    filled: list[Filling] = []
+
+    def solve(n_vertices: int, filling: Filling, n_modes: int, *_: object) -> Solved:
+        filled.append(filling)
+        return Solved(np.zeros(n_modes), np.zeros((n_modes, n_vertices, 3)), np.zeros(6), filling, 6)
+
+    monkeypatch.setattr(solving, "solve", solve)
+    monkeypatch.setattr(solving, "meshing_order", lambda surfaces: list(range(len(surfaces))))
+    monkeypatch.setattr(Filler, "body", lambda self, posed: Body(posed, BAR))
+    tried = []
+    monkeypatch.setattr(Filler, "carried", lambda self, body, posed: tried.append(posed))
+    modes.extract_bases(poses, COMPACT, 5, mesher="lattice", cache=False)
+    assert tried == []
+    assert all(filling.body.surface is filling.surface for filling in filled)
+    modes.extract_bases(poses[::-1].copy(), COMPACT, 5, mesher="lattice", cache=False)
+    assert len(tried) == 1
 
 
 def test_carried_tetrahedra_come_from_the_cache(

@@ -26,6 +26,10 @@ N_SAMPLES = 5000
 """At least, where these are measured, and of as many as"""
 SEEN_SAMPLES = 10_000
 MOST_SHRINKINGS = 10
+TOUCHING = 0.015
+"""How far apart points of a surface touch each other, for tetrahedra, in bounding-box diagonals."""
+CELL = 0.005
+"""Of so large cells one point is looked at for that."""
 
 
 def self_proximity(surface: Surface) -> float:
@@ -35,6 +39,30 @@ def self_proximity(surface: Surface) -> float:
     """
     # Half-way to the opposing side that side becomes nearer than the own one.
     return _opposed_part(surface, np.array([1 / 16, 1 / 8, 1 / 4, 1 / 2]) * NEAR * DIAGONAL)
+
+
+def parting(rest: Surface, posed: Surface) -> float:
+    """How far parts of a surface that touch in one pose are from each other in another, in bounding-box diagonals.
+
+    Root mean square over the surface of half of what the distance of a point to those near it grows by, at most.
+    Tetrahedra of the first pose hang on both parts, and cannot follow either.
+
+    Args:
+        rest: The surface in the first pose.
+        posed: In the other.
+    """
+    cells = np.floor(rest.points / (CELL * DIAGONAL)).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, chosen, cell = np.unique(np.ravel_multi_index(tuple(cells.T), cells.max(axis=0) + 1), True, True)
+    areas = np.bincount(cell.reshape(-1), vertex_areas(rest.points, rest.faces))
+    # The bounding box, which is the unit here, changes with the pose; the size of the shape hardly does.
+    before, after = rest.points[chosen], posed.points[chosen] * np.sqrt(rest.area / posed.area)
+    one, other = cKDTree(before).query_pairs(TOUCHING * DIAGONAL, output_type="ndarray").T
+    growth = np.linalg.norm(after[one] - after[other], axis=1) - np.linalg.norm(before[one] - before[other], axis=1)
+    largest = np.zeros(len(chosen))
+    for point in (one, other):
+        np.maximum.at(largest, point, growth)
+    return float(np.sqrt(np.average((largest / 2) ** 2, weights=areas))) / DIAGONAL
 
 
 class Clearance(NamedTuple):

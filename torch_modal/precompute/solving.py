@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch_modal.errors import MeshError
 from torch_modal.io.cache import Cache
 from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
-from torch_modal.precompute.filling import Filler, Filling, meshing_order
+from torch_modal.precompute.filling import Filler, Filling, is_torn, meshing_order
 from torch_modal.precompute.parallel import Budget, run_all
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian
 from torch_modal.precompute.surface import Surface
@@ -73,11 +73,15 @@ class KeyframeSet:
 
     def solve_carried(self) -> list[Solved]:
         """With the tetrahedra of the one that touches itself least, carried to those where they survive that."""
-        first = meshing_order(self.surfaces)[0]
-        own = self._own(first)
+        first, *others = meshing_order(self.surfaces)
+        # Those that are known to need their own do not wait until carrying has failed.
+        alone = [first, *(index for index in others if is_torn(self.surfaces[first], self.surfaces[index]))]
+        made = run_all(lambda i: self._own(alone[i]), len(alone), self.filler.stop)
+        own = dict(zip(alone, made, strict=True))
 
         def solve(index: int) -> Solved:
-            return self._solved(index, own if index == first else self._carried(own, index) or self._own(index))
+            filling = own.get(index) or self._carried(own[first], index) or self._own(index)
+            return self._solved(index, filling)
 
         return run_all(solve, len(self.surfaces), self.filler.stop)
 
