@@ -1,7 +1,7 @@
 """Gradients of a minimiser: by the implicit function theorem, or through a fixed number of steps."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -42,16 +42,22 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        minimisation: Minimisation, tree: Any, usable: Tensor, times: Tensor, start: Tensor, *tensors: Tensor
+        minimisation: Minimisation,
+        tree: Any,
+        usable: Tensor,
+        times: Tensor,
+        energy: Tensor | None,
+        start: Tensor,
+        *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         minimisation.require(times)
         placement = trees.filled(tree, tensors)
         if minimisation.guessed:
             # Never a start that is worse than linear interpolation: what comes out must not be, either.
             zeros = torch.zeros_like(start)
-            start, _ = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
+            start, energy = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
         limits = minimisation.max_steps, minimisation.tolerance, minimisation.least_gain
-        solution = minimise(minimisation.step, start, placement, *limits)
+        solution = minimise(minimisation.step, start, placement, *limits, energy=energy)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         if minimisation.report is not None:
             minimisation.report(solution)
@@ -59,7 +65,7 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        minimisation, tree, _, _, _, *tensors = inputs
+        minimisation, tree, _, _, _, _, *tensors = inputs
         amplitudes, *diagnostics = output
         ctx.mark_non_differentiable(*diagnostics)
         ctx.minimisation, ctx.tree = minimisation, tree
@@ -79,18 +85,22 @@ class _ArgMin(torch.autograd.Function):
         _warn_of_singular(singular)
         adjoint = torch.where(converged & ~singular, adjoint, 0)
         to_placement = step.energy.pull_back(amplitudes, adjoint, placement)
-        return (None,) * 5 + tuple(-gradient for gradient in trees.leaves(to_placement))
+        return (None,) * 6 + tuple(-gradient for gradient in trees.leaves(to_placement))
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], minimisation: Minimisation, tree: Any, *tensors: Tensor
+        info: Any, in_dims: tuple[Any, ...], minimisation: Minimisation, tree: Any, *tensors: Tensor | None
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        flat = flattened(info.batch_size, in_dims[-len(tensors) :], tensors)
+        known = [i for i, tensor in enumerate(tensors) if tensor is not None]
+        flat: list[Tensor | None] = [None] * len(tensors)
+        dims = [in_dims[-len(tensors) :][i] for i in known]
+        for i, tensor in zip(known, flattened(info.batch_size, dims, [tensors[i] for i in known]), strict=True):
+            flat[i] = tensor
         output = _ArgMin.apply(minimisation, tree, *flat)
         return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
 
 
-def flattened(n: int, in_dims: tuple[int | None, ...], tensors: tuple[Tensor, ...]) -> list[Tensor]:
+def flattened(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> list[Tensor]:
     """Tensors under ``vmap`` as those of one larger batch: the mapped dimension joins the first."""
     flat = []
     for tensor, dim in zip(tensors, in_dims, strict=True):
@@ -113,7 +123,7 @@ def _warn_of_singular(singular: Tensor) -> None:
 
 
 def solve_implicit(
-    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor
+    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor, energy: Tensor | None
 ) -> Solution:
     """Minimise; gradients of the amplitudes by the implicit function theorem.
 
@@ -123,16 +133,17 @@ def solve_implicit(
         start: Where to start, unless zeros have a lower energy. *Shape:* ``(B, n)``.
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
         times: Checked before all else. *Shape:* ``(B,)``.
+        energy: At the start, where it is known and the start is no guess. *Shape:* ``(B,)``.
     """
     tensors = trees.leaves(placement)
     # Kernels compute in float64, whatever goes in and comes out.
-    batched = (usable, times, start.detach().to(tensors[0].dtype), *tensors)
+    batched = (usable, times, energy, start.detach().to(tensors[0].dtype), *tensors)
     found = applied(_ArgMin, minimisation, trees.skeleton(placement), *batched)
     return Solution(*(value.to(start.dtype) if value.is_floating_point() else value for value in found))
 
 
 def solve_unrolled(
-    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor
+    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor, energy: Tensor | None
 ) -> Solution:
     """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
 

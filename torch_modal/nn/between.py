@@ -50,6 +50,8 @@ class Batch(NamedTuple):
     problem: Any
     minimisation: Minimisation
     start: Tensor
+    energy: Tensor | None
+    """There, where it is known. *Shape:* ``(B,)``."""
     usable: Tensor
     pair: Pair
     samples: Samples
@@ -150,7 +152,9 @@ class Between(nn.Module):
             problem = self.problem(pair, samples, anchors)
             start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
             minimisation = self._minimisation(exact, problem.start is not None, report)
-            x, solution = self.solved(Batch(problem, minimisation, start, usable, pair, samples, anchors))
+            x, solution = self.solved(
+                Batch(problem, minimisation, start, problem.energy, usable, pair, samples, anchors)
+            )
         fused = self.fused is not None and fused_alignment.serves(x, placed.first, t)
         shapes = (fused_alignment.restore if fused else Alignment.restore)(self.frame, x, placed, t)
         valid = solution.status != Status.INVALID
@@ -167,7 +171,8 @@ class Between(nn.Module):
         """The shapes of the modal space that have the least energy, likewise."""
         solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         problem = batch.problem
-        solution = solve(batch.minimisation, problem.placement, batch.start, batch.usable, batch.samples.t)
+        given = problem.placement, batch.start, batch.usable, batch.samples.t, batch.energy
+        solution = solve(batch.minimisation, *given)
         return self.space.lift(solution.amplitudes, problem), solution
 
     def _minimisation(self, exact: bool, guessed: bool, report: Callable[[Solution], None] | None) -> Minimisation:
@@ -310,8 +315,7 @@ class Between(nn.Module):
         pair, sizes = found
         usable = sizes > SMALLEST_SIZE * DIAGONAL
         if self.closed:
-            _, volumes, _ = self.fused.sizes(pair.first, pair.second)
-            usable = usable & ~(volumes.prod(-1) < 0)
+            usable = usable & ~(self.fused.volumes(pair.first, pair.second).prod(-1) < 0)
         return pair, usable
 
     def _solvable(self, pair: Pair) -> Tensor:

@@ -117,4 +117,5 @@ def _rows(batch: Batch, some: Tensor, start: Tensor) -> Batch:
         which=of[some], t=samples.t[some], mu=samples.mu[some], stiffness=[k[some] for k in samples.stiffness]
     )
     problem, usable, anchors = trees.rows((batch.problem, batch.usable, batch.anchors), some)
-    return batch._replace(problem=problem, start=start.detach(), usable=usable, samples=samples, anchors=anchors)
+    batch = batch._replace(problem=problem, start=start.detach(), energy=None)
+    return batch._replace(usable=usable, samples=samples, anchors=anchors)

@@ -137,10 +137,16 @@ class FusedShell(nn.Module):
     # ------------------------------------------------------------------------------------------------------- the energy
     def sizes(self, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
         """Lengths of all edges together, volume and area of both ends. *Shape of each:* ``(B, 2)``."""
-        given = [first, second, self.centre(first), self.centre(second), self.record, self.walls, self.n_vertices]
+        return self._sizes(first, second, self.record)
+
+    def volumes(self, first: Tensor, second: Tensor) -> Tensor:
+        """Volumes of both ends alone. *Shape:* ``(B, 2)``."""
+        return self._sizes(first, second, self.record[:0])[1]
+
+    def _sizes(self, first: Tensor, second: Tensor, record: Tensor) -> tuple[Tensor, ...]:
+        given = [first, second, self.centre(first), self.centre(second), record, self.walls, self.n_vertices]
         shapes: Shapes = dict.fromkeys((7, 8, 9), (len(first), 2))
-        n = len(self.record) + len(self.walls)
-        return self._run(kernels("shell").sizes, shapes, [*given, None, None, None], n)
+        return self._run(kernels("shell").sizes, shapes, [*given, None, None, None], len(record) + len(self.walls))
 
     def centre(self, x: Tensor) -> Tensor | None:
         """What volumes are relative to: the mean; None, any vertex, where it does not matter. *Shape:* ``(B, 3)``."""

@@ -40,6 +40,8 @@ class JointProblem(NamedTuple):
     """The fine shape that the modes are added to. *Shape:* ``(B, V, 3)``."""
     difference: Difference
     """The column of the last amplitude."""
+    energy: Tensor | None = None
+    """At zeros, where it is known. *Shape:* ``(B,)``."""
 
 
 class _Modal(nn.Module):
@@ -152,6 +154,7 @@ class JointSpace(nn.Module):
         base = torch.lerp(first, second, t[:, None, None])
         coarse = torch.lerp(coarse_first, coarse_second, t[:, None, None])
         placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
+        energy = None
         if self.modal.guess is not None:
             with torch.no_grad():
                 start = self.modal.guess(coarse_first, coarse_second, extras[0], t)
@@ -160,14 +163,18 @@ class JointSpace(nn.Module):
             seen = levels.seen(blend, self.frame.coarsen(blend))
             turned = levels.place(self.energy, seen, references, extras, anchors)
             with torch.no_grad():
-                zeros = t.new_zeros(len(t), self.n_unknowns)
-                better = self.energy.value(zeros, turned) < self.energy.value(zeros, placement)
+                zeros = t.new_zeros(2, len(t), self.n_unknowns)
+                pairs = zip(turned, placement, strict=True)
+                both = [bent._replace(base=torch.stack([bent.base, straight.base])) for bent, straight in pairs]
+                energies = self.energy.value(zeros, both)
+                better = energies[0] < energies[1]
+                energy = torch.where(better, energies[0], energies[1])
             base = torch.where(better[:, None, None], blend, base)
             placement = tuple(
                 straight._replace(base=torch.where(better[:, None, None], bent.base, straight.base))
                 for bent, straight in zip(turned, placement, strict=True)
             )
-        return JointProblem(placement, start, base, difference)
+        return JointProblem(placement, start, base, difference, energy)
 
     def on_course(self, pair: Pair, index: Tensor | None, t: Tensor) -> Tensor:
         """The shape that the motion passes through, by what the neighbours in time say. *Shape:* ``(B, V, 3)``."""
@@ -195,11 +202,11 @@ class JointSpace(nn.Module):
 
     def lift(self, a: Tensor, problem: JointProblem) -> Tensor:
         """The fine shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""
-        own = problem.difference
-        scale = own.scale * a[:, -1]
-        modal = self.columns.combine(a[:, :-1] - scale[:, None] * own.modal)
-        rigid = self.frame.rigid.combine(scale[:, None] * own.rigid)
-        return problem.base + modal - rigid + scale[:, None, None] * own.whole
+        own, flat = problem.difference, problem.base.flatten(1)
+        scale = (own.scale * a[:, -1])[:, None]
+        found = torch.addmm(flat, a[:, :-1] - scale * own.modal, self.columns.fine.flatten(1))
+        found = torch.addmm(found, scale * own.rigid, self.frame.rigid.fine.flatten(1), alpha=-1)
+        return torch.addcmul(found, scale, own.whole.flatten(1)).view_as(problem.base)
 
     def _difference(self, pair: Pair, coarse: Tensor) -> tuple[Difference, Tensor]:
         """The difference of the key-frames as a column, and that on the coarse mesh. *Shape:* ``(B, V_coarse, 3)``."""

@@ -104,7 +104,7 @@ class ModalEnergy(nn.Module):
 
     def _extended(self, x: Tensor, anchors: Tensor | None = None) -> Tensor:
         fixed = None if anchors is None else anchors.movedim(-1, 0)
-        return self.energy.extend(x.movedim(-1, 0), fixed).transpose(0, 1)
+        return self.energy.extend(x.movedim(-1, 0), fixed).movedim(0, -2)
 
     def rows(self, a: Tensor, placement: Placement) -> Tensor:
         """The shape ``x(a)``, components first. *Shape:* ``(..., B, n) -> (3, ..., B, V)``."""

@@ -36,6 +36,8 @@ class PairedProblem(NamedTuple):
     """*Shape:* ``(B, V, 3)``."""
     second: Tensor
     """*Shape:* ``(B, V, 3)``."""
+    energy: None = None
+    """At zeros, it is not known."""
 
 
 class PairedEnergy(nn.Module):

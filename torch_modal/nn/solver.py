@@ -268,6 +268,7 @@ def minimise(
     max_steps: int = 40,
     tolerance: float = 1e-8,
     least_gain: float = 0.0,
+    energy: Tensor | None = None,
 ) -> Solution:
     """Repeat the step until every sample has converged, or cannot go on.
 
@@ -282,8 +283,9 @@ def minimise(
         tolerance: Bound on the gradient norm, relative to its value at the start.
         least_gain: Where a step promises less than this part of the energy, it is the last one. The gradient norm of
             the solution is then the one before that step.
+        energy: At the start, where it is known. *Shape:* ``(B,)``.
     """
-    energy = step.energy.value(a, placement)
+    energy = step.energy.value(a, placement) if energy is None else energy
     eps, tiny = torch.finfo(energy.dtype).eps, torch.finfo(energy.dtype).tiny
     found, blank = torch.zeros_like(a), energy.new_zeros(len(a))
     # What decides are a few numbers of each sample: on the host, where a GPU is waited for twice in a step.
