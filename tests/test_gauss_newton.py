@@ -35,6 +35,9 @@ class LeastSquares:
         gradient, gauss_newton, curved, resolution = map(torch.stack, zip(*rows, strict=True))
         return Derivatives(gradient, gauss_newton, curved if second_order else None, resolution)
 
+    def gradient(self, a: Tensor, placement: Any) -> Tensor:
+        return self.derivatives(a, placement).gradient
+
     def second_order(self, a: Tensor, placement: Any) -> Tensor:
         curved = self.derivatives(a, placement).second_order
         assert curved is not None

@@ -179,7 +179,7 @@ class Between(nn.Module):
         space, solver = self.space, self.solver
         least_gain = 0.0 if exact or isinstance(space, PairedSpace) else solver.least_gain
         limits = solver.max_steps, solver.tolerance, least_gain
-        return Minimisation(self.step, *limits, guessed, space.require, report)
+        return Minimisation(self.step, *limits, guessed, exact, space.require, report)
 
     def placed(self, samples: Samples) -> Pair:
         """The pairs of key-frames in the frame, with their neighbours in time."""

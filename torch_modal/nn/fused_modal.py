@@ -194,6 +194,18 @@ class FusedModalEnergy(ModalEnergy):
         curved = self._second(x, to.stiffness * off, placement) if second_order else None
         return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
+    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
+        """As the other's."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().gradient(a.to(plain.base), plain).to(placement.base)
+        to: Any = placement.reference
+        x = self.shell.gradient(self._shapes(a, placement.base, placement.extra), to)
+        found = x.flatten(1) @ self.flat.double().T
+        if placement.extra is None:
+            return found
+        return torch.cat([found, (x * placement.extra).sum((-1, -2))[:, None]], -1)
+
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """As the other's."""
         plain = self._plain(placement)

@@ -146,6 +146,16 @@ class ModalEnergy(nn.Module):
         curved = self._curved(at, extra) if second_order else None
         return Derivatives(reduce(torch.add, gradient), inner, curved, rounding * (stiffest * stiffness).sqrt())
 
+    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
+        """The gradient alone. *Shape:* ``(B, n)``."""
+        at = self.energy.linearise(self.rows(a, placement), placement.reference)
+        return self._along_columns(self.energy.gradient(at).transpose(0, 1).flatten(1), placement.extra)
+
+    def _along_columns(self, x: Tensor, extra: Tensor | None) -> Tensor:
+        """Inner products with all directions. *Shape:* ``(B, 3 V), (B, 3, V) -> (B, n)``."""
+        found = x @ self.columns.flatten(1).mT
+        return found if extra is None else torch.cat([found, (x * extra.flatten(1)).sum(-1, keepdim=True)], -1)
+
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
         at = self.energy.linearise(self.rows(a, placement), placement.reference)
@@ -261,6 +271,10 @@ class SumOfEnergies(nn.Module):
         found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
         sums = (None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True))
         return Derivatives(*sums)  # type: ignore[arg-type]
+
+    def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
+        """The gradient alone. *Shape:* ``(B, n)``."""
+        return reduce(torch.add, [part.gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)])
 
     def second_order(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""

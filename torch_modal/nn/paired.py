@@ -81,6 +81,11 @@ class PairedEnergy(nn.Module):
         curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
 
+    def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
+        """The gradient alone. *Shape:* ``(B, n)``."""
+        strain = torch.cat([energy.gradient(part, place) for energy, part, place in self._ends(a, placement)], -1)
+        return strain + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
+
     def pull_back(self, a: Tensor, direction: Tensor, placement: PairedPlacement) -> PairedPlacement:
         """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
         first, second = (

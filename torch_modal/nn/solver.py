@@ -25,6 +25,12 @@ LEAST_CURVATURE = 0.1
 # Where the gradient has grown by this factor after what should have been the last Newton step, it was not the last.
 GROWN = 10.0
 
+# A Newton step that promises less than this part of the energy is followed by steps with the same Hessian, which cost a
+# gradient each, while that falls by this factor.
+NEAR = 0.01
+FALLS = 0.25
+MOST_WITH_ONE_HESSIAN = 12
+
 # Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
 ROUNDING_MARGIN = 4.0
 ENERGY_ROUNDING = 64.0
@@ -38,6 +44,9 @@ class AmplitudeEnergy(Protocol):
 
     def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
         """Derivatives. *Shape:* ``(B, n)``."""
+
+    def gradient(self, a: Tensor, placement: Any) -> Tensor:
+        """The gradient alone. *Shape:* ``(B, n)``."""
 
     def second_order(self, a: Tensor, placement: Any) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
@@ -64,6 +73,8 @@ class Step(NamedTuple):
 
     *Shape:* ``(B, n)``.
     """
+    factor: Tensor | None
+    """Of the full Hessian, where one was asked for. *Shape:* ``(B, n, n)``."""
 
 
 class Status(IntEnum):
@@ -151,6 +162,10 @@ class GaussNewtonStep(nn.Module):
         Returns:
             NaN for a sample whose Hessian is not positive definite. *Shape:* ``(D, B, n)``.
         """
+        return self._factored(derivatives)[0]
+
+    def _factored(self, derivatives: Derivatives) -> tuple[Tensor, Tensor]:
+        """The same, with the factors of the Hessians. *Shape:* ``(D, B, n), (D, B, n, n)``."""
         hessians = derivatives.gauss_newton[None]
         if derivatives.second_order is not None:
             hessians = torch.cat([hessians, hessians + derivatives.second_order])
@@ -163,7 +178,7 @@ class GaussNewtonStep(nn.Module):
             factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], hessians, eye))
         gradient = derivatives.gradient.expand(len(hessians), -1, -1)[..., None]
         direction = -torch.cholesky_solve(gradient, factor).squeeze(-1)
-        return torch.where(definite[..., None], direction, torch.nan)
+        return torch.where(definite[..., None], direction, torch.nan), factor
 
     @staticmethod
     def floor(derivatives: Derivatives) -> Tensor:
@@ -172,7 +187,7 @@ class GaussNewtonStep(nn.Module):
 
     def take(self, a: Tensor, energy: Tensor, derivatives: Derivatives, placement: Any) -> Step:
         """The best of the candidate steps from a point whose derivatives are known."""
-        plain = self.directions(derivatives)
+        plain, factors = self._factored(derivatives)
         directions = self._past_saddles(plain, derivatives)
         best, lowest = self.lowest(a, directions, placement)
         promised = self._promised(directions, derivatives)
@@ -182,8 +197,8 @@ class GaussNewtonStep(nn.Module):
             improves = poor & (energies < lowest)
             best = torch.where(improves[:, None], shorter, best)
             lowest = torch.where(improves, energies, lowest)
-        newton = torch.full_like(a, torch.nan) if derivatives.second_order is None else a + plain[1]
-        return self._unless_uphill(a, energy, best, lowest, promised, newton, derivatives)
+        found = self._unless_uphill(a, energy, best, lowest, promised, derivatives)
+        return found if derivatives.second_order is None else found._replace(newton=a + plain[1], factor=factors[1])
 
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, trying both directions at all lengths, without a branch that depends on data.
@@ -197,7 +212,8 @@ class GaussNewtonStep(nn.Module):
         best, lowest = self.lowest(a, torch.cat([directions, self._shortened(directions)]), placement)
         promised = self._promised(directions, derivatives)
         value = self.energy.value(a, placement)
-        return self._unless_uphill(a, value, best, lowest, promised, a + directions[-1], derivatives)
+        found = self._unless_uphill(a, value, best, lowest, promised, derivatives)
+        return found._replace(newton=a + directions[-1])
 
     def _past_saddles(self, directions: Tensor, derivatives: Derivatives) -> Tensor:
         """The directions, with saddle-free Newton (Dauphin et al. 2014) where the full Hessian is indefinite.
@@ -243,14 +259,42 @@ class GaussNewtonStep(nn.Module):
         best: Tensor,
         lowest: Tensor,
         promised: Tensor,
-        newton: Tensor,
         derivatives: Derivatives,
     ) -> Step:
         # At the optimum the energy is flat to rounding while the gradient still has digits to gain.
         moved = lowest <= energy + 4 * torch.finfo(energy.dtype).eps * energy.abs()
         norm = derivatives.gradient.norm(dim=-1)
         reached = torch.where(moved[:, None], best, a)
-        return Step(reached, torch.where(moved, lowest, energy), norm, promised, moved, newton)
+        newton = torch.full_like(a, torch.nan)
+        return Step(reached, torch.where(moved, lowest, energy), norm, promised, moved, newton, None)
+
+    def settled(self, a: Tensor, taken: Step, near: Tensor, small: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+        """Further steps with the Hessian of the last one, never uphill.
+
+        Args:
+            a: Where that one led. *Shape:* ``(B, n)``.
+            taken: That one.
+            near: Which samples go further. *Shape:* ``(B,)``, bool.
+            small: Gradient norms from which on there is one more step. *Shape:* ``(B,)``.
+            placement: What the energy knows of each sample.
+
+        Returns:
+            Where they lead, and the energy there.
+        """
+        assert taken.factor is not None
+        start, energy, norm = a, taken.energy, taken.gradient_norm
+        for _ in range(MOST_WITH_ONE_HESSIAN):
+            gradient = self.energy.gradient(a, placement)
+            found = gradient.norm(dim=-1)
+            near = near & (found <= FALLS * norm)
+            further = torch.cholesky_solve(gradient[..., None], taken.factor).squeeze(-1)
+            a, norm = torch.where(near[:, None], a - further, a), torch.where(near, found, norm)
+            near = near & (found > small)
+            if not bool(near.any()):
+                break
+        reached = self.energy.value(a, placement)
+        downhill = reached <= energy + ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
+        return torch.where(downhill[:, None], a, start), torch.where(downhill, reached, energy)
 
     def lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
         """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low; ``a`` if nowhere finite."""
@@ -269,6 +313,7 @@ def minimise(
     tolerance: float = 1e-8,
     least_gain: float = 0.0,
     energy: Tensor | None = None,
+    hessians: list[Tensor] | None = None,
 ) -> Solution:
     """Repeat the step until every sample has converged, or cannot go on.
 
@@ -284,10 +329,12 @@ def minimise(
         least_gain: Where a step promises less than this part of the energy, it is the last one. The gradient norm of
             the solution is then the one before that step.
         energy: At the start, where it is known. *Shape:* ``(B,)``.
+        hessians: Receives Gauss-Newton's at the amplitudes of those that converged. *Shape:* ``(B, n, n)``.
     """
     energy = step.energy.value(a, placement) if energy is None else energy
     eps, tiny = torch.finfo(energy.dtype).eps, torch.finfo(energy.dtype).tiny
     found, blank = torch.zeros_like(a), energy.new_zeros(len(a))
+    inner = None if hessians is None else a.new_zeros(*a.shape, a.shape[-1])
     # What decides are a few numbers of each sample: on the host, where a GPU is waited for twice in a step.
     everyone = live = [_Course(row, value) for row, value in enumerate(energy.tolist())]
     for k in range(max_steps + 1):
@@ -306,14 +353,27 @@ def minimise(
             pairs = zip(live, going, numbers, strict=True)
             ways = [own.go(each, eps, least_gain) if still else _STAY for own, still, each in pairs]
             a = _chosen(ways, [a, taken.amplitudes, taken.newton])
+            near = [still and own.near and not least_gain for still, own in zip(going, live, strict=True)]
+            if any(near):
+                small = a.new_tensor(
+                    [max(tolerance * own.start, floor) for own, (_, floor) in zip(live, told, strict=True)]
+                )
+                a, energy = step.settled(a, taken, torch.tensor(near, device=a.device), small, placement)
+                for own, value in zip(live, energy.tolist(), strict=True):
+                    own.energy = value
             going = [still and own.status == Status.OUT_OF_STEPS for still, own in zip(going, live, strict=True)]
         if not all(going):
             left = torch.tensor([not still for still in going], device=a.device)
-            found[[own.row for own, still in zip(live, going, strict=True) if not still]] = a[left]
+            gone = [own.row for own, still in zip(live, going, strict=True) if not still]
+            found[gone] = a[left]
+            if inner is not None:
+                inner[gone] = derivatives.gauss_newton[left]
             live = [own for own, still in zip(live, going, strict=True) if still]
             if not live:
                 break
             a, energy, placement = trees.rows((a, energy, placement), torch.nonzero(~left).flatten())
+    if hessians is not None and inner is not None:
+        hessians.append(inner)
     values = [[own.energy, own.norm / max(own.start, tiny)] for own in everyone]
     counts = [[own.n_steps, own.status] for own in everyone]
     reached, norms = blank.new_tensor(values).reshape(-1, 2).unbind(1)
@@ -335,6 +395,8 @@ class _Course:
         self.status = Status.OUT_OF_STEPS
         #: Whether it needs the full Hessian, and whether its next Newton step was to be the last.
         self.slow = self.last = False
+        #: Whether the Hessian of the last step is good for others.
+        self.near = False
 
     def look(self, norm: float, floor: float, tolerance: float, first: bool) -> None:
         """Whether it has arrived."""
@@ -353,6 +415,7 @@ class _Course:
         # Newton step is taken, and is the last.
         drowned = promised <= ENERGY_ROUNDING * eps * abs(self.energy)
         self.last = self.slow and drowned and math.isfinite(newton)
+        self.near = bool(moved) and not self.last and math.isfinite(newton) and promised < NEAR * abs(self.energy)
         if self.slow and not moved and not self.last:
             self.status = Status.CONVERGED if drowned else Status.STALLED
             return _STAY
