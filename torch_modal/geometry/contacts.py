@@ -70,8 +70,7 @@ class Search:
             watched: Of earlier searches: what was pushed apart is watched on. *Shape:* ``(V,)``.
         """
         crossings = self.crossings
-        pairs = crossings.pairs(x)
-        pairs = pairs[crossings.is_far(pairs)]
+        pairs = crossings.far_pairs(x)
         seeds = np.zeros(len(x), dtype=bool) if watched is None else watched.copy()
         none = np.zeros(0, np.int64)
         if not len(pairs) and not seeds.any():

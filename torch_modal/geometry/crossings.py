@@ -5,6 +5,8 @@ are the extra ``contact`` and are imported when they are first needed.
 """
 
 from functools import cached_property
+from itertools import chain
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,8 @@ FAR = 0.06
 """Of the diagonal, along the surface: what crosses nearer is a fold, not two parts that meet."""
 _OFFSET = 1e-4
 """Of the diagonal, outwards: where the winding number of a vertex is taken. On the surface itself it is a half."""
+_FACES = attrgetter("face0_id", "face1_id")
+"""Of a candidate of ipctk."""
 
 
 def require(name: str) -> Any:
@@ -77,9 +81,9 @@ class Crossings:
 
     # ------------------------------------------------------------------------------------------------- once for a mesh
     @cached_property
-    def _arrays(self) -> tuple[Any, Any]:
-        """Edges and faces as ipctk takes them."""
-        return tuple(np.asfortranarray(a.astype(np.int32)) for a in (self.mesh.edges, self.mesh.faces))  # type: ignore[return-value]
+    def _corners(self) -> Any:
+        """Faces as ipctk takes them."""
+        return np.asfortranarray(self.mesh.faces.astype(np.int32))
 
     @cached_property
     def adjacency(self) -> sparse.csr_matrix:
@@ -148,29 +152,23 @@ class Crossings:
         Returns:
             *Shape:* ``(P, 2)``.
         """
-        faces = self.mesh.faces
         tree = require("ipctk").LBVH()
         # Scaled and centred: the library's boxes are of single precision.
         centred = np.asfortranarray((x - self.like.mean(0)) / self.diagonal)
-        tree.build(centred, *self._arrays, 1e-6)
-        found = tree.detect_face_face_candidates()
-        candidates = np.array([(c.face0_id, c.face1_id) for c in found], dtype=np.int64).reshape(-1, 2)
-        shared = (faces[candidates[:, 0]][:, :, None] == faces[candidates[:, 1]][:, None, :]).any((1, 2))
-        candidates = candidates[~shared]
-        corners = centred[faces]
-        crossing = np.zeros(len(candidates), dtype=bool)
-        for one, other in (candidates.T, candidates[:, ::-1].T):
-            triangle = corners[other]
-            normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
-            side = ((corners[one] - triangle[:, :1]) * normal[:, None]).sum(-1) > 0
-            for i, j in ((0, 1), (1, 2), (2, 0)):
-                at = np.flatnonzero((side[:, i] != side[:, j]) & ~crossing)
-                start, end = corners[one[at], i], corners[one[at], j]
-                rays = triangle[at] - start[:, None]
-                along = end - start
-                turns = [(np.cross(rays[:, k], rays[:, (k + 1) % 3]) * along).sum(-1) > 0 for k in range(3)]
-                crossing[at[(turns[0] == turns[1]) & (turns[1] == turns[2])]] = True
-        return np.unique(np.sort(candidates[crossing], axis=1), axis=0)
+        # Without the edges: nobody asks for their boxes.
+        tree.build(centred, np.zeros((0, 2), np.int32, order="F"), self._corners, 1e-6)
+        found = map(_FACES, tree.detect_face_face_candidates())
+        candidates = np.fromiter(chain.from_iterable(found), np.int64).reshape(-1, 2)
+        corners = self.mesh.faces[candidates]
+        candidates = candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
+        one, other = (centred[self.mesh.faces[side]] for side in candidates.T)
+        crossing = candidates[pierces(one, other) | pierces(other, one)]
+        return np.unique(np.sort(crossing, axis=1), axis=0)
+
+    def far_pairs(self, x: FloatArray) -> IntArray:
+        """Those of :meth:`pairs` that are far, by :meth:`is_far`. *Shape:* ``(V, 3) -> (P, 2)``."""
+        pairs = self.pairs(x)
+        return pairs[self.is_far(pairs)]
 
     def is_new(self, pairs: IntArray) -> BoolArray:
         """Which pairs cross in none of the known shapes. *Shape:* ``(P, 2) -> (P,)``."""
@@ -285,6 +283,21 @@ class Crossings:
         for _ in range(rings):
             chosen |= self.adjacency @ chosen.astype(np.float64) > 0
         return chosen
+
+
+def pierces(edges_of: FloatArray, through: FloatArray) -> BoolArray:
+    """Whether an edge of each triangle passes through another one. *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``."""
+    normal = np.cross(through[:, 1] - through[:, 0], through[:, 2] - through[:, 0])
+    side = ((edges_of - through[:, :1]) * normal[:, None]).sum(-1) > 0
+    crossing = np.zeros(len(edges_of), dtype=bool)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        at = np.flatnonzero((side[:, i] != side[:, j]) & ~crossing)
+        start, end = edges_of[at, i], edges_of[at, j]
+        rays = through[at] - start[:, None]
+        along = end - start
+        turns = [(np.cross(rays[:, k], rays[:, (k + 1) % 3]) * along).sum(-1) > 0 for k in range(3)]
+        crossing[at[(turns[0] == turns[1]) & (turns[1] == turns[2])]] = True
+    return crossing
 
 
 def unit(vectors: FloatArray) -> FloatArray:

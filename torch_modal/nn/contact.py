@@ -149,8 +149,7 @@ class ContactSearch:
         search = self._search(i)
         if not bool(x.isfinite().all()):
             return 0, 0
-        pairs = search.crossings.pairs(x.detach().double().cpu().numpy())
-        pairs = pairs[search.crossings.is_far(pairs)]
+        pairs = search.crossings.far_pairs(x.detach().double().cpu().numpy())
         return len(pairs), search.n_left(pairs, *self._when(i))
 
     def __call__(self, x: Tensor) -> Contacts | None:
