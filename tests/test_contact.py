@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
+from scipy.optimize import minimize
 from torch import Tensor
 
 import torch_modal as tm
@@ -21,10 +22,11 @@ from torch_modal.geometry.crossings import Crossings
 from torch_modal.nn import trees
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.contact_rounds import ContactRounds
+from torch_modal.nn.held import Held, settled
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence import acceleration, contact
 from torch_modal.sequence.acceleration import AccelerationLimit
-from torch_modal.sequence.contact import splines
+from torch_modal.sequence.contact import splines, through
 from torch_modal.sequence.region import Region
 
 pytest.importorskip("ipctk")
@@ -240,14 +242,42 @@ def test_kernels_and_torch_see_the_same_region(hand: Shapes, smooth: bool, gener
         field = torch.randn(rows.shape, dtype=DOUBLE, generator=generator)
         rows = rows + 0.05 * field
         value, gradient, blocks, at = region.linearised(rows)
-        (exact,) = torch.autograd.grad(region.held.value(x := rows.clone().requires_grad_()), x)
-        torch.testing.assert_close(region.held.linearised(rows).gradient, exact)
+        flat = rows.flatten(1)
+        (exact,) = torch.autograd.grad(region.held.value(x := flat.clone().requires_grad_()).sum(), x)
+        held = region.held.linearised(flat)
+        assert held.gradient.abs().max() > 0
+        torch.testing.assert_close(torch.zeros_like(flat).index_add(1, held.corners, held.gradient), exact)
         whole = region.value(rows)
         results.append([value, gradient, blocks, region.product(at, field), whole - region.value(rows + 0.01 * field)])
         torch.testing.assert_close(value, whole)
     for name, a, b in zip(["value", "gradient", "blocks", "product", "fall"], *results, strict=True):
         if name != "value":  # kernels leave out the constant
             torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8 * float(b.abs().max()), msg=name)
+
+
+@pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
+def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
+    pytest.importorskip("warp")
+    t = torch.tensor([0.2, 0.75 if smooth else 0.875], dtype=DOUBLE)
+    three = hand.pick(0, 1, 0)
+    results = []
+    for backend in ("torch", "warp"):
+        path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
+        member = path.layer.members[0]
+        samples = path.samples(three.keyframes[None], 0, torch.zeros(2, dtype=torch.int64), t)
+        pair = member.placed(samples)
+        x = member.frame.bring(member(samples, False, None).shapes, trees.picked(pair, samples.which), t)
+        search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t)
+        held = search(x)
+        assert held is not None and held.samples.tolist() == [1]
+        held = held.of_all(torch.arange(2))
+        flat = x.movedim(-1, 0).flatten(1)
+        y = settled(member, samples, pair, x, held, 2, 10)
+        term = Held(held, None, x.shape[1])
+        pushed = term.value(y.movedim(-1, 0).flatten(1))
+        assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(term.value(flat)[1])
+        results.append(y)
+    torch.testing.assert_close(*results, rtol=0, atol=1e-6)
 
 
 # ------------------------------------------------------------------------------------------------------------ sequence
@@ -260,6 +290,18 @@ def test_splines_vanish_at_the_ends_and_know_their_curvature() -> None:
     at = torch.tensor([0.3], dtype=DOUBLE, requires_grad=True)
     (slope,) = torch.autograd.grad(splines(at, 8).values[0, 3], at)
     assert float(slope) == pytest.approx(float((values[1201, 3] - values[1199, 3]) * 2000), rel=1e-5)
+
+
+def test_values_in_time_lie_on_a_curve_through_them() -> None:
+    times = torch.tensor([0.2, 0.5, 0.6, 0.9], dtype=DOUBLE)
+    torch.testing.assert_close(through(times, times), torch.eye(4, dtype=DOUBLE))
+    assert float(through(times, torch.tensor([0.0, 1.0], dtype=DOUBLE)).abs().max()) < 1e-15
+    t = torch.linspace(0, 1, 1001, dtype=DOUBLE)
+    line = through(times, t) @ torch.sin(torch.pi * times)
+    torch.testing.assert_close(line, torch.sin(torch.pi * t), rtol=0, atol=0.02)
+    at = torch.tensor([0.3], dtype=DOUBLE, requires_grad=True)
+    (slope,) = torch.autograd.grad(through(times, at) @ torch.sin(torch.pi * times), at)
+    assert float(slope) == pytest.approx(float((line[301] - line[299]) * 500), rel=1e-4)
 
 
 def test_course_is_free_of_crossings_and_does_not_pop(hand: Shapes) -> None:
@@ -308,14 +350,14 @@ def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> N
 def test_limit_sees_the_accelerations_of_frames(generator: torch.Generator) -> None:
     t = torch.linspace(0, 1, 11, dtype=DOUBLE)
     values = splines(t, 5).values
-    second = 100 * (values[2:] - 2 * values[1:-1] + values[:-2])
+    differences = 100 * torch.eye(11, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
     course = torch.randn(3, 9, 4, dtype=DOUBLE, generator=generator)
     at = 0.1 * torch.randn(3, values.shape[1], 4, dtype=DOUBLE, generator=generator)
     area = torch.tensor([1.0, 2.0, 0.5, 0.5], dtype=DOUBLE)
     there = course + 100 * torch.stack([values @ x for x in at]).diff(n=2, dim=1)
     lengths = there.norm(dim=0)
     most = float(lengths.quantile(0.6))
-    limit = AccelerationLimit(course, second, area, most)
+    limit = AccelerationLimit(course, differences, values[1:-1], area, most)
     excess = limit.linearised(at)
     expected = acceleration.STIFFNESS / 9 * (area * (lengths - most).clamp_min(0) ** 2).sum()
     torch.testing.assert_close(excess.value, expected)
@@ -332,8 +374,36 @@ def test_limit_sees_the_accelerations_of_frames(generator: torch.Generator) -> N
     columns = torch.randn(2, 4, 3, dtype=DOUBLE, generator=generator)
     expected = torch.einsum("mva,ajvbkw,nwb->jmkn", columns, hessian, columns)
     torch.testing.assert_close(limit.in_columns(excess, columns), expected)
-    still = AccelerationLimit(course, second, area, 1e3).linearised(at)
+    still = AccelerationLimit(course, differences, values[1:-1], area, 1e3).linearised(at)
     assert float(still.value) == 0 == len(still.vertices)
+
+
+def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> None:
+    differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
+    differences = 64 * torch.cat([differences, 2 * torch.eye(7, dtype=DOUBLE)[:1]])  # and it goes on at the start
+    course = 8 * torch.randn(3, 8, 5, dtype=DOUBLE, generator=generator)
+    wanted = torch.randn(3, 7, 5, dtype=DOUBLE, generator=generator)
+    wanted[..., 4] *= 1e-3
+    limit = AccelerationLimit(course, differences, torch.eye(7, dtype=DOUBLE), torch.ones(5, dtype=DOUBLE), 25.0)
+    found = limit.nearest(wanted)
+    assert torch.equal(found[..., 4], wanted[..., 4]) and not torch.equal(found[..., 0], wanted[..., 0])
+    assert float((course + differences @ found).norm(dim=0).max()) < 25.0 * 1.02
+    for v in range(4):
+
+        def room(x: np.ndarray, v: int = v) -> np.ndarray:
+            rows = course[..., v].numpy() + x.reshape(3, 7) @ differences.numpy().T
+            return 25.0**2 - (rows**2).sum(0)
+
+        goal = wanted[..., v].numpy().ravel()
+        best = minimize(
+            lambda x, goal=goal: ((x - goal) ** 2).sum(),
+            goal,
+            jac=lambda x, goal=goal: 2 * (x - goal),
+            constraints={"type": "ineq", "fun": room},
+            method="SLSQP",
+            options={"maxiter": 300},
+        )
+        assert float(((found[..., v] - wanted[..., v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
 
 
 @pytest.mark.filterwarnings("ignore:in .* in-betweens looked at")

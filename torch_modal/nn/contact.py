@@ -206,6 +206,14 @@ class ContactSearch:
     def _when(self, i: int) -> tuple[float, float, tuple[bool, bool]]:
         return float(self.t[i]), self.acceleration, self.free
 
+    def watch(self, held: Contacts, around: int) -> None:
+        """Watch what is held in a sample, and beside it, in that one and its neighbours in time."""
+        crossings = self.searches[0].crossings
+        for i, weights in zip(held.samples.tolist(), held.weights, strict=True):
+            own = crossings.grown(held.elements[weights > 0].flatten().unique().cpu().numpy(), 2)
+            for k in range(max(0, i - around), min(len(self.watched), i + around + 1)):
+                self.watched[k] = own if self.watched[k] is None else self.watched[k] | own
+
     def near(self, part: float) -> Tensor:
         """Vertices within a part of the diagonal of those that were ever watched, of one pair. *Shape:* ``(V,)``."""
         watched = [own for own in self.watched if own is not None]

@@ -1,6 +1,6 @@
 """The local steps by kernels of NVIDIA Warp, where that is installed; torch's are what they are tested against."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -82,7 +82,7 @@ class FusedRelax(FusedShell):
         lengths = x.new_zeros(n_steps, len(x))
         at = self.at(x, to)
         for k in range(n_steps):
-            done = self._solved(x, at, to, n_products, keep=kept is not None)
+            done = self.solved(x, at, to, n_products, keep=kept is not None)
             solution, reached = done.solution, done.reached
             if kept is not None:
                 kept.append(_Taken(x, at, done))
@@ -109,8 +109,14 @@ class FusedRelax(FusedShell):
                 break
         return length
 
-    def _solved(
-        self, x: Tensor, at: ShellPoint, to: ShellReference, n_products: int, keep: bool = False
+    def solved(
+        self,
+        x: Tensor,
+        at: ShellPoint,
+        to: ShellReference,
+        n_products: int,
+        keep: bool = False,
+        beyond: Callable[[Tensor, Tensor, Tensor], None] | None = None,
     ) -> "_Iterations":
         """Conjugate gradients, fused.
 
@@ -120,6 +126,8 @@ class FusedRelax(FusedShell):
             to: What is compared with.
             n_products: Iterations.
             keep: Whether each iteration has memory of its own.
+            beyond: Adds what there is beyond Eq. 5, of a direction, to its product and the form of both, whose shapes
+                are ``(B, V, 3)`` and ``(B,)``.
         """
         module, (b, n) = kernels("steps"), x.shape[:2]
         _, gradient, diagonal, edges, hinges, normal, moment = at
@@ -135,6 +143,8 @@ class FusedRelax(FusedShell):
         for k in range(n_products):
             direction, product = directions[k], products[k]
             launch(kernels("shell").product, records, [direction, self.record, edges, hinges, n, product, form[k]])
+            if beyond is not None:
+                beyond(direction, product, form[k])
             if k == n_products - 1:
                 given = [x, direction, to.stiffness, sweep[k], size[k], form[k], n, solution, reached]
                 launch(module.arrive, vertices, given)
@@ -173,7 +183,7 @@ class FusedRelax(FusedShell):
         to = ShellReference(*(value.detach() for value in recorded))
         for length in [] if kept else lengths:
             at = self.at(x, to)
-            kept = [*kept, _Taken(x, at, self._solved(x, at, to, n_products, keep=True))]
+            kept = [*kept, _Taken(x, at, self.solved(x, at, to, n_products, keep=True))]
             x = x + length[:, None, None] * kept[-1].done.solution
         to_reference = ShellReference(*(torch.zeros_like(value) for value in to))
         for length, taken in zip(lengths.flip(0), reversed(kept), strict=True):

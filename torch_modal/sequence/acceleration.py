@@ -10,11 +10,19 @@ are differences of shapes that follow each other: what one sees.
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy import linalg, sparse
 from torch import Tensor
 
 STIFFNESS = 1e7
 """``kappa``, with the area of the surface as the unit: a contact gives way to it."""
+ROUNDS = 100
+"""Of :meth:`AccelerationLimit.nearest`, at most."""
+TOLERANCE = 0.01
+"""How far over the limit it may leave a vertex, as a part of it."""
+RELAXATION = 1.7
+PENALTY = 0.3
 
 
 class Excess(NamedTuple):
@@ -34,18 +42,22 @@ class AccelerationLimit:
 
     Args:
         course: Accelerations without the displacement. *Shape:* ``(3, N, V)``.
-        second: Those of the functions of time. *Shape:* ``(N, J)``.
+        differences: Accelerations of a displacement from what it is at each time. *Shape:* ``(N, T)``.
+        functions: Of time, in which a displacement is given. *Shape:* ``(T, J)``.
         area: Around each vertex. *Shape:* ``(V,)``.
         most: The largest that is allowed, of a vertex.
     """
 
-    def __init__(self, course: Tensor, second: Tensor, area: Tensor, most: float) -> None:
-        self.course, self.second, self.area, self.most = course, second, area, most
-        self.weights = STIFFNESS / len(second) * area
+    def __init__(self, course: Tensor, differences: Tensor, functions: Tensor, area: Tensor, most: float) -> None:
+        self.course, self.differences, self.functions, self.area, self.most = course, differences, functions, area, most
+        #: Accelerations of the functions. *Shape:* ``(N, J)``.
+        self.second = differences @ functions
+        self.weights = STIFFNESS / len(differences) * area
 
     def of(self, vertices: Tensor) -> "AccelerationLimit":
         """The same for some of the vertices. *Shape:* ``(R,)``."""
-        return AccelerationLimit(self.course[..., vertices], self.second, self.area[vertices], self.most)
+        given = self.course[..., vertices], self.differences, self.functions, self.area[vertices]
+        return AccelerationLimit(*given, self.most)
 
     def _excess(self, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Accelerations, how large they are, and what is too much of it."""
@@ -96,3 +108,49 @@ class AccelerationLimit:
                 one = turned.flatten(1) @ columns[:, own].flatten(1).T
                 found += (second[:, None] * second)[:, None, :, None] * one[:, None, :]
         return found
+
+    def nearest(self, wanted: Tensor) -> Tensor:
+        """The displacement nearest to a wanted one, in least squares, that keeps each vertex below the limit.
+
+        Vertices do not know of each other here, and what is below the limit is left as it is. The rest is a convex
+        problem for each vertex, and solved by the alternating direction method of multipliers (Boyd et al. 2011).
+
+        Args:
+            wanted: At each time. *Shape:* ``(3, T, V)``.
+        """
+        own = torch.nonzero((self.course + self.differences @ wanted).norm(dim=0).amax(0) > self.most).flatten()
+        if not len(own):
+            return wanted
+        # In frames: the unit of time drops out.
+        unit = float(self.differences.abs().max()) / 2
+        rows = sparse.csr_matrix(self.differences.double().cpu().numpy() / unit)
+        goal, course = (
+            x[..., own].double().cpu().numpy().swapaxes(0, 1).reshape(x.shape[1], -1) for x in (wanted, self.course)
+        )
+        course, most = course / unit, self.most / unit
+        normal = (sparse.eye(len(goal)) + PENALTY * rows.T @ rows).tocsc()
+        upper = np.stack([np.pad(normal.diagonal(k), (k, 0)) for k in (2, 1, 0) if k < len(goal)])
+        factor = linalg.cholesky_banded(upper)
+        split, dual = _clipped(rows @ goal + course, most), 0.0
+        for _ in range(ROUNDS):
+            pulled = goal + PENALTY * (rows.T @ (split - dual - course))
+            found = linalg.cho_solve_banded((factor, False), pulled)
+            reached = rows @ found + course
+            if _lengths(reached).max() <= (1 + TOLERANCE) * most:
+                break
+            relaxed = RELAXATION * reached + (1 - RELAXATION) * split + dual
+            split = _clipped(relaxed, most)
+            dual = relaxed - split
+        there = torch.from_numpy(found.reshape(len(goal), 3, -1).swapaxes(0, 1)).to(wanted)
+        return wanted.index_copy(2, own, there)
+
+
+def _lengths(rows: np.ndarray) -> np.ndarray:
+    """*Shape:* ``(N, 3 V) -> (N, V)``."""
+    return np.linalg.norm(rows.reshape(len(rows), 3, -1), axis=1)
+
+
+def _clipped(rows: np.ndarray, most: float) -> np.ndarray:
+    """Vectors shortened to a length where they are longer. *Shape:* ``(N, 3 V)``."""
+    part = np.minimum(1, most / np.maximum(_lengths(rows), 1e-300))
+    return (rows.reshape(len(rows), 3, -1) * part[:, None]).reshape(rows.shape)

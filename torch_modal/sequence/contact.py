@@ -8,6 +8,9 @@ accelerations of the displacement:
 .. math:: \sum_i E_i(x_i + d(t_i)) + \lambda \sum_v A_v \int |\ddot d_v|^2 dt
 
 and of what is beyond the largest acceleration that a vertex may have (``sequence/acceleration.py``).
+
+At last each shape comes to rest on its own, with what is held in it. The displacement is then what comes nearest to
+that among those that accelerate no vertex too much: where nothing is in the way, it is at rest.
 """
 
 from functools import partial
@@ -21,6 +24,7 @@ from torch_modal.nn import trees
 from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.frame import Pair
+from torch_modal.nn.held import settled
 from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.relax import STEP_LENGTHS, conjugate_gradients, inverse_of_symmetric
 from torch_modal.nn.samples import Samples
@@ -37,45 +41,70 @@ LEAST_LIMIT = 30.0
 """That is never less than this, at a diagonal of 100: a straight course has to be left, too."""
 REGION = 0.2
 """Of the diagonal, along the surface: how far from what is held vertices move on their own, beside the modes."""
-WIDE_REGION = 0.5
-"""The same once nothing passes through anything any more, for :data:`FINAL_STEPS`."""
 LOOKED_AT = 8
 SEARCHED = 16
 """:func:`push_apart` has it."""
 BESIDE = 0.125
 ROUNDS = 4
 MODAL_STEPS = 2
-FINE_STEPS = 2
-FINAL_STEPS = 2
+FINE_STEPS = 1
 FINE_PRODUCTS = 40
+SETTLINGS = 2
+"""How often all shapes come to rest, each on its own, and their displacement is fitted to what may be accelerated."""
+SETTLING_STEPS = 2
+SETTLING_PRODUCTS = 20
+AROUND = 2
+"""Shapes beside those that hold something in which the same is watched."""
 
 
 class Displacement(NamedTuple):
     """What pushes the shapes between two key-frames apart, at all times."""
 
-    coefficients: Tensor | None
-    """Of :func:`splines`, in the frame; None where nothing passes through anything. *Shape:* ``(3, J, V)``."""
+    field: Tensor | None
+    """At the times of the shapes, in the frame; None where nothing passes through anything. *Shape:* ``(3, T, V)``."""
+    times: Tensor
+    """*Shape:* ``(T,)``."""
     n_before: Tensor
-    """Pairs of triangles of parts that went through each other, in the shapes that were searched. *Shape:* ``(T,)``."""
+    """Pairs of triangles of parts that went through each other, in those that were looked at. *Shape:* ``(T,)``."""
     n_crossing: Tensor
     """Those that are left. *Shape:* ``(T,)``, int64."""
 
     def apply(self, member: Between, samples: Samples, shapes: Tensor) -> Tensor:
-        """Push shapes apart, at any times.
+        """Push shapes apart, at any times; between those of the field, along a cubic spline.
 
-        The gradient reaches shapes and times; the coefficients are constants.
+        The gradient reaches shapes and times; the field is a constant.
 
         Args:
             member: In-betweens of the pair of key-frames.
             samples: Of that pair, with the times of the shapes.
             shapes: In the caller's coordinates. *Shape:* ``(T, V, 3)``.
         """
-        if self.coefficients is None:
+        if self.field is None:
             return shapes
         frame, t = member.frame, samples.t
         placed = trees.picked(member.placed(samples), samples.which)
-        moved = (splines(t).values @ self.coefficients).movedim(0, -1)
-        return frame.restore(frame.bring(shapes, placed, t) + moved, placed, t)
+        moved = self.field
+        if t.requires_grad or not torch.equal(t, self.times):
+            moved = through(self.times, t) @ moved
+        return frame.restore(frame.bring(shapes, placed, t) + moved.movedim(0, -1), placed, t)
+
+
+def through(times: Tensor, t: Tensor) -> Tensor:
+    """Weights of a cubic spline through values at given times, and zero at 0 and 1. *Shape:* ``(T,), (B,) -> (B, T)``.
+
+    Their first derivative in ``t`` comes as a gradient.
+    """
+    from scipy.interpolate import CubicSpline  # 0.1 s, where nothing needs it
+
+    knots = np.concatenate([[0.0], times.detach().double().cpu().numpy(), [1.0]])
+    return _with_slopes(CubicSpline(knots, np.eye(len(knots)), bc_type="natural"), t)
+
+
+def _with_slopes(spline: Any, t: Tensor) -> Tensor:
+    """All but the first and the last of some functions, at given times. *Shape:* ``(B,) -> (B, J)``."""
+    at = t.detach().double().cpu().numpy()
+    values, slopes = (torch.from_numpy(f(at)[:, 1:-1]).to(t) for f in (spline, spline.derivative()))
+    return values + slopes * (t - t.detach())[:, None] if t.requires_grad else values
 
 
 class Splines(NamedTuple):
@@ -98,15 +127,11 @@ def splines(t: Tensor, n: int | None = None) -> Splines:
 
     n = KNOTS if n is None else n
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, n + 1), np.ones(3)])
-    at = t.detach().double().cpu().numpy()
     every = BSpline(knots, np.eye(n + 3), 3)
-    values, slopes = (torch.from_numpy(f(at)[:, 1:-1]).to(t) for f in (every, every.derivative()))
-    if t.requires_grad:
-        values = values + slopes * (t - t.detach())[:, None]
     # Second derivatives are linear in each interval: Gauss' rule with two points is exact for their products.
     middle, half = (np.arange(n) + 0.5) / n, 0.5 / n / np.sqrt(3)
     second = every.derivative(2)(np.concatenate([middle - half, middle + half]))[:, 1:-1]
-    return Splines(values, torch.from_numpy(second.T @ second / (2 * n)).to(t.detach()))
+    return Splines(_with_slopes(every, t), torch.from_numpy(second.T @ second / (2 * n)).to(t.detach()))
 
 
 @torch.no_grad()
@@ -131,7 +156,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     every = -(-len(t) // LOOKED_AT)
     few = range(every - 1, len(t), every)
     if next(search.crossing(start, few), None) is None:
-        return Displacement(None, search.n_far, search.n_far)
+        return Displacement(None, t, search.n_far, search.n_far)
     stride = max(1, (len(t) + 1) // SEARCHED)
     # The first and the last hardly cost energy, and would be bent by what is done to the next.
     chosen = {0, *range(stride - 1, len(t), stride), len(t) - 1}
@@ -140,12 +165,12 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
         chosen |= set(torch.nonzero((t < BESIDE) | (t > 1 - BESIDE)).flatten().tolist())
     course = _Course(member, samples, pair, start, limit, search)
     course.push(chosen)
-    if course.at is not None:
-        moved = start + (splines(t).values @ course.at).movedim(0, -1)
-        more = set(search.crossing(moved, [i for i in range(len(t)) if i not in chosen]))
-        if more:
-            course.push(chosen | more)
-    return Displacement(course.at, course.n_before, course.n_crossing)
+    if course.at is None:
+        return Displacement(None, t, course.n_before, course.n_crossing)
+    more = set(search.crossing(course.moved(), [i for i in range(len(t)) if i not in chosen]))
+    if more:
+        course.push(chosen | more)
+    return course.settled()
 
 
 def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor, start: Tensor) -> AccelerationLimit:
@@ -159,14 +184,14 @@ def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor, start:
     bent = n**2 * (given[2:] - 2 * given[1:-1] + given[:-2])
     placed = trees.picked(pair, samples.which)
     own = (member.frame.bring(shapes + bent, placed, t) - start).nan_to_num()
-    values = splines(torch.linspace(0, 1, n + 1).to(t)).values
-    second = n**2 * (values[2:] - 2 * values[1:-1] + values[:-2])
+    each = torch.eye(n + 1).to(t)
+    second = n**2 * (each[2:] - 2 * each[1:-1] + each[:-2])[:, 1:-1]
     ends = [i for i, beside in ((0, samples.before), (-1, samples.after)) if beside is not None]
     rows = torch.cat([own, *(own[i][None] for i in ends)])
-    second = torch.cat([second, *(2 * n**2 * values[1:-1][i][None] for i in ends)])
+    second = torch.cat([second, *(2 * n**2 * each[1:-1, 1:-1][i][None] for i in ends)])
     area = member.frame.weights / member.frame.weights.sum()
     most = max(ROOM * float(own.norm(dim=-1).max()), LEAST_LIMIT)
-    return AccelerationLimit(rows.movedim(-1, 0).contiguous(), second, area, most)
+    return AccelerationLimit(rows.movedim(-1, 0).contiguous(), second, splines(t).values, area, most)
 
 
 class _Course:
@@ -187,7 +212,12 @@ class _Course:
         self.at: Tensor | None = None
         #: With the numbers of the shapes that hold something.
         self.held: Contacts | None = None
-        self.n_before = self.n_crossing = search.n_far
+        self.n_before, self.n_crossing = torch.zeros_like(search.n_far), search.n_far
+
+    def moved(self) -> Tensor:
+        """All shapes, pushed apart by what was found so far. *Shape:* ``(T, V, 3)``."""
+        assert self.at is not None
+        return self.start + (splines(self.samples.t).values @ self.at).movedim(0, -1)
 
     def push(self, chosen: set[int]) -> None:
         """Push some of the shapes apart, from what was found for others; what leaves the fewest crossings is kept."""
@@ -205,11 +235,11 @@ class _Course:
         else:
             at = self.at
             search.count(start)
-            self.n_before = search.n_far
+            self.n_before[some] = search.n_far
         found = search(solver.moved(at).movedim(0, -1))
         self.n_crossing = search.n_far
         if self.at is None:
-            self.n_before = search.n_far
+            self.n_before[some] = search.n_far
         if found is None or not bool(search.n_left.any()):
             return
         best = self.at, search.n_left, search.n_far
@@ -224,16 +254,32 @@ class _Course:
             if found is None or not bool(search.n_left.any()):
                 break
             held = found.of_all(kept).beside(held)
-        if best[0] is not None:
-            # What was pushed apart in a hurry is brought to rest, in a wider region.
-            rested = solver.fine(best[0], held, search.near(WIDE_REGION), FINAL_STEPS)
-            search.count(solver.moved(rested).movedim(0, -1))
-            best = min((rested, search.n_left, search.n_far), best, key=_left)
         self.at, _, self.n_crossing = best
         self.held = held._replace(samples=some)
 
+    def settled(self) -> Displacement:
+        """All shapes brought to rest, each on its own, and as near to that as their accelerations allow.
 
-def _left(found: tuple[Tensor | None, Tensor, Tensor]) -> tuple[int, int]:
+        What leaves the fewest crossings is kept.
+        """
+        assert self.held is not None
+        search, start, every = self.search, self.start, torch.arange(len(self.start), device=self.start.device)
+        held = self.held.of_all(every)
+        search.watch(held, AROUND)
+        x = self.moved()
+        found = search(x)
+        best = x, search.n_left, search.n_far
+        for _ in range(SETTLINGS):
+            held = held if found is None else found.of_all(every).beside(held)
+            at_rest = settled(self.member, self.samples, self.pair, x, held, SETTLING_STEPS, SETTLING_PRODUCTS)
+            x = start + self.limit.nearest((at_rest - start).movedim(-1, 0)).movedim(0, -1)
+            found = search(x)
+            best = min((x, search.n_left, search.n_far), best, key=_left)
+        x, _, n_crossing = best
+        return Displacement((x - start).movedim(-1, 0), self.samples.t, self.n_before, n_crossing)
+
+
+def _left(found: tuple[Any, Tensor, Tensor]) -> tuple[int, int]:
     return int(found[2].sum()), int(found[1].sum())
 
 

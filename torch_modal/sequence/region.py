@@ -1,20 +1,19 @@
 """The energy of shapes at many times, around what is held apart: values, gradients and products with its Hessian."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_modal.energy.contact import Contact
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.terms import Bend, Mesh, Stretch
-from torch_modal.geometry.vectors import pick
 from torch_modal.nn import trees
 from torch_modal.nn.between import Between, fine_chunk
 from torch_modal.nn.contact import Contacts
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.fused_shell import FusedShell
+from torch_modal.nn.held import Held, rest_shapes
 from torch_modal.nn.launch import kernels, launch
 from torch_modal.nn.relax import ConvexHessian
 from torch_modal.nn.samples import Samples
@@ -49,17 +48,17 @@ class Region:
         fused = member.fused is not None and [type(term) for term in terms] == [Stretch, Bend]
         kind: Any = _Fused if fused else _ByTorch
         self.energy = kind(member, samples, pair, self.vertices, local, energy, stiffness)
-        self.held: _Held | None = None
+        self.held: Held | None = None
 
     def hold(self, held: Contacts) -> "Region":
         """Hold vertices and faces apart, of all times."""
-        self.held = _Held(held, self.numbers.to(held.elements.device), len(self.vertices))
+        self.held = Held(held, self.numbers.to(held.elements.device), len(self.vertices))
         return self
 
     def value(self, rows: Tensor) -> Tensor:
         """Summed over all times. *Shape:* ``(3, T, R) -> ()``."""
         own = self.energy.value(rows).sum()
-        return own if self.held is None else own + self.held.value(rows)
+        return own if self.held is None else own + self.held.value(rows.flatten(1)).sum()
 
     def linearised(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Any]:
         """At given shapes, *shape* ``(3, T, R)``.
@@ -71,70 +70,18 @@ class Region:
         value, gradient, blocks, hessian = self.energy.linearised(rows)
         if self.held is None:
             return value, gradient, blocks, (hessian, None)
-        at = self.held.linearised(rows)
-        return value + at.value, gradient + at.gradient, blocks + at.blocks, (hessian, at)
+        at, shape = self.held.linearised(rows.flatten(1)), rows.shape[1:]
+        gradient = gradient.flatten(1).index_add(1, at.corners, at.gradient).unflatten(1, shape)
+        blocks = blocks.flatten(2).index_add(2, at.corners, at.blocks).unflatten(2, shape)
+        return value + at.value.sum(), gradient, blocks, (hessian, at)
 
     def product(self, hessians: Any, field: Tensor) -> Tensor:
         """The convex Hessians times displacements. *Shape:* ``(3, T, R) -> (3, T, R)``."""
         hessian, at = hessians
         found: Tensor = self.energy.product(hessian, field)
-        return found if self.held is None else self.held.add_product(at, field, found)
-
-
-class _AtHeld(NamedTuple):
-    value: Tensor
-    gradient: Tensor
-    blocks: Tensor
-    on_corners: Tensor
-    """Of the distances in the vertices. *Shape:* ``(3, 4 N)``."""
-    stiffness: Tensor
-    """*Shape:* ``(N,)``."""
-    corners: Tensor
-    """Of those that are too near. *Shape:* ``(4 N,)``."""
-
-
-class _Held:
-    """The contact term at the times at which each vertex is held: pairs of a time and an element, without the rest."""
-
-    def __init__(self, held: Contacts, numbers: Tensor, n: int) -> None:
-        local = numbers[held.elements]
-        at, which = torch.nonzero((held.weights > 0) & (local >= 0).all(1), as_tuple=True)
-        #: The vertices of each, in rows of all times. *Shape:* ``(4, N)``.
-        self.corners = (local[which] + (held.samples[at] * n)[:, None]).T.contiguous()
-        self.weights, self.gaps = held.weights[at, which], held.gaps[at, which]
-        self.term = Contact(held.elements)
-
-    def _spokes(self, flat: Tensor, corners: Tensor) -> Tensor:
-        first, *others = (pick(flat, corner) for corner in corners)
-        return torch.stack([other - first for other in others])
-
-    def _missing(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        spokes = self._spokes(rows.flatten(1), self.corners)
-        return spokes, self.term.difference(self.term.measures(spokes), self.gaps)
-
-    def value(self, rows: Tensor) -> Tensor:
-        return (self.weights * self._missing(rows)[1] ** 2).sum()
-
-    def linearised(self, rows: Tensor) -> _AtHeld:
-        spokes, missing = self._missing(rows)
-        near = torch.nonzero(missing).flatten()
-        weights, missing = self.weights[near], missing[near]
-        corners = self.corners[:, near].flatten()
-        gradients = self.term.gradients(spokes[..., near])
-        on_corners = torch.cat([-gradients.sum(0), *gradients], -1)
-        stiffness = 2 * weights
-        flat = torch.zeros_like(rows).flatten(1)
-        gradient = flat.index_add(1, corners, (stiffness * missing).repeat(4) * on_corners)
-        outer = (stiffness.repeat(4) * on_corners)[:, None] * on_corners
-        blocks = flat.new_zeros(3, 3, flat.shape[1]).index_add(2, corners, outer)
-        value = (weights * missing**2).sum()
-        shape = rows.shape[1:]
-        return _AtHeld(value, gradient.unflatten(1, shape), blocks.unflatten(2, shape), on_corners, stiffness, corners)
-
-    def add_product(self, at: _AtHeld, field: Tensor, to: Tensor) -> Tensor:
-        rate = (pick(field.flatten(1), at.corners) * at.on_corners).sum(0).unflatten(0, (4, -1)).sum(0)
-        pushed = (at.stiffness * rate).repeat(4) * at.on_corners
-        return to.flatten(1).index_add(1, at.corners, pushed).unflatten(1, to.shape[1:])
+        if at is None:
+            return found
+        return found.flatten(1).index_add(1, at.corners, at.product(field.flatten(1))[0]).unflatten(1, field.shape[1:])
 
 
 class _ByTorch:
@@ -195,10 +142,7 @@ class _Fused:
         to = samples.t.device
         self.shell = FusedShell(energy, local).to(to)
         chosen = vertices.to(to)
-        if pair.around is not None:
-            first = second = member.space.on_course(pair, samples.which, samples.t)[:, chosen]
-        else:
-            first, second = trees.picked((pair.first[:, chosen], pair.second[:, chosen]), samples.which)
+        first, second = (x[:, chosen] for x in rest_shapes(member, samples, pair))
         given = [value.double().contiguous() for value in (first, second, samples.t, *stiffness)]
         # A stiffness of nothing for the volume.
         self.reference = self.shell.reference(*given, given[2].new_zeros(len(given[2]), 1))

@@ -1,0 +1,173 @@
+"""What is held apart in many shapes: its energy and derivatives, and steps of all vertices with it."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.energy.contact import Contact
+from torch_modal.geometry.vectors import pick
+from torch_modal.nn import trees
+from torch_modal.nn.between import Between, fine_chunk
+from torch_modal.nn.contact import Contacts
+from torch_modal.nn.frame import Pair
+from torch_modal.nn.fused_relax import FusedRelax
+from torch_modal.nn.fused_shell import ShellReference
+from torch_modal.nn.relax import STEP_LENGTHS, relax
+from torch_modal.nn.samples import Samples
+
+
+class AtHeld(NamedTuple):
+    """The contact term at given shapes, of the vertices that are too near."""
+
+    value: Tensor
+    """Of each shape. *Shape:* ``(T,)``."""
+    gradient: Tensor
+    """*Shape:* ``(3, 4 N)``."""
+    on_corners: Tensor
+    """Of the distances in the vertices. *Shape:* ``(3, 4 N)``."""
+    stiffness: Tensor
+    """*Shape:* ``(N,)``."""
+    corners: Tensor
+    """Their places in the rows of all shapes. *Shape:* ``(4 N,)``."""
+
+    @property
+    def blocks(self) -> Tensor:
+        """Of the Hessian's diagonal. *Shape:* ``(3, 3, 4 N)``."""
+        return (self.stiffness.repeat(4) * self.on_corners)[:, None] * self.on_corners
+
+    def product(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """The Hessian times displacements, at the corners, and its form. *Shape:* ``(3, T R) -> (3, 4 N), (N,)``."""
+        rate = (pick(field, self.corners) * self.on_corners).sum(0).unflatten(0, (4, -1)).sum(0)
+        return (self.stiffness * rate).repeat(4) * self.on_corners, self.stiffness * rate**2
+
+
+class Held:
+    """The contact term where each vertex is held: pairs of a shape and an element, without the rest.
+
+    Args:
+        held: Of all shapes.
+        numbers: Of each vertex among those that are seen, negative for others. Default: all are. *Shape:* ``(V,)``.
+        n: How many these are, R.
+    """
+
+    def __init__(self, held: Contacts, numbers: Tensor | None, n: int) -> None:
+        local = held.elements if numbers is None else numbers[held.elements]
+        #: The shape of each, and which element it is. *Shape:* ``(N,)``.
+        self.shapes, which = torch.nonzero((held.weights > 0) & (local >= 0).all(1), as_tuple=True)
+        #: The vertices of each, in rows of all shapes. *Shape:* ``(4, N)``.
+        self.corners = (local[which] + (self.shapes * n)[:, None]).T.contiguous()
+        self.weights, self.gaps = held.weights[self.shapes, which], held.gaps[self.shapes, which]
+        self.term, self.n_shapes = Contact(held.elements), len(held.weights)
+
+    def _missing(self, flat: Tensor) -> tuple[Tensor, Tensor]:
+        first, *others = (pick(flat, corner) for corner in self.corners)
+        spokes = torch.stack([other - first for other in others])
+        return spokes, self.term.difference(self.term.measures(spokes), self.gaps)
+
+    def value(self, flat: Tensor) -> Tensor:
+        """Of each shape. *Shape:* ``(3, T R) -> (T,)``."""
+        each = self.weights * self._missing(flat)[1] ** 2
+        return each.new_zeros(self.n_shapes).index_add(0, self.shapes, each)
+
+    def linearised(self, flat: Tensor) -> AtHeld:
+        """*Shape:* ``(3, T R)``."""
+        spokes, missing = self._missing(flat)
+        near = torch.nonzero(missing).flatten()
+        each = self.weights * missing**2
+        value = each.new_zeros(self.n_shapes).index_add(0, self.shapes, each)
+        gradients = self.term.gradients(spokes[..., near])
+        on_corners = torch.cat([-gradients.sum(0), *gradients], -1)
+        stiffness = 2 * self.weights[near]
+        gradient = (stiffness * missing[near]).repeat(4) * on_corners
+        return AtHeld(value, gradient, on_corners, stiffness, self.corners[:, near].flatten())
+
+
+@torch.no_grad()
+def settled(
+    member: Between, samples: Samples, pair: Pair, x: Tensor, held: Contacts, n_steps: int, n_products: int
+) -> Tensor:
+    """Newton steps of all vertices of each shape, with what is held in it, never uphill.
+
+    Args:
+        member: In-betweens of the pair of key-frames.
+        samples: Of that pair, with the times of the shapes.
+        pair: The key-frames in the frame.
+        x: Where to start. *Shape:* ``(T, V, 3)``.
+        held: Of all shapes.
+        n_steps: How many.
+        n_products: Iterations of conjugate gradients in each.
+    """
+    if member.fused is not None:
+        return _by_kernels(member, member.fused, samples, pair, x, held, n_steps, n_products)
+    energy, fixed = held.fine(member.mesh, member.terms), member.anchors(trees.picked(pair, samples.which), samples.t)
+    every = torch.arange(member.mesh.n_vertices, device=x.device)
+    reference = member.fine_reference(samples, pair, member.fine, every, samples.stiffness)
+    size, parts = fine_chunk(len(every), x.device), []
+    for i in range(0, len(x), size):
+        own = slice(i, i + size)
+        rest, anchors = trees.rows((reference, fixed), own)
+        parts.append(relax(energy, x[own], held.rows(own).joined(rest), n_steps, n_products, anchors))
+    return torch.cat(parts)
+
+
+def rest_shapes(member: Between, samples: Samples, pair: Pair) -> tuple[Tensor, Tensor]:
+    """Both shapes that each is compared with. *Shape of each:* ``(T, V, 3)``."""
+    if pair.around is not None:
+        course = member.space.on_course(pair, samples.which, samples.t)
+        return course, course
+    first, second = trees.picked((pair.first, pair.second), samples.which)
+    return first, second
+
+
+def _by_kernels(
+    member: Between,
+    fused: FusedRelax,
+    samples: Samples,
+    pair: Pair,
+    x: Tensor,
+    held: Contacts,
+    n_steps: int,
+    n_products: int,
+) -> Tensor:
+    size, n = fine_chunk(x.shape[1], x.device), x.shape[1]
+    given = [*rest_shapes(member, samples, pair), samples.t, *samples.stiffness]
+    parts = []
+    for i in range(0, len(x), size):
+        own = slice(i, i + size)
+        to = fused.reference(*(value[own].double().contiguous() for value in given))
+        parts.append(
+            _steps(fused, x[own].double().contiguous(), to, Held(held.rows(own), None, n), n_steps, n_products)
+        )
+    return torch.cat(parts).to(x)
+
+
+def _steps(fused: FusedRelax, x: Tensor, to: ShellReference, held: Held, n_steps: int, n_products: int) -> Tensor:
+    def value(x: Tensor) -> Tensor:
+        return fused.value(x, to) + held.value(_flat(x))
+
+    for _ in range(n_steps):
+        at, own = fused.at(x, to), held.linearised(_flat(x))
+        before = at.energy + own.value
+        _flat(at.gradient).index_add_(1, own.corners, own.gradient)
+        _flat(at.diagonal).index_add_(1, own.corners, own.blocks.flatten(0, 1)[[0, 1, 2, 4, 5, 8]])
+
+        def beyond(direction: Tensor, product: Tensor, form: Tensor) -> None:
+            pushed, forms = own.product(_flat(direction))  # noqa: B023
+            _flat(product).index_add_(1, own.corners, pushed)  # noqa: B023
+            form.index_add_(0, own.corners[: len(forms)] // x.shape[1], forms)  # noqa: B023
+
+        step = fused.solved(x, at, to, n_products, beyond=beyond)
+        length = torch.zeros_like(before)
+        for shorter in STEP_LENGTHS:
+            downhill = (length == 0) & (value(x + shorter * step.solution) < before)
+            length = torch.where(downhill, shorter, length)
+            if bool((length > 0).all()):
+                break
+        x = x + length[:, None, None] * step.solution
+    return x
+
+
+def _flat(x: Tensor) -> Tensor:
+    """Components first, in place. *Shape:* ``(T, V, c) -> (c, T V)``."""
+    return x.view(-1, x.shape[-1]).T
