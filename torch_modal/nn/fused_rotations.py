@@ -30,6 +30,7 @@ class FusedRotations(LocalRotations):
         }
         for name, values in of_faces.items():
             self.register_buffer(f"_{name}", values.int().contiguous(), persistent=False)
+        self._n_pieces = int(self.piece.max()) + 1
         self.register_buffer("_signs", self.side_signs.unflatten(0, (3, -1)).T.contiguous(), persistent=False)
 
     def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
@@ -43,27 +44,30 @@ class FusedRotations(LocalRotations):
         """The same by torch."""
         return super().forward(first, second, t)
 
-    def sense(self, first: Tensor, second: Tensor) -> Tensor:
+    def turns(self, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
+        """Quaternions, twice both areas and sizes of all triangles. *Shape:* ``(B, F, 4), (B, F), (B, F, 12)``."""
+        (b, n), n_faces = first.shape[:2], len(self.faces)
+        found = tuple(first.new_empty(shape) for shape in ((b, n_faces, 4), (b, n_faces), (b, n_faces, 12)))
+        launch(kernels("rotations").turns, (b, n_faces), [first, second, self._face, n, *found])
+        return found
+
+    def sense(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """The sign of the quaternion of each triangle. *Shape:* ``(B, F)``."""
-        module, (b, n), n_faces = kernels("rotations"), first.shape[:2], len(self.faces)
-        quaternions, areas = first.new_empty(b, n_faces, 4), first.new_empty(b, n_faces)
-        launch(module.turns, (b, n_faces), [first, second, self._face, n, quaternions, areas])
-        if first.device.type != "cpu":  # the walk down the tree is one thread's
+        module, b = kernels("rotations"), len(areas)
+        if areas.device.type != "cpu":  # the walk down the tree is one thread's
             return self._senses(quaternions.movedim(-1, 0), areas)
-        n_pieces = int(self.piece.max()) + 1
-        sign, vote = torch.empty_like(areas), first.new_zeros(b, n_pieces)
+        n_pieces = self._n_pieces
+        sign, vote = torch.empty_like(areas), areas.new_zeros(b, n_pieces)
         given = [quaternions, areas, self._order, self._parent, self._piece_of, n_pieces, sign, vote]
         launch(module.senses, (b,), given)
         return sign
 
-    def sums(self, sense: Tensor, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+    def sums(self, turns: tuple[Tensor, ...], sense: Tensor, t: Tensor) -> Tensor:
         """Sides by area, summed on the edges, and areas, where the senses are known. *Shape:* ``(B, E, 4)``."""
-        total = first.new_zeros(len(first), len(self.per_length), 4)
-        launch(
-            kernels("rotations").turned_edges,
-            (len(first), len(self.faces)),
-            self._given(sense, first, second, t, total),
-        )
+        n_edges = len(self.per_length)
+        total = t.new_zeros(len(t), n_edges, 4)
+        given = [*turns, t, self._edge_of, self._signs.double(), sense, n_edges, total]
+        launch(kernels("rotations").part_turned, (len(t), len(self.faces)), given)
         return total
 
     def pull_back(self, to_total: Tensor, total: Tensor, sense: Tensor, *given: Tensor) -> list[Tensor]:
@@ -144,8 +148,9 @@ class _Turned(torch.autograd.Function):
     @staticmethod
     def forward(fused: FusedRotations, *given: Tensor) -> tuple[Tensor, ...]:
         first, second, t = (value.detach().contiguous() for value in given)
-        sense = fused.sense(first, second)
-        total = fused.sums(sense, first, second, t)
+        turns = fused.turns(first, second)
+        sense = fused.sense(*turns[:2])
+        total = fused.sums(turns, sense, t)
         return _means(total), sense, total
 
     @staticmethod

@@ -8,6 +8,9 @@ from torch_modal.nn.kernels.elements import HALF, TINIEST, length_of, real, vec3
 packed_course = wp.types.vector(length=31, dtype=real)
 """A row of :meth:`torch_modal.geometry.local_rotations.Course`, in the order of its parts."""
 
+packed_turn = wp.types.vector(length=12, dtype=real)
+"""Of a triangle, the sides' directions in the first shape; length, along and height there, and how they change."""
+
 NO_HEIGHT = wp.constant(real(triangle_frames.FLAT))
 SMALL = wp.constant(real(rotations.SMALL))
 
@@ -75,15 +78,31 @@ def turns(
     n: int,
     quaternions: wp.array(dtype=vec4),
     areas: wp.array(dtype=real),
+    packed: wp.array(dtype=packed_turn),
 ):
-    """Quaternions between the frames of triangles, and twice both areas."""
+    """Quaternions between the frames of triangles, twice both areas, and what else :func:`part_turned` needs."""
     s, k = wp.tid()
     v = s * n
     f = faces[k]
     a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
     b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
-    quaternions[s * faces.shape[0] + k] = quaternion(a, b)
-    areas[s * faces.shape[0] + k] = a.length * a.height + b.length * b.height
+    at = s * faces.shape[0] + k
+    quaternions[at] = quaternion(a, b)
+    areas[at] = a.length * a.height + b.length * b.height
+    packed[at] = packed_turn(
+        a.e1[0],
+        a.e1[1],
+        a.e1[2],
+        a.e2[0],
+        a.e2[1],
+        a.e2[2],
+        a.length,
+        a.along,
+        a.height,
+        b.length - a.length,
+        b.along - a.along,
+        b.height - a.height,
+    )
 
 
 @wp.kernel(enable_backward=False)
@@ -205,6 +224,32 @@ def turned_edges(
     one = turned(turn, x * a.e1)
     two = turned(turn, y * a.e1 + z * a.e2)
     add_sides(total, s * n_edges, sides[k], signs[k], a.length * a.height + b.length * b.height, one, two)
+
+
+@wp.kernel(enable_backward=False)
+def part_turned(
+    quaternions: wp.array(dtype=vec4),
+    areas: wp.array(dtype=real),
+    packed: wp.array(dtype=packed_turn),
+    time: wp.array(dtype=real),
+    sides: wp.array(dtype=wp.vec3i),
+    signs: wp.array(dtype=vec3),
+    sense: wp.array(dtype=real),
+    n_edges: int,
+    total: wp.array(dtype=vec4),
+):
+    """As :func:`turned_edges`, of turns that are known."""
+    s, k = wp.tid()
+    at = s * sides.shape[0] + k
+    c = packed[at]
+    t = time[s]
+    turn = about(t * half_turn(sense[at] * quaternions[at]))
+    one = turned(turn, vec3(c[0], c[1], c[2]))
+    two = turned(turn, vec3(c[3], c[4], c[5]))
+    x = c[6] + t * c[9]
+    y = c[7] + t * c[10]
+    z = c[8] + t * c[11]
+    add_sides(total, s * n_edges, sides[k], signs[k], areas[at], x * one, y * one + z * two)
 
 
 @wp.kernel
