@@ -102,7 +102,7 @@ class Solution(NamedTuple):
     gradient_norm: Tensor
     """Relative to the gradient norm at the start. *Shape:* ``(B,)``."""
     n_steps: Tensor
-    """Steps taken. *Shape:* ``(B,)``, int64."""
+    """Steps taken, each with a Hessian of its own. *Shape:* ``(B,)``, int64."""
     status: Tensor
     """A :class:`Status` for each. *Shape:* ``(B,)``, int64."""
     n_crossing: Tensor | None = None
