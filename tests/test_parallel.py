@@ -46,6 +46,26 @@ def test_as_many_at_once_as_processors(cpus: int) -> None:
     assert most == cpus
 
 
+def test_who_has_nothing_else_to_do_does_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
+    did: list[Any] = []
+    done = threading.Event()
+
+    def work(index: int) -> int:
+        did.append(index)
+        assert index < 2 or done.wait(30)  # the last one ends after it
+        return index
+
+    def meanwhile() -> None:
+        did.append("meanwhile")
+        done.set()
+
+    assert run_all(work, 3, threading.Event(), meanwhile) == [0, 1, 2]
+    assert "meanwhile" in did
+    with pytest.raises(ZeroDivisionError):
+        run_all(lambda index: index, 3, threading.Event(), lambda: 1 // 0)
+
+
 def test_the_first_error_ends_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
     stop, begun, ended = threading.Event(), [], []

@@ -1,5 +1,6 @@
 """The main job on bars: counts, places, what stays bit for bit, and the order of modes and motions."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -235,14 +236,20 @@ def test_nearest_key_frame_by_edge_lengths(scattered: Shapes) -> None:
 
 def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
+    loaded: list[str] = []
 
-    def extract(keyframes: Tensor, faces: Tensor, n_modes: int, progress: bool | None) -> list[tm.ModalBasis]:
+    def extract(
+        keyframes: Tensor, faces: Tensor, n_modes: int, progress: bool | None, meanwhile: Callable[[], None]
+    ) -> list[tm.ModalBasis]:
         asked.append((len(keyframes), n_modes))
+        meanwhile()
         return scattered.bases
 
-    monkeypatch.setattr(sequence, "extract_bases", extract)
+    monkeypatch.setattr(sequence, "bases_of_checked", extract)
+    monkeypatch.setattr(sequence, "load_kernels", loaded.append)
     frames = subdivide(scattered.keyframes, scattered.faces, 1, n_modes=7, progress=False, **COARSE)
     assert asked == [(3, 7)]
+    assert loaded == ["auto"]
     given = subdivide(scattered.keyframes, scattered.faces, 1, bases=scattered.bases, progress=False, **COARSE)
     assert torch.equal(frames, given)
 

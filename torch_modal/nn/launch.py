@@ -18,10 +18,13 @@ from torch_modal.extras import require_installed, uncollected
 from torch_modal.progress import ProgressReport
 
 Backend = Literal["auto", "torch", "warp"]
+Module = Literal["alignment", "shell", "modal", "steps", "steps_adjoint", "rotations"]
+IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps")
+"""What in-betweens need that record no gradient."""
 
 
 @cache
-def kernels(name: Literal["alignment", "shell", "modal", "steps", "steps_adjoint", "rotations"]) -> Any:
+def kernels(name: Module) -> Any:
     """A module of :mod:`torch_modal.nn.kernels`, compiled by the first who asks on a machine, and kept by Warp."""
     with uncollected():
         import warp as wp
@@ -73,6 +76,13 @@ def has_kernels(backend: Backend) -> bool:
     if backend == "warp":
         require_installed(("warp",), "warp", "backend='warp'")
     return backend != "torch" and _works()
+
+
+def load_kernels(backend: Backend) -> None:
+    """Load those of in-betweens, if they are used, so that nobody waits for it later."""
+    if has_kernels(backend):
+        for name in IN_BETWEENS:
+            kernels(name)
 
 
 class _Commands(threading.local):

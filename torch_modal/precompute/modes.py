@@ -1,6 +1,7 @@
 """From key-frames to modal bases: the calls that users make, what they check and what they warn about."""
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,9 @@ QUALITIES = {
 }
 """Named settings; ``docs/precompute.md`` says what each costs and gives."""
 
+TIMEOUT = 600.0
+"""Seconds that fTetWild may take for a key-frame."""
+
 
 def extract_modes(
     vertices: Any,
@@ -35,7 +39,7 @@ def extract_modes(
     settings: TetrahedraSettings | str = "fast",
     mesher: Mesher = "auto",
     tolerance: float = ENOUGH,
-    timeout: float = 600.0,
+    timeout: float = TIMEOUT,
     cache_dir: str | None = None,
     cache: bool = True,
 ) -> ModalBasis:
@@ -90,7 +94,7 @@ def extract_bases(
     mesher: Mesher = "auto",
     tolerance: float = ENOUGH,
     carry: bool = True,
-    timeout: float = 600.0,
+    timeout: float = TIMEOUT,
     cache_dir: str | None = None,
     cache: bool = True,
     progress: Progress = None,
@@ -139,9 +143,41 @@ def extract_bases(
         raise ValueError(f"the mesher is {mesher!r}; give one of {MESHERS}")
     if not 0 < tolerance < np.inf:
         raise ValueError(f"the tolerance is {tolerance!r}; give a positive number, {ENOUGH:g} by default")
+    filler = Filler(_settings(settings), mesher, timeout, Cache.at(cache_dir, enabled=cache))
     positions, working_faces = check_keyframes(keyframes, faces)
-    shapes = positions.detach().cpu().double().numpy()
-    triangles = working_faces.cpu().numpy()
+    return bases_of_checked(
+        positions, working_faces, n_modes, filler, form=form, tolerance=tolerance, carry=carry, progress=progress
+    )
+
+
+def bases_of_checked(
+    keyframes: torch.Tensor,
+    faces: torch.Tensor,
+    n_modes: int,
+    filler: Filler | None = None,
+    *,
+    form: HessianForm = "edge",
+    tolerance: float = ENOUGH,
+    carry: bool = True,
+    progress: Progress = None,
+    meanwhile: Callable[[], object] | None = None,
+) -> list[ModalBasis]:
+    """`extract_bases` for key-frames that :func:`~torch_modal.keyframes.check.check_keyframes` has seen.
+
+    Args:
+        keyframes: *Shape:* ``(K, V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
+        n_modes: As there, like the others that are not named here.
+        filler: Gives them tetrahedra. Default: as there.
+        form: As there.
+        tolerance: As there.
+        carry: As there.
+        progress: As there.
+        meanwhile: Called while this goes on, by a processor that has nothing else to do, if there is one.
+    """
+    filler = filler or Filler(QUALITIES["fast"], "auto", TIMEOUT, Cache.at(None))
+    shapes = keyframes.detach().cpu().double().numpy()
+    triangles = faces.cpu().numpy()
     _check_n_modes(n_modes, len(np.unique(triangles)))
     surfaces: list[Surface] = []
     for index, shape in enumerate(shapes):
@@ -149,7 +185,6 @@ def extract_bases(
             require_solid(shape, triangles)
             surfaces.append(Surface.of(shape, triangles))
 
-    filler = Filler(_settings(settings), mesher, timeout, Cache.at(cache_dir, enabled=cache))
     with ProgressReport(2 * len(shapes), "vibration modes", progress) as bar:
 
         def report(index: int, stage: str) -> None:
@@ -157,7 +192,7 @@ def extract_bases(
                 raise StoppedError
             bar.describe(f"key-frame {index + 1}/{len(shapes)}: {stage}")
 
-        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, report, bar.update)
+        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, report, bar.update, meanwhile)
         solved = work.solve_carried() if carry and len(shapes) > 1 else work.solve_each()
     for index, one in enumerate(solved):
         _warn(f"key-frame {index}: " if len(shapes) > 1 else "", one)
@@ -198,7 +233,7 @@ def _warn(name: str, solved: Solved) -> None:
         warnings.warn(
             f"{name}fTetWild failed, so a lattice of cubes takes its place: {filling.body.problem}",
             MeshWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     if n_zero > N_RIGID:
         warnings.warn(
@@ -206,7 +241,7 @@ def _warn(name: str, solved: Solved) -> None:
             f"{n_zero - N_RIGID} of its first modes move them without deforming them; join them, or ask for that many "
             "more modes",
             MeshWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -29,7 +29,9 @@ def n_cpus() -> int:
     return os.cpu_count() or 1
 
 
-def run_all(work: Callable[[int], Result], n: int, stop: threading.Event) -> list[Result]:
+def run_all(
+    work: Callable[[int], Result], n: int, stop: threading.Event, meanwhile: Callable[[], object] | None = None
+) -> list[Result]:
     """The results of ``work(0)`` to ``work(n - 1)``, as many at a time as there are processors.
 
     The first error ends everything: ``stop`` is set, what has not begun is not begun, and the error is raised once the
@@ -40,6 +42,8 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event) -> lis
         work: Looks at ``stop`` from time to time if it takes long, and then raises `StoppedError`.
         n: How many.
         stop: Set when the results are no longer wanted.
+        meanwhile: What the first processor does that has nothing else to do while others are at work; left out where
+            there is but one, or one result.
     """
 
     def alone(index: int) -> Result:
@@ -50,7 +54,9 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event) -> lis
     if n_threads < 2:
         return [alone(index) for index in range(n)]
     with one_blas_thread(), ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
-        futures = [pool.submit(alone, index) for index in range(n)]
+        futures: list[Future[Any]] = [pool.submit(alone, index) for index in range(n)]
+        if meanwhile is not None:
+            futures.append(pool.submit(meanwhile))
         try:
             for future in as_completed(futures):
                 future.result()
@@ -59,7 +65,7 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event) -> lis
             for future in futures:
                 future.cancel()
             raise
-    return [future.result() for future in futures]
+    return [future.result() for future in futures[:n]]
 
 
 class _Inside:

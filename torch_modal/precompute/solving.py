@@ -55,6 +55,7 @@ class KeyframeSet:
         tolerance: Residual of the modes.
         report: Called with the index of a key-frame and the stage that it enters.
         done: Called twice for each key-frame: when it has its tetrahedra, and when it has its modes.
+        meanwhile: Called by a thread that has nothing else to do, see :func:`~torch_modal.precompute.parallel.run_all`.
     """
 
     surfaces: list[Surface]
@@ -65,11 +66,12 @@ class KeyframeSet:
     tolerance: float
     report: Callable[[int, str], None]
     done: Callable[[], object]
+    meanwhile: Callable[[], object] | None = None
     _memory: Budget = field(default_factory=lambda: Budget(VERTICES_AT_ONCE))
 
     def solve_each(self) -> list[Solved]:
         """With tetrahedra of its own for each."""
-        return run_all(lambda index: self._solved(index, self._own(index)), len(self.surfaces), self.filler.stop)
+        return self._all(lambda index: self._solved(index, self._own(index)))
 
     def solve_carried(self) -> list[Solved]:
         """With the tetrahedra of the one that touches itself least, carried to those where they survive that."""
@@ -83,7 +85,10 @@ class KeyframeSet:
             filling = own.get(index) or self._carried(own[first], index) or self._own(index)
             return self._solved(index, filling)
 
-        return run_all(solve, len(self.surfaces), self.filler.stop)
+        return self._all(solve)
+
+    def _all(self, solve: Callable[[int], Solved]) -> list[Solved]:
+        return run_all(solve, len(self.surfaces), self.filler.stop, self.meanwhile)
 
     def _own(self, index: int) -> Filling:
         """A key-frame with tetrahedra of its own."""

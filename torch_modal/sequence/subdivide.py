@@ -4,6 +4,7 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -16,11 +17,12 @@ from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.between import Between
+from torch_modal.nn.launch import load_kernels
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.samples import Samples
 from torch_modal.nn.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.modes import extract_bases
+from torch_modal.precompute.modes import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.sequence.contact import push_apart
 from torch_modal.sequence.path import Path
@@ -88,7 +90,7 @@ def subdivide(
         MeshWarning: With ``contact``, which key-frames pass through themselves, and how many frames still do that no
             key-frame does.
     """
-    keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2, warn=bases is not None)
+    keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2)
     n_keys = len(keyframes)
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
     chosen = settings(preset, objective, solver, contact)
@@ -103,7 +105,8 @@ def subdivide(
     if smooth and chosen.objective.space == "paired":
         raise ValueError("the paired space (Eq. 4) knows pairs only: smooth=True needs space='joint'")
     if bases is None:
-        bases = extract_bases(keyframes, faces, n_modes, progress=progress)
+        load = partial(load_kernels, chosen.solver.backend)
+        bases = bases_of_checked(keyframes, working_faces, n_modes, progress=progress, meanwhile=load)
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
