@@ -139,10 +139,18 @@ class ContactSearch:
         """Those of some samples in which parts went through each other. *Shape:* ``(B, V, 3)``, of all samples."""
         return (i for i in some if self._counted(i, x[i])[1])
 
-    def count(self, x: Tensor) -> None:
-        """Count what crosses in all samples, without looking for what is to be held. *Shape:* ``(B, V, 3)``."""
-        counts = [self._counted(i, shape) for i, shape in enumerate(x)]
-        self.n_far, self.n_left = (self._counts(x, each) for each in zip(*counts, strict=True))
+    def count(self, x: Tensor, some: Sequence[int] | None = None) -> None:
+        """Count what crosses in all samples, or some; nothing is looked for that is to be held. *Shape:* ``(B, V, 3)``."""
+        some = range(len(x)) if some is None else some
+        self._keep(some, [self._counted(i, x[i]) for i in some])
+
+    def _keep(self, some: Sequence[int], counts: Sequence[tuple[int, int]]) -> None:
+        found = torch.tensor(counts, dtype=torch.int64, device=self.t.device).reshape(-1, 2)
+        places = torch.tensor(some, dtype=torch.int64, device=self.t.device)
+        self.n_far, self.n_left = (
+            before.index_copy(0, places, own)
+            for before, own in zip((self.n_far, self.n_left), found.unbind(1), strict=True)
+        )
 
     def _counted(self, i: int, x: Tensor) -> tuple[int, int]:
         """Pairs of triangles that went through each other in a sample, and those of them that are not tolerated."""
@@ -152,24 +160,22 @@ class ContactSearch:
         pairs = search.crossings.far_pairs(x.detach().double().cpu().numpy())
         return len(pairs), search.n_left(pairs, *self._when(i))
 
-    def __call__(self, x: Tensor) -> Contacts | None:
+    def __call__(self, x: Tensor, some: Sequence[int] | None = None) -> Contacts | None:
         """Contacts of the samples; None where nothing has gone through anything, now or before.
 
         Args:
             x: *Shape:* ``(B, V, 3)``.
+            some: Those that are searched; the counts of the others stay as they are. Default: all.
         """
-        shapes = x.detach().double().cpu().numpy()
-        found = []
-        for i, shape in enumerate(shapes):
-            held = None
+        some = range(len(x)) if some is None else some
+        found: list[Any] = [None] * len(x)
+        counts = [(0, 0)] * len(some)
+        for k, i in enumerate(some):
             if bool(x[i].isfinite().all()):
-                held = self._search(i)(shape, self.watched[i])
+                held = found[i] = self._search(i)(x[i].detach().double().cpu().numpy(), self.watched[i])
                 self.watched[i] = held.watched
-            found.append(held)
-        self.n_far = self._counts(x, [0 if held is None else len(held.far) for held in found])
-        self.n_left = self._counts(
-            x, [0 if held is None else self._search(i).n_left(held.far, *self._when(i)) for i, held in enumerate(found)]
-        )
+                counts[k] = len(held.far), self._search(i).n_left(held.far, *self._when(i))
+        self._keep(some, counts)
         if not any(held is not None and len(held.vertices) for held in found):
             return None
         n = len(self.faces)
@@ -178,7 +184,7 @@ class ContactSearch:
         every = torch.cat(codes).unique()
         vertices, faces = every // n, every % n
         elements = torch.cat([self.faces[faces], vertices[:, None]], 1)
-        weights = torch.zeros(len(shapes), len(every), dtype=x.dtype)
+        weights = torch.zeros(len(x), len(every), dtype=x.dtype)
         gaps = torch.full_like(weights, GAP)
         for i, (code, held) in enumerate(zip(codes, found, strict=True)):
             places = torch.searchsorted(every, code)
@@ -187,13 +193,9 @@ class ContactSearch:
                 slack = torch.from_numpy(held.slack).to(x.dtype)
                 ramps = torch.from_numpy(self._search(i).tolerance(held.slack, *self._when(i))).to(x.dtype)
                 gaps[i, places] = GAP * (1 - ramps.amax(1)) - (slack * ramps).amax(1)
-        some = torch.nonzero((weights > 0).any(1)).flatten()
+        own = torch.nonzero((weights > 0).any(1)).flatten()
         to = x.device
-        return Contacts(some.to(to), elements.to(to), weights[some].to(to), gaps[some].to(to))
-
-    @staticmethod
-    def _counts(like: Tensor, counts: Sequence[int]) -> Tensor:
-        return torch.tensor(counts, dtype=torch.int64, device=like.device)
+        return Contacts(own.to(to), elements.to(to), weights[own].to(to), gaps[own].to(to))
 
     @property
     def is_tolerant(self) -> bool:

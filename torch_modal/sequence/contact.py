@@ -47,9 +47,10 @@ SEARCHED = 16
 BESIDE = 0.125
 ROUNDS = 4
 MODAL_STEPS = 2
-FINE_STEPS = 1
+FINE_STEPS = 2
 FINE_PRODUCTS = 40
-SETTLINGS = 2
+LEAST_SETTLINGS = 2
+SETTLINGS = 3
 """How often all shapes come to rest, each on its own, and their displacement is fitted to what may be accelerated."""
 SETTLING_STEPS = 2
 SETTLING_PRODUCTS = 20
@@ -164,13 +165,13 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
         # What a key-frame has comes out beside it.
         chosen |= set(torch.nonzero((t < BESIDE) | (t > 1 - BESIDE)).flatten().tolist())
     course = _Course(member, samples, pair, start, limit, search)
-    course.push(chosen)
-    if course.at is None:
-        return Displacement(None, t, course.n_before, course.n_crossing)
-    more = set(search.crossing(course.moved(), [i for i in range(len(t)) if i not in chosen]))
-    if more:
-        course.push(chosen | more)
-    return course.settled()
+    some = torch.tensor(sorted(chosen), device=start.device)
+    found = course.pushed(some)
+    n_before = torch.zeros_like(search.n_far).index_copy(0, some, found.n_before)
+    if found.held is None:
+        return Displacement(None, t, n_before, n_before)
+    x, n_crossing = course.settled(found.x, found.held)
+    return Displacement((x - start).movedim(-1, 0), t, n_before, n_crossing)
 
 
 def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor, start: Tensor) -> AccelerationLimit:
@@ -194,8 +195,19 @@ def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor, start:
     return AccelerationLimit(rows.movedim(-1, 0).contiguous(), second, splines(t).values, area, most)
 
 
+class _Pushed(NamedTuple):
+    """Shapes that were pushed apart together."""
+
+    x: Tensor
+    """All of them. *Shape:* ``(T, V, 3)``."""
+    held: Contacts | None
+    """Of those that were searched, by their numbers; None where nothing is to be pushed."""
+    n_before: Tensor
+    """Of these. *Shape:* ``(S,)``."""
+
+
 class _Course:
-    """Shapes between two key-frames, the displacement that was found so far, and what is held with it."""
+    """Shapes between two key-frames."""
 
     def __init__(
         self,
@@ -208,20 +220,9 @@ class _Course:
     ) -> None:
         self.member, self.samples, self.pair, self.start = member, samples, pair, start
         self.limit, self.search = limit, search
-        #: Coefficients of the splines; None as long as nothing has to move. *Shape:* ``(3, J, V)``.
-        self.at: Tensor | None = None
-        #: With the numbers of the shapes that hold something.
-        self.held: Contacts | None = None
-        self.n_before, self.n_crossing = torch.zeros_like(search.n_far), search.n_far
 
-    def moved(self) -> Tensor:
-        """All shapes, pushed apart by what was found so far. *Shape:* ``(T, V, 3)``."""
-        assert self.at is not None
-        return self.start + (splines(self.samples.t).values @ self.at).movedim(0, -1)
-
-    def push(self, chosen: set[int]) -> None:
-        """Push some of the shapes apart, from what was found for others; what leaves the fewest crossings is kept."""
-        some = torch.tensor(sorted(chosen), device=self.start.device)
+    def pushed(self, some: Tensor) -> _Pushed:
+        """All shapes with a displacement that frees some of them; what leaves the fewest crossings is kept."""
         search, start, samples = self.search.of(some), self.start[some], self.samples
         samples = samples._replace(
             which=None if samples.which is None else samples.which[some],
@@ -230,23 +231,12 @@ class _Course:
             stiffness=[k[some] for k in samples.stiffness],
         )
         solver = _Coupled(self.member, samples, self.pair, start.movedim(-1, 0).contiguous(), self.limit)
-        if self.at is None:
-            at = start.new_zeros(3, solver.basis.shape[1], start.shape[1])
-        else:
-            at = self.at
-            search.count(start)
-            self.n_before[some] = search.n_far
-        found = search(solver.moved(at).movedim(0, -1))
-        self.n_crossing = search.n_far
-        if self.at is None:
-            self.n_before[some] = search.n_far
+        found, n_before = search(start), search.n_far
         if found is None or not bool(search.n_left.any()):
-            return
-        best = self.at, search.n_left, search.n_far
-        kept = torch.arange(len(start), device=start.device)
+            return _Pushed(self.start, None, n_before)
+        at = start.new_zeros(3, solver.basis.shape[1], start.shape[1])
+        best, kept = (at, search.n_left, search.n_far), torch.arange(len(start), device=start.device)
         held = found.of_all(kept)
-        if self.held is not None:
-            held = held.beside(self.held._replace(samples=torch.searchsorted(some, self.held.samples)).of_all(kept))
         for _ in range(ROUNDS):
             at = solver.fine(solver.modal(at, held), held, search.near(REGION), FINE_STEPS)
             found = search(solver.moved(at).movedim(0, -1))
@@ -254,29 +244,38 @@ class _Course:
             if found is None or not bool(search.n_left.any()):
                 break
             held = found.of_all(kept).beside(held)
-        self.at, _, self.n_crossing = best
-        self.held = held._replace(samples=some)
+        x = self.start + (splines(self.samples.t).values @ best[0]).movedim(0, -1)
+        return _Pushed(x, held._replace(samples=some), n_before)
 
-    def settled(self) -> Displacement:
+    def settled(self, x: Tensor, held: Contacts) -> tuple[Tensor, Tensor]:
         """All shapes brought to rest, each on its own, and as near to that as their accelerations allow.
 
-        What leaves the fewest crossings is kept.
+        Args:
+            x: Where to start. *Shape:* ``(T, V, 3)``.
+            held: In some of them.
+
+        Returns:
+            What leaves the fewest crossings, and how many these are in each shape. *Shape:* ``(T, V, 3), (T,)``.
         """
-        assert self.held is not None
         search, start, every = self.search, self.start, torch.arange(len(self.start), device=self.start.device)
-        held = self.held.of_all(every)
+        held = held.of_all(every)
         search.watch(held, AROUND)
-        x = self.moved()
-        found = search(x)
-        best = x, search.n_left, search.n_far
-        for _ in range(SETTLINGS):
+        found, some, best = search(x), None, None
+        for k in range(SETTLINGS):
             held = held if found is None else found.of_all(every).beside(held)
-            at_rest = settled(self.member, self.samples, self.pair, x, held, SETTLING_STEPS, SETTLING_PRODUCTS)
-            x = start + self.limit.nearest((at_rest - start).movedim(-1, 0)).movedim(0, -1)
-            found = search(x)
-            best = min((x, search.n_left, search.n_far), best, key=_left)
-        x, _, n_crossing = best
-        return Displacement((x - start).movedim(-1, 0), self.samples.t, self.n_before, n_crossing)
+            x = settled(self.member, self.samples, self.pair, x, held, SETTLING_STEPS, SETTLING_PRODUCTS)
+            x = start + self.limit.nearest((x - start).movedim(-1, 0)).movedim(0, -1)
+            # The others are looked at in the end.
+            some = torch.nonzero((held.weights > 0).any(1) | (search.n_far > 0)).flatten().tolist()
+            found = search(x, some)
+            if k >= LEAST_SETTLINGS - 1:
+                best = min((x, search.n_left, search.n_far), best or (x, search.n_left, search.n_far), key=_left)
+                if not bool(search.n_left.any()):
+                    break
+        assert best is not None and some is not None
+        search.n_left, search.n_far = best[1:]
+        search.count(best[0], sorted(set(range(len(start))) - set(some)))
+        return best[0], search.n_far
 
 
 def _left(found: tuple[Any, Tensor, Tensor]) -> tuple[int, int]:
