@@ -1,10 +1,11 @@
 """Rigid motions between shapes: best fit, and the geodesic along which they are interpolated."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.functions import applied, traced
 from torch_modal.geometry.rotations import exp, log
 
 
@@ -42,7 +43,7 @@ class RigidMotion(NamedTuple):
 
 def centroid(x: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean of the vertices. *Shape:* ``(..., V, 3), (V,) -> (..., 3)``."""
-    return (weights[:, None] * x).sum(-2) / weights.sum()
+    return weights @ x / weights.sum()
 
 
 def best_rotation(covariance: Tensor) -> Tensor:
@@ -50,8 +51,9 @@ def best_rotation(covariance: Tensor) -> Tensor:
 
     The singular value decomposition gives the value alone (the largest eigenvector of the quaternions' 4 x 4 matrix by
     repeated squaring is as exact for all shapes, and takes ten times as long). Its derivative divides by differences of
-    singular values and fails on symmetric shapes, where the rotation itself is smooth. The derivatives come from two
-    Newton steps that start at the solution, each of which makes them exact to a higher order.
+    singular values and fails on symmetric shapes, where the rotation itself is smooth. The first derivative is written
+    out. Those after it come from two Newton steps that start at the solution, each of which makes them exact to a
+    higher order.
 
     Args:
         covariance: ``A = sum_v w_v y_v x_v^T``. *Shape:* ``(..., 3, 3)``.
@@ -59,26 +61,82 @@ def best_rotation(covariance: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(..., 3, 3)``, determinant one.
     """
+    if traced(covariance):
+        rotation = _by_singular_values(covariance)
+        return _polished(covariance, rotation) if torch.is_grad_enabled() else rotation
+    return applied(_BestRotation, covariance)  # type: ignore[no-any-return]
+
+
+def _by_singular_values(covariance: Tensor) -> Tensor:
+    """The value. *Shape:* ``(..., 3, 3)``."""
     u, _, vh = torch.linalg.svd(covariance.detach())
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)
-    rotation = (u * sign[..., None, :]) @ vh
-    if not torch.is_grad_enabled():
-        return rotation
-    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    return (u * sign[..., None, :]) @ vh
+
+
+def _polished(covariance: Tensor, rotation: Tensor) -> Tensor:
+    """The same, with derivatives. *Shape:* ``(..., 3, 3)``."""
     for _ in range(2):
         p = rotation.mT @ covariance
-        torque = torch.stack(
-            [p[..., 2, 1] - p[..., 1, 2], p[..., 0, 2] - p[..., 2, 0], p[..., 1, 0] - p[..., 0, 1]], -1
-        )
-        trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        stiffness = trace * eye - 0.5 * (p + p.mT)
-        # Shapes on a line, in a point or turned inside out leave a rotation free: held still, well above rounding.
-        floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, 64 * torch.finfo(p.dtype).eps * trace.abs(), 1)
-        stiffness = stiffness + floor.detach() * eye
-        turn = torch.linalg.solve_ex(stiffness, torque).result  # never singular: not asked for, so that a GPU runs on
+        turn = torch.linalg.solve_ex(_stiffness(p), _torque(p)).result  # never singular: a GPU is not asked and runs on
         rotation = rotation @ exp(turn)
     return rotation
+
+
+def _torque(p: Tensor) -> Tensor:
+    """The inner product with infinitesimal rotations. *Shape:* ``(..., 3, 3) -> (..., 3)``."""
+    return torch.stack([p[..., 2, 1] - p[..., 1, 2], p[..., 0, 2] - p[..., 2, 0], p[..., 1, 0] - p[..., 0, 1]], -1)
+
+
+def _stiffness(p: Tensor) -> Tensor:
+    """What resists a further rotation. *Shape:* ``(..., 3, 3)``."""
+    eye = torch.eye(3, dtype=p.dtype, device=p.device)
+    trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    # Shapes on a line, in a point or turned inside out leave a rotation free: held still, well above rounding.
+    floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, 64 * torch.finfo(p.dtype).eps * trace.abs(), 1)
+    return trace * eye - 0.5 * (p + p.mT) + floor.detach() * eye
+
+
+def _skew(v: Tensor) -> Tensor:
+    """*Shape:* ``(..., 3) -> (..., 3, 3)``."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+class _BestRotation(torch.autograd.Function):
+    """Where ``A`` changes, ``R`` turns on by ``w`` with ``stiffness w = torque``."""
+
+    @staticmethod
+    def forward(covariance: Tensor) -> Tensor:
+        return _by_singular_values(covariance)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs, output)
+        ctx.save_for_forward(*inputs, output)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        covariance, rotation = ctx.saved_tensors
+        if torch.is_grad_enabled():  # gradients of gradients
+            return torch.func.vjp(lambda a: _polished(a, rotation.detach()), covariance)[1](grads[0])[0]  # type: ignore[no-any-return]
+        stiffness = _stiffness(rotation.mT @ covariance)
+        turn = torch.linalg.solve_ex(stiffness, _torque(rotation.mT @ grads[0])).result
+        return rotation @ _skew(turn)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor) -> Tensor:
+        covariance, rotation = ctx.saved_tensors
+        back = rotation.mT
+        return rotation @ _skew(
+            torch.linalg.solve_ex(_stiffness(back @ covariance), _torque(back @ tangents[0])).result
+        )
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int], covariance: Tensor) -> tuple[Tensor, int]:
+        return _BestRotation.apply(covariance.movedim(in_dims[0], 0)), 0
 
 
 def best_fit(x: Tensor, y: Tensor, weights: Tensor) -> RigidMotion:
