@@ -121,10 +121,12 @@ class _BestRotation(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
         covariance, rotation = ctx.saved_tensors
         if torch.is_grad_enabled():  # gradients of gradients
-            return torch.func.vjp(lambda a: _polished(a, rotation.detach()), covariance)[1](grads[0])[0]  # type: ignore[no-any-return]
-        stiffness = _stiffness(rotation.mT @ covariance)
-        turn = torch.linalg.solve_ex(stiffness, _torque(rotation.mT @ grads[0])).result
-        return rotation @ _skew(turn)
+            (found,) = torch.func.vjp(lambda a: _polished(a, rotation.detach()), covariance)[1](grads[0])
+            return found  # type: ignore[no-any-return]
+        with torch.autocast(rotation.device.type, enabled=False):  # backward may be called within it
+            back = rotation.mT
+            turn = torch.linalg.solve_ex(_stiffness(back @ covariance), _torque(back @ grads[0])).result
+            return rotation @ _skew(turn)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor) -> Tensor:
