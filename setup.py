@@ -23,7 +23,7 @@ def description_for_pypi() -> str:
 
 
 EXTRAS = {
-    "view": ["viser>=1.0.20"],  # a session in which key-frames are deformed by hand
+    "view": ["viser>=1.1"],  # a session in which key-frames are deformed by hand
     "pictures": ["pyvista>=0.46"],  # pictures and videos in better light, on the graphics card
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],

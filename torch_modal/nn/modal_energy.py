@@ -4,7 +4,7 @@ First derivatives are local (3 numbers of an edge, 9 of a hinge) and are gathere
 which are the same for a whole batch.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -287,5 +287,5 @@ class SumOfEnergies(nn.Module):
             for part, own in self._each(placement)
         ]
 
-    def _each(self, placement: Sequence[Placement]) -> Iterator[tuple[ModalEnergy, Placement]]:
-        return zip(self.parts, placement, strict=True)
+    def _each(self, placement: Sequence[Placement]) -> list[tuple[ModalEnergy, Placement]]:
+        return list(zip(self.parts, placement, strict=True))  # an iterator, torch 2.8 cannot compile
