@@ -121,16 +121,20 @@ class Indicator(NamedTuple):
         return np.clip(values, 0.0, 1.0)
 
     def _by_grid(self, points: FloatArray) -> FloatArray:
-        place = (points - self.low) / self.spacing
-        last = np.array(self.values.shape) - 2
-        base = np.clip(place.astype(np.int64), 0, last)
-        part = np.clip(place - base, 0.0, 1.0)
+        # Coordinate by coordinate: half the time of rows of three.
         strides = np.array(self.values.strides) // self.values.itemsize
-        index, flat = base @ strides, self.values.reshape(-1)
-        found = np.zeros(len(points))
-        for step in itertools.product((0, 1), repeat=3):
-            weight = np.where(step, part, 1 - part).prod(axis=1)
-            found += weight * flat[index + int(np.array(step) @ strides)]
+        index, shares = np.zeros(len(points), dtype=np.int64), []
+        for axis in range(3):
+            place = (points[:, axis] - self.low[axis]) / self.spacing
+            base = np.clip(place.astype(np.int64), 0, self.values.shape[axis] - 2)
+            part = np.clip(place - base, 0.0, 1.0)
+            index += base * strides[axis]
+            shares.append((1 - part, part))
+        flat, found = self.values.reshape(-1), np.zeros(len(points))
+        for x, y in itertools.product((0, 1), repeat=2):
+            column = shares[0][x] * shares[1][y]
+            for z in (0, 1):
+                found += column * shares[2][z] * flat[index + int(np.array((x, y, z)) @ strides)]
         return found
 
 
@@ -325,16 +329,17 @@ def _indicator(samples: Samples, low: FloatArray, spacing: float, counts: IntArr
     Its gradient is minus the normal on the surface, so it solves a Poisson equation with the divergence of the
     normals: in trilinear finite elements, by Fourier transform, once. On an open surface it closes the holes smoothly.
     """
-    places, normals = (samples.points - low) / spacing, samples.normals * samples.areas[:, None]
+    places = (samples.points - low) / spacing
     base = np.floor(places).astype(np.int64)
-    part = places - base
+    part = np.ascontiguousarray((places - base).T)
+    normals = np.ascontiguousarray((samples.normals * samples.areas[:, None]).T)
     index = np.ravel_multi_index(tuple(base.T), tuple(counts))
     size = int(counts.prod())
     divergence = np.zeros(size)
     for step in itertools.product((0, 1), repeat=3):
-        share = np.where(step, part, 1 - part)
+        share = np.where(np.array(step)[:, None], part, 1 - part)
         slope = np.where(step, 1.0, -1.0)
-        weight = sum(normals[:, a] * slope[a] * share[:, a - 1] * share[:, a - 2] for a in range(3))
+        weight = sum(normals[a] * slope[a] * share[a - 1] * share[a - 2] for a in range(3))
         divergence += np.bincount(index + np.ravel_multi_index(step, tuple(counts)), weight, minlength=size)
 
     waves = [2 * np.pi * np.fft.fftfreq(n) for n in counts[:2]] + [2 * np.pi * np.fft.rfftfreq(counts[2])]
