@@ -140,7 +140,7 @@ class ContactSearch:
         return (i for i in some if self._counted(i, x[i])[1])
 
     def count(self, x: Tensor, some: Sequence[int] | None = None) -> None:
-        """Count what crosses in all samples, or some; nothing is looked for that is to be held. *Shape:* ``(B, V, 3)``."""
+        """Count what crosses in all samples, or some; nothing is looked for that is held. *Shape:* ``(B, V, 3)``."""
         some = range(len(x)) if some is None else some
         self._keep(some, [self._counted(i, x[i]) for i in some])
 
