@@ -9,7 +9,7 @@ from conftest import Shapes
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.precompute import coarsening
-from torch_modal.precompute.coarsening import Coarsening, coarsen
+from torch_modal.precompute.coarsening import Coarsening, Collapses, coarsen
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +146,21 @@ def test_no_triangle_has_its_corners_on_a_line() -> None:
         sides = corners - np.roll(corners, 1, axis=2)
         area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
         assert (area / (sides**2).sum(-1).max(-1)).min() > 1e-3
+
+
+def test_pairs_share_the_collapses_of_a_key_frame(
+    fine: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyframes, faces = fine
+    three = np.stack([keyframes[0], keyframes[1], 1.1 * keyframes[1]])
+    seen = []
+    once = coarsening._collapse_once
+    monkeypatch.setattr(coarsening, "_collapse_once", lambda x, *rest: seen.append(x) or once(x, *rest))
+    shared = Collapses(three, faces)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        alone = coarsen(three[[i, j]], faces, 100)
+        before = len(seen)
+        found = coarsen(three[[i, j]], faces, 100, shared.of(i, j))
+        np.testing.assert_array_equal(found.clusters, alone.clusters)
+        np.testing.assert_array_equal(found.faces, alone.faces)
+        assert len(seen) - before <= {(0, 1): 2, (1, 2): 1, (2, 0): 0}[i, j] * len(coarsening.MORE_FACES)

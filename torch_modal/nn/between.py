@@ -24,6 +24,7 @@ from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.settings import Objective, Solver
 from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, unmoved
+from torch_modal.precompute.coarsening import Collapses
 
 # Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
 # of the gap in energy between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
@@ -67,13 +68,16 @@ class Shared(NamedTuple):
     """Its kernels, where there are some."""
     weights: Tensor
     """Of the vertices in alignments, so that a motion through several has one course. *Shape:* ``(V,)``."""
+    collapses: Collapses
+    """Of the references."""
 
     @classmethod
     def of(cls, mesh: Mesh, shapes: Tensor, terms: Sequence[Term], solver: Solver) -> "Shared":
         """Of these terms and the references of all bases, float64 on the CPU. *Shape:* ``(K, V, 3)``."""
         energy = Energy(mesh, terms)
         fused = FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None
-        return cls(energy, fused, mean_areas(shapes, mesh.faces))
+        collapses = Collapses(shapes.numpy(), mesh.faces.numpy())
+        return cls(energy, fused, mean_areas(shapes, mesh.faces), collapses)
 
 
 class Between(nn.Module):
@@ -81,6 +85,7 @@ class Between(nn.Module):
 
     Args:
         shapes: The references of both bases, float64 on the CPU. *Shape:* ``(2, V, 3)``.
+        places: Of both among those that all pairs have.
         modes: Their modes, likewise. *Shape of each:* ``(k, V, 3)``.
         mesh: The caller's mesh.
         objective: What is minimised.
@@ -91,6 +96,7 @@ class Between(nn.Module):
     def __init__(
         self,
         shapes: Tensor,
+        places: tuple[int, int],
         modes: Sequence[Tensor],
         mesh: Mesh,
         objective: Objective,
@@ -104,7 +110,7 @@ class Between(nn.Module):
         self.bare = not objective.terms
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
         self.fine, self.fused = shared.energy, shared.fused
-        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights)
+        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, shared.collapses.of(*places))
         # Steps that are unrolled are differentiated like any other expression: by torch.
         modal = objective.space == "joint" and solver.gradient == "implicit"
         levels = partial(Levels, self.frame, mesh, self.terms, solver.backend if modal else "torch")

@@ -13,7 +13,9 @@ from torch_modal.geometry.functions import applied
 from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, squared_length
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
-from torch_modal.precompute.coarsening import coarsen
+from torch_modal.precompute.coarsening import Coarsening, coarsen
+
+Collapsing = Callable[[int, int], Coarsening]
 
 # Combinations of columns whose squared norm is below this part of the largest are rounding, not directions.
 DEPENDENT = 1e-9
@@ -151,6 +153,7 @@ class Coarse(nn.Module):
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: Of the coarse mesh.
         weights: Of the vertices. *Shape:* ``(V,)``.
+        collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`.
     """
 
     faces: Tensor
@@ -160,9 +163,11 @@ class Coarse(nn.Module):
     first_member: Tensor
     shares_of_members: Tensor
 
-    def __init__(self, shapes: Tensor, faces: Tensor, n_faces: int, weights: Tensor) -> None:
+    def __init__(
+        self, shapes: Tensor, faces: Tensor, n_faces: int, weights: Tensor, collapses: Collapsing | None
+    ) -> None:
         super().__init__()
-        coarsening = coarsen(shapes.numpy(), faces.numpy(), n_faces)
+        coarsening = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
         clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
         member = torch.from_numpy(coarsening.clusters >= 0).double()
         per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
@@ -205,12 +210,20 @@ class Frame(Alignment):
         faces: Vertex indices, likewise. *Shape:* ``(F, 3)``.
         coarse_faces: Number of faces of the coarse mesh.
         weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
+        collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`, of these two.
     """
 
     faces: Tensor
     turn: Tensor
 
-    def __init__(self, shapes: Tensor, faces: Tensor, coarse_faces: int, weights: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        shapes: Tensor,
+        faces: Tensor,
+        coarse_faces: int,
+        weights: Tensor | None = None,
+        collapses: Collapsing | None = None,
+    ) -> None:
         used = shapes[0][faces.flatten()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
         weights = mean_areas(shapes, faces) if weights is None else weights
@@ -220,7 +233,7 @@ class Frame(Alignment):
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("turn", turn.rotation, persistent=False)
         self._coarse: Any = None
-        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights)
+        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, collapses)
 
     @property
     def coarse(self) -> Coarse:

@@ -102,6 +102,7 @@ class InBetween(nn.Module):
         made = [
             kind(
                 torch.stack([ends[i][0], ends[j][0]]),
+                (i, j),
                 [ends[i][1], ends[j][1]],
                 mesh,
                 self.objective,

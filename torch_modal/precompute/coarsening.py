@@ -1,6 +1,8 @@
 """One edge-collapse rule for all key-frames, and the cluster averages that it gives (section 3.2 of the paper)."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +55,34 @@ class Coarsening:
         return np.moveaxis(coarse, 0, 1).reshape(*lead, self.n_vertices, 3)
 
 
+class Collapses:
+    """Partitions by the edge collapses of single key-frames, each made once: pairs of key-frames share them.
+
+    Args:
+        keyframes: Vertex positions, in any coordinates. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+    """
+
+    def __init__(self, keyframes: FloatArray, faces: IntArray) -> None:
+        self.keyframes, self.faces = keyframes, faces
+        self._known: dict[tuple[int, int], Coarsening] = {}
+
+    def __call__(self, keyframe: int, n_faces: int) -> Coarsening:
+        """The partition by one of them, to so many faces."""
+        key = keyframe, n_faces
+        if key not in self._known:
+            self._known[key] = _collapse_once(self.keyframes[keyframe], self.faces, n_faces)
+        return self._known[key]
+
+    def of(self, *chosen: int) -> Callable[[int, int], Coarsening]:
+        """The same of some of the key-frames, by their places among these."""
+        return partial(_renumbered, self, chosen)
+
+
+def _renumbered(collapses: Collapses, chosen: Sequence[int], keyframe: int, n_faces: int) -> Coarsening:
+    return collapses(chosen[keyframe], n_faces)
+
+
 def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
     """Partition by the edge collapses of one pose."""
     collapses = decimate(points, faces, n_faces).collapses
@@ -84,7 +114,12 @@ def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, floa
     return float(fatness.min()), float(np.percentile(fatness, 1, axis=-1).min())
 
 
-def coarsen(keyframes: FloatArray, faces: IntArray, n_faces: int = 1000) -> Coarsening:
+def coarsen(
+    keyframes: FloatArray,
+    faces: IntArray,
+    n_faces: int = 1000,
+    collapses: Callable[[int, int], Coarsening] | None = None,
+) -> Coarsening:
     """Partition the vertices of all key-frames by the edge collapses of one of them.
 
     Every key-frame is tried as the one that the collapses are chosen on; the partition is kept whose triangles stay
@@ -95,6 +130,7 @@ def coarsen(keyframes: FloatArray, faces: IntArray, n_faces: int = 1000) -> Coar
         keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: Faces of the coarse mesh; a mesh with no more than that is left as it is.
+        collapses: Partitions by the edge collapses of each key-frame to a number of faces, where they are shared.
 
     Raises:
         ValueError: If ``n_faces`` is below 4.
@@ -106,9 +142,10 @@ def coarsen(keyframes: FloatArray, faces: IntArray, n_faces: int = 1000) -> Coar
         index = np.full(keyframes.shape[1], -1)
         index[used] = np.arange(len(used))
         return Coarsening(index, index[faces])
+    collapses = Collapses(keyframes, faces) if collapses is None else collapses
     found: list[tuple[float, Coarsening]] = []
     for factor in MORE_FACES:
-        candidates = [_collapse_once(points, faces, int(factor * n_faces)) for points in keyframes]
+        candidates = [collapses(i, int(factor * n_faces)) for i in range(len(keyframes))]
         fatness = [_fatness(keyframes, candidate) for candidate in candidates]
         # Those without needles first, then by the bulk of the triangles.
         best = max(range(len(candidates)), key=lambda i: (min(fatness[i][0], NEEDLE), fatness[i][1]))
