@@ -156,11 +156,11 @@ def test_pairs_share_the_collapses_of_a_key_frame(
     seen = []
     once = coarsening._collapse_once
     monkeypatch.setattr(coarsening, "_collapse_once", lambda x, *rest: seen.append(x) or once(x, *rest))
-    shared = Collapses(three, faces)
+    shared = Collapses(faces)
     for i, j in ((0, 1), (1, 2), (2, 0)):
         alone = coarsen(three[[i, j]], faces, 100)
         before = len(seen)
-        found = coarsen(three[[i, j]], faces, 100, shared.of(i, j))
+        found = coarsen(three[[i, j]], faces, 100, shared.of((i, j), three[[i, j]]))
         np.testing.assert_array_equal(found.clusters, alone.clusters)
         np.testing.assert_array_equal(found.faces, alone.faces)
         assert len(seen) - before <= {(0, 1): 2, (1, 2): 1, (2, 0): 0}[i, j] * len(coarsening.MORE_FACES)

@@ -14,7 +14,7 @@ from torch_modal.geometry.vectors import cross, pick
 from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.blend import RotationBlend
-from torch_modal.nn.frame import Alignment, Frame, Pair, mean_areas
+from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
@@ -24,7 +24,6 @@ from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.settings import Objective, Solver
 from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, unmoved
-from torch_modal.precompute.coarsening import Collapses
 
 # Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
 # of the gap in energy between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
@@ -68,16 +67,15 @@ class Shared(NamedTuple):
     """Its kernels, where there are some."""
     weights: Tensor
     """Of the vertices in alignments, so that a motion through several has one course. *Shape:* ``(V,)``."""
-    collapses: Collapses
-    """Of the references."""
+    collapses: Callable[..., Collapsing]
+    """Those of pairs of references, by their places."""
 
     @classmethod
     def of(cls, mesh: Mesh, shapes: Tensor, terms: Sequence[Term], solver: Solver) -> "Shared":
         """Of these terms and the references of all bases, float64 on the CPU. *Shape:* ``(K, V, 3)``."""
         energy = Energy(mesh, terms)
         fused = FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None
-        collapses = Collapses(shapes.numpy(), mesh.faces.numpy())
-        return cls(energy, fused, mean_areas(shapes, mesh.faces), collapses)
+        return cls(energy, fused, mean_areas(shapes, mesh.faces), shared_collapses(mesh.faces))
 
 
 class Between(nn.Module):
@@ -110,7 +108,8 @@ class Between(nn.Module):
         self.bare = not objective.terms
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
         self.fine, self.fused = shared.energy, shared.fused
-        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, shared.collapses.of(*places))
+        collapses = partial(shared.collapses, places)
+        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses)
         # Steps that are unrolled are differentiated like any other expression: by torch.
         modal = objective.space == "joint" and solver.gradient == "implicit"
         levels = partial(Levels, self.frame, mesh, self.terms, solver.backend if modal else "torch")

@@ -4,7 +4,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
@@ -13,7 +15,7 @@ from torch_modal.geometry.functions import applied
 from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, squared_length
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
-from torch_modal.precompute.coarsening import Coarsening, coarsen
+from torch_modal.precompute.coarsening import Coarsening, Collapses, coarsen
 
 Collapsing = Callable[[int, int], Coarsening]
 
@@ -210,7 +212,7 @@ class Frame(Alignment):
         faces: Vertex indices, likewise. *Shape:* ``(F, 3)``.
         coarse_faces: Number of faces of the coarse mesh.
         weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
-        collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`, of these two.
+        collapses: What is shared of the edge collapses of both, given them in the frame. Default: nothing.
     """
 
     faces: Tensor
@@ -222,7 +224,7 @@ class Frame(Alignment):
         faces: Tensor,
         coarse_faces: int,
         weights: Tensor | None = None,
-        collapses: Collapsing | None = None,
+        collapses: Callable[[NDArray[np.float64]], Collapsing] | None = None,
     ) -> None:
         used = shapes[0][faces.flatten()]
         scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
@@ -232,8 +234,9 @@ class Frame(Alignment):
         super().__init__(references[0].clone(), scale, weights)
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("turn", turn.rotation, persistent=False)
+        own = None if collapses is None else collapses(references.numpy())
         self._coarse: Any = None
-        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, collapses)
+        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, own)
 
     @property
     def coarse(self) -> Coarse:
@@ -336,6 +339,11 @@ def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:
     """Vertex areas of several shapes, as parts of the whole: none of them comes first. *Shape:* ``(K, V, 3)``."""
     areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
     return (areas / areas.sum(1, keepdim=True)).mean(0)
+
+
+def shared_collapses(faces: Tensor) -> Callable[..., Collapsing]:
+    """Edge collapses of shapes that several pairs have, given by their places, each made once. *Shape:* ``(F, 3)``."""
+    return Collapses(faces.numpy()).of
 
 
 def _rigid_fields(x: Tensor) -> Tensor:

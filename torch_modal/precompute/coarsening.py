@@ -59,24 +59,31 @@ class Collapses:
     """Partitions by the edge collapses of single key-frames, each made once: pairs of key-frames share them.
 
     Args:
-        keyframes: Vertex positions, in any coordinates. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
     """
 
-    def __init__(self, keyframes: FloatArray, faces: IntArray) -> None:
-        self.keyframes, self.faces = keyframes, faces
+    def __init__(self, faces: IntArray) -> None:
+        self.faces = faces
+        self._poses: dict[int, FloatArray] = {}
         self._known: dict[tuple[int, int], Coarsening] = {}
 
     def __call__(self, keyframe: int, n_faces: int) -> Coarsening:
         """The partition by one of them, to so many faces."""
         key = keyframe, n_faces
         if key not in self._known:
-            self._known[key] = _collapse_once(self.keyframes[keyframe], self.faces, n_faces)
+            self._known[key] = _collapse_once(self._poses[keyframe], self.faces, n_faces)
         return self._known[key]
 
-    def of(self, *chosen: int) -> Callable[[int, int], Coarsening]:
-        """The same of some of the key-frames, by their places among these."""
-        return partial(_renumbered, self, chosen)
+    def of(self, places: Sequence[int], keyframes: FloatArray) -> Callable[[int, int], Coarsening]:
+        """The same of some key-frames, at these places among all. A key-frame keeps the pose in which it first came.
+
+        Args:
+            places: One for each.
+            keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
+        """
+        for place, points in zip(places, keyframes, strict=True):
+            self._poses.setdefault(place, points)
+        return partial(_renumbered, self, places)
 
 
 def _renumbered(collapses: Collapses, chosen: Sequence[int], keyframe: int, n_faces: int) -> Coarsening:
@@ -142,7 +149,7 @@ def coarsen(
         index = np.full(keyframes.shape[1], -1)
         index[used] = np.arange(len(used))
         return Coarsening(index, index[faces])
-    collapses = Collapses(keyframes, faces) if collapses is None else collapses
+    collapses = Collapses(faces).of(range(len(keyframes)), keyframes) if collapses is None else collapses
     found: list[tuple[float, Coarsening]] = []
     for factor in MORE_FACES:
         candidates = [collapses(i, int(factor * n_faces)) for i in range(len(keyframes))]
