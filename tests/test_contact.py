@@ -347,6 +347,19 @@ def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> N
     assert search.n_left(pairs, 0.02, 10.0) == 0 and search.n_left(pairs, 0.5, 10.0) == 1
 
 
+def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
+    # A vertex in the finger beside it is also behind faces on that finger's far side.
+    stuck = stuck_in_first(hand)
+    search = Search(Crossings(Connectivity(hand.faces.numpy(), hand.keyframes.shape[1]), stuck.keyframes.numpy()))
+    deep = search.tolerated
+    assert deep[:, 0].max() > 0 == deep[:, 1].max()
+    x = 0.9 * stuck.keyframes[0] + 0.1 * hand.keyframes[0]
+    held = search(x.numpy(), search.crossings.within(deep[:, 0] > 0, 0.02))
+    beside = np.maximum(deep[held.vertices], deep[hand.faces.numpy()[held.faces]].max(1))
+    assert (beside[:, 0] > 0).sum() > 10
+    np.testing.assert_array_equal(held.slack[beside > 0], beside[beside > 0])
+
+
 def test_limit_sees_the_accelerations_of_frames(generator: torch.Generator) -> None:
     t = torch.linspace(0, 1, 11, dtype=DOUBLE)
     values = splines(t, 5).values
@@ -385,7 +398,8 @@ def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> No
     wanted = torch.randn(3, 7, 5, dtype=DOUBLE, generator=generator)
     wanted[..., 4] *= 1e-3
     limit = AccelerationLimit(course, differences, torch.eye(7, dtype=DOUBLE), torch.ones(5, dtype=DOUBLE), 25.0)
-    found = limit.nearest(wanted)
+    weights = torch.tensor([1.0, 1, 20, 1, 3, 1, 1], dtype=DOUBLE)
+    found = limit.nearest(wanted, weights)
     assert torch.equal(found[..., 4], wanted[..., 4]) and not torch.equal(found[..., 0], wanted[..., 0])
     assert float((course + differences @ found).norm(dim=0).max()) < 25.0 * 1.02
     for v in range(4):
@@ -394,16 +408,16 @@ def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> No
             rows = course[..., v].numpy() + x.reshape(3, 7) @ differences.numpy().T
             return 25.0**2 - (rows**2).sum(0)
 
-        goal = wanted[..., v].numpy().ravel()
+        goal, weight = wanted[..., v].numpy().ravel(), np.tile(weights.numpy(), 3)
         best = minimize(
-            lambda x, goal=goal: ((x - goal) ** 2).sum(),
+            lambda x, goal=goal, weight=weight: (weight * (x - goal) ** 2).sum(),
             goal,
-            jac=lambda x, goal=goal: 2 * (x - goal),
+            jac=lambda x, goal=goal, weight=weight: 2 * weight * (x - goal),
             constraints={"type": "ineq", "fun": room},
             method="SLSQP",
             options={"maxiter": 300},
         )
-        assert float(((found[..., v] - wanted[..., v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
+        assert float((weights * (found[..., v] - wanted[..., v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
 
 
 @pytest.mark.filterwarnings("ignore:in .* in-betweens looked at")

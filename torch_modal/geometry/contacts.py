@@ -181,7 +181,9 @@ class Search:
         order = np.lexsort((distance, v))
         first = order[np.flatnonzero(np.diff(v[order], prepend=-1))]
         v, f, both = v[first], f[first], np.stack(slack, 1)[first] if slack else np.zeros((len(first), 0))
-        both = np.maximum(both, np.maximum(self.tolerated[v], self.tolerated[corners[f]].max(1)))
+        # What is in a part also lies behind its far side, deeper than it went in.
+        own = np.maximum(self.tolerated[v], self.tolerated[corners[f]].max(1))
+        both = np.where(own > 0, own, both)
         # Folds are inside, too, where they are in a key-frame.
         keep = np.ones(len(v), dtype=bool)
         keep[stuck[v]] = crossings.apart(v[stuck[v]], corners[f[stuck[v]]])

@@ -22,7 +22,7 @@ ROUNDS = 100
 TOLERANCE = 0.01
 """How far over the limit it may leave a vertex, as a part of it."""
 RELAXATION = 1.7
-PENALTY = 0.3
+PENALTY = 10.0
 
 
 class Excess(NamedTuple):
@@ -109,7 +109,7 @@ class AccelerationLimit:
                 found += (second[:, None] * second)[:, None, :, None] * one[:, None, :]
         return found
 
-    def nearest(self, wanted: Tensor) -> Tensor:
+    def nearest(self, wanted: Tensor, weights: Tensor) -> Tensor:
         """The displacement nearest to a wanted one, in least squares, that keeps each vertex below the limit.
 
         Vertices do not know of each other here, and what is below the limit is left as it is. The rest is a convex
@@ -117,6 +117,7 @@ class AccelerationLimit:
 
         Args:
             wanted: At each time. *Shape:* ``(3, T, V)``.
+            weights: Of the times. *Shape:* ``(T,)``.
         """
         own = torch.nonzero((self.course + self.differences @ wanted).norm(dim=0).amax(0) > self.most).flatten()
         if not len(own):
@@ -128,12 +129,14 @@ class AccelerationLimit:
             x[..., own].double().cpu().numpy().swapaxes(0, 1).reshape(x.shape[1], -1) for x in (wanted, self.course)
         )
         course, most = course / unit, self.most / unit
-        normal = (sparse.eye(len(goal)) + PENALTY * rows.T @ rows).tocsc()
+        weight = weights.double().cpu().numpy()
+        penalty = PENALTY * weight.max() ** 0.5
+        normal = (sparse.diags(weight) + penalty * rows.T @ rows).tocsc()
         upper = np.stack([np.pad(normal.diagonal(k), (k, 0)) for k in (2, 1, 0) if k < len(goal)])
         factor = linalg.cholesky_banded(upper)
         split, dual = _clipped(rows @ goal + course, most), 0.0
         for _ in range(ROUNDS):
-            pulled = goal + PENALTY * (rows.T @ (split - dual - course))
+            pulled = weight[:, None] * goal + penalty * (rows.T @ (split - dual - course))
             found = linalg.cho_solve_banded((factor, False), pulled)
             reached = rows @ found + course
             if _lengths(reached).max() <= (1 + TOLERANCE) * most:

@@ -52,6 +52,9 @@ FINE_PRODUCTS = 40
 LEAST_SETTLINGS = 2
 SETTLINGS = 3
 """How often all shapes come to rest, each on its own, and their displacement is fitted to what may be accelerated."""
+INSISTENCE = 10.0
+"""How much more the displacement of a shape counts in the fit, each time that it was not free of crossings."""
+MOST_INSISTENCE = 100.0
 SETTLING_STEPS = 2
 SETTLING_PRODUCTS = 20
 AROUND = 2
@@ -140,8 +143,8 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     """Find what pushes shapes between two key-frames apart where parts went through each other.
 
     A few of many shapes are looked at first: where parts go through each other in none of these, there is nothing to
-    do. What is found pushes about :data:`SEARCHED` of the shapes apart; the others are looked at then, and where it was
-    not enough for some, these join.
+    do. What is found pushes about :data:`SEARCHED` of the shapes apart, and the others along with them; all are looked
+    at as they come to rest.
 
     Args:
         member: In-betweens of the pair.
@@ -261,13 +264,15 @@ class _Course:
         held = held.of_all(every)
         search.watch(held, AROUND)
         found, some, best = search(x), None, None
+        weights = torch.ones_like(self.samples.t)
         for k in range(SETTLINGS):
             held = held if found is None else found.of_all(every).beside(held)
             x = settled(self.member, self.samples, self.pair, x, held, SETTLING_STEPS, SETTLING_PRODUCTS)
-            x = start + self.limit.nearest((x - start).movedim(-1, 0)).movedim(0, -1)
+            x = start + self.limit.nearest((x - start).movedim(-1, 0), weights).movedim(0, -1)
             # The others are looked at in the end.
             some = torch.nonzero((held.weights > 0).any(1) | (search.n_far > 0)).flatten().tolist()
             found = search(x, some)
+            weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights).clamp_max(MOST_INSISTENCE)
             if k >= LEAST_SETTLINGS - 1:
                 best = min((x, search.n_left, search.n_far), best or (x, search.n_left, search.n_far), key=_left)
                 if not bool(search.n_left.any()):
