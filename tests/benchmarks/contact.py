@@ -158,7 +158,27 @@ def crossings(names: list[str]) -> Iterator[tuple[Case, Run]]:
         )
         line += f"{peaks[1]:8.3f} %{peaks[1] / peaks[0]:10.2f}{found.seconds[1]:10.2f}"
         print(line + f"{found.seconds[1] / found.seconds[0]:10.2f}", flush=True)
+        shapes_left(case, found, before, after, contacts[0].depth)
         yield case, found
+
+
+def shapes_left(case: Case, found: Run, before: Tensor, after: Tensor, depth: Tensor) -> None:
+    """Shapes with far pairs left: how deep they were without contact, and how far sides could have been moved.
+
+    A displacement that vanishes at both key-frames and is accelerated by at most ``A`` is at most ``A k (n - k) / 2``
+    after ``k`` of ``n`` frames; ``A`` is 1.3 times the peak, so that it is for vertices with no acceleration of their
+    own.
+    """
+    diagonal = float((case.keyframes[0].amax(0) - case.keyframes[0].amin(0)).norm())
+    n, most = len(after) - 1, 1.3 * peak(found.plain)
+    for k in torch.nonzero(after).flatten().tolist():
+        deep, room = 100 * float(depth[k].max()) / diagonal, most * k * (n - k) / 2
+        allowed = "one side" if deep <= room else "both sides" if deep <= 2 * room else "no"
+        print(
+            f"    shape {k:2d}: {int(before[k]):4d} pairs without, {int(after[k]):4d} with; {deep:.2f} % deep without, "
+            f"room of a side {room:.2f} %: allowed for {allowed}",
+            flush=True,
+        )
 
 
 def inside(case: Case) -> Tensor:

@@ -22,7 +22,7 @@ ROUNDS = 100
 TOLERANCE = 0.01
 """How far over the limit it may leave a vertex, as a part of it."""
 RELAXATION = 1.7
-PENALTY = 10.0
+PENALTY = 2.0
 
 
 class Excess(NamedTuple):
@@ -130,7 +130,7 @@ class AccelerationLimit:
         )
         course, most = course / unit, self.most / unit
         weight = weights.double().cpu().numpy()
-        penalty = PENALTY * weight.max() ** 0.5
+        penalty = PENALTY * weight.max() ** 0.75
         normal = (sparse.diags(weight) + penalty * rows.T @ rows).tocsc()
         upper = np.stack([np.pad(normal.diagonal(k), (k, 0)) for k in (2, 1, 0) if k < len(goal)])
         factor = linalg.cholesky_banded(upper)

@@ -50,11 +50,10 @@ MODAL_STEPS = 2
 FINE_STEPS = 2
 FINE_PRODUCTS = 40
 LEAST_SETTLINGS = 2
-SETTLINGS = 3
+SETTLINGS = 4
 """How often all shapes come to rest, each on its own, and their displacement is fitted to what may be accelerated."""
 INSISTENCE = 10.0
-"""How much more the displacement of a shape counts in the fit, each time that it was not free of crossings."""
-MOST_INSISTENCE = 100.0
+"""How much more the displacement of a shape counts in the fit, each time that it is not free of crossings."""
 SETTLING_STEPS = 2
 SETTLING_PRODUCTS = 20
 AROUND = 2
@@ -272,11 +271,12 @@ class _Course:
             # The others are looked at in the end.
             some = torch.nonzero((held.weights > 0).any(1) | (search.n_far > 0)).flatten().tolist()
             found = search(x, some)
-            weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights).clamp_max(MOST_INSISTENCE)
-            if k >= LEAST_SETTLINGS - 1:
-                best = min((x, search.n_left, search.n_far), best or (x, search.n_left, search.n_far), key=_left)
-                if not bool(search.n_left.any()):
-                    break
+            if k + 1 < LEAST_SETTLINGS:
+                continue
+            best = min((x, search.n_left, search.n_far), best or (x, search.n_left, search.n_far), key=_left)
+            if not bool(search.n_left.any()):
+                break
+            weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights)
         assert best is not None and some is not None
         search.n_left, search.n_far = best[1:]
         search.count(best[0], sorted(set(range(len(start))) - set(some)))
