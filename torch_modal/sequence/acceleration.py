@@ -17,12 +17,12 @@ from torch import Tensor
 
 STIFFNESS = 1e7
 """``kappa``, with the area of the surface as the unit: a contact gives way to it."""
-ROUNDS = 100
+ROUNDS = 200
 """Of :meth:`AccelerationLimit.nearest`, at most."""
 TOLERANCE = 0.01
 """How far over the limit it may leave a vertex, as a part of it."""
 RELAXATION = 1.7
-PENALTY = 2.0
+PENALTY = 0.5
 
 
 class Excess(NamedTuple):
