@@ -1,6 +1,7 @@
 """What torch does too, at less: functions with a derivative of their own where none is recorded, shapes together."""
 
 from collections.abc import Callable, Sequence
+from itertools import zip_longest
 from typing import Any, TypeVar
 
 import torch
@@ -68,4 +69,12 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     Raises:
         RuntimeError: They do not broadcast.
     """
-    return torch.broadcast_tensors(*(torch.empty((), device="meta").expand(shape) for shape in shapes))[0].shape
+    if torch.compiler.is_compiling():  # sizes need not be numbers
+        return torch.broadcast_tensors(*(torch.empty((), device="meta").expand(shape) for shape in shapes))[0].shape
+    found = []
+    for sizes in zip_longest(*(reversed(shape) for shape in shapes), fillvalue=1):
+        others = {size for size in sizes if size != 1}
+        if len(others) > 1:
+            raise RuntimeError(f"shapes {[tuple(shape) for shape in shapes]} do not broadcast")
+        found.append(others.pop() if others else 1)
+    return torch.Size(reversed(found))
