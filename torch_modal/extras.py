@@ -23,7 +23,7 @@ def uncollected() -> Iterator[None]:
         yield
     finally:
         if was_on:
-            # Python 3.12 starts with a few hundred frozen; what others have frozen, which is all that they had, stays so.
+            # Python 3.12 starts with a few hundred frozen. What others froze, which is all that they had, stays so.
             if gc.get_freeze_count() < 1000:
                 gc.freeze()
                 gc.unfreeze()
