@@ -18,14 +18,6 @@ from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement
 _BLOCK = 8
 
 
-def _gram(x: Tensor) -> Tensor:
-    """``x^T x``. *Shape:* ``(B, m, n) -> (B, n, n)``."""
-    if x.device.type != "cpu" or not len(x):
-        return x.mT @ x
-    # NumPy sees that it is symmetric: half the time.
-    return torch.stack([torch.from_numpy(one.T @ one) for one in x.numpy()])
-
-
 def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
     """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
     given = [value.double() for value in (first, second, t, *stiffness)]
@@ -187,7 +179,7 @@ class FusedModalEnergy(ModalEnergy):
         last[:, n_all] = off
         last *= root
         last[:, n_all + 1 :] = 0
-        products = _gram(jacobian)
+        products = jacobian.mT @ jacobian
         gradient, inner = products[:, :n_all, n_all], products[:, :n_all, :n_all]
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
