@@ -105,8 +105,14 @@ def _skew(v: Tensor) -> Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
+def _turned_on(rotation: Tensor, covariance: Tensor, change: Tensor) -> Tensor:
+    """The derivative, its own adjoint: where ``A`` changes, ``R`` turns on by ``w`` with ``stiffness w = torque``."""
+    back = rotation.mT
+    return rotation @ _skew(torch.linalg.solve_ex(_stiffness(back @ covariance), _torque(back @ change)).result)
+
+
 class _BestRotation(torch.autograd.Function):
-    """Where ``A`` changes, ``R`` turns on by ``w`` with ``stiffness w = torque``."""
+    """By singular values, with its first derivative written out."""
 
     @staticmethod
     def forward(covariance: Tensor) -> Tensor:
@@ -124,17 +130,12 @@ class _BestRotation(torch.autograd.Function):
             (found,) = torch.func.vjp(lambda a: _polished(a, rotation.detach()), covariance)[1](grads[0])
             return found  # type: ignore[no-any-return]
         with torch.autocast(rotation.device.type, enabled=False):  # backward may be called within it
-            back = rotation.mT
-            turn = torch.linalg.solve_ex(_stiffness(back @ covariance), _torque(back @ grads[0])).result
-            return rotation @ _skew(turn)
+            return _turned_on(rotation, covariance, grads[0])
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor) -> Tensor:
         covariance, rotation = ctx.saved_tensors
-        back = rotation.mT
-        return rotation @ _skew(
-            torch.linalg.solve_ex(_stiffness(back @ covariance), _torque(back @ tangents[0])).result
-        )
+        return _turned_on(rotation, covariance, tangents[0])
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int], covariance: Tensor) -> tuple[Tensor, int]:

@@ -111,11 +111,6 @@ def _left(apart: Apart) -> tuple[int, int]:
 
 def _rows(batch: Batch, some: Tensor, start: Tensor) -> Batch:
     """Some of the samples, started elsewhere. *Shape:* ``(S,), (S, n)``."""
-    samples = batch.samples
-    of = torch.arange(len(samples.t), device=some.device) if samples.which is None else samples.which
-    samples = samples._replace(
-        which=of[some], t=samples.t[some], mu=samples.mu[some], stiffness=[k[some] for k in samples.stiffness]
-    )
     problem, usable, anchors = trees.rows((batch.problem, batch.usable, batch.anchors), some)
     batch = batch._replace(problem=problem, start=start.detach(), energy=None)
-    return batch._replace(usable=usable, samples=samples, anchors=anchors)
+    return batch._replace(usable=usable, samples=batch.samples.rows(some), anchors=anchors)

@@ -12,7 +12,7 @@ from torch_modal.nn import trees
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellReference
 from torch_modal.nn.launch import kernels, launch, pulled_back
-from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement
+from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8
@@ -173,9 +173,7 @@ class FusedModalEnergy(ModalEnergy):
         launch(kernels("modal").jacobian, (b, len(shell.record)), given)
         volume, normal = shell.volume(x)
         root, off, last = to.stiffness.sqrt()[:, None], volume - to.volume, jacobian[:, -1]
-        last[:, :n] = normal.flatten(1) @ self.flat.double().T
-        if extra is not None:
-            last[:, n] = (normal * extra).sum((-1, -2))
+        last[:, :n_all] = along_columns(normal, self.flat.double(), extra)
         last[:, n_all] = off
         last *= root
         last[:, n_all + 1 :] = 0
@@ -193,10 +191,7 @@ class FusedModalEnergy(ModalEnergy):
             return super().gradient(a.to(plain.base), plain).to(placement.base)
         to: Any = placement.reference
         x = self.shell.gradient(self._shapes(a, placement.base, placement.extra), to)
-        found = x.flatten(1) @ self.flat.double().T
-        if placement.extra is None:
-            return found
-        return torch.cat([found, (x * placement.extra).sum((-1, -2))[:, None]], -1)
+        return along_columns(x, self.flat.double(), placement.extra)
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """As the other's."""

@@ -149,12 +149,7 @@ class ModalEnergy(nn.Module):
     def gradient(self, a: Tensor, placement: Placement) -> Tensor:
         """The gradient alone. *Shape:* ``(B, n)``."""
         at = self.energy.linearise(self.rows(a, placement), placement.reference)
-        return self._along_columns(self.energy.gradient(at).transpose(0, 1).flatten(1), placement.extra)
-
-    def _along_columns(self, x: Tensor, extra: Tensor | None) -> Tensor:
-        """Inner products with all directions. *Shape:* ``(B, 3 V), (B, 3, V) -> (B, n)``."""
-        found = x @ self.columns.flatten(1).mT
-        return found if extra is None else torch.cat([found, (x * extra.flatten(1)).sum(-1, keepdim=True)], -1)
+        return along_columns(self.energy.gradient(at).transpose(0, 1), self.columns, placement.extra)
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
@@ -242,6 +237,12 @@ def _normal_equations(one: Linearised, columns: Tensor, extra: Tensor | None) ->
     gradient, border = (jacobian.mT @ torch.stack([residual, own], -1)).unbind(-1)
     last = (own * residual).sum(-1, keepdim=True)
     return torch.cat([gradient, last], -1), _bordered(inner, border, (own * own).sum(-1))
+
+
+def along_columns(x: Tensor, columns: Tensor, extra: Tensor | None) -> Tensor:
+    """Inner products with columns and an extra one. *Shape:* ``(B, ...), (m, ...), (B, ...) -> (B, n)``."""
+    found = x.flatten(1) @ columns.flatten(1).mT
+    return found if extra is None else torch.cat([found, (x * extra).flatten(1).sum(-1, keepdim=True)], -1)
 
 
 def _bordered(inner: Tensor, border: Tensor, corner: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 import warnings
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torch_modal.geometry.hermite import Spacing
@@ -44,6 +45,12 @@ class Samples(NamedTuple):
     """The key-frames after those at 1. *Shape:* ``(P, V, 3)``."""
     spacing: Spacing | None = None
     """Durations of the three intervals; None if the course is of the pair alone. *Shape of each:* ``(P,)``."""
+
+    def rows(self, some: Tensor) -> "Samples":
+        """Some of the samples, of the same pairs. *Shape:* ``(S,)``."""
+        of = torch.arange(len(self.t), device=some.device) if self.which is None else self.which
+        stiffness = [values[some] for values in self.stiffness]
+        return self._replace(which=of[some], t=self.t[some], mu=self.mu[some], stiffness=stiffness)
 
 
 def report(solution: Solution, max_steps: int, forbid: bool) -> None:

@@ -225,13 +225,7 @@ class _Course:
 
     def pushed(self, some: Tensor) -> _Pushed:
         """All shapes with a displacement that frees some of them; what leaves the fewest crossings is kept."""
-        search, start, samples = self.search.of(some), self.start[some], self.samples
-        samples = samples._replace(
-            which=None if samples.which is None else samples.which[some],
-            t=samples.t[some],
-            mu=samples.mu[some],
-            stiffness=[k[some] for k in samples.stiffness],
-        )
+        search, start, samples = self.search.of(some), self.start[some], self.samples.rows(some)
         solver = _Coupled(self.member, samples, self.pair, start.movedim(-1, 0).contiguous(), self.limit)
         found, n_before = search(start), search.n_far
         if found is None or not bool(search.n_left.any()):
