@@ -20,8 +20,10 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import Search
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.nn import trees
+from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.contact_rounds import ContactRounds
+from torch_modal.nn.frame import Pair
 from torch_modal.nn.held import Held, settled
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence import acceleration, contact
@@ -219,19 +221,24 @@ def test_counting_finds_what_searching_finds(hand: Shapes) -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- region
+def first_interval(hand: Shapes, t: Tensor, smooth: bool, backend: Any) -> tuple[Between, Samples, Pair]:
+    """Times between the first two key-frames of a hand that closes and opens."""
+    three = hand.pick(0, 1, 0)
+    path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
+    member = path.layer.members[0]
+    samples = path.samples(three.keyframes[None], 0, torch.zeros(len(t), dtype=torch.int64), t)
+    return member, samples, member.placed(samples)
+
+
 @pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
 def test_kernels_and_torch_see_the_same_region(hand: Shapes, smooth: bool, generator: torch.Generator) -> None:
     pytest.importorskip("warp")
     x_a = hand.keyframes[0]
     near = x_a[:, 1] > x_a[:, 1].median()
     t = torch.tensor([0.3, 0.6], dtype=DOUBLE)
-    three = hand.pick(0, 1, 0)
     results = []
     for backend in ("torch", "warp"):
-        path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
-        member = path.layer.members[0]
-        samples = path.samples(three.keyframes[None], 0, torch.zeros(2, dtype=torch.int64), t)
-        pair = member.placed(samples)
+        member, samples, pair = first_interval(hand, t, smooth, backend)
         region = Region(member, samples, pair, near)
         touching = torch.cat([hand.faces[:4], region.vertices[-4:, None]], 1)
         touching[:, :3] = region.vertices[:12].reshape(4, 3)
@@ -259,13 +266,9 @@ def test_kernels_and_torch_see_the_same_region(hand: Shapes, smooth: bool, gener
 def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
     pytest.importorskip("warp")
     t = torch.tensor([0.2, 0.75 if smooth else 0.875], dtype=DOUBLE)
-    three = hand.pick(0, 1, 0)
     results = []
     for backend in ("torch", "warp"):
-        path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
-        member = path.layer.members[0]
-        samples = path.samples(three.keyframes[None], 0, torch.zeros(2, dtype=torch.int64), t)
-        pair = member.placed(samples)
+        member, samples, pair = first_interval(hand, t, smooth, backend)
         x = member.frame.bring(member(samples, False, None).shapes, trees.picked(pair, samples.which), t)
         search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t)
         held = search(x)
@@ -278,6 +281,15 @@ def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
         assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(term.value(flat)[1])
         results.append(y)
     torch.testing.assert_close(*results, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("which", [None, torch.tensor([0, 0, 1])], ids=["own", "shared"])
+def test_some_samples_keep_what_is_theirs(which: Tensor | None) -> None:
+    x, t = torch.zeros(3, 4, 3, dtype=DOUBLE), torch.tensor([0.1, 0.2, 0.3], dtype=DOUBLE)
+    some = Samples(x, x, which, t, 10 * t, [20 * t[:, None]]).rows(torch.tensor([2, 0]))
+    assert some.t.tolist() == [0.3, 0.1] and some.which is not None
+    assert some.which.tolist() == ([2, 0] if which is None else [1, 0])
+    torch.testing.assert_close([some.mu, some.stiffness[0][:, 0]], [10 * some.t, 20 * some.t])
 
 
 # ------------------------------------------------------------------------------------------------------------ sequence

@@ -165,6 +165,7 @@ class TestModal:
         assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
         assert_alike(found, wanted, 1e-9)
         assert_alike((fused.second_order(a, own),), (plain.second_order(a, truth),), 1e-9)
+        assert_alike((fused.gradient(a, own),), (wanted.gradient,), 1e-9)
 
     @pytest.mark.parametrize("extra", [False, True])
     def test_pull_back(self, case: Case, extra: bool) -> None:
