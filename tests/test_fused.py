@@ -293,6 +293,15 @@ class TestLayers:
         assert found.dtype == dtype
         torch.testing.assert_close(found, truth, rtol=0, atol=1e-7 if dtype == torch.float64 else 1e-4)
 
+    def test_local_steps_after_the_papers_space(self, bars: Shapes) -> None:
+        solvers = [tm.Solver(backend=kind) for kind in ("warp", "torch")]
+        found, truth, without = (
+            tm.InBetween(bars.bases[:2], bars.faces, "paper", solver=solver)(*bars.keyframes[:2], 0.5)
+            for solver in [*solvers, tm.Solver(local_steps=0)]
+        )
+        torch.testing.assert_close(found, truth, rtol=0, atol=1e-7)
+        assert float((found - without).abs().max()) > 1e-3
+
     def test_path(self, bars: Shapes) -> None:
         paths = [tm.Path(bars.bases, bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]
         times = torch.tensor([0.2, 1.0, 1.7], dtype=DOUBLE)

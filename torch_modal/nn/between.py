@@ -268,11 +268,9 @@ class Between(nn.Module):
         chunk = fine_chunk(self.mesh.n_vertices, samples.t.device)
         for i in range(0, len(samples.t), chunk):
             own = slice(i, i + chunk)
-            course, t, stiffness, fixed = trees.rows(
-                (batch.problem.base, samples.t, samples.stiffness, batch.anchors), own
-            )
+            t, stiffness, fixed = trees.rows((samples.t, samples.stiffness, batch.anchors), own)
             if pair.around is not None:
-                reference = Energy.against(self._fine_rest(course), stiffness)
+                reference = Energy.against(self._fine_rest(batch.problem.base[own]), stiffness)
             else:
                 if known is None or samples.which is None:
                     first, second = (self._fine_rest(end[own]) for end in ends)

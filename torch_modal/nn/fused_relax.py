@@ -85,7 +85,8 @@ class FusedRelax(FusedShell):
             done = self.solved(x, at, to, n_products, keep=kept is not None)
             solution, reached = done.solution, done.reached
             if kept is not None:
-                kept.append(_Taken(x, at, done))
+                # Detached: the last one's is what is returned, which must not be kept by its own node.
+                kept.append(_Taken(x, at, done._replace(reached=reached.detach())))
             # The whole step, linearised at once for the next one, is nearly always the one that is taken.
             if k < n_steps - 1:
                 there = self.at(reached, to)

@@ -253,7 +253,9 @@ class _Recorded(torch.autograd.Function):
         ctx: Any, kernel: Any, dim: tuple[int, ...], shapes: Shapes, written: tuple[int, ...], *given: Any
     ) -> tuple[Tensor, ...]:
         outputs, whole = _launched(kernel, dim, shapes, written, given)
-        ctx.kernel, ctx.dim, ctx.places, ctx.whole = kernel, dim, list(shapes), whole
+        # Detached: an output whose own node keeps it would never be freed.
+        kept = [value.detach() if isinstance(value, Tensor) else value for value in whole]
+        ctx.kernel, ctx.dim, ctx.places, ctx.whole = kernel, dim, list(shapes), kept
         return tuple(outputs.values())
 
     @staticmethod
