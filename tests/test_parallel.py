@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,28 @@ def test_who_has_nothing_else_to_do_does_that(monkeypatch: pytest.MonkeyPatch) -
     assert "meanwhile" in did
     with pytest.raises(ZeroDivisionError):
         run_all(lambda index: index, 3, threading.Event(), lambda: 1 // 0)
+
+
+def test_ctrl_c_while_work_is_handed_out_ends_what_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
+    stop, begun, told = threading.Event(), threading.Event(), []
+
+    def work(index: int) -> None:
+        begun.set()
+        told.append(stop.wait(30))
+
+    class Interrupted(ThreadPoolExecutor):
+        def submit(self, *given: Any) -> Any:
+            if not begun.is_set():
+                future = super().submit(*given)
+                assert begun.wait(30)
+                return future
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(parallel, "ThreadPoolExecutor", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_all(work, 2, stop)
+    assert told == [True]
 
 
 def test_the_first_error_ends_the_others(monkeypatch: pytest.MonkeyPatch) -> None:

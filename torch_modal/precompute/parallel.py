@@ -54,10 +54,13 @@ def run_all(
     if n_threads < 2:
         return [alone(index) for index in range(n)]
     with one_blas_thread(), ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
-        futures: list[Future[Any]] = [pool.submit(alone, index) for index in range(n)]
-        if meanwhile is not None:
-            futures.append(pool.submit(meanwhile))
+        futures: list[Future[Any]] = []
         try:
+            # Ctrl-C may come before all are told: the first are at work by then.
+            for index in range(n):
+                futures.append(pool.submit(alone, index))
+            if meanwhile is not None:
+                futures.append(pool.submit(meanwhile))
             for future in as_completed(futures):
                 future.result()
         except BaseException:
