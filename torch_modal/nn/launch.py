@@ -183,13 +183,17 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
 
     Args:
         kernel: Of :func:`kernels`.
-        dim: Number of threads.
-        given: What it takes, a tensor first; tensors are contiguous and of the types that it declares.
+        dim: Number of samples; and of what each has, where a sample may have several threads, whose number is then the
+            kernel's last argument. Each takes the first of what is left, then every so many-th. On a CPU there is one.
+        given: What it takes but for that, a tensor first; tensors are contiguous and of the types that it declares.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
     """
     if 0 in dim:
         return  # Warp would not, either, but has no command to tell of it
     device = given[0].device
+    if len(dim) == 2:
+        threads = 1 if device == _CPU else dim[1]
+        dim, given, adjoints = (dim[0] * threads,), [*given, threads], [*adjoints, None] if adjoints else ()
     key, known = (kernel, dim, device, bool(adjoints)), _COMMANDS.known
     command = known.get(key)
     if command is None:
@@ -219,7 +223,7 @@ def recorded(
 
     Args:
         kernel: Of :func:`kernels`.
-        dim: Number of threads.
+        dim: As for :func:`launch`.
         shapes: Of the outputs.
         given: What it takes, tensors contiguous; anything in the places of the outputs.
         written: The outputs whose entries are all written, so that it does not matter what they start as.

@@ -3,7 +3,7 @@
 import warp as wp
 
 from torch_modal.geometry import rotations
-from torch_modal.nn.kernels.elements import real, vec3
+from torch_modal.nn.kernels.elements import place, real, vec3
 from torch_modal.nn.kernels.rotations import about, half_turn, quaternion_of, turned
 
 SIDE = wp.constant(vec3(*rotations.HALF_TURN_SIDE))
@@ -18,11 +18,20 @@ def moments(
     n: int,
     a: wp.array(dtype=vec3),
     b: wp.array(dtype=vec3),
+    threads: int,
 ):
     """Weighted sums of the vertices of both ends."""
-    s, i = wp.tid()
-    wp.atomic_add(a, s, weights[i] * first[s * n + i])
-    wp.atomic_add(b, s, weights[i] * second[s * n + i])
+    i = wp.tid()
+    s = i // threads
+    total_a = vec3()
+    total_b = vec3()
+    for k in range(i - s * threads, n, threads):
+        v = place(s * n, k)
+        weight = weights[place(k, 0)]
+        total_a += weight * first[v]
+        total_b += weight * second[v]
+    wp.atomic_add(a, s, total_a)
+    wp.atomic_add(b, s, total_b)
 
 
 @wp.kernel(enable_backward=False)
@@ -35,12 +44,20 @@ def covariances(
     b: wp.array(dtype=vec3),
     n: int,
     found: wp.array(dtype=wp.mat33d),
+    threads: int,
 ):
     """Of the reference with the first end, and of the first with the second, about their centroids."""
-    s, i = wp.tid()
-    x = weights[i] * (first[s * n + i] - a[s])
-    wp.atomic_add(found, 2 * s, wp.outer(reference[i], x))
-    wp.atomic_add(found, 2 * s + 1, wp.outer(x, second[s * n + i] - b[s]))
+    i = wp.tid()
+    s = i // threads
+    to_reference = wp.mat33d()
+    to_first = wp.mat33d()
+    for k in range(i - s * threads, n, threads):
+        v = place(s * n, k)
+        x = weights[place(k, 0)] * (first[v] - a[s])
+        to_reference += wp.outer(reference[place(k, 0)], x)
+        to_first += wp.outer(x, second[v] - b[s])
+    wp.atomic_add(found, 2 * s, to_reference)
+    wp.atomic_add(found, 2 * s + 1, to_first)
 
 
 @wp.kernel(enable_backward=False)
@@ -53,14 +70,25 @@ def carried(
     out: wp.array(dtype=vec3),
     highest: wp.array(dtype=vec3),
     lowest: wp.array(dtype=vec3),
+    threads: int,
 ):
     """``turn (x - centre) + target``, and how far that reaches, where there is room for it."""
-    s, i = wp.tid()
-    found = turn[s] * (x[s * n + i] - centre[s]) + target[s]
-    out[s * n + i] = found
+    i = wp.tid()
+    s = i // threads
+    own = turn[s]
+    start = centre[s]
+    end = target[s]
+    high = own * (x[s * n] - start) + end
+    low = high
+    for k in range(i - s * threads, n, threads):
+        v = place(s * n, k)
+        found = own * (x[v] - start) + end
+        out[v] = found
+        high = wp.max(high, found)
+        low = wp.min(low, found)
     if highest:
-        wp.atomic_max(highest, s, found)
-        wp.atomic_min(lowest, s, found)
+        wp.atomic_max(highest, s, high)
+        wp.atomic_min(lowest, s, low)
 
 
 @wp.kernel(enable_backward=False)

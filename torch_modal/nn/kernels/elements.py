@@ -19,6 +19,13 @@ TINIEST = wp.constant(real(2.2250738585072014e-308))
 FLAT = wp.constant(real(COLLAPSED))
 TURN = wp.constant(real(6.283185307179586))
 HALF = wp.constant(real(0.5))
+LARGEST = wp.constant(0x7FFFFFFF)
+
+
+@wp.func
+def place(start: int, i: int):
+    """Of the i-th of what starts there. Warp counts from the end what is below zero, which this tells never to be."""
+    return (start + i) & LARGEST
 
 
 @wp.func
@@ -60,7 +67,7 @@ def angle_of(e: vec3, a: vec3, b: vec3, n1: vec3, n2: vec3):
 def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
     found = centre
     if v >= 0:
-        found = x[at + v]
+        found = x[place(at, v)]
     return found
 
 
@@ -69,7 +76,7 @@ def middle_of(
     x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), walls: wp.array(dtype=wp.vec3i), sample: int, at: int
 ):
     """What volumes are relative to: the centre, or where the surface is closed and there is none, any vertex."""
-    found = x[at + walls[0][0]]
+    found = x[place(at, walls[0][0])]
     if centre:
         found = centre[sample]
     return found

@@ -3,7 +3,7 @@
 import warp as wp
 
 from torch_modal.geometry import rotations, triangle_frames
-from torch_modal.nn.kernels.elements import HALF, TINIEST, length_of, real, vec3, vec4
+from torch_modal.nn.kernels.elements import HALF, TINIEST, length_of, place, real, vec3, vec4
 
 packed_course = wp.types.vector(length=31, dtype=real)
 """A row of :meth:`torch_modal.geometry.local_rotations.Course`, in the order of its parts."""
@@ -79,30 +79,36 @@ def turns(
     quaternions: wp.array(dtype=vec4),
     areas: wp.array(dtype=real),
     packed: wp.array(dtype=packed_turn),
+    threads: int,
 ):
     """Quaternions between the frames of triangles, twice both areas, and what else :func:`part_turned` needs."""
-    s, k = wp.tid()
+    i = wp.tid()
+    s = i // threads
     v = s * n
-    f = faces[k]
-    a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
-    b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
-    at = s * faces.shape[0] + k
-    quaternions[at] = quaternion(a, b)
-    areas[at] = a.length * a.height + b.length * b.height
-    packed[at] = packed_turn(
-        a.e1[0],
-        a.e1[1],
-        a.e1[2],
-        a.e2[0],
-        a.e2[1],
-        a.e2[2],
-        a.length,
-        a.along,
-        a.height,
-        b.length - a.length,
-        b.along - a.along,
-        b.height - a.height,
-    )
+    for k in range(i - s * threads, faces.shape[0], threads):
+        f = faces[place(k, 0)]
+        p = place(v, f[0])
+        q = place(v, f[1])
+        r = place(v, f[2])
+        a = triangle(first[p], first[q], first[r])
+        b = triangle(second[p], second[q], second[r])
+        at = place(s * faces.shape[0], k)
+        quaternions[at] = quaternion(a, b)
+        areas[at] = a.length * a.height + b.length * b.height
+        packed[at] = packed_turn(
+            a.e1[0],
+            a.e1[1],
+            a.e1[2],
+            a.e2[0],
+            a.e2[1],
+            a.e2[2],
+            a.length,
+            a.along,
+            a.height,
+            b.length - a.length,
+            b.along - a.along,
+            b.height - a.height,
+        )
 
 
 @wp.kernel(enable_backward=False)
@@ -120,18 +126,20 @@ def senses(
     s = wp.tid()
     n = order.shape[0]
     for j in range(n):
-        k = order[j]
+        k = order[place(j, 0)]
+        at = place(s * n, k)
+        above = parent[place(k, 0)]
+        q = quaternions[at]
         own = real(1.0)
-        if wp.dot(quaternions[s * n + k], quaternions[s * n + parent[k]]) < real(0.0):
-            own = real(-1.0)
-        if parent[k] != k:
-            own = own * sign[s * n + parent[k]]
-        sign[s * n + k] = own
-        q = quaternions[s * n + k]
-        vote[s * n_pieces + piece[k]] = vote[s * n_pieces + piece[k]] + areas[s * n + k] * own * q[0]
+        if above != k:
+            own = sign[place(s * n, above)]
+            if wp.dot(q, quaternions[place(s * n, above)]) < real(0.0):
+                own = -own
+        sign[at] = own
+        wp.atomic_add(vote, place(s * n_pieces, piece[place(k, 0)]), areas[at] * own * q[0])
     for k in range(n):
-        if vote[s * n_pieces + piece[k]] < real(0.0):
-            sign[s * n + k] = -sign[s * n + k]
+        if vote[place(s * n_pieces, piece[place(k, 0)])] < real(0.0):
+            sign[place(s * n, k)] = -sign[place(s * n, k)]
 
 
 @wp.func
@@ -179,9 +187,9 @@ def add_sides(total: wp.array(dtype=vec4), edge: int, e: wp.vec3i, g: vec3, area
     s1 = (area * g[0]) * first
     s2 = (area * g[1]) * (second - first)
     s3 = (-area * g[2]) * second
-    wp.atomic_add(total, edge + e[0], vec4(s1[0], s1[1], s1[2], area))
-    wp.atomic_add(total, edge + e[1], vec4(s2[0], s2[1], s2[2], area))
-    wp.atomic_add(total, edge + e[2], vec4(s3[0], s3[1], s3[2], area))
+    wp.atomic_add(total, place(edge, e[0]), vec4(s1[0], s1[1], s1[2], area))
+    wp.atomic_add(total, place(edge, e[1]), vec4(s2[0], s2[1], s2[2], area))
+    wp.atomic_add(total, place(edge, e[2]), vec4(s3[0], s3[1], s3[2], area))
 
 
 @wp.func
@@ -209,21 +217,35 @@ def turned_edges(
     n: int,
     n_edges: int,
     total: wp.array(dtype=vec4),
+    threads: int,
 ):
     """Sides of all triangles at their times, summed on the edges by area, and the areas."""
-    s, k = wp.tid()
+    i = wp.tid()
+    s = i // threads
     v = s * n
-    f = faces[k]
-    a = triangle(first[v + f[0]], first[v + f[1]], first[v + f[2]])
-    b = triangle(second[v + f[0]], second[v + f[1]], second[v + f[2]])
     t = time[s]
-    turn = about(t * half_turn(sense[s * faces.shape[0] + k] * quaternion(a, b)))
-    x = a.length + t * (b.length - a.length)
-    y = a.along + t * (b.along - a.along)
-    z = a.height + t * (b.height - a.height)
-    one = turned(turn, x * a.e1)
-    two = turned(turn, y * a.e1 + z * a.e2)
-    add_sides(total, s * n_edges, sides[k], signs[k], a.length * a.height + b.length * b.height, one, two)
+    for k in range(i - s * threads, faces.shape[0], threads):
+        f = faces[place(k, 0)]
+        p = place(v, f[0])
+        q = place(v, f[1])
+        r = place(v, f[2])
+        a = triangle(first[p], first[q], first[r])
+        b = triangle(second[p], second[q], second[r])
+        turn = about(t * half_turn(sense[place(s * faces.shape[0], k)] * quaternion(a, b)))
+        x = a.length + t * (b.length - a.length)
+        y = a.along + t * (b.along - a.along)
+        z = a.height + t * (b.height - a.height)
+        one = turned(turn, x * a.e1)
+        two = turned(turn, y * a.e1 + z * a.e2)
+        add_sides(
+            total,
+            s * n_edges,
+            sides[place(k, 0)],
+            signs[place(k, 0)],
+            a.length * a.height + b.length * b.height,
+            one,
+            two,
+        )
 
 
 @wp.kernel(enable_backward=False)
@@ -237,19 +259,22 @@ def part_turned(
     sense: wp.array(dtype=real),
     n_edges: int,
     total: wp.array(dtype=vec4),
+    threads: int,
 ):
     """As :func:`turned_edges`, of turns that are known."""
-    s, k = wp.tid()
-    at = s * sides.shape[0] + k
-    c = packed[at]
+    i = wp.tid()
+    s = i // threads
     t = time[s]
-    turn = about(t * half_turn(sense[at] * quaternions[at]))
-    one = turned(turn, vec3(c[0], c[1], c[2]))
-    two = turned(turn, vec3(c[3], c[4], c[5]))
-    x = c[6] + t * c[9]
-    y = c[7] + t * c[10]
-    z = c[8] + t * c[11]
-    add_sides(total, s * n_edges, sides[k], signs[k], areas[at], x * one, y * one + z * two)
+    for k in range(i - s * threads, sides.shape[0], threads):
+        at = place(s * sides.shape[0], k)
+        c = packed[at]
+        turn = about(t * half_turn(sense[at] * quaternions[at]))
+        one = turned(turn, vec3(c[0], c[1], c[2]))
+        two = turned(turn, vec3(c[3], c[4], c[5]))
+        x = c[6] + t * c[9]
+        y = c[7] + t * c[10]
+        z = c[8] + t * c[11]
+        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], areas[at], x * one, y * one + z * two)
 
 
 @wp.kernel
@@ -261,28 +286,31 @@ def course_edges(
     signs: wp.array(dtype=vec3),
     n_edges: int,
     total: wp.array(dtype=vec4),
+    threads: int,
 ):
     """The same of triangles on a smooth course."""
-    s, k = wp.tid()
-    c = course[which[s] * sides.shape[0] + k]
-    e1 = vec3(c[0], c[1], c[2])
-    e2 = vec3(c[3], c[4], c[5])
-    normal = vec3(c[6], c[7], c[8])
+    i = wp.tid()
+    s = i // threads
     u = time[s]
     a = u * (real(1.0) - u) * (real(1.0) - u)
     b = -u * (real(1.0) - u) * u
-    straight = about((HALF * u) * vec3(c[12], c[13], c[14]))
-    bend = about(HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26])))
-    unit = c[30]
-    length = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
-    along = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
-    height = c[11] + unit * (u * c[17] + a * c[23] + b * c[29])
-    one = turned(straight, turned(bend, vec3(length, real(0.0), real(0.0))))
-    two = turned(straight, turned(bend, vec3(along, height, real(0.0))))
-    area = c[9] * c[11] + (c[9] + unit * c[15]) * (c[11] + unit * c[17])
-    first = one[0] * e1 + one[1] * e2 + one[2] * normal
-    second = two[0] * e1 + two[1] * e2 + two[2] * normal
-    add_sides(total, s * n_edges, sides[k], signs[k], area, first, second)
+    for k in range(i - s * threads, sides.shape[0], threads):
+        c = course[place(which[s] * sides.shape[0], k)]
+        e1 = vec3(c[0], c[1], c[2])
+        e2 = vec3(c[3], c[4], c[5])
+        normal = vec3(c[6], c[7], c[8])
+        straight = about((HALF * u) * vec3(c[12], c[13], c[14]))
+        bend = about(HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26])))
+        unit = c[30]
+        length = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
+        along = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
+        height = c[11] + unit * (u * c[17] + a * c[23] + b * c[29])
+        one = turned(straight, turned(bend, vec3(length, real(0.0), real(0.0))))
+        two = turned(straight, turned(bend, vec3(along, height, real(0.0))))
+        area = c[9] * c[11] + (c[9] + unit * c[15]) * (c[11] + unit * c[17])
+        first = one[0] * e1 + one[1] * e2 + one[2] * normal
+        second = two[0] * e1 + two[1] * e2 + two[2] * normal
+        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], area, first, second)
 
 
 # ---------------------------------------------------------------------------------------------------- Poisson problem
@@ -293,12 +321,16 @@ def pulls(
     ends: wp.array(dtype=wp.vec2i),
     n: int,
     out: wp.array(dtype=vec3),
+    threads: int,
 ):
     """What edges ask of their ends: the right side of the Poisson problem."""
-    s, k = wp.tid()
-    pull = weights[k] * wanted[s * ends.shape[0] + k]
-    wp.atomic_add(out, s * n + ends[k][0], -pull)
-    wp.atomic_add(out, s * n + ends[k][1], pull)
+    i = wp.tid()
+    s = i // threads
+    for k in range(i - s * threads, ends.shape[0], threads):
+        pull = weights[place(k, 0)] * wanted[place(s * ends.shape[0], k)]
+        both = ends[place(k, 0)]
+        wp.atomic_add(out, place(s * n, both[0]), -pull)
+        wp.atomic_add(out, place(s * n, both[1]), pull)
 
 
 @wp.kernel(enable_backward=False)
@@ -318,15 +350,16 @@ def substituted(
     n_free = order.shape[0]
     at = s * n_free
     for k in range(n_free):
-        work[at + k] = right[s * n + order[k]]
+        work[place(at, k)] = right[place(s * n, order[place(k, 0)])]
     for k in range(n_free):
-        found = work[at + k]
-        for p in range(start[k], start[k + 1]):
-            work[at + row[p]] = work[at + row[p]] - entry[p] * found
+        found = work[place(at, k)]
+        for p in range(start[place(k, 0)], start[place(k, 1)]):
+            to = place(at, row[place(p, 0)])
+            work[to] = work[to] - entry[place(p, 0)] * found
     for j in range(n_free):
-        k = n_free - 1 - j
-        found = work[at + k] / pivot[k]
-        for p in range(start[k], start[k + 1]):
-            found = found - entry[p] * work[at + row[p]]
-        work[at + k] = found
-        out[s * n + order[k]] = found
+        k = place(n_free - 1, -j)
+        found = work[place(at, k)] / pivot[k]
+        for p in range(start[k], start[place(k, 1)]):
+            found = found - entry[place(p, 0)] * work[place(at, row[place(p, 0)])]
+        work[place(at, k)] = found
+        out[place(s * n, order[k])] = found

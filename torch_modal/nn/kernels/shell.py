@@ -13,6 +13,7 @@ from torch_modal.nn.kernels.elements import (
     is_flat,
     length_of,
     middle_of,
+    place,
     real,
     squared,
     stretched,
@@ -41,29 +42,36 @@ def sizes(
     length: wp.array(dtype=wp.vec2d),
     volume: wp.array(dtype=wp.vec2d),
     area: wp.array(dtype=wp.vec2d),
+    threads: int,
 ):
     """Of both rest shapes: all edges together, the volume about the centre, the surface, closed towards the centre."""
-    s, k = wp.tid()
+    i = wp.tid()
+    s = i // threads
     v = s * n
-    if k < record.shape[0]:
-        i = v + record[k][0]
-        j = v + record[k][1]
-        wp.atomic_add(length, s, wp.vec2d(length_of(first[j] - first[i]), length_of(second[j] - second[i])))
-    else:
-        wall = walls[k - record.shape[0]]
-        middle1 = middle_of(first, first_centre, walls, s, v)
-        a1 = first[v + wall[0]] - middle1
-        b1 = first[v + wall[1]] - middle1
+    total = wp.vec2d()
+    for k in range(i - s * threads, record.shape[0], threads):
+        q = record[place(k, 0)]
+        e1 = first[place(v, q[1])] - first[place(v, q[0])]
+        e2 = second[place(v, q[1])] - second[place(v, q[0])]
+        total += wp.vec2d(length_of(e1), length_of(e2))
+    wp.atomic_add(length, s, total)
+    middle1 = middle_of(first, first_centre, walls, s, v)
+    middle2 = middle_of(second, second_centre, walls, s, v)
+    sixth = real(1.0) / real(6.0)
+    enclosed = wp.vec2d()
+    around = wp.vec2d()
+    for k in range(i - s * threads, walls.shape[0], threads):
+        wall = walls[place(k, 0)]
+        a1 = first[place(v, wall[0])] - middle1
+        b1 = first[place(v, wall[1])] - middle1
         c1 = corner(first, middle1, v, wall[2]) - middle1
-        middle2 = middle_of(second, second_centre, walls, s, v)
-        a2 = second[v + wall[0]] - middle2
-        b2 = second[v + wall[1]] - middle2
+        a2 = second[place(v, wall[0])] - middle2
+        b2 = second[place(v, wall[1])] - middle2
         c2 = corner(second, middle2, v, wall[2]) - middle2
-        sixth = real(1.0) / real(6.0)
-        wp.atomic_add(volume, s, sixth * wp.vec2d(wp.dot(a1, wp.cross(b1, c1)), wp.dot(a2, wp.cross(b2, c2))))
-        s1 = length_of(wp.cross(b1 - a1, c1 - a1))
-        s2 = length_of(wp.cross(b2 - a2, c2 - a2))
-        wp.atomic_add(area, s, wp.vec2d(HALF * s1, HALF * s2))
+        enclosed += sixth * wp.vec2d(wp.dot(a1, wp.cross(b1, c1)), wp.dot(a2, wp.cross(b2, c2)))
+        around += HALF * wp.vec2d(length_of(wp.cross(b1 - a1, c1 - a1)), length_of(wp.cross(b2 - a2, c2 - a2)))
+    wp.atomic_add(volume, s, enclosed)
+    wp.atomic_add(area, s, around)
 
 
 @wp.func
@@ -127,53 +135,61 @@ def rest(
     stretch: wp.array(dtype=wp.vec2d),
     bend: wp.array(dtype=vec4),
     constant: wp.array(dtype=real),
+    threads: int,
 ):
     """Both rest shapes as one reference: Eq. 8. Weights are doubled, for derivatives."""
-    s, k = wp.tid()
+    i = wp.tid()
+    s = i // threads
     v = s * n
-    q = record[k]
-    out = s * record.shape[0] + k
-    e1 = first[v + q[1]] - first[v + q[0]]
-    e2 = second[v + q[1]] - second[v + q[0]]
-    l1 = length_of(e1)
-    l2 = length_of(e2)
     both = pull[s]
-    w1 = real(0.0)
-    w2 = real(0.0)
-    if l1 > shortest[s][0]:
-        w1 = both[0] / l1
-    if l2 > shortest[s][1]:
-        w2 = both[1] / l2
-    whole = w1 + w2
-    share = real(0.0)
-    if whole > real(0.0):
-        share = w2 / whole
-    own = alpha[s * n_alpha + wp.min(k, n_alpha - 1)]
-    stretch[out] = wp.vec2d(real(2.0) * own * whole, l1 + share * (l2 - l1))
-    wp.atomic_add(constant, s, own * w1 * share * (l2 - l1) * (l2 - l1))
-    if q[2] >= 0:
-        stiffness = real(2.0) * beta[s * n_beta + wp.min(hinge[k], n_beta - 1)]
-        a1 = first[v + q[2]] - first[v + q[0]]
-        b1 = first[v + q[3]] - first[v + q[0]]
-        a2 = second[v + q[2]] - second[v + q[0]]
-        b2 = second[v + q[3]] - second[v + q[0]]
-        m1 = wp.cross(e1, a1)
-        m2 = wp.cross(b1, e1)
-        n1 = wp.cross(e2, a2)
-        n2 = wp.cross(b2, e2)
-        p1 = real(0.0)
-        t1 = real(0.0)
-        p2 = real(0.0)
-        t2 = real(0.0)
-        if not (is_flat(e1, m1) or is_flat(e1, m2)):
-            p1 = stiffness * both[0] * bend_weight(e1, m1, m2)
-            t1 = angle_of(e1, a1, b1, m1, m2)
-        if not (is_flat(e2, n1) or is_flat(e2, n2)):
-            p2 = stiffness * both[1] * bend_weight(e2, n1, n2)
-            t2 = angle_of(e2, a2, b2, n1, n2)
-        bend[out] = vec4(p1, t1, p2, t2)
-    else:
-        bend[out] = vec4()
+    short = shortest[s]
+    total = real(0.0)
+    for k in range(i - s * threads, record.shape[0], threads):
+        q = record[place(k, 0)]
+        out = place(s * record.shape[0], k)
+        origin1 = first[place(v, q[0])]
+        origin2 = second[place(v, q[0])]
+        e1 = first[place(v, q[1])] - origin1
+        e2 = second[place(v, q[1])] - origin2
+        l1 = length_of(e1)
+        l2 = length_of(e2)
+        w1 = real(0.0)
+        w2 = real(0.0)
+        if l1 > short[0]:
+            w1 = both[0] / l1
+        if l2 > short[1]:
+            w2 = both[1] / l2
+        whole = w1 + w2
+        share = real(0.0)
+        if whole > real(0.0):
+            share = w2 / whole
+        own = alpha[place(s * n_alpha, wp.min(k, n_alpha - 1))]
+        stretch[out] = wp.vec2d(real(2.0) * own * whole, l1 + share * (l2 - l1))
+        total += own * w1 * share * (l2 - l1) * (l2 - l1)
+        if q[2] >= 0:
+            stiffness = real(2.0) * beta[place(s * n_beta, wp.min(hinge[place(k, 0)], n_beta - 1))]
+            a1 = first[place(v, q[2])] - origin1
+            b1 = first[place(v, q[3])] - origin1
+            a2 = second[place(v, q[2])] - origin2
+            b2 = second[place(v, q[3])] - origin2
+            m1 = wp.cross(e1, a1)
+            m2 = wp.cross(b1, e1)
+            n1 = wp.cross(e2, a2)
+            n2 = wp.cross(b2, e2)
+            p1 = real(0.0)
+            t1 = real(0.0)
+            p2 = real(0.0)
+            t2 = real(0.0)
+            if not (is_flat(e1, m1) or is_flat(e1, m2)):
+                p1 = stiffness * both[0] * bend_weight(e1, m1, m2)
+                t1 = angle_of(e1, a1, b1, m1, m2)
+            if not (is_flat(e2, n1) or is_flat(e2, n2)):
+                p2 = stiffness * both[1] * bend_weight(e2, n1, n2)
+                t2 = angle_of(e2, a2, b2, n1, n2)
+            bend[out] = vec4(p1, t1, p2, t2)
+        else:
+            bend[out] = vec4()
+    wp.atomic_add(constant, s, total)
 
 
 # --------------------------------------------------------------------------------------------------- value, derivatives
@@ -189,62 +205,66 @@ def value(
     walls: wp.array(dtype=wp.vec3i),
     energy: wp.array(dtype=real),
     total: wp.array(dtype=real),
+    threads: int,
 ):
     """The energy but for the volume's, and the volume; references come round where there are fewer than shapes."""
-    s, k = wp.tid()
+    i = wp.tid()
+    s = i // threads
     v = s * n
-    if k >= record.shape[0]:
-        wall = walls[k - record.shape[0]]
-        middle = middle_of(x, centre, walls, s, v)
-        c = corner(x, middle, v, wall[2]) - middle
-        wp.atomic_add(total, s, wp.dot(x[v + wall[0]] - middle, wp.cross(x[v + wall[1]] - middle, c)) / real(6.0))
-        return
-    q = record[k]
-    at = (s % n_references) * record.shape[0] + k
-    origin = x[v + q[0]]
-    e = x[v + q[1]] - origin
-    wanted = stretch[at]
-    d = length_of(e) - wanted[1]
-    found = wanted[0] * d * d
-    if q[2] >= 0:
-        a = x[v + q[2]] - origin
-        b = x[v + q[3]] - origin
-        n1 = wp.cross(e, a)
-        n2 = wp.cross(b, e)
-        theta = real(0.0)
-        if not (is_flat(e, n1) or is_flat(e, n2)):
-            theta = angle_of(e, a, b, n1, n2)
-        w = bend[at]
-        d1 = wrapped(theta - w[1])
-        d2 = wrapped(theta - w[3])
-        found += w[0] * d1 * d1 + w[2] * d2 * d2
+    to = (s % n_references) * record.shape[0]
+    found = real(0.0)
+    for k in range(i - s * threads, record.shape[0], threads):
+        q = record[place(k, 0)]
+        at = place(to, k)
+        origin = x[place(v, q[0])]
+        e = x[place(v, q[1])] - origin
+        wanted = stretch[at]
+        d = length_of(e) - wanted[1]
+        found += wanted[0] * d * d
+        if q[2] >= 0:
+            a = x[place(v, q[2])] - origin
+            b = x[place(v, q[3])] - origin
+            n1 = wp.cross(e, a)
+            n2 = wp.cross(b, e)
+            theta = real(0.0)
+            if not (is_flat(e, n1) or is_flat(e, n2)):
+                theta = angle_of(e, a, b, n1, n2)
+            w = bend[at]
+            d1 = wrapped(theta - w[1])
+            d2 = wrapped(theta - w[3])
+            found += w[0] * d1 * d1 + w[2] * d2 * d2
     wp.atomic_add(energy, s, HALF * found)
+    middle = middle_of(x, centre, walls, s, v)
+    enclosed = real(0.0)
+    for k in range(i - s * threads, walls.shape[0], threads):
+        wall = walls[place(k, 0)]
+        c = corner(x, middle, v, wall[2]) - middle
+        enclosed += wp.dot(x[place(v, wall[0])] - middle, wp.cross(x[place(v, wall[1])] - middle, c))
+    wp.atomic_add(total, s, enclosed / real(6.0))
 
 
 @wp.func
-def add_wall(
+def enclosed(
     x: wp.array(dtype=vec3),
-    centre: wp.array(dtype=vec3),
-    walls: wp.array(dtype=wp.vec3i),
-    sample: int,
-    wall: int,
+    middle: vec3,
+    q: wp.vec3i,
     at: int,
-    total: wp.array(dtype=real),
     gradient: wp.array(dtype=vec3),
 ):
-    """Volume of the tetrahedron from the centre, a vertex of -1, to a triangle; its gradient where that stays."""
-    q = walls[wall]
-    middle = middle_of(x, centre, walls, sample, at)
-    a = x[at + q[0]] - middle
-    b = x[at + q[1]] - middle
+    """Six times the volume of the tetrahedron from the middle, a vertex of -1, to a triangle.
+
+    A sixth of its gradient, where the middle stays, is added.
+    """
+    a = x[place(at, q[0])] - middle
+    b = x[place(at, q[1])] - middle
     c = corner(x, middle, at, q[2]) - middle
     bc = wp.cross(b, c)
     sixth = real(1.0) / real(6.0)
-    wp.atomic_add(total, sample, sixth * wp.dot(a, bc))
-    wp.atomic_add(gradient, at + q[0], sixth * bc)
-    wp.atomic_add(gradient, at + q[1], sixth * wp.cross(c, a))
+    wp.atomic_add(gradient, place(at, q[0]), sixth * bc)
+    wp.atomic_add(gradient, place(at, q[1]), sixth * wp.cross(c, a))
     if q[2] >= 0:
-        wp.atomic_add(gradient, at + q[2], sixth * wp.cross(a, b))
+        wp.atomic_add(gradient, place(at, q[2]), sixth * wp.cross(a, b))
+    return wp.dot(a, bc)
 
 
 @wp.kernel(enable_backward=False)
@@ -255,10 +275,17 @@ def volume(
     n: int,
     total: wp.array(dtype=real),
     gradient: wp.array(dtype=vec3),
+    threads: int,
 ):
     """The volume and its gradient alone."""
-    s, k = wp.tid()
-    add_wall(x, centre, walls, s, k, s * n, total, gradient)
+    i = wp.tid()
+    s = i // threads
+    v = s * n
+    middle = middle_of(x, centre, walls, s, v)
+    found = real(0.0)
+    for k in range(i - s * threads, walls.shape[0], threads):
+        found += enclosed(x, middle, walls[place(k, 0)], v, gradient)
+    wp.atomic_add(total, s, found / real(6.0))
 
 
 @wp.kernel
@@ -277,73 +304,83 @@ def linearise(
     hinges: wp.array(dtype=bent),
     total: wp.array(dtype=real),
     normal: wp.array(dtype=vec3),
+    threads: int,
 ):
     """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and what a product with it needs.
 
     The volume's are apart: the volume and its gradient, see there.
     """
-    s, k = wp.tid()
+    i = wp.tid()
+    s = i // threads
     v = s * n
-    if k >= record.shape[0]:
-        add_wall(x, centre, walls, s, k - record.shape[0], v, total, normal)
-        return
-    q = record[k]
-    at = s * record.shape[0] + k
-    origin = x[v + q[0]]
-    e = x[v + q[1]] - origin
-    base = wp.dot(e, e)
-    length = length_of(e)
-    per_length = real(0.0)
-    if base > TINY:
-        per_length = real(1.0) / length
-    wanted = stretch[at]
-    d = length - wanted[1]
-    slope = wanted[0] * d
-    unit = per_length * e
-    width = SLACKNESS * wanted[0] * length
-    across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
-    along = wanted[0] - across
-    edges[at] = stretched(unit[0], unit[1], unit[2], across, along)
-    block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
-    pull = slope * unit
-    wp.atomic_add(energy, s, HALF * slope * d)
-    wp.atomic_add(gradient, v + q[0], -pull)
-    wp.atomic_add(gradient, v + q[1], pull)
-    wp.atomic_add(diagonal, v + q[0], block)
-    wp.atomic_add(diagonal, v + q[1], block)
-    if q[2] >= 0:
-        a = x[v + q[2]] - origin
-        b = x[v + q[3]] - origin
-        n1 = wp.cross(e, a)
-        n2 = wp.cross(b, e)
-        w = bend[at]
-        if is_flat(e, n1) or is_flat(e, n2):
-            d3 = wrapped(-w[1])
-            d4 = wrapped(-w[3])
-            hinges[at] = bent()
-            wp.atomic_add(energy, s, HALF * (w[0] * d3 * d3 + w[2] * d4 * d4))
-        else:
-            theta = angle_of(e, a, b, n1, n2)
-            d1 = wrapped(theta - w[1])
-            d2 = wrapped(theta - w[3])
-            moment = w[0] * d1 + w[2] * d2
-            stiffness = w[0] + w[2]
-            ga = (-length / wp.dot(n1, n1)) * n1
-            gb = (-length / wp.dot(n2, n2)) * n2
-            ge = (-per_length * per_length) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)
-            gi = -(ga + gb + ge)
-            hinges[at] = bent(ge[0], ge[1], ge[2], ga[0], ga[1], ga[2], gb[0], gb[1], gb[2], stiffness)
-            wp.atomic_add(energy, s, HALF * (w[0] * d1 * d1 + w[2] * d2 * d2))
-            wp.atomic_add(gradient, v + q[0], moment * gi)
-            wp.atomic_add(gradient, v + q[1], moment * ge)
-            wp.atomic_add(gradient, v + q[2], moment * ga)
-            wp.atomic_add(gradient, v + q[3], moment * gb)
-            wp.atomic_add(diagonal, v + q[0], stiffness * squared(gi))
-            wp.atomic_add(diagonal, v + q[1], stiffness * squared(ge))
-            wp.atomic_add(diagonal, v + q[2], stiffness * squared(ga))
-            wp.atomic_add(diagonal, v + q[3], stiffness * squared(gb))
-    else:
-        hinges[at] = bent()
+    own = real(0.0)
+    for k in range(i - s * threads, record.shape[0], threads):
+        q = record[place(k, 0)]
+        at = place(s * record.shape[0], k)
+        q0 = place(v, q[0])
+        q1 = place(v, q[1])
+        origin = x[q0]
+        e = x[q1] - origin
+        base = wp.dot(e, e)
+        length = length_of(e)
+        per_length = real(0.0)
+        if base > TINY:
+            per_length = real(1.0) / length
+        wanted = stretch[at]
+        d = length - wanted[1]
+        slope = wanted[0] * d
+        unit = per_length * e
+        width = SLACKNESS * wanted[0] * length
+        across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
+        along = wanted[0] - across
+        edges[at] = stretched(unit[0], unit[1], unit[2], across, along)
+        block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
+        pull = slope * unit
+        own += slope * d
+        wp.atomic_add(gradient, q0, -pull)
+        wp.atomic_add(gradient, q1, pull)
+        wp.atomic_add(diagonal, q0, block)
+        wp.atomic_add(diagonal, q1, block)
+        found = bent()
+        if q[2] >= 0:
+            q2 = place(v, q[2])
+            q3 = place(v, q[3])
+            a = x[q2] - origin
+            b = x[q3] - origin
+            n1 = wp.cross(e, a)
+            n2 = wp.cross(b, e)
+            w = bend[at]
+            if is_flat(e, n1) or is_flat(e, n2):
+                d3 = wrapped(-w[1])
+                d4 = wrapped(-w[3])
+                own += w[0] * d3 * d3 + w[2] * d4 * d4
+            else:
+                theta = angle_of(e, a, b, n1, n2)
+                d1 = wrapped(theta - w[1])
+                d2 = wrapped(theta - w[3])
+                moment = w[0] * d1 + w[2] * d2
+                stiffness = w[0] + w[2]
+                ga = (-length / wp.dot(n1, n1)) * n1
+                gb = (-length / wp.dot(n2, n2)) * n2
+                ge = (-per_length * per_length) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)
+                gi = -(ga + gb + ge)
+                found = bent(ge[0], ge[1], ge[2], ga[0], ga[1], ga[2], gb[0], gb[1], gb[2], stiffness)
+                own += w[0] * d1 * d1 + w[2] * d2 * d2
+                wp.atomic_add(gradient, q0, moment * gi)
+                wp.atomic_add(gradient, q1, moment * ge)
+                wp.atomic_add(gradient, q2, moment * ga)
+                wp.atomic_add(gradient, q3, moment * gb)
+                wp.atomic_add(diagonal, q0, stiffness * squared(gi))
+                wp.atomic_add(diagonal, q1, stiffness * squared(ge))
+                wp.atomic_add(diagonal, q2, stiffness * squared(ga))
+                wp.atomic_add(diagonal, q3, stiffness * squared(gb))
+        hinges[at] = found
+    wp.atomic_add(energy, s, HALF * own)
+    middle = middle_of(x, centre, walls, s, v)
+    sixfold = real(0.0)
+    for k in range(i - s * threads, walls.shape[0], threads):
+        sixfold += enclosed(x, middle, walls[place(k, 0)], v, normal)
+    wp.atomic_add(total, s, sixfold / real(6.0))
 
 
 @wp.kernel(enable_backward=False)
@@ -355,33 +392,41 @@ def product(
     n: int,
     out: wp.array(dtype=vec3),
     form: wp.array(dtype=real),
+    threads: int,
 ):
     """The convex Hessian times a field, and the field times that, where there is an array for it."""
-    s, k = wp.tid()
+    i = wp.tid()
+    s = i // threads
     v = s * n
-    q = record[k]
-    at = s * record.shape[0] + k
-    origin = field[v + q[0]]
-    e = field[v + q[1]] - origin
-    r = edges[at]
-    unit = vec3(r[0], r[1], r[2])
-    rate = wp.dot(unit, e)
-    to_j = r[3] * e + (r[4] * rate) * unit
+    total = real(0.0)
+    for k in range(i - s * threads, record.shape[0], threads):
+        q = record[place(k, 0)]
+        at = place(s * record.shape[0], k)
+        q0 = place(v, q[0])
+        q1 = place(v, q[1])
+        origin = field[q0]
+        e = field[q1] - origin
+        r = edges[at]
+        unit = vec3(r[0], r[1], r[2])
+        rate = wp.dot(unit, e)
+        to_j = r[3] * e + (r[4] * rate) * unit
+        total += wp.dot(to_j, e)
+        if q[2] >= 0:
+            q2 = place(v, q[2])
+            q3 = place(v, q[3])
+            h = hinges[at]
+            ge = vec3(h[0], h[1], h[2])
+            ga = vec3(h[3], h[4], h[5])
+            gb = vec3(h[6], h[7], h[8])
+            change = wp.dot(ge, e) + wp.dot(ga, field[q2] - origin) + wp.dot(gb, field[q3] - origin)
+            moment = h[9] * change
+            total += moment * change
+            wp.atomic_add(out, q0, -moment * (ga + gb + ge) - to_j)
+            wp.atomic_add(out, q1, moment * ge + to_j)
+            wp.atomic_add(out, q2, moment * ga)
+            wp.atomic_add(out, q3, moment * gb)
+        else:
+            wp.atomic_add(out, q0, -to_j)
+            wp.atomic_add(out, q1, to_j)
     if form:
-        wp.atomic_add(form, s, wp.dot(to_j, e))
-    if q[2] >= 0:
-        h = hinges[at]
-        ge = vec3(h[0], h[1], h[2])
-        ga = vec3(h[3], h[4], h[5])
-        gb = vec3(h[6], h[7], h[8])
-        change = wp.dot(ge, e) + wp.dot(ga, field[v + q[2]] - origin) + wp.dot(gb, field[v + q[3]] - origin)
-        moment = h[9] * change
-        if form:
-            wp.atomic_add(form, s, moment * change)
-        wp.atomic_add(out, v + q[0], -moment * (ga + gb + ge) - to_j)
-        wp.atomic_add(out, v + q[1], moment * ge + to_j)
-        wp.atomic_add(out, v + q[2], moment * ga)
-        wp.atomic_add(out, v + q[3], moment * gb)
-    else:
-        wp.atomic_add(out, v + q[0], -to_j)
-        wp.atomic_add(out, v + q[1], to_j)
+        wp.atomic_add(form, s, total)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from torch_modal.nn import relax
-from torch_modal.nn.kernels.elements import applied, real, symmetric, vec3
+from torch_modal.nn.kernels.elements import applied, place, real, symmetric, vec3
 
 RIDGE = wp.constant(real(relax.RIDGE))
 
@@ -39,19 +39,27 @@ def begin(
     product: wp.array(dtype=vec3),
     size: wp.array(dtype=real),
     swept: wp.array(dtype=real),
+    threads: int,
 ):
-    s, i = wp.tid()
-    v = s * n + i
-    r = -(gradient[v] + moment[s] * normal[v])
-    inverse = inverted(diagonal[v])
-    z = applied(inverse, r)
-    diagonal[v] = inverse
-    residual[v] = r
-    direction[v] = z
-    solution[v] = vec3()
-    product[v] = vec3()
-    wp.atomic_add(size, s, wp.dot(r, z))
-    wp.atomic_add(swept, s, wp.dot(normal[v], z))
+    i = wp.tid()
+    s = i // threads
+    push = moment[s]
+    squared = real(0.0)
+    across = real(0.0)
+    for k in range(i - s * threads, n, threads):
+        v = place(s * n, k)
+        r = -(gradient[v] + push * normal[v])
+        inverse = inverted(diagonal[v])
+        z = applied(inverse, r)
+        diagonal[v] = inverse
+        residual[v] = r
+        direction[v] = z
+        solution[v] = vec3()
+        product[v] = vec3()
+        squared += wp.dot(r, z)
+        across += wp.dot(normal[v], z)
+    wp.atomic_add(size, s, squared)
+    wp.atomic_add(swept, s, across)
 
 
 @wp.func
@@ -78,15 +86,20 @@ def advance(
     solution: wp.array(dtype=vec3),
     next_residual: wp.array(dtype=vec3),
     next_size: wp.array(dtype=real),
+    threads: int,
 ):
-    s, i = wp.tid()
-    v = s * n + i
+    i = wp.tid()
+    s = i // threads
     push = stiffness[s] * swept[s]
     step = quotient(size[s], form[s] + push * swept[s])
-    solution[v] = solution[v] + step * direction[v]
-    r = residual[v] - step * (product[v] + push * normal[v])
-    next_residual[v] = r
-    wp.atomic_add(next_size, s, wp.dot(r, applied(inverse[v], r)))
+    squared = real(0.0)
+    for k in range(i - s * threads, n, threads):
+        v = place(s * n, k)
+        solution[v] = solution[v] + step * direction[v]
+        r = residual[v] - step * (product[v] + push * normal[v])
+        next_residual[v] = r
+        squared += wp.dot(r, applied(inverse[v], r))
+    wp.atomic_add(next_size, s, squared)
 
 
 @wp.kernel(enable_backward=False)
@@ -101,13 +114,19 @@ def turn(
     next_direction: wp.array(dtype=vec3),
     product: wp.array(dtype=vec3),
     swept: wp.array(dtype=real),
+    threads: int,
 ):
-    s, i = wp.tid()
-    v = s * n + i
-    d = applied(inverse[v], residual[v]) + quotient(next_size[s], size[s]) * direction[v]
-    next_direction[v] = d
-    product[v] = vec3()
-    wp.atomic_add(swept, s, wp.dot(normal[v], d))
+    i = wp.tid()
+    s = i // threads
+    ratio = quotient(next_size[s], size[s])
+    across = real(0.0)
+    for k in range(i - s * threads, n, threads):
+        v = place(s * n, k)
+        d = applied(inverse[v], residual[v]) + ratio * direction[v]
+        next_direction[v] = d
+        product[v] = vec3()
+        across += wp.dot(normal[v], d)
+    wp.atomic_add(swept, s, across)
 
 
 @wp.kernel(enable_backward=False)
@@ -121,10 +140,13 @@ def arrive(
     n: int,
     solution: wp.array(dtype=vec3),
     reached: wp.array(dtype=vec3),
+    threads: int,
 ):
-    s, i = wp.tid()
-    v = s * n + i
+    i = wp.tid()
+    s = i // threads
     step = quotient(size[s], form[s] + stiffness[s] * swept[s] * swept[s])
-    found = solution[v] + step * direction[v]
-    solution[v] = found
-    reached[v] = x[v] + found
+    for k in range(i - s * threads, n, threads):
+        v = place(s * n, k)
+        found = solution[v] + step * direction[v]
+        solution[v] = found
+        reached[v] = x[v] + found
