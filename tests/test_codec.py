@@ -46,6 +46,29 @@ def test_no_amplitudes_are_the_path(bars: Shapes, cyclic: bool) -> None:
     assert torch.allclose(decoder(torch.zeros(8, 8).double(), t), path(bars.keyframes, t), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        (0, torch.zeros(1, 164, 3).double(), "at least 2"),
+        (0, torch.full((3, 164, 3), torch.nan).double(), "NaN"),
+        (1, torch.tensor([[0, 1, 164]]), "do not exist"),
+        (2, [0.0, 2.0, 1.0], "ascend"),
+        (2, [0.0], "one time for each key-frame"),
+        (3, torch.zeros(163, 3).double(), "reference must be"),
+        (4, torch.zeros(164, 3).double(), "modes must be"),
+        (4, torch.full((2, 164, 3), torch.inf).double(), "modes has entries that are not finite"),
+        (4, [[0.0]], "got a list"),
+    ],
+)
+def test_what_does_not_fit_is_said(bars: Shapes, place: int, value: Any, said: str) -> None:
+    basis = bars.bases[0]
+    given = [bars.keyframes, bars.faces, [0.0, 1.0, 3.0], basis.reference, basis.modes]
+    assert tm.ModalDecoder(*given).n_intervals == 2
+    given[place] = value
+    with pytest.raises(ValueError, match=said):
+        tm.ModalDecoder(*given)
+
+
 def test_small_amplitudes_are_the_modes(decoder: tm.ModalDecoder, bars: Shapes) -> None:
     """Up to a rigid motion, and to what triangles that turn with their edges alone do not know of a solid's modes."""
     modes = bars.bases[0].modes
@@ -100,6 +123,8 @@ def test_leading_dimensions_and_dtypes(decoder: tm.ModalDecoder, bars: Shapes) -
     assert y.dtype == torch.float32 and torch.allclose(y.double(), x, rtol=0, atol=1e-4)
     with pytest.raises(ValueError, match=r"\(\.\.\., 8\)"):
         decoder(a[..., :5], t)
+    with pytest.raises(ValueError, match=r"motions have the shape \(\.\.\., 6\)"):
+        decoder(torch.zeros(2, 8).double(), 0.5, torch.zeros(2, 5).double())
     with pytest.raises(ValueError, match=r"0 and 3; got 3\.5"):
         decoder(a, 3.5)
 

@@ -66,17 +66,28 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
 
 def checked_surface(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, Connectivity, list[str]]:
     """The same for who goes on with the connectivity, and what there would be to warn of."""
-    positions = as_positions(keyframes)
-    indices = as_faces(faces)
     found: list[str] = []
     note = found.append
-    _check_shapes(positions, indices, min_keyframes)
-    shapes = positions.detach().cpu().double().resolve_neg().numpy()
-    _check_values(shapes, indices)
+    positions, shapes, indices = checked_arrays(keyframes, faces, min_keyframes)
     mesh, orientable = _repaired(indices, shapes.shape[1], note)
     scaled = _check_sizes(shapes, mesh, positions.dtype, note)
     _check_surface(scaled, mesh, orientable, _RESOLUTION[positions.dtype], note)
     return positions, mesh, found
+
+
+def checked_arrays(
+    keyframes: Any, faces: Any, min_keyframes: int = 1
+) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.int64]]:
+    """Positions as they came and in float64, and faces: of the right shapes, finite, and indices of vertices.
+
+    Raises:
+        MeshError: They are not.
+    """
+    positions, indices = as_positions(keyframes), as_faces(faces)
+    _check_shapes(positions, indices, min_keyframes)
+    shapes = positions.detach().cpu().double().resolve_neg().numpy()
+    _check_values(shapes, indices)
+    return positions, shapes, indices
 
 
 def require_solid(vertices: Any, faces: Any) -> None:

@@ -6,6 +6,7 @@ key-frame serve all shapes of the motion: they bend the shape on the path, and l
 stretch.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,8 @@ from torch_modal.geometry.hermite import Excess, Spacing, around, beyond, locate
 from torch_modal.geometry.local_rotations import Course
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
+from torch_modal.keyframes.check import checked_arrays
+from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.frame import Alignment, Pair, mean_areas, vertex_excess
 
@@ -53,12 +56,16 @@ class ModalDecoder(nn.Module):
     by local rotations). An amplitude of 1 moves the vertices by 1 % of the diagonal in the root mean square.
 
     Args:
-        keyframes: Two or more, finite, of one connectivity, with faces that can be used. *Shape:* ``(K, V, 3)``.
+        keyframes: Two or more of one connectivity, with faces that can be used. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         times: When the key-frames are, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)`` or
             ``(K + 1,)``.
         reference: The shape that the modes belong to, one of the key-frames. *Shape:* ``(V, 3)``.
         modes: Displacements of it, of any size. *Shape:* ``(k, V, 3)``.
+
+    Raises:
+        ValueError: Shapes that do not fit, numbers that are not finite, indices of vertices that do not exist, or times
+            that do not ascend.
     """
 
     keyframes: Tensor
@@ -68,18 +75,23 @@ class ModalDecoder(nn.Module):
     faces: Tensor
     size: Tensor
 
-    def __init__(self, keyframes: Tensor, faces: Tensor, times: Tensor, reference: Tensor, modes: Tensor) -> None:
+    def __init__(
+        self, keyframes: Tensor, faces: Tensor, times: Tensor | Sequence[float], reference: Tensor, modes: Tensor
+    ) -> None:
         super().__init__()
+        keyframes, _, indices = checked_arrays(keyframes, faces, 2)
+        reference, modes = (_finite(*one, keyframes) for one in (("reference", reference, 2), ("modes", modes, 3)))
+        times = checked_times(times, len(keyframes), len(times) > len(keyframes))
         keyframes, reference, modes = (x.detach().double().cpu() for x in (keyframes, reference, modes))
-        faces = faces.cpu()
-        mesh = self._mesh = Connectivity(faces.numpy(), len(reference))
+        faces, mesh = torch.from_numpy(indices), Connectivity(indices, len(reference))
+        self._mesh = mesh
         used = reference[faces.unique()]
         size = torch.linalg.norm(used.amax(0) - used.amin(0))
         placed = reference * (DIAGONAL / size)
         self.register_buffer("faces", faces, persistent=False)
         #: Diagonal of the reference's bounding box.
         self.register_buffer("size", size, persistent=False)
-        self._start(keyframes, times.detach().double().cpu(), placed)
+        self._start(keyframes, times, placed)
         rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
         displaced = (modes * (UNIT * DIAGONAL / rms)[:, None, None]).movedim(-1, 0).contiguous()
         own = frames(sides(placed.T[:, None].contiguous(), faces))
@@ -164,6 +176,8 @@ class ModalDecoder(nn.Module):
             raise ValueError(f"amplitudes have the shape (..., {self.n_modes}); got {tuple(amplitudes.shape)}")
         if keyframes is not None and keyframes.shape != self.keyframes.shape:
             raise ValueError(f"keyframes have the shape {tuple(self.keyframes.shape)}; got {tuple(keyframes.shape)}")
+        if motions is not None and motions.shape[-1:] != (6,):
+            raise ValueError(f"motions have the shape (..., 6); got {tuple(motions.shape)}")
         t = torch.as_tensor(t, dtype=self.times.dtype, device=amplitudes.device)
         lead = broadcast_shapes(amplitudes.shape[:-1], t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
@@ -225,6 +239,22 @@ class ModalDecoder(nn.Module):
         before, after, spacing = around(i, self.times, self.cyclic)
         earlier, later = (None if j is None else x[j] for j in (before, after))
         return self.alignment.surround(pair, earlier, later, Spacing(*(h.to(x)[None] for h in spacing)))
+
+
+def _finite(name: str, x: Tensor, n_dimensions: int, keyframes: Tensor) -> Tensor:
+    """Displacements or positions of the vertices of the key-frames.
+
+    Raises:
+        ValueError: They are not.
+    """
+    item = tuple(keyframes.shape[1:])
+    if not isinstance(x, Tensor) or x.dim() != n_dimensions or x.shape[-2:] != item or not x.is_floating_point():
+        shape = f"({'k, ' * (n_dimensions - 2)}{item[0]}, 3)"
+        got = f"{tuple(x.shape)} of {x.dtype}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
+        raise ValueError(f"{name} must be floating-point of shape {shape} as the key-frames are; got {got}")
+    if not bool(x.isfinite().all()):
+        raise ValueError(f"{name} has entries that are not finite")
+    return x
 
 
 def _bounded(columns: Tensor, own: Frames) -> Tensor:

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.modal_decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.sequence.codec_file import read, write_exact
 from torch_modal.sequence.codec_fit import Fit, fit
 from torch_modal.sequence.codec_modes import FixedModes, fixed_modes
 from torch_modal.sequence.codec_selection import select_keyframes
-from torch_modal.sequence.times import checked_times
 
 ERROR = 0.002
 """Mean distance over the diagonal that key-frames are chosen for, if nothing is said."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch_modal.extras import require_installed
 from torch_modal.io.files import write_atomically
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.keyframes.times import checked_times
 from torch_modal.progress import Progress
 from torch_modal.sequence import codec_packing as packing
 from torch_modal.sequence.codec import ERROR, ModalSequence, chosen_keys, fitted, with_worst
@@ -24,7 +25,6 @@ from torch_modal.sequence.codec_file import probe, read_bytes, to_bytes
 from torch_modal.sequence.codec_head import Head
 from torch_modal.sequence.codec_levels import Levels
 from torch_modal.sequence.codec_modes import fixed_modes
-from torch_modal.sequence.times import checked_times
 
 OF_SELECTION = 0.7
 """Of the error, what is left for shapes between key-frames when these are chosen, before anything is rounded."""

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.functions import broadcast_shapes
 from torch_modal.geometry.hermite import Spacing, around, located
+from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
 from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.settings import Objective, Preset, Solver, settings
 from torch_modal.nn.solver import Solution
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.sequence.contact import push_apart
-from torch_modal.sequence.times import checked_times
 
 # Even times between two key-frames at which a path looks for contacts.
 N_SEARCHED = 31

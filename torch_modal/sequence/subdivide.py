@@ -16,6 +16,7 @@ from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.between import Between
 from torch_modal.nn.launch import load_kernels
 from torch_modal.nn.mid_shape import MidShape
@@ -26,7 +27,6 @@ from torch_modal.precompute.modes import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.sequence.contact import push_apart
 from torch_modal.sequence.path import Path
-from torch_modal.sequence.times import checked_times
 
 logger = logging.getLogger(__name__)
 
