@@ -173,7 +173,7 @@ class ContactSearch:
         for k, i in enumerate(some):
             if bool(x[i].isfinite().all()):
                 held = found[i] = self._search(i)(x[i].detach().double().cpu().numpy(), self.watched[i])
-                self.watched[i] = held.watched
+                self.watched[i] = held.watched if held.watched.any() else None
                 counts[k] = len(held.far), self._search(i).n_left(held.far, *self._when(i))
         self._keep(some, counts)
         if not any(held is not None and len(held.vertices) for held in found):
@@ -212,9 +212,16 @@ class ContactSearch:
         """Watch what is held in a sample, and beside it, in that one and its neighbours in time."""
         crossings = self.searches[0].crossings
         for i, weights in zip(held.samples.tolist(), held.weights, strict=True):
+            if not bool(weights.any()):
+                continue
             own = crossings.grown(held.elements[weights > 0].flatten().unique().cpu().numpy(), 2)
             for k in range(max(0, i - around), min(len(self.watched), i + around + 1)):
                 self.watched[k] = own if self.watched[k] is None else self.watched[k] | own
+
+    def beside(self, some: Tensor) -> list[int]:
+        """The samples in which something is watched, but for some. *Shape:* ``(S,)``."""
+        chosen = set(some.tolist())
+        return [i for i, watched in enumerate(self.watched) if watched is not None and i not in chosen]
 
     def near(self, part: float) -> Tensor:
         """Vertices within a part of the diagonal of those that were ever watched, of one pair. *Shape:* ``(V,)``."""

@@ -168,12 +168,15 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
         chosen |= set(torch.nonzero((t < BESIDE) | (t > 1 - BESIDE)).flatten().tolist())
     course = _Course(member, samples, pair, start, limit, search)
     some = torch.tensor(sorted(chosen), device=start.device)
-    found = course.pushed(some)
-    n_before = torch.zeros_like(search.n_far).index_copy(0, some, found.n_before)
-    if found.held is None:
-        return Displacement(None, t, n_before, n_before)
-    x, n_crossing = course.settled(found.x, found.held)
-    return Displacement((x - start).movedim(-1, 0), t, n_before, n_crossing)
+    held = search(start, some.tolist())
+    if held is None or not bool(search.n_left.any()):
+        return Displacement(None, t, search.n_far, search.n_far)
+    held = held.of_all(torch.arange(len(t), device=start.device))
+    search.watch(held, AROUND)
+    search.count(start, search.beside(some))
+    n_before = search.n_far
+    x = course.settled(course.pushed(held, some), some)
+    return Displacement((x - start).movedim(-1, 0), t, n_before, search.n_far)
 
 
 def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor, start: Tensor) -> AccelerationLimit:
@@ -197,17 +200,6 @@ def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor, start:
     return AccelerationLimit(rows.movedim(-1, 0).contiguous(), second, splines(t).values, area, most)
 
 
-class _Pushed(NamedTuple):
-    """Shapes that were pushed apart together."""
-
-    x: Tensor
-    """All of them. *Shape:* ``(T, V, 3)``."""
-    held: Contacts | None
-    """Of those that were searched, by their numbers; None where nothing is to be pushed."""
-    n_before: Tensor
-    """Of these. *Shape:* ``(S,)``."""
-
-
 class _Course:
     """Shapes between two key-frames."""
 
@@ -223,62 +215,99 @@ class _Course:
         self.member, self.samples, self.pair, self.start = member, samples, pair, start
         self.limit, self.search = limit, search
 
-    def pushed(self, some: Tensor) -> _Pushed:
-        """All shapes with a displacement that frees some of them; what leaves the fewest crossings is kept."""
-        search, start, samples = self.search.of(some), self.start[some], self.samples.rows(some)
-        solver = _Coupled(self.member, samples, self.pair, start.movedim(-1, 0).contiguous(), self.limit)
-        found, n_before = search(start), search.n_far
-        if found is None or not bool(search.n_left.any()):
-            return _Pushed(self.start, None, n_before)
-        at = start.new_zeros(3, solver.basis.shape[1], start.shape[1])
-        best, kept = (at, search.n_left, search.n_far), torch.arange(len(start), device=start.device)
-        held = found.of_all(kept)
-        for _ in range(ROUNDS):
-            at = solver.fine(solver.modal(at, held), held, search.near(REGION), FINE_STEPS)
-            found = search(solver.moved(at).movedim(0, -1))
-            best = min(best, (at, search.n_left, search.n_far), key=_left)
-            if found is None or not bool(search.n_left.any()):
-                break
-            held = found.of_all(kept).beside(held)
-        x = self.start + (splines(self.samples.t).values @ best[0]).movedim(0, -1)
-        return _Pushed(x, held._replace(samples=some), n_before)
-
-    def settled(self, x: Tensor, held: Contacts) -> tuple[Tensor, Tensor]:
-        """All shapes brought to rest, each on its own, and as near to that as their accelerations allow.
+    def pushed(self, held: Contacts, some: Tensor) -> "_Found":
+        """All shapes with a displacement that frees some of them; what leaves the fewest crossings is kept.
 
         Args:
-            x: Where to start. *Shape:* ``(T, V, 3)``.
-            held: In some of them.
-
-        Returns:
-            What leaves the fewest crossings, and how many these are in each shape. *Shape:* ``(T, V, 3), (T,)``.
+            held: Of all shapes.
+            some: Those that are to be free. *Shape:* ``(S,)``.
         """
-        search, start, every = self.search, self.start, torch.arange(len(self.start), device=self.start.device)
-        held = held.of_all(every)
-        search.watch(held, AROUND)
-        found, some, best = search(x), None, None
-        weights = torch.ones_like(self.samples.t)
+        search, start = self.search, self.start
+        rows = start[some].movedim(-1, 0).contiguous()
+        solver = _Coupled(self.member, self.samples.rows(some), self.pair, rows, self.limit)
+        at, functions = start.new_zeros(3, solver.basis.shape[1], start.shape[1]), splines(self.samples.t).values
+        found: list[_Found] = []
+        for _ in range(ROUNDS):
+            own = held.rows(some)
+            at = solver.fine(solver.modal(at, own), own, search.near(REGION), FINE_STEPS)
+            x = start + (functions @ at).movedim(0, -1)
+            held = self.looked(x, held, some)
+            found.append(_Found(x, held, search.n_left, search.n_far))
+            if not bool(search.n_left[some].any()):
+                break
+        return min(found, key=_left)
+
+    def looked(self, x: Tensor, held: Contacts, some: Tensor) -> Contacts:
+        """What is held after another search in those of some shapes that hold something, or are beside such ones."""
+        found = self.search(x, self.searched(some))
+        return held if found is None else found.of_all(held.samples).beside(held)
+
+    def settled(self, found: "_Found", own: Tensor) -> Tensor:
+        """Some shapes brought to rest, each on its own, and all as near to that as their accelerations allow.
+
+        Those between follow along a cubic spline; what passes through itself there comes to rest on its own, too. What
+        leaves the fewest crossings is kept; the search counts them. *Shape:* ``(T, V, 3)``.
+
+        Args:
+            found: Where to start.
+            own: The shapes that come to rest on their own. *Shape:* ``(S,)``.
+        """
+        search, weights, tried = self.search, torch.ones_like(self.samples.t), []
         for k in range(SETTLINGS):
-            held = held if found is None else found.of_all(every).beside(held)
-            x = settled(self.member, self.samples, self.pair, x, held, SETTLING_STEPS, SETTLING_PRODUCTS)
-            x = start + self.limit.nearest((x - start).movedim(-1, 0), weights).movedim(0, -1)
-            # The others are looked at in the end.
-            some = torch.nonzero((held.weights > 0).any(1) | (search.n_far > 0)).flatten().tolist()
-            found = search(x, some)
+            x, held = self.at_rest(found, own, weights), found.held
+            if k + 1 >= LEAST_SETTLINGS:
+                search.count(x, sorted(set(range(len(x))) - set(self.searched(own))))
+                own = torch.nonzero((search.n_left > 0).index_fill(0, own, True)).flatten()
+            held = self.looked(x, held, own)
+            found = _Found(x, held, search.n_left, search.n_far)
             if k + 1 < LEAST_SETTLINGS:
                 continue
-            best = min((x, search.n_left, search.n_far), best or (x, search.n_left, search.n_far), key=_left)
+            tried.append(found)
             if not bool(search.n_left.any()):
                 break
             weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights)
-        assert best is not None and some is not None
-        search.n_left, search.n_far = best[1:]
-        search.count(best[0], sorted(set(range(len(start))) - set(some)))
-        return best[0], search.n_far
+        best = min(tried, key=_left)
+        search.n_left, search.n_far = best.n_left, best.n_far
+        return best.x
+
+    def searched(self, some: Tensor) -> list[int]:
+        """Those of some shapes in which something is watched, or parts went through each other."""
+        search = self.search
+        return [i for i in some.tolist() if search.watched[i] is not None or int(search.n_far[i])]
+
+    def at_rest(self, found: "_Found", own: Tensor, weights: Tensor) -> Tensor:
+        """All shapes after some have taken steps of their own. *Shape:* ``(T, V, 3)``.
+
+        Args:
+            found: Where these start.
+            own: Which. *Shape:* ``(S,)``.
+            weights: How much each counts where not all can be had. *Shape:* ``(T,)``.
+        """
+        samples, t = self.samples.rows(own), self.samples.t
+        rest = settled(
+            self.member, samples, self.pair, found.x[own], found.held.rows(own), SETTLING_STEPS, SETTLING_PRODUCTS
+        )
+        moved = (rest - self.start[own]).movedim(-1, 0)
+        if len(own) < len(t):
+            moved = through(t[own], t) @ moved
+        return self.start + self.limit.nearest(moved, weights).movedim(0, -1)
 
 
-def _left(found: tuple[Any, Tensor, Tensor]) -> tuple[int, int]:
-    return int(found[2].sum()), int(found[1].sum())
+class _Found(NamedTuple):
+    """Shapes that were pushed apart, what is held in them, and what is left."""
+
+    x: Tensor
+    """*Shape:* ``(T, V, 3)``."""
+    held: Contacts
+    """Of all of them."""
+    n_left: Tensor
+    """*Shape:* ``(T,)``."""
+    n_far: Tensor
+    """*Shape:* ``(T,)``."""
+
+
+def _left(found: _Found) -> tuple[int, int]:
+    return int(found.n_far.sum()), int(found.n_left.sum())
 
 
 class _Coupled:
