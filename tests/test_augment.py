@@ -122,6 +122,8 @@ def test_without_a_generator_the_global_one_is_used(bars: Shapes, space: tm.Shap
         (lambda: tm.RandomRigidMotion(p=1.5), "probability"),
         (lambda: tm.RandomInBetween(t=(0.2, 1.2)), r"t is a range .* within \[0, 1\]"),
         (lambda: tm.RandomExtrapolation(beyond=(0.3, 0.1)), "beyond is a range"),
+        (lambda: tm.RandomInBetween("half"), "t is a range"),
+        (lambda: tm.RandomInBetween(0.5), "t is a range .* got 0.5"),
         (lambda: tm.RandomModalDeformation(max_strain=1.0), "max_strain"),
         (lambda: tm.RandomModalDeformation(strain=-0.1), "strain is a range"),
         (lambda: tm.RandomRigidMotion(degrees=270), "degrees is a range"),

@@ -1,5 +1,6 @@
 """What all random transforms of shapes share; the conventions are those of kornia's augmentations."""
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -314,9 +315,12 @@ def check_range(name: str, given: tuple[float, float], lowest: float, highest: f
     Raises:
         ValueError: Says which bounds.
     """
-    low, high = given
+    try:
+        low, high = map(float, given)
+    except (TypeError, ValueError):
+        low = high = math.nan
     if not lowest <= low <= high <= highest:
-        raise ValueError(f"{name} is a range (low, high) within [{lowest}, {highest}]; got {given}")
+        raise ValueError(f"{name} is a range (low, high) within [{lowest}, {highest}]; got {str(given)[:100]}")
     return low, high
 
 
