@@ -29,7 +29,7 @@ class Setting:
         self.shell = ShellEnergy(self.frame.coarse.faces)
         terms = [Stretch(500.0), Bend(10.0), Volume(1000.0)]
         levels = Levels(self.frame, Mesh.of(bars.faces, bars.keyframes.shape[1]), terms)
-        self.space = PairedSpace(self.frame, levels, self.frame.modes(*(basis.modes for basis in bars.bases[:2])))
+        self.space = PairedSpace(self.frame, levels, [basis.modes for basis in bars.bases[:2]])
         self.pair: Pair = self.frame.place(bars.keyframes[:2], bars.keyframes[1:3])
         half = torch.full((2,), 0.5, dtype=torch.float64)
         each = [torch.full((2, 1), term.stiffness, dtype=torch.float64) for term in terms]

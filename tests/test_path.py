@@ -1,5 +1,6 @@
 """Motion through many key-frames: its laws, its gradients, and how close it comes to known motions."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from itertools import pairwise
@@ -180,6 +181,18 @@ def test_velocities_are_continuous(path: Path, motion: Shapes) -> None:
         return largest(right - left)
 
     assert jump(path) < 0.02 * jump(pair)
+
+
+def test_velocities_are_continuous_where_edges_change(bars: Shapes) -> None:
+    """Both sides of a key-frame fit vertices to edges by the same weights."""
+    x, key, h = bars.keyframes.clone(), times(1.0), 1e-5
+    x[1] *= 1 + 0.5 * torch.sin(3 * x[1][:, :1])
+    bases = [dataclasses.replace(basis, reference=shape) for basis, shape in zip(bars.bases, x, strict=True)]
+    jumps = [
+        largest((course(x, key + h) + course(x, key - h) - 2 * x[1]) / h)
+        for course in (Path(bases, bars.faces, smooth=smooth) for smooth in (True, False))
+    ]
+    assert jumps[0] < 1e-4 * jumps[1]
 
 
 def test_what_rests_between_equal_keyframes_does_not_move(bars: Shapes) -> None:

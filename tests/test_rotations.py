@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
-from torch_modal.nn.blend import RotationBlend
+from torch_modal.nn.blend import Blends, RotationBlend
 from torch_modal.nn.mid_shape import MidShape
 
 T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
@@ -86,6 +86,33 @@ def test_blend_is_the_shape_of_these_edges(degrees: int) -> None:
     for piece in (slice(0, len(x_a)), slice(len(x_a), -1), slice(-1, None)):
         centre = 0.5 * (first + second)[piece].mean(0)
         torch.testing.assert_close(found[piece].mean(0), centre, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_pairs_share_a_blend_where_no_tree_would_tell_another_sense(
+    fused: bool, small_bars: Shapes, generator: torch.Generator
+) -> None:
+    if fused:
+        pytest.importorskip("warp")
+    # Torn to pieces: neighbours turn any way, so that it matters which of them are compared.
+    x = small_bars.keyframes
+    torn = x[:1] + 0.5 * torch.randn(x[:1].shape, dtype=x.dtype, generator=generator)
+    mesh, shapes = Connectivity(small_bars.faces.numpy()), torch.cat([x, torn])
+    blends = Blends(mesh, shapes, (0, 1), fused)
+    shared, own = blends.of(0, 1), blends.of(2, 3)
+    assert blends.of(1, 2) is shared and blends.of(2, 0) is shared
+    assert own is not shared and own.poisson is shared.poisson
+    alone = RotationBlend(mesh, shapes[2:], fused)
+    assert torch.equal(own.rotations.ancestors, alone.rotations.ancestors)
+    assert not torch.equal(own.rotations.ancestors, shared.rotations.ancestors)
+
+
+def test_a_tree_of_another_pair_tells_the_way_round() -> None:
+    (x, faces), half, whole = ribbon(0.0), ribbon(math.radians(130))[0], ribbon(math.radians(300))[0]
+    mesh = Connectivity(faces.numpy())
+    blend = Blends(mesh, torch.stack([x, half, whole]), (0, 1)).of(0, 2)
+    found = blend(x[None], whole[None], T[2:3])[0]
+    torch.testing.assert_close(edges(found, mesh), edges(ribbon(math.radians(150))[0], mesh), rtol=0, atol=1e-9)
 
 
 def test_pieces_that_share_a_vertex_stay_together() -> None:

@@ -1,5 +1,6 @@
 """Between two shapes by local rotations: every triangle turns at constant speed."""
 
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -52,7 +53,8 @@ class LocalRotations(nn.Module):
 
     Args:
         mesh: The connectivity.
-        references: Two shapes near the key-frames, for the tree and the weights. *Shape:* ``(2, V, 3)``.
+        references: Shapes near the key-frames, two or more: the tree is that of the turns between the first two, and
+            avoids what is a sliver in any. *Shape:* ``(K, V, 3)``.
     """
 
     faces: Tensor
@@ -60,14 +62,14 @@ class LocalRotations(nn.Module):
     side_signs: Tensor
     ancestors: Tensor
     piece: Tensor
-    per_length: Tensor
 
     def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__()
-        faces, (first, second) = torch.tensor(mesh.faces), torch.tensor(mesh.edges).unbind(1)
-        lengths = (references[:, second] - references[:, first]).norm(dim=-1).mean(0)
-        a, b = (_frames(x[None], faces) for x in references)
-        parents, piece = self._tree(a, b, mesh)
+        faces = torch.tensor(mesh.faces)
+        a, b = (_frames(x[None], faces) for x in references[:2])
+        others = (_frames(x[None], faces).slenderness for x in references[2:])
+        slenderness = reduce(torch.minimum, [a.slenderness, b.slenderness, *others]).squeeze(0)
+        parents, piece = self._tree(_turn_between(a, b).squeeze(1), slenderness, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
@@ -77,16 +79,13 @@ class LocalRotations(nn.Module):
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
-        #: The weight of each edge where edge vectors are fitted. *Shape:* ``(E,)``.
-        self.register_buffer("per_length", 1 / lengths.clamp_min(SHORTEST * lengths.mean()), persistent=False)
+        self.n_edges = len(mesh.edges)
 
     @staticmethod
-    def _tree(a: Frames, b: Frames, mesh: Connectivity) -> tuple[Tensor, Tensor]:
-        """The parent of each triangle, and its piece. *Shape:* ``(F,)`` each."""
+    def _tree(turns: Tensor, slenderness: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
+        """The parent of each triangle, and its piece. *Shape:* ``(4, F), (F,) -> (F,)`` each."""
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
-        turns = _turn_between(a, b).squeeze(1)
         alike = (pick(turns, one) * pick(turns, other)).sum(0).abs().clamp_max(1)
-        slenderness = torch.minimum(a.slenderness, b.slenderness).squeeze(0)
         slenderness = torch.minimum(pick(slenderness, one), pick(slenderness, other))
         costs = 2 * torch.arccos(alike) + SLIVER / slenderness.clamp_min(SLIVER / 1e3)
         parents, piece = spanning_forest(len(mesh.faces), mesh.face_neighbours, costs.numpy())
@@ -179,7 +178,11 @@ class LocalRotations(nn.Module):
 
     def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
         """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""
-        return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, len(self.per_length))
+        return edge_means(wanted, areas.repeat(1, 3), self.sides, self.side_signs, self.n_edges)
+
+    def turns(self, first: Tensor, second: Tensor) -> Tensor:
+        """Quaternions of triangles, whose signs tell the way round. *Shape:* ``(B, V, 3), (B, V, 3) -> (4, B, F)``."""
+        return self._sensed(_frames(first, self.faces), _frames(second, self.faces))
 
     def _sensed(self, a: Frames, b: Frames) -> Tensor:
         """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""
@@ -195,6 +198,13 @@ class LocalRotations(nn.Module):
         # Of both senses of a whole piece, the one in which most of it turns by less than half a turn.
         vote = torch.zeros_like(areas).index_add(1, self.piece, areas * signs * quaternions[0])
         return torch.where(pick(vote, self.piece) < 0, -signs, signs)
+
+
+def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
+    """Of edges where edge vectors are fitted: one over their mean lengths. *Shape:* ``(K, V, 3) -> (E,)``."""
+    first, second = torch.tensor(mesh.edges).unbind(1)
+    lengths = reduce(torch.add, ((x[second] - x[first]).norm(dim=-1) for x in references)) / len(references)
+    return 1 / lengths.clamp_min(SHORTEST * lengths.mean())
 
 
 def _turn_between(a: Frames, b: Frames) -> Tensor:

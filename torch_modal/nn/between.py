@@ -13,7 +13,7 @@ from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.vectors import cross, pick
 from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
-from torch_modal.nn.blend import RotationBlend
+from torch_modal.nn.blend import Blends
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.joint import JointSpace
@@ -69,13 +69,18 @@ class Shared(NamedTuple):
     """Of the vertices in alignments, so that a motion through several has one course. *Shape:* ``(V,)``."""
     collapses: Callable[..., Collapsing]
     """Those of pairs of references, by their places."""
+    blends: Blends
+    """Shapes by local rotations, likewise."""
 
     @classmethod
-    def of(cls, mesh: Mesh, shapes: Tensor, terms: Sequence[Term], solver: Solver) -> "Shared":
-        """Of these terms and the references of all bases, float64 on the CPU. *Shape:* ``(K, V, 3)``."""
+    def of(
+        cls, mesh: Mesh, shapes: Tensor, pairs: Sequence[tuple[int, int]], terms: Sequence[Term], solver: Solver
+    ) -> "Shared":
+        """Of these terms and pairs of the references of all bases, float64 on the CPU. *Shape:* ``(K, V, 3)``."""
         energy = Energy(mesh, terms)
         fused = FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None
-        return cls(energy, fused, mean_areas(shapes, mesh.faces), shared_collapses(mesh.faces))
+        blends = Blends(mesh.connectivity, shapes, pairs[0], has_kernels(solver.backend))
+        return cls(energy, fused, mean_areas(shapes, mesh.faces), shared_collapses(mesh.faces), blends)
 
 
 class Between(nn.Module):
@@ -116,9 +121,7 @@ class Between(nn.Module):
         if objective.space == "joint":
             ends = self.frame.place(*shapes[:, None])
             references = torch.cat([ends.first, ends.second])
-            blend = None
-            if objective.base == "rotations":
-                blend = RotationBlend(mesh.connectivity, references, has_kernels(solver.backend))
+            blend = shared.blends.of(*places) if objective.base == "rotations" else None
             self.space: Any = JointSpace(self.frame, levels, modes, references, blend)
         else:
             self.space = PairedSpace(self.frame, levels(), modes)

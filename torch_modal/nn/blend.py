@@ -1,5 +1,6 @@
 """A shape between two key-frames by local rotations, with every vertex free: what the modes then improve."""
 
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -7,9 +8,10 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.functions import applied, traced
-from torch_modal.geometry.local_rotations import Course, LocalRotations
+from torch_modal.geometry.local_rotations import Course, LocalRotations, weights_per_length
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.sparse import SparseSolver
+from torch_modal.geometry.vectors import pick
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_rotations import FusedRotations
 from torch_modal.nn.launch import kernels, launch
@@ -23,16 +25,22 @@ class RotationBlend(nn.Module):
 
     Args:
         mesh: The connectivity.
-        references: Two shapes near the key-frames. *Shape:* ``(2, V, 3)``.
+        references: Shapes near the key-frames, as for :class:`LocalRotations`. *Shape:* ``(K, V, 3)``.
         fused: Whether the edges come from kernels.
+        poisson: The system, where others share it. Default: that of the mean edge lengths of the references.
     """
 
     ends: Tensor
 
-    def __init__(self, mesh: Connectivity, references: Tensor, fused: bool = False) -> None:
+    def __init__(
+        self, mesh: Connectivity, references: Tensor, fused: bool = False, poisson: Poisson | None = None
+    ) -> None:
         super().__init__()
         self.rotations = (FusedRotations if fused else LocalRotations)(mesh, references)
-        self.poisson = Poisson(mesh, self.rotations.per_length, solver=FusedSolver if fused else SparseSolver)
+        if poisson is None:
+            weights = weights_per_length(mesh, references)
+            poisson = Poisson(mesh, weights, solver=FusedSolver if fused else SparseSolver)
+        self.poisson = poisson
         self.fused = fused
         self.register_buffer("ends", self.poisson.edges.int(), persistent=False)
 
@@ -61,6 +69,44 @@ class RotationBlend(nn.Module):
             return self.poisson(edges, rows).movedim(0, -1)
         right = applied(_Pulls, self.ends, self.poisson.weights, edges.movedim(0, -1), near.shape[1])
         return self.poisson.placed(right.movedim(-1, 0), rows).movedim(0, -1)
+
+
+class Blends:
+    """The blends of pairs of shapes. One Poisson system serves all, so that velocities go on where two of them meet.
+
+    So does the tree of the first pair, wherever turns have the same senses by every tree: where neighbours have the
+    same one by this. Other pairs have one of their own.
+
+    Args:
+        mesh: The connectivity.
+        shapes: All of them, float64 on the CPU. *Shape:* ``(K, V, 3)``.
+        first: The pair whose tree others share, if they can.
+        fused: Whether the edges come from kernels.
+    """
+
+    def __init__(self, mesh: Connectivity, shapes: Tensor, first: tuple[int, int], fused: bool = False) -> None:
+        self.mesh, self.shapes, self.fused = mesh, shapes, fused
+        self._pair = first
+
+    @cached_property
+    def first(self) -> RotationBlend:
+        """That of the first pair."""
+        others = [k for k in range(len(self.shapes)) if k not in self._pair]
+        return RotationBlend(self.mesh, self.shapes[[*self._pair, *others]], self.fused)
+
+    def of(self, i: int, j: int) -> RotationBlend:
+        """That of two of the shapes; several have the same."""
+        if (i, j) == self._pair or self._is_plain(i, j):
+            return self.first
+        return RotationBlend(self.mesh, self.shapes[[i, j]], self.fused, self.first.poisson)
+
+    def _is_plain(self, i: int, j: int) -> bool:
+        """Whether neighbours have the same sense by the first tree, as they then have by every other."""
+        rotations = self.first.rotations
+        pair = self.shapes[[i, j]].to(rotations.piece.device)
+        turns = rotations.turns(pair[:1], pair[1:])[:, 0]
+        one, other = torch.tensor(self.mesh.face_neighbours, device=turns.device).unbind(1)
+        return bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
 
 
 class FusedSolver(SparseSolver):

@@ -1,6 +1,7 @@
 """Between the caller's coordinates and the frame in which an in-between is sought."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -53,29 +54,103 @@ class Pair(NamedTuple):
     """What the neighbours in time say, where the course is to be smooth."""
 
 
+class Directions(NamedTuple):
+    """Displacements of the fine vertices, as they were given."""
+
+    given: Tensor
+    """*Shape:* ``(m, V, 3)``."""
+    turn: Tensor | None = None
+    """What turns them into the frame. *Shape:* ``(3, 3)``."""
+
+    def turned(self, x: Tensor) -> Tensor:
+        """Vectors of the given coordinates in those of the frame. *Shape:* ``(..., 3)``."""
+        return x if self.turn is None else x @ self.turn.mT
+
+
+# Names of what columns are combined from.
+_PARTS = ("_mix", "_given", "_turn")
+
+
 class Columns(nn.Module):
     """The same directions on the fine and on the coarse mesh.
 
+    On the fine mesh they are combinations of others, which several pairs have, and which are as large: so they are
+    written out only where somebody asks for them.
+
     Args:
-        fine: *Shape:* ``(n, V, 3)``.
+        mixes: Combinations of directions, whose sum the columns are. *Shape of each:* ``(n, m)``.
+        parts: These directions.
         coarse: Orthonormal under the coarse vertex weights. *Shape:* ``(n, V_coarse, 3)``.
         weights: Of the coarse vertices. *Shape:* ``(V_coarse,)``.
     """
 
-    fine: Tensor
     coarse: Tensor
     weighted: Tensor
+    _fine: Tensor | None
 
-    def __init__(self, fine: Tensor, coarse: Tensor, weights: Tensor) -> None:
+    def __init__(self, mixes: Sequence[Tensor], parts: Sequence[Directions], coarse: Tensor, weights: Tensor) -> None:
         super().__init__()
-        self.register_buffer("fine", fine, persistent=False)
+        for i, (mix, part) in enumerate(zip(mixes, parts, strict=True)):
+            for name, tensor in zip(_PARTS, (mix, *part), strict=True):
+                self.register_buffer(f"{name}_{i}", tensor, persistent=False)
+        self._n_parts = len(parts)
+        self._shape = [len(coarse), *parts[0].given.shape[1:]]
+        self.register_buffer("_fine", None, persistent=False)
         self.register_buffer("coarse", coarse, persistent=False)
         #: What amplitudes are told by. *Shape:* ``(3 V_coarse, n)``.
         self.register_buffer("weighted", (coarse * weights[:, None]).flatten(1).mT.contiguous(), persistent=False)
 
+    def __len__(self) -> int:
+        """How many."""
+        return self._shape[0]
+
+    @property
+    def fine(self) -> Tensor:
+        """On the fine mesh, kept. *Shape:* ``(n, V, 3)``."""
+        if self._fine is None:
+            with torch.no_grad():
+                self._fine = self.combine(torch.eye(len(self)).to(self.coarse))
+        return self._fine
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Columns":
+        """In a lower precision than they were made in, what their directions have in common would not cancel."""
+        after = fn(self.coarse)
+        if (after.dtype, after.device) != (self.coarse.dtype, self.coarse.device) and self._n_parts:
+            self.fine  # noqa: B018
+            for i, name in itertools.product(range(self._n_parts), _PARTS):
+                delattr(self, f"{name}_{i}")
+            self._n_parts = 0
+        return super()._apply(fn, recurse)
+
     def combine(self, a: Tensor) -> Tensor:
         """Fine displacement of given amplitudes. *Shape:* ``(..., n) -> (..., V, 3)``."""
-        return (a @ self.fine.flatten(1)).unflatten(-1, (-1, 3))
+        rows = a.reshape(-1, len(self))
+        return self.added(a.new_zeros(len(rows), *self._shape[1:]), rows).unflatten(0, a.shape[:-1])
+
+    def added(self, x: Tensor, a: Tensor) -> Tensor:
+        """Fine shapes with that of given amplitudes added. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
+        # Not by what may have been written out since: the same amplitudes give the same bits every time.
+        if not self._n_parts:
+            return torch.addmm(x.flatten(1), a, self.fine.flatten(1)).view_as(x)
+        for mix, part in self._parts():
+            own, given = a @ mix, part.given.flatten(1)
+            if part.turn is None:
+                x = torch.addmm(x.flatten(1), own, given).view_as(x)
+            else:
+                x = torch.addmm(x.flatten(0, 1), (own @ given).view(-1, 3), part.turn.mT).view_as(x)
+        return x
+
+    def at(self, vertices: Tensor) -> Tensor:
+        """Those of some of the vertices. *Shape:* ``(P,) -> (n, P, 3)``."""
+        if not self._n_parts:
+            return self.fine[:, vertices]
+        found = [part.turned(torch.tensordot(mix, part.given[:, vertices], 1)) for mix, part in self._parts()]
+        return torch.stack(found).sum(0)
+
+    def _parts(self) -> Iterator[tuple[Tensor, Directions]]:
+        for i in range(self._n_parts):
+            mix, given, turn = (getattr(self, f"{name}_{i}") for name in _PARTS)
+            yield mix, Directions(given, turn)
 
 
 class Alignment(nn.Module):
@@ -188,7 +263,7 @@ class Coarse(nn.Module):
         fields = _rigid_fields(shapes.mean(0))
         coarse = self.restrict(fields)
         mix = self.orthonormal(coarse)
-        self.rigid = Columns(torch.tensordot(mix, fields, 1), torch.tensordot(mix, coarse, 1), self.weights)
+        self.rigid = Columns([mix], [Directions(fields)], torch.tensordot(mix, coarse, 1), self.weights)
 
     def restrict(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
@@ -258,9 +333,9 @@ class Frame(Alignment):
         """Rigid motions of the shape half-way between the references, to first order."""
         return self.coarse.rigid
 
-    def modes(self, first: Tensor, second: Tensor) -> list[Tensor]:
-        """Modes of both ends, turned into this frame; their scale does not matter. *Shape of each:* ``(k, V, 3)``."""
-        return [first, second @ self.turn.mT]
+    def modes(self, first: Tensor, second: Tensor) -> list[Directions]:
+        """Modes of both ends, in this frame; their scale does not matter. *Shape of each:* ``(k, V, 3)``."""
+        return [Directions(first), Directions(second, self.turn)]
 
     def coarsen(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
@@ -271,27 +346,25 @@ class Frame(Alignment):
         amplitudes = coarse.flatten(-2) @ columns.weighted
         return amplitudes, coarse - (amplitudes @ columns.coarse.flatten(1)).unflatten(-1, (-1, 3))
 
-    def elastic_columns(self, *directions: Tensor) -> Columns:
+    def elastic_columns(self, *directions: Directions) -> Columns:
         """Independent combinations of directions, without rigid motions, orthonormal on the coarse mesh.
 
         The energy does not see translations, and rotations only to second order: left in, they are null directions of
         its Hessian. Modes of two key-frames are partly the same: what is dependent is dropped here, explicitly.
 
         Args:
-            directions: Displacements of the fine vertices, of any scale. *Shape of each:* ``(m, V, 3)``.
+            directions: Of any scale.
 
         Returns:
             No more columns than there are directions.
         """
-        rigid, coarse = self.split(torch.cat([self.coarsen(part) for part in directions]), self.rigid)
+        restricted = torch.cat([part.turned(self.coarsen(part.given)) for part in directions])
+        rigid, coarse = self.split(restricted, self.rigid)
         sizes = torch.linalg.norm(coarse.flatten(1), dim=1)[:, None].clamp_min(torch.finfo(coarse.dtype).tiny)
         mix = self.coarse.orthonormal(coarse / sizes[:, None]) / sizes.T
-        # The fine columns are as large as all modes: nothing else of their size is made.
-        fine = -(mix @ rigid) @ self.rigid.fine.flatten(1)
-        for part, own in zip(directions, mix.split([len(part) for part in directions], 1), strict=True):
-            fine.addmm_(own, part.flatten(1))
-        fine = fine.view(-1, *directions[0].shape[1:])
-        return Columns(fine, torch.tensordot(mix, coarse, 1), self.coarse.weights)
+        mixes = [*mix.split([len(part.given) for part in directions], 1), -(mix @ rigid)]
+        parts = [*directions, Directions(self.rigid.fine)]
+        return Columns(mixes, parts, torch.tensordot(mix, coarse, 1), self.coarse.weights)
 
 
 class _ClusterMeans(torch.autograd.Function):

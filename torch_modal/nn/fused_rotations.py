@@ -44,7 +44,12 @@ class FusedRotations(LocalRotations):
         """The same by torch."""
         return super().forward(first, second, t)
 
-    def turns(self, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
+    def turns(self, first: Tensor, second: Tensor) -> Tensor:
+        """As the other's."""
+        found = self._turned(first.contiguous(), second.contiguous())
+        return (self.sense(*found[:2])[..., None] * found[0]).movedim(-1, 0)
+
+    def _turned(self, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
         """Quaternions, twice both areas and sizes of all triangles. *Shape:* ``(B, F, 4), (B, F), (B, F, 12)``."""
         (b, n), n_faces = first.shape[:2], len(self.faces)
         found = tuple(first.new_empty(shape) for shape in ((b, n_faces, 4), (b, n_faces), (b, n_faces, 12)))
@@ -64,7 +69,7 @@ class FusedRotations(LocalRotations):
 
     def sums(self, turns: tuple[Tensor, ...], sense: Tensor, t: Tensor) -> Tensor:
         """Sides by area, summed on the edges, and areas, where the senses are known. *Shape:* ``(B, E, 4)``."""
-        n_edges = len(self.per_length)
+        n_edges = self.n_edges
         total = t.new_zeros(len(t), n_edges, 4)
         given = [*turns, t, self._edge_of, self._signs.double(), sense, n_edges, total]
         launch(kernels("rotations").part_turned, (len(t), len(self.faces)), given)
@@ -80,7 +85,7 @@ class FusedRotations(LocalRotations):
         return found
 
     def _given(self, sense: Tensor, first: Tensor, second: Tensor, t: Tensor, total: Tensor) -> list[Any]:
-        signs, n, n_edges = self._signs.double(), first.shape[1], len(self.per_length)
+        signs, n, n_edges = self._signs.double(), first.shape[1], self.n_edges
         return [first, second, t, self._face, self._edge_of, signs, sense, n, n_edges, total]
 
     def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
@@ -98,7 +103,7 @@ class FusedRotations(LocalRotations):
 
     def course_edges(self, which: Tensor, packed: Tensor, t: Tensor) -> Tensor:
         """The same by kernels. *Shape:* ``(3, B, E)``."""
-        b, n_edges = len(t), len(self.per_length)
+        b, n_edges = len(t), self.n_edges
         given = [packed, which.int(), t, self._edge_of, self._signs.double(), n_edges, None]
         return _means(*recorded(kernels("rotations").course_edges, (b, len(self.faces)), {6: (b, n_edges, 4)}, *given))
 
@@ -148,7 +153,7 @@ class _Turned(torch.autograd.Function):
     @staticmethod
     def forward(fused: FusedRotations, *given: Tensor) -> tuple[Tensor, ...]:
         first, second, t = (value.detach().contiguous() for value in given)
-        turns = fused.turns(first, second)
+        turns = fused._turned(first, second)
         sense = fused.sense(*turns[:2])
         total = fused.sums(turns, sense, t)
         return _means(total), sense, total

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
-from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.local_rotations import LocalRotations, weights_per_length
 from torch_modal.geometry.vectors import pick
 
 # Directions that move no edge (coincident key-frames) get no amplitude.
@@ -23,6 +23,7 @@ class Guess(nn.Module):
     edges: Tensor
     edge_columns: Tensor
     gram: Tensor
+    per_length: Tensor
 
     def __init__(self, mesh: Mesh, columns: Tensor, references: Tensor) -> None:
         super().__init__()
@@ -30,7 +31,8 @@ class Guess(nn.Module):
         self.register_buffer("edges", mesh.edges, persistent=False)
         vectors = self._vectors(columns).permute(2, 0, 1).flatten(0, 1).contiguous()
         self.register_buffer("edge_columns", vectors, persistent=False)
-        weights = self.rotations.per_length.repeat_interleave(3)[:, None]
+        self.register_buffer("per_length", weights_per_length(mesh.connectivity, references), persistent=False)
+        weights = self.per_length.repeat_interleave(3)[:, None]
         self.register_buffer("gram", vectors.mT @ (vectors * weights), persistent=False)
 
     def forward(self, first: Tensor, second: Tensor, extra: Tensor, t: Tensor) -> Tensor:
@@ -48,7 +50,7 @@ class Guess(nn.Module):
         straight, own = self._vectors(torch.lerp(first, second, t[:, None, None])), self._vectors(extra)
         columns = self.edge_columns
         missing = self.rotations(first, second, t) - straight
-        per_length = self.rotations.per_length
+        per_length = self.per_length
         missing, weighted, own = (x.permute(1, 2, 0).flatten(1) for x in (missing * per_length, own * per_length, own))
         border = weighted @ columns
         upper = torch.cat([self.gram.expand(len(t), -1, -1), border[..., None]], -1)

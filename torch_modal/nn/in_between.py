@@ -98,7 +98,7 @@ class InBetween(nn.Module):
         ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
         mesh = Mesh(connectivity)
         kind = ContactRounds if self.objective.contact else Between
-        shared = Shared.of(mesh, torch.stack(shapes), list(self.terms), self.solver)
+        shared = Shared.of(mesh, torch.stack(shapes), self.pairs, list(self.terms), self.solver)
         made = [
             kind(
                 torch.stack([ends[i][0], ends[j][0]]),

@@ -118,7 +118,7 @@ class JointSpace(nn.Module):
     @property
     def n_unknowns(self) -> int:
         """Number of amplitudes."""
-        return len(self.columns.fine) + 1
+        return len(self.columns) + 1
 
     def problem(
         self, pair: Pair, index: Tensor | None, t: Tensor, stiffness: Stiffness, mu: Tensor, anchors: Tensor | None
@@ -202,11 +202,11 @@ class JointSpace(nn.Module):
 
     def lift(self, a: Tensor, problem: JointProblem) -> Tensor:
         """The fine shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""
-        own, flat = problem.difference, problem.base.flatten(1)
+        own, base = problem.difference, problem.base
         scale = (own.scale * a[:, -1])[:, None]
-        found = torch.addmm(flat, a[:, :-1] - scale * own.modal, self.columns.fine.flatten(1))
-        found = torch.addmm(found, scale * own.rigid, self.frame.rigid.fine.flatten(1), alpha=-1)
-        return torch.addcmul(found, scale, own.whole.flatten(1)).view_as(problem.base)
+        found = self.columns.added(base, a[:, :-1] - scale * own.modal)
+        found = torch.addmm(found.flatten(1), scale * own.rigid, self.frame.rigid.fine.flatten(1), alpha=-1)
+        return torch.addcmul(found, scale, own.whole.flatten(1)).view_as(base)
 
     def _difference(self, pair: Pair, coarse: Tensor) -> tuple[Difference, Tensor]:
         """The difference of the key-frames as a column, and that on the coarse mesh. *Shape:* ``(B, V_coarse, 3)``."""

@@ -61,7 +61,7 @@ class Levels(nn.Module):
             parts = [ModalEnergy(coarse, columns.coarse)]
         else:
             parts = [FusedModalEnergy(self.shell, self.mesh, columns.coarse)]
-        return SumOfEnergies(*parts, *(ModalEnergy(energy, columns.fine[:, energy.vertices]) for energy in sampled))
+        return SumOfEnergies(*parts, *(ModalEnergy(energy, columns.at(energy.vertices)) for energy in sampled))
 
     def seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
         """A fine shape and its coarse one as each energy sees them. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""

@@ -21,7 +21,7 @@ from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
 from torch_modal.keyframes.check import checked_arrays
 from torch_modal.keyframes.times import checked_times
-from torch_modal.nn.blend import RotationBlend
+from torch_modal.nn.blend import Blends, RotationBlend
 from torch_modal.nn.frame import Alignment, Pair, mean_areas, vertex_excess
 
 UNIT = 0.01
@@ -114,6 +114,7 @@ class ModalDecoder(nn.Module):
 
     def _forget(self) -> None:
         self._known: list[Interval | None] = [None] * self.n_intervals
+        self._shared = Blends(self._mesh, self.keyframes.double().cpu(), (0, 1))
         self._blends: list[RotationBlend | None] = [None] * self.n_intervals
         self._made: list[int] = []
 
@@ -132,8 +133,8 @@ class ModalDecoder(nn.Module):
         known = self._blends[i]
         if known is None:
             with torch.no_grad():
-                ends = torch.cat(self._pair(i, self.keyframes)[:2]).double().cpu()
-                known = self._blends[i] = RotationBlend(self._mesh, ends).to(self.keyframes)
+                blend = self._shared.of(i, (i + 1) % len(self.keyframes))
+                known = self._blends[i] = blend.to(self.keyframes)
             self._made.append(i)
             while len(self._made) > max(2, KEPT // self.keyframes.shape[1]):
                 oldest = self._made.pop(0)
@@ -151,8 +152,9 @@ class ModalDecoder(nn.Module):
         return len(self.columns)
 
     def _apply(self, *args: object, **kwargs: object) -> "ModalDecoder":
+        moved = super()._apply(*args, **kwargs)  # type: ignore[arg-type]
         self._forget()
-        return super()._apply(*args, **kwargs)  # type: ignore[arg-type]
+        return moved
 
     def forward(
         self, amplitudes: Tensor, t: Tensor | float, motions: Tensor | None = None, keyframes: Tensor | None = None

@@ -55,7 +55,7 @@ class PairedEnergy(nn.Module):
     def __init__(self, energies: Sequence[SumOfEnergies], ends: Sequence[Columns], used: Tensor) -> None:
         super().__init__()
         self.first, self.second = energies
-        self.n_first = len(ends[0].fine)
+        self.n_first = len(ends[0])
         gap = (torch.cat([ends[0].fine, -ends[1].fine]) * used[:, None]).flatten(1)
         self.register_buffer("gap", gap, persistent=False)
         self.register_buffer("gap_gram", gap @ gap.mT, persistent=False)

@@ -395,7 +395,7 @@ class _Coupled:
         member = self.member
         columns = member.space.columns
         inner, contact = member.space.energy.parts[0], held.modal(member.mesh, columns.fine)
-        n, j = len(columns.fine), self.basis.shape[1]
+        n, j = len(columns), self.basis.shape[1]
         weighted = (columns.fine * self.area[:, None]).flatten(1)
         gram = weighted @ columns.fine.flatten(1).T
         for _ in range(MODAL_STEPS):
