@@ -13,7 +13,9 @@ from conftest import random_rotation
 import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample, sample_files
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import nearest_on_triangles
+from torch_modal.geometry.crossings import Crossings
 
 pytest.importorskip("ipctk")
 
@@ -54,6 +56,36 @@ def test_pairs_are_those_of_a_slow_search(generator: torch.Generator) -> None:
     found = tm.self_contacts(x, faces)
     assert {tuple(pair) for pair in found.pairs.tolist()} == wanted
     assert bool(found.new.all()) and bool(found.far.all())  # of two pieces: nothing leads from one to the other
+
+
+@pytest.mark.parametrize("n_faces", [1, 2, 3, 20, 500])
+def test_kernels_find_the_boxes_that_overlap(n_faces: int, generator: torch.Generator) -> None:
+    pytest.importorskip("warp")
+    from torch_modal.nn import fused_crossings
+
+    corners = torch.stack([torch.randperm(n_faces + 3, generator=generator)[:3] for _ in range(n_faces)]).numpy()
+    mesh = Connectivity(corners, n_faces + 3)
+    first, x = torch.rand(2, n_faces + 3, 3, dtype=torch.float64, generator=generator).numpy()
+    lower, upper = x[mesh.faces].min(1), x[mesh.faces].max(1)
+    overlap = ((lower[:, None] <= upper) & (upper[:, None] >= lower)).all(-1)
+    overlap &= ~(mesh.faces[:, None, :, None] == mesh.faces[None, :, None, :]).any((2, 3))
+    wanted = {(int(f), int(g)) for f, g in np.argwhere(overlap) if f < g}
+    assert n_faces < 500 or len(wanted) > fused_crossings.ROOM  # which has to be made larger
+    found = fused_crossings.FusedBroadPhase(mesh, first[None])(x)
+    assert len(found) == len(wanted) and {tuple(pair) for pair in np.sort(found, 1).tolist()} == wanted
+
+
+def test_searches_agree_whatever_the_broad_phase() -> None:
+    pytest.importorskip("warp")
+    from torch_modal.nn.fused_crossings import FusedBroadPhase
+
+    sample = load_sample("hand")
+    mesh, x = Connectivity(sample.faces.numpy(), sample.keyframes.shape[1]), sample.keyframes.numpy()
+    kernels = Crossings(mesh, x, broad_phase=FusedBroadPhase(mesh, x))
+    middle = x.mean(0)  # as linear interpolation has it, which flattens fingers
+    found = kernels.pairs(middle)
+    assert len(found) > 20
+    np.testing.assert_array_equal(found, Crossings(mesh, x).pairs(middle))
 
 
 def test_pairs_do_not_depend_on_pose_and_size(generator: torch.Generator) -> None:

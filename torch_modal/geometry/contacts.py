@@ -121,8 +121,7 @@ class Search:
         crossings = self.crossings
         found = np.zeros((crossings.mesh.n_vertices, len(crossings.known)))
         alone = Search(Crossings(crossings.mesh, crossings.known[:0], crossings.like))
-        for k, x in enumerate(crossings.known):
-            pairs = crossings.pairs(x)
+        for k, (x, pairs) in enumerate(zip(crossings.known, crossings.pairs_of_known, strict=True)):
             deep = alone.depth(x, pairs[crossings.far_apart(pairs)])
             own = np.flatnonzero(deep)
             patch = connected_components(crossings.adjacency[own][:, own], directed=False)[1]

@@ -4,6 +4,7 @@ Pairs come from a broad phase of ``ipctk`` and a test of an edge against a face;
 are the extra ``contact`` and are imported when they are first needed.
 """
 
+from collections.abc import Callable
 from functools import cached_property
 from itertools import chain
 from operator import attrgetter
@@ -69,10 +70,19 @@ class Crossings:
         mesh: The connectivity.
         known: Shapes whose own crossings are tolerated. *Shape:* ``(K, V, 3)``.
         like: The shape whose lengths say what is far along the surface. Default: the first of ``known``.
+        broad_phase: Finds the pairs of faces without a common vertex whose boxes overlap. *Shape:*
+            ``(V, 3) -> (P, 2)``. Default: that of ``ipctk``.
     """
 
-    def __init__(self, mesh: Connectivity, known: FloatArray, like: FloatArray | None = None) -> None:
+    def __init__(
+        self,
+        mesh: Connectivity,
+        known: FloatArray,
+        like: FloatArray | None = None,
+        broad_phase: Callable[[FloatArray], IntArray] | None = None,
+    ) -> None:
         self.mesh, self.known = mesh, known
+        self.broad_phase = broad_phase or self._overlapping
         self.like = known[0] if like is None else like
         used = self.like[np.unique(mesh.faces)]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
@@ -113,10 +123,14 @@ class Crossings:
         return (half + half.T).tocsr()
 
     @cached_property
+    def pairs_of_known(self) -> list[IntArray]:
+        """Pairs that cross in each of the known shapes. *Shape of each:* ``(P, 2)``."""
+        return [self.pairs(x) for x in self.known]
+
+    @cached_property
     def known_pairs(self) -> IntArray:
         """Pairs that cross in any of the known shapes. *Shape:* ``(P, 2)``."""
-        found = [self.pairs(x) for x in self.known]
-        return np.unique(np.concatenate([*found, np.zeros((0, 2), np.int64)]), axis=0)
+        return np.unique(np.concatenate([*self.pairs_of_known, np.zeros((0, 2), np.int64)]), axis=0)
 
     @cached_property
     def _around_known(self) -> sparse.csr_matrix | None:
@@ -152,6 +166,12 @@ class Crossings:
         Returns:
             *Shape:* ``(P, 2)``.
         """
+        candidates = self.broad_phase(x)
+        one, other = (x[self.mesh.faces[side]] for side in candidates.T)
+        crossing = candidates[pierces(one, other) | pierces(other, one)]
+        return np.unique(np.sort(crossing, axis=1), axis=0)
+
+    def _overlapping(self, x: FloatArray) -> IntArray:
         tree = require("ipctk").LBVH()
         # Scaled and centred: the library's boxes are of single precision.
         centred = np.asfortranarray((x - self.like.mean(0)) / self.diagonal)
@@ -160,10 +180,7 @@ class Crossings:
         found = map(_FACES, tree.detect_face_face_candidates())
         candidates = np.fromiter(chain.from_iterable(found), np.int64).reshape(-1, 2)
         corners = self.mesh.faces[candidates]
-        candidates = candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
-        one, other = (centred[self.mesh.faces[side]] for side in candidates.T)
-        crossing = candidates[pierces(one, other) | pierces(other, one)]
-        return np.unique(np.sort(crossing, axis=1), axis=0)
+        return candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
 
     def far_pairs(self, x: FloatArray) -> IntArray:
         """Those of :meth:`pairs` that are far, by :meth:`is_far`. *Shape:* ``(V, 3) -> (P, 2)``."""

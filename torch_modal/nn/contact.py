@@ -1,7 +1,7 @@
 """Contacts of a batch of in-betweens: what is held in each, as a term of the modal solve and of the fine steps."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from torch_modal.energy.contact import GAP, STIFFNESS, Contact
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.contacts import Search
-from torch_modal.geometry.crossings import Crossings
+from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
 from torch_modal.nn.modal_energy import ModalEnergy, Placement
 
 ROUNDS = 4
@@ -110,6 +110,7 @@ class ContactSearch:
         acceleration: The largest that a vertex may have in the course that the samples are of; the time between the
             key-frames is the unit.
         free: Whether the course starts at the first key-frame, and ends at the second.
+        broad_phase: As for :class:`~torch_modal.geometry.crossings.Crossings`.
     """
 
     def __init__(
@@ -121,9 +122,10 @@ class ContactSearch:
         t: Tensor,
         acceleration: float = math.inf,
         free: tuple[bool, bool] = (True, True),
+        broad_phase: Callable[[FloatArray], IntArray] | None = None,
     ) -> None:
         known = torch.stack([first, second], 1).detach().double().cpu().numpy()
-        self.searches = [Search(Crossings(mesh.connectivity, both)) for both in known]
+        self.searches = [Search(Crossings(mesh.connectivity, both, broad_phase=broad_phase)) for both in known]
         self.which = list(range(len(t))) if which is None else which.tolist()
         self.faces = mesh.faces
         self.areas = torch.stack([_areas(x.detach(), mesh.faces) for x in first])

@@ -18,7 +18,7 @@ from torch_modal.extras import require_installed, uncollected
 from torch_modal.progress import ProgressReport
 
 Backend = Literal["auto", "torch", "warp"]
-Module = Literal["alignment", "shell", "modal", "steps", "steps_adjoint", "rotations"]
+Module = Literal["alignment", "shell", "modal", "steps", "steps_adjoint", "rotations", "crossings"]
 IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps")
 """What in-betweens need that record no gradient."""
 

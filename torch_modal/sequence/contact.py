@@ -155,7 +155,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     start = frame.bring(shapes, trees.picked(pair, samples.which), t)
     limit = _limit(member, samples, pair, shapes, start)
     free = samples.before is None, samples.after is None
-    search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t, limit.most, free)
+    search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t, limit.most, free, member.broad_phase)
     every = -(-len(t) // LOOKED_AT)
     few = range(every - 1, len(t), every)
     if next(search.crossing(start, few), None) is None:

@@ -1,0 +1,91 @@
+"""Faces whose boxes overlap: a tree of boxes against itself."""
+
+import warp as wp
+
+from torch_modal.nn.kernels.elements import place, vec3
+
+
+@wp.func
+def overlap(lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3), i: int, j: int) -> bool:
+    low = lower[place(i, 0)]
+    high = upper[place(i, 0)]
+    other_low = lower[place(j, 0)]
+    other_high = upper[place(j, 0)]
+    return (
+        low[0] <= other_high[0]
+        and low[1] <= other_high[1]
+        and low[2] <= other_high[2]
+        and high[0] >= other_low[0]
+        and high[1] >= other_low[1]
+        and high[2] >= other_low[2]
+    )
+
+
+@wp.func
+def meet(a: wp.vec3i, b: wp.vec3i):
+    """Whether two faces have a common vertex."""
+    one = a[0] == b[0] or a[0] == b[1] or a[0] == b[2]
+    other = a[1] == b[0] or a[1] == b[1] or a[1] == b[2]
+    return one or other or a[2] == b[0] or a[2] == b[1] or a[2] == b[2]
+
+
+@wp.kernel(enable_backward=False)
+def overlapping(
+    x: wp.array(dtype=vec3),
+    corners: wp.array(dtype=wp.vec3i),
+    n: int,
+    lower: wp.array(dtype=vec3),
+    upper: wp.array(dtype=vec3),
+    stack: wp.array(dtype=wp.vec2i),
+    room: int,
+    pairs: wp.array(dtype=wp.vec2i),
+    number: wp.array(dtype=int),
+):
+    """Pairs of faces without a common vertex whose boxes overlap, as many as there is room for, and their number.
+
+    Node ``i`` has the nodes ``2 i`` and ``2 i + 1`` below it, and the last ``n`` are the faces. One thread goes down
+    from the root, with the two nodes of each pair on the same level, or one above.
+    """
+    start = wp.tid()
+    for f in range(start, n):
+        face = corners[place(f, 0)]
+        a = x[place(face[0], 0)]
+        b = x[place(face[1], 0)]
+        c = x[place(face[2], 0)]
+        lower[place(n, f)] = wp.min(a, wp.min(b, c))
+        upper[place(n, f)] = wp.max(a, wp.max(b, c))
+    for above in range(1, n):
+        node = n - above
+        lower[place(node, 0)] = wp.min(lower[place(node, node)], lower[place(node, node + 1)])
+        upper[place(node, 0)] = wp.max(upper[place(node, node)], upper[place(node, node + 1)])
+    count = start
+    depth = start + 1
+    stack[0] = wp.vec2i(1, 1)
+    while depth > 0:
+        depth -= 1
+        both = stack[place(depth, 0)]
+        i = both[0]
+        j = both[1]
+        if i == j:
+            if i < n:
+                one = 2 * i
+                stack[place(depth, 0)] = wp.vec2i(one, one)
+                stack[place(depth, 1)] = wp.vec2i(one + 1, one + 1)
+                depth += 2
+                if overlap(lower, upper, one, one + 1):
+                    stack[place(depth, 0)] = wp.vec2i(one, one + 1)
+                    depth += 1
+        else:
+            # The smaller number is never farther down.
+            split = wp.min(i, j)
+            other = wp.max(i, j)
+            if split < n:
+                for k in range(2):
+                    if overlap(lower, upper, 2 * split + k, other):
+                        stack[place(depth, 0)] = wp.vec2i(2 * split + k, other)
+                        depth += 1
+            elif not meet(corners[place(i, -n)], corners[place(j, -n)]):
+                if count < room:
+                    pairs[place(count, 0)] = wp.vec2i(i - n, j - n)
+                count += 1
+    number[start] = count
