@@ -220,6 +220,7 @@ class TestRotations:
         truth = rotations.oracle(*given)
         assert float(truth[0].min()) < -0.5 / (n - 1), "nothing turns by more than 90 degrees half-way"
         torch.testing.assert_close(rotations(*given), truth, rtol=0, atol=1e-12)
+        assert_alike(gradients(rotations, given), gradients(rotations.oracle, given), 1e-9)
 
     def test_the_same_shape(self, rotations: FusedRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes[:1]

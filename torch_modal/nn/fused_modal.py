@@ -11,7 +11,7 @@ from torch_modal.geometry.functions import applied, made_outside, traced, transf
 from torch_modal.nn import trees
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellReference
-from torch_modal.nn.launch import kernels, launch, pulled_back
+from torch_modal.nn.launch import kernels, launch
 from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
 
 # Columns that a kernel takes at a time.
@@ -39,10 +39,9 @@ class _Referred(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         given = ctx.saved_tensors
         if torch.is_grad_enabled():
-            run = ctx.shell.reference_by_torch
-        else:
-            run, given = ctx.shell.reference, [value.detach().contiguous() for value in given]
-        return (None, *pulled_back(lambda *given: tuple(run(*given)), given, grads, ctx.needs_input_grad[1:]))
+            return (None, *torch.func.vjp(lambda *given: tuple(ctx.shell.reference_by_torch(*given)), *given)[1](grads))
+        received = ShellReference(*(grad.contiguous() for grad in grads))
+        return (None, *ctx.shell.from_reference(received, *(value.detach().contiguous() for value in given)))
 
     @staticmethod
     def vmap(
@@ -232,16 +231,16 @@ class FusedModalEnergy(ModalEnergy):
         if plain is not None:
             pulled = super().pull_back(a.to(plain.base), direction.to(plain.base), plain)
             return self._repacked(pulled, placement)
-        given, skeleton = trees.leaves(placement), trees.skeleton(placement)
-
-        def slope(*values: Tensor) -> Tensor:
-            base, extra, reference = trees.filled(skeleton, values)
-            moved = self._shapes(direction, torch.zeros_like(base), extra)
-            return (moved * self.shell.gradient(self._shapes(a, base, extra), reference)).sum((-1, -2))
-
-        found = pulled_back(slope, given, torch.ones_like(to.constant), [True] * len(given))
-        pairs = zip(found, given, strict=True)
-        return trees.filled(skeleton, [torch.zeros_like(x) if to_x is None else to_x for to_x, x in pairs])  # type: ignore[no-any-return]
+        base, extra, shell = placement.base, placement.extra, self.shell
+        x, moved = self._shapes(a, base, extra), self._shapes(direction, torch.zeros_like(base), extra)
+        at = shell.at(x, to)
+        to_base, to_reference = torch.zeros_like(x), ShellReference(*(torch.zeros_like(value) for value in to))
+        shell.from_point(x, at, to, moved, to_base, to_reference)
+        to_extra = None
+        if extra is not None:
+            own = torch.addcmul(at.gradient, at.moment[:, None, None], at.normal)
+            to_extra = a[:, -1, None, None] * to_base + direction[:, -1, None, None] * own
+        return Placement(to_base, to_extra, to_reference)  # type: ignore[arg-type]
 
     def _repacked(self, found: Placement, placement: Placement) -> Placement:
         """Gradients in a placement for torch as those in the one for kernels that it was made of."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_modal.geometry.functions import applied, traced
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellPoint, ShellReference
-from torch_modal.nn.launch import kernels, launch, pulled_back
+from torch_modal.nn.launch import kernels, launch
 from torch_modal.nn.relax import STEP_LENGTHS, relax
 
 
@@ -86,7 +86,7 @@ class FusedRelax(FusedShell):
             solution, reached = done.solution, done.reached
             if kept is not None:
                 # Detached: the last one's is what is returned, which must not be kept by its own node.
-                kept.append(_Taken(x, at, done._replace(reached=reached.detach())))
+                kept.append(_Taken(x, to, at, done._replace(reached=reached.detach())))
             # The whole step, linearised at once for the next one, is nearly always the one that is taken.
             if k < n_steps - 1:
                 there = self.at(reached, to)
@@ -178,34 +178,25 @@ class FusedRelax(FusedShell):
             needed: Which of all these need a gradient.
             kept: What :meth:`steps` kept; if nothing, they are taken once more.
         """
-        with torch.enable_grad():
-            leaves = [value.detach().requires_grad_(need) for value, need in zip(rest, needed[1:], strict=True)]
-            recorded = self.reference(*leaves)
-        to = ShellReference(*(value.detach() for value in recorded))
+        to = kept[0].to if kept else self.reference(*rest)
         for length in [] if kept else lengths:
             at = self.at(x, to)
-            kept = [*kept, _Taken(x, at, self.solved(x, at, to, n_products, keep=True))]
+            kept = [*kept, _Taken(x, to, at, self.solved(x, at, to, n_products, keep=True))]
             x = x + length[:, None, None] * kept[-1].done.solution
         to_reference = ShellReference(*(torch.zeros_like(value) for value in to))
         for length, taken in zip(lengths.flip(0), reversed(kept), strict=True):
-            to_x = self._step_back(taken, to, to_x, length, to_reference)
-        wanted = [leaf for leaf in leaves if leaf.requires_grad]
-        if wanted:
-            both = [pair for pair in zip(recorded, to_reference, strict=True) if pair[0].requires_grad]
-            outputs, received = zip(*both, strict=True)
-            found = iter(torch.autograd.grad(outputs, wanted, received))
-        return to_x, *(next(found) if leaf.requires_grad else None for leaf in leaves)
+            to_x = self._step_back(taken, to_x, length, to_reference)
+        return to_x, *(self.from_reference(to_reference, *rest) if any(needed[1:]) else [None] * len(rest))
 
     def _step_back(
         self,
         taken: "_Taken",
-        to: ShellReference,
         to_reached: Tensor,
         length: Tensor,
         to_reference: ShellReference,
     ) -> Tensor:
         """The gradient where a step started, of that where it led; what the reference receives is added to its own."""
-        x, at, done = taken
+        x, to, at, done = taken
         module, shell, (b, n) = kernels("steps_adjoint"), kernels("shell"), x.shape[:2]
         vertices, records = (b, n), (b, len(self.record))
         residuals, directions, products = (part.unbind() for part in done.kept)
@@ -239,26 +230,11 @@ class FusedRelax(FusedShell):
         to_edges, to_hinges = torch.empty_like(at.edges), torch.empty_like(at.hinges)
         given = [done.kept[1], fields, self.record, at.edges, at.hinges, n, b, n_products, to_edges, to_hinges]
         launch(module.back_to_elements, records, given)
+        to_x = to_reached.clone()
         # The right side is the gradient's opposite.
-        to_gradient = -to_residual
-        to_moment = (to_gradient * normal).sum((1, 2))
-        to_volume = stiffness * to_moment
-        to_normal = torch.addcmul(to_normal, at.moment[:, None, None], to_gradient)
-        if not self.closed:  # the adjoint of shared()
-            to_normal = to_normal - self.mean(to_normal)[:, None]
-        to_x, centre = to_reached.clone(), self.centre(x)
-        to_centre = None if centre is None else torch.zeros_like(centre)
-        given = [x, self.record, to.stretch, to.bend, centre, self.walls, n, at.energy, at.gradient, at.diagonal]
-        given += [at.edges, at.hinges, torch.empty_like(to_volume), to_direction]  # outputs may be written once more
-        adjoints = [to_x, None, to_reference.stretch, to_reference.bend, to_centre, None, None]
-        adjoints += [torch.zeros_like(at.energy), to_gradient, to_diagonal, to_edges, to_hinges, to_volume, to_normal]
-        launch(shell.linearise, (b, len(self.record) + len(self.walls)), given, adjoints)
-        if to_centre is not None:
-            share = to_centre[:, None] / len(self.used)
-            to_x.index_add_(1, self.used, share.expand(-1, len(self.used), -1))
-        off = torch.where(stiffness > 0, at.moment / torch.where(stiffness > 0, stiffness, 1), 0)
-        to_reference.stiffness.add_(to_moment * off + (done.scalars[1, :-1] * backs[2]).sum(0))
-        to_reference.volume.sub_(to_volume)
+        others = to_diagonal, to_edges, to_hinges
+        self.from_point(x, at, to, -to_residual, to_x, to_reference, others, to_normal)
+        to_reference.stiffness.add_((done.scalars[1, :-1] * backs[2]).sum(0))
         return to_x
 
 
@@ -288,6 +264,8 @@ class _Taken(NamedTuple):
 
     x: Tensor
     """Where it started. *Shape:* ``(B, V, 3)``."""
+    to: ShellReference
+    """What is compared with."""
     at: ShellPoint
     """The energy there, its diagonal inverted."""
     done: _Iterations
@@ -311,12 +289,13 @@ class _Relaxed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, to_shape: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         lengths, *given = ctx.saved_tensors
-        needed = ctx.needs_input_grad[4:]
         if torch.is_grad_enabled():  # torch differentiates its own code once more
             run = partial(ctx.fused.oracle, ctx.n_steps, ctx.n_products)
-            return (None,) * 4 + pulled_back(run, given, to_shape, needed)
+            return (None,) * 4 + torch.func.vjp(run, *given)[1](to_shape)
         given = [lengths, to_shape.contiguous(), *(value.detach().contiguous() for value in given)]
-        return (None,) * 4 + ctx.fused.pull_back(ctx.n_products, *given, needed=needed, kept=ctx.kept or [])
+        return (None,) * 4 + ctx.fused.pull_back(
+            ctx.n_products, *given, needed=ctx.needs_input_grad[4:], kept=ctx.kept or []
+        )
 
     @staticmethod
     def vmap(

@@ -1,6 +1,5 @@
 """Local rotations by kernels of NVIDIA Warp, where that is installed; torch's are what they are tested against."""
 
-from functools import partial
 from typing import Any
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor
 from torch_modal.geometry.functions import applied, traced
 from torch_modal.geometry.local_rotations import Course, LocalRotations
 from torch_modal.nn.adjoint import flattened
-from torch_modal.nn.launch import kernels, launch, pulled_back, recorded
+from torch_modal.nn.launch import kernels, launch
 
 
 class FusedRotations(LocalRotations):
@@ -75,37 +74,42 @@ class FusedRotations(LocalRotations):
         launch(kernels("rotations").part_turned, (len(t), len(self.faces)), given)
         return total
 
-    def pull_back(self, to_total: Tensor, total: Tensor, sense: Tensor, *given: Tensor) -> list[Tensor]:
-        """Gradients in both shapes and the times, of that in the sums, which are spoilt."""
-        found = [torch.zeros_like(value) for value in given]
-        adjoints = [*found, *[None] * 6, to_total]
-        first, second, t = given
-        taken = self._given(sense, first, second, t, total)
-        launch(kernels("rotations").turned_edges, (len(sense), len(self.faces)), taken, adjoints)
+    def from_sums(self, to_total: Tensor, sense: Tensor, first: Tensor, second: Tensor, t: Tensor) -> list[Tensor]:
+        """Gradients in both shapes and the times, of that in the sums."""
+        found = [torch.zeros_like(value) for value in (first, second, t)]
+        given = [first, second, t, self._face, self._edge_of, self._signs.double(), sense, first.shape[1]]
+        given += [self.n_edges, to_total, *found]
+        launch(kernels("rotations_adjoint").from_turned, (len(sense), len(self.faces)), given)
         return found
-
-    def _given(self, sense: Tensor, first: Tensor, second: Tensor, t: Tensor, total: Tensor) -> list[Any]:
-        signs, n, n_edges = self._signs.double(), first.shape[1], self.n_edges
-        return [first, second, t, self._face, self._edge_of, signs, sense, n, n_edges, total]
 
     def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
         """As the other's."""
         if traced(t):
             return super().along(course, which, t)
         packed = torch.cat([part if part.dim() > 2 else part[None] for part in course])
-        edges = applied(_OnCourse, self, packed.movedim(0, -1).double(), which, t.double())
-        return edges.to(course.unit)
+        return applied(_OnCourse, self, packed.movedim(0, -1).double(), which, t.double())[0].to(course.unit)
 
     def course_oracle(self, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
         """Edges on a packed course, by torch. *Shape:* ``(P, F, 31)``."""
         parts = packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6, 1])
         return super().along(Course._make([*parts[:-1], parts[-1][0]]), which, t)
 
-    def course_edges(self, which: Tensor, packed: Tensor, t: Tensor) -> Tensor:
-        """The same by kernels. *Shape:* ``(3, B, E)``."""
-        b, n_edges = len(t), self.n_edges
-        given = [packed, which.int(), t, self._edge_of, self._signs.double(), n_edges, None]
-        return _means(*recorded(kernels("rotations").course_edges, (b, len(self.faces)), {6: (b, n_edges, 4)}, *given))
+    def course_sums(self, which: Tensor, packed: Tensor, t: Tensor) -> Tensor:
+        """Sides on courses by area, summed on the edges, and areas. *Shape:* ``(B, E, 4)``."""
+        total = t.new_zeros(len(t), self.n_edges, 4)
+        launch(kernels("rotations").course_edges, (len(t), len(self.faces)), self._on_course(packed, which, t, total))
+        return total
+
+    def from_course_sums(self, to_total: Tensor, total: Tensor, which: Tensor, *given: Tensor) -> list[Tensor]:
+        """Gradients in courses and times, of that in the sums, both of which are spoilt."""
+        found = [torch.zeros_like(value) for value in given]
+        adjoints = [found[0], None, found[1], *[None] * 3, to_total]
+        taken = self._on_course(given[0], which, given[1], total)
+        launch(kernels("rotations").course_edges, (len(which), len(self.faces)), taken, adjoints)
+        return found
+
+    def _on_course(self, packed: Tensor, which: Tensor, t: Tensor, total: Tensor) -> list[Any]:
+        return [packed, which.int(), t, self._edge_of, self._signs.double(), self.n_edges, total]
 
 
 def _means(total: Tensor) -> Tensor:
@@ -113,38 +117,52 @@ def _means(total: Tensor) -> Tensor:
     return (total[..., :3] / total[..., 3:].clamp_min(torch.finfo(total.dtype).tiny)).movedim(-1, 0)
 
 
+def _to_sums(total: Tensor, to_means: Tensor) -> Tensor:
+    """Back through :func:`_means`. *Shape:* ``(B, E, 4), (3, B, E) -> (B, E, 4)``."""
+    sums, weights = total.split([3, 1], -1)
+    tiny = torch.finfo(total.dtype).tiny
+    to_sums = to_means.movedim(0, -1) / weights.clamp_min(tiny)
+    to_weights = (sums * to_sums).sum(-1, keepdim=True) / weights.clamp_min(tiny)
+    return torch.cat([to_sums, torch.where(weights >= tiny, -to_weights, 0)], -1)
+
+
 class _OnCourse(torch.autograd.Function):
-    @staticmethod
-    def forward(fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
-        return fused.course_edges(which, packed.detach().contiguous(), t.detach().contiguous())
+    """Edges, and what the way back needs: the sums."""
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def forward(fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        total = fused.course_sums(which, packed.detach().contiguous(), t.detach().contiguous())
+        return _means(total), total
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
         ctx.fused, *given = inputs
-        ctx.save_for_backward(*given)
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1], *given)
 
     @staticmethod
-    def backward(ctx: Any, to_edges: Tensor) -> tuple[Tensor | None, ...]:
-        packed, which, t = ctx.saved_tensors
+    def backward(ctx: Any, to_edges: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        total, packed, which, t = ctx.saved_tensors
         if torch.is_grad_enabled():
-            given, run = [packed, t], lambda packed, t: ctx.fused.course_oracle(packed, which, t)
+            back = torch.func.vjp(lambda packed, t: ctx.fused.course_oracle(packed, which, t), packed, t)[1]
+            to_packed, to_t = back(to_edges)
         else:
-            given, run = [packed.contiguous(), t.contiguous()], partial(ctx.fused.course_edges, which)
-        to_packed, to_t = pulled_back(run, given, to_edges, [ctx.needs_input_grad[1], ctx.needs_input_grad[3]])
+            given = packed.detach().contiguous(), t.detach().contiguous()
+            to_packed, to_t = ctx.fused.from_course_sums(_to_sums(total, to_edges), total.clone(), which, *given)
         return None, to_packed, None, to_t
 
     @staticmethod
     def vmap(
         info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor
-    ) -> tuple[Tensor, int]:
+    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
         n = info.batch_size
         packed, which, t = (
             x.expand(n, *x.shape) if dim is None else x.movedim(dim, 0)
             for x, dim in zip((packed, which, t), in_dims[1:], strict=True)
         )
         which = which + packed.shape[1] * torch.arange(n, device=which.device)[:, None]
-        out = _OnCourse.apply(fused, packed.flatten(0, 1), which.flatten(), t.flatten())
-        return out.unflatten(1, (n, -1)), 1
+        edges, total = _OnCourse.apply(fused, packed.flatten(0, 1), which.flatten(), t.flatten())
+        return (edges.unflatten(1, (n, -1)), total.unflatten(0, (n, -1))), (1, 0)
 
 
 class _Turned(torch.autograd.Function):
@@ -168,10 +186,9 @@ class _Turned(torch.autograd.Function):
     def backward(ctx: Any, to_edges: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         sense, total, *given = ctx.saved_tensors
         if torch.is_grad_enabled():
-            return (None, *pulled_back(ctx.fused.oracle, given, to_edges, ctx.needs_input_grad[1:]))
-        (to_total,) = pulled_back(_means, [total], to_edges, [True])
+            return (None, *torch.func.vjp(ctx.fused.oracle, *given)[1](to_edges))
         given = [value.detach().contiguous() for value in given]
-        return (None, *ctx.fused.pull_back(to_total.contiguous(), total.clone(), sense, *given))
+        return (None, *ctx.fused.from_sums(_to_sums(total, to_edges), sense, *given))
 
     @staticmethod
     def vmap(

@@ -4,6 +4,8 @@ Each kernel does in one pass over the elements what torch does in dozens. The to
 tested against, what runs where Warp is not, and what differentiates a gradient once more.
 """
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -11,7 +13,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
-from torch_modal.nn.launch import Backend, Shapes, has_kernels, kernels, launch, recorded
+from torch_modal.nn.launch import Backend, has_kernels, kernels, launch
 
 
 class ShellReference(NamedTuple):
@@ -92,7 +94,7 @@ class FusedShell(nn.Module):
 
     # ---------------------------------------------------------------------------------------------------- the reference
     def reference(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
-        """What shapes are compared with; recorded where gradients are.
+        """What shapes are compared with.
 
         Args:
             first: Rest shapes of the weight ``1 - t``. *Shape:* ``(B, V, 3)``.
@@ -100,17 +102,44 @@ class FusedShell(nn.Module):
             t: *Shape:* ``(B,)``.
             stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
-        module, (b, n), n_edges = kernels("shell"), first.shape[:2], len(self.record)
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
-        found = self.sizes(first, second)
-        shapes: Shapes = {6: (b, 2), 7: (b, 2), 8: (b,), 9: (b,), 10: (b,)}
-        given: list[Any] = [t, gamma, *found, n_edges, *[None] * 5]
-        pull, shortest, whole, volume, apart = recorded(module.weigh, (b,), shapes, *given, written=tuple(shapes))
-        given = [first, second, self.record, self.hinge, pull, shortest, alpha, beta]
-        given += [n, alpha.shape[-1], beta.shape[-1], None, None, None]
-        shapes = {11: (b, n_edges, 2), 12: (b, n_edges, 4), 13: (b,)}
-        stretch, bend, constant = self._run(module.rest, shapes, given, written=(11, 12))
-        return ShellReference(stretch, bend, whole, volume, constant + apart)
+        pull, shortest, whole, volume, apart = self._weighed(t, gamma, self.sizes(first, second))
+        (b, n), n_edges = first.shape[:2], len(self.record)
+        stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 4)
+        given = [first, second, self.record, self.hinge, pull, shortest, alpha, beta, n, alpha.shape[-1]]
+        launch(kernels("shell").rest, (b, n_edges), [*given, beta.shape[-1], stretch, bend, apart])
+        return ShellReference(stretch, bend, whole, volume, apart)
+
+    def _weighed(self, t: Tensor, gamma: Tensor, sizes: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Pulls and shortest lengths of both ends, *shape* ``(B, 2)``; of volumes stiffness, value, constant."""
+        found = (*t.new_empty(2, len(t), 2).unbind(), *t.new_empty(3, len(t)).unbind())
+        launch(kernels("shell").weigh, (len(t),), [t, gamma, *sizes, len(self.record), *found])
+        return found
+
+    def from_reference(
+        self, received: ShellReference, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Gradients in all that :meth:`reference` takes, of that in what it finds but for the constant."""
+        (b, n), n_edges = first.shape[:2], len(self.record)
+        alpha, beta, gamma = (value.contiguous() for value in stiffness)
+        sizes = self.sizes(first, second)
+        weighed = self._weighed(t, gamma, sizes)
+        to_volumes, to_areas, to_pull = t.new_zeros(3, b, 2)
+        to_t, to_gamma, to_constant = t.new_zeros(3, b)
+        adjoints = [to_t, to_gamma, None, to_volumes, to_areas, None, to_pull, None]
+        adjoints += [received.stiffness.clone(), received.volume.clone(), to_constant]
+        launch(kernels("shell").weigh, (b,), [t, gamma, *sizes, n_edges, *weighed], adjoints)
+        to_first, to_second = torch.zeros(2, *first.shape, dtype=first.dtype, device=first.device)
+        to_alpha, to_beta = torch.zeros_like(alpha), torch.zeros_like(beta)
+        centres = (None, None) if self.closed else first.new_zeros(2, b, 3).unbind()
+        given: list[Any] = [first, second, self.centre(first), self.centre(second), self.record, self.hinge, self.walls]
+        given += [*weighed[:2], alpha, beta, n, alpha.shape[-1], beta.shape[-1], received.stretch, received.bend]
+        given += [to_volumes, to_areas, to_first, to_second, *centres, to_pull, to_alpha, to_beta]
+        launch(kernels("shell_adjoint").from_reference, (b, n_edges + len(self.walls)), given)
+        for found, centre in zip((to_first, to_second), centres, strict=True):
+            self._spread(centre, found)
+        to_t += to_pull[:, 1] - to_pull[:, 0]
+        return to_first, to_second, to_t, to_alpha, to_beta, to_gamma[:, None]
 
     def reference_by_torch(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
         """The same by torch."""
@@ -144,9 +173,10 @@ class FusedShell(nn.Module):
         return self._sizes(first, second, self.record[:0])[1]
 
     def _sizes(self, first: Tensor, second: Tensor, record: Tensor) -> tuple[Tensor, ...]:
-        given = [first, second, self.centre(first), self.centre(second), record, self.walls, self.n_vertices]
-        shapes: Shapes = dict.fromkeys((7, 8, 9), (len(first), 2))
-        return self._run(kernels("shell").sizes, shapes, [*given, None, None, None], len(record) + len(self.walls))
+        found = first.new_zeros(3, len(first), 2).unbind()
+        given = [first, second, self.centre(first), self.centre(second), record, self.walls, self.n_vertices, *found]
+        launch(kernels("shell").sizes, (len(first), len(record) + len(self.walls)), given)
+        return found
 
     def centre(self, x: Tensor) -> Tensor | None:
         """What volumes are relative to: the mean; None, any vertex, where it does not matter. *Shape:* ``(B, 3)``."""
@@ -156,8 +186,14 @@ class FusedShell(nn.Module):
         """Of all vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
         return x.mean(1) if len(self.used) == self.n_vertices else x[:, self.used].mean(1)
 
+    def _spread(self, to_centre: Tensor | None, to_x: Tensor) -> None:
+        """Add what shapes receive of the centre. *Shape:* ``(B, 3), (B, V, 3)``."""
+        if to_centre is not None:
+            share = to_centre[:, None] / len(self.used)
+            to_x.index_add_(1, self.used, share.expand(-1, len(self.used), -1))
+
     def volume(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The volume about the centre, and its gradient; not recorded. *Shape:* ``(B,), (B, V, 3)``."""
+        """The volume about the centre, and its gradient. *Shape:* ``(B,), (B, V, 3)``."""
         total, normal = x.new_zeros(len(x)), torch.zeros_like(x)
         given = [x, self.centre(x), self.walls, self.n_vertices, total, normal]
         launch(kernels("shell").volume, (len(x), len(self.walls)), given)
@@ -173,29 +209,63 @@ class FusedShell(nn.Module):
         share = normal.sum(1, keepdim=True) / len(self.used)
         return normal.index_add(1, self.used, -share.expand(-1, len(self.used), -1))
 
-    def _run(
-        self, kernel: Any, shapes: Shapes, given: list[Any], n: int | None = None, written: tuple[int, ...] = ()
-    ) -> tuple[Tensor, ...]:
-        n_samples = next(iter(shapes.values()))[0]
-        return recorded(kernel, (n_samples, len(self.record) if n is None else n), shapes, *given, written=written)
-
     def at(self, x: Tensor, to: ShellReference) -> ShellPoint:
-        """Value and derivatives but for the constant; recorded where gradients are. *Shape:* ``(B, V, 3)``."""
-        b, e = len(x), len(self.record)
-        shapes: Shapes = {7: (b,), 8: tuple(x.shape), 9: (*x.shape[:2], 6), 10: (b, e, 5), 11: (b, e, 10)}
-        shapes |= {12: (b,), 13: tuple(x.shape)}
-        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, self.n_vertices, *[None] * 7]
-        found = self._run(kernels("shell").linearise, shapes, given, e + len(self.walls), written=(10, 11))
-        energy, gradient, diagonal, edges, hinges, volume, normal = found
+        """Value and derivatives but for the constant. *Shape:* ``(B, V, 3)``."""
+        (b, n), n_edges = x.shape[:2], len(self.record)
+        # What starts as zeros lies together.
+        energy, volume, gradient, normal, diagonal = _parts(x, (b,), (b,), (b, n, 3), (b, n, 3), (b, n, 6))
+        edges, hinges = x.new_empty(b, n_edges, 5), x.new_empty(b, n_edges, 10)
+        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, n]
+        given += [energy, gradient, diagonal, edges, hinges, volume, normal]
+        launch(kernels("shell").linearise, (b, n_edges + len(self.walls)), given)
         off = volume - to.volume
         moment = to.stiffness * off
         energy = torch.addcmul(energy, moment, off, value=0.5)
         return ShellPoint(energy, gradient, diagonal, edges, hinges, self.shared(normal), moment)
 
+    def from_point(
+        self,
+        x: Tensor,
+        at: ShellPoint,
+        to: ShellReference,
+        to_gradient: Tensor,
+        to_x: Tensor,
+        to_reference: ShellReference,
+        others: Sequence[Tensor | None] = (None, None, None),
+        to_normal: Tensor | None = None,
+    ) -> None:
+        """Add what shapes and references receive of what :meth:`at` finds.
+
+        Args:
+            x: The shapes. *Shape:* ``(B, V, 3)``.
+            at: What is found there; its diagonal, edges and hinges are not looked at.
+            to: The references.
+            to_gradient: In the whole gradient, with the volume's part. *Shape:* ``(B, V, 3)``.
+            to_x: Is added to. *Shape:* ``(B, V, 3)``.
+            to_reference: Is added to.
+            others: In the diagonal, the edges and the hinges.
+            to_normal: In the volume's gradient beyond that. *Shape:* ``(B, V, 3)``.
+        """
+        to_moment = (to_gradient * at.normal).sum((1, 2))
+        to_volume = to.stiffness * to_moment
+        own = at.moment[:, None, None] * to_gradient
+        to_normal = own if to_normal is None else own.add_(to_normal)
+        if not self.closed:  # the adjoint of shared()
+            to_normal = to_normal - self.mean(to_normal)[:, None]
+        centre = self.centre(x)
+        to_centre = None if centre is None else torch.zeros_like(centre)
+        given = [x, self.record, to.stretch, to.bend, centre, self.walls, self.n_vertices, to_gradient, *others]
+        given += [to_volume, to_normal, to_x, to_reference.stretch, to_reference.bend, to_centre]
+        launch(kernels("shell_adjoint").from_point, (len(x), len(self.record) + len(self.walls)), given)
+        self._spread(to_centre, to_x)
+        off = torch.where(to.stiffness > 0, at.moment / torch.where(to.stiffness > 0, to.stiffness, 1), 0)
+        to_reference.stiffness.add_(to_moment * off)
+        to_reference.volume.sub_(to_volume)
+
     def gradient(self, x: Tensor, to: ShellReference) -> Tensor:
-        """The gradient; recorded where gradients are. *Shape:* ``(B, V, 3)``."""
+        """The gradient. *Shape:* ``(B, V, 3)``."""
         at = self.at(x, to)
-        return at.gradient + at.moment[:, None, None] * at.normal
+        return torch.addcmul(at.gradient, at.moment[:, None, None], at.normal)
 
     def value(self, x: Tensor, to: ShellReference) -> Tensor:
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
@@ -210,3 +280,10 @@ class FusedShell(nn.Module):
     @staticmethod
     def _of_volume(volume: Tensor, to: ShellReference) -> Tensor:
         return 0.5 * to.stiffness * (volume - to.volume) ** 2
+
+
+def _parts(like: Tensor, *shapes: tuple[int, ...]) -> tuple[Tensor, ...]:
+    """Tensors of zeros, one after the other in memory."""
+    sizes = [math.prod(shape) for shape in shapes]
+    parts = like.new_zeros(sum(sizes)).split(sizes)
+    return tuple(part.view(shape) for part, shape in zip(parts, shapes, strict=True))

@@ -12,13 +12,22 @@ from functools import cache
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from torch_modal.extras import require_installed, uncollected
 from torch_modal.progress import ProgressReport
 
 Backend = Literal["auto", "torch", "warp"]
-Module = Literal["alignment", "shell", "modal", "steps", "steps_adjoint", "rotations", "crossings"]
+Module = Literal[
+    "alignment",
+    "shell",
+    "shell_adjoint",
+    "modal",
+    "steps",
+    "steps_adjoint",
+    "rotations",
+    "rotations_adjoint",
+    "crossings",
+]
 IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps")
 """What in-betweens need that record no gradient."""
 
@@ -210,82 +219,3 @@ def _stream(device: torch.device) -> Any:
     import warp as wp
 
     return wp.stream_from_torch(torch.cuda.current_stream(device))
-
-
-Shapes = dict[int, tuple[int, ...]]
-"""Of the arguments of a kernel that are its output, by their places."""
-
-
-def recorded(
-    kernel: Any, dim: tuple[int, ...], shapes: Shapes, *given: Any, written: tuple[int, ...] = ()
-) -> tuple[Tensor, ...]:
-    """Run a kernel whose outputs start as zeros and are added to, so that autograd can go back through it.
-
-    Args:
-        kernel: Of :func:`kernels`.
-        dim: As for :func:`launch`.
-        shapes: Of the outputs.
-        given: What it takes, tensors contiguous; anything in the places of the outputs.
-        written: The outputs whose entries are all written, so that it does not matter what they start as.
-
-    Returns:
-        The outputs.
-    """
-    if torch.is_grad_enabled():
-        return _Recorded.apply(kernel, dim, shapes, written, *given)
-    return tuple(_launched(kernel, dim, shapes, written, given)[0].values())
-
-
-def _launched(
-    kernel: Any, dim: tuple[int, ...], shapes: Shapes, written: tuple[int, ...], given: Sequence[Any]
-) -> tuple[dict[int, Tensor], list[Any]]:
-    """The outputs by their places, and all arguments."""
-    like = next(value for value in given if isinstance(value, Tensor) and value.is_floating_point())
-    outputs = {
-        place: like.new_empty(shape) if place in written else like.new_zeros(shape) for place, shape in shapes.items()
-    }
-    whole = [outputs.get(place, value) for place, value in enumerate(given)]
-    launch(kernel, dim, whole)
-    return outputs, whole
-
-
-class _Recorded(torch.autograd.Function):
-    """With the adjoint that Warp derives."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, kernel: Any, dim: tuple[int, ...], shapes: Shapes, written: tuple[int, ...], *given: Any
-    ) -> tuple[Tensor, ...]:
-        outputs, whole = _launched(kernel, dim, shapes, written, given)
-        # Detached: an output whose own node keeps it would never be freed.
-        kept = [value.detach() if isinstance(value, Tensor) else value for value in whole]
-        ctx.kernel, ctx.dim, ctx.places, ctx.whole = kernel, dim, list(shapes), kept
-        return tuple(outputs.values())
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
-        received = dict(zip(ctx.places, (grad.contiguous() for grad in grads), strict=True))
-        adjoints: list[Any] = []
-        for place, value in enumerate(ctx.whole):
-            if place in received:
-                adjoints.append(received[place].clone())
-            elif isinstance(value, Tensor) and value.is_floating_point():
-                adjoints.append(torch.zeros_like(value))
-            else:
-                adjoints.append(None)
-        launch(ctx.kernel, ctx.dim, ctx.whole, adjoints)
-        return (None,) * 4 + tuple(None if place in received else own for place, own in enumerate(adjoints))
-
-
-def pulled_back(run: Any, given: Sequence[Tensor], to_output: Any, needed: Sequence[bool]) -> tuple[Any, ...]:
-    """Gradients of a function of tensors, of one output or a tuple of them, in those that need one."""
-    if torch.is_grad_enabled():  # gradients of gradients, or a transform of torch.func
-        return torch.func.vjp(run, *given)[1](to_output)
-    with torch.enable_grad():
-        leaves = [value.detach().requires_grad_(need) for value, need in zip(given, needed, strict=True)]
-        wanted = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
-        outputs = run(*leaves)
-        pairs = [(outputs, to_output)] if isinstance(outputs, Tensor) else zip(outputs, to_output, strict=True)
-        reached, gradients = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
-        found = iter(torch.autograd.grad(reached, wanted, gradients, allow_unused=True))
-    return tuple(next(found) if need else None for need in needed)

@@ -205,49 +205,6 @@ def turned(q: vec4, v: vec3):
     return rotated(q[0], vec3(q[1], q[2], q[3]), v)
 
 
-@wp.kernel
-def turned_edges(
-    first: wp.array(dtype=vec3),
-    second: wp.array(dtype=vec3),
-    time: wp.array(dtype=real),
-    faces: wp.array(dtype=wp.vec3i),
-    sides: wp.array(dtype=wp.vec3i),
-    signs: wp.array(dtype=vec3),
-    sense: wp.array(dtype=real),
-    n: int,
-    n_edges: int,
-    total: wp.array(dtype=vec4),
-    threads: int,
-):
-    """Sides of all triangles at their times, summed on the edges by area, and the areas."""
-    i = wp.tid()
-    s = i // threads
-    v = s * n
-    t = time[s]
-    for k in range(i - s * threads, faces.shape[0], threads):
-        f = faces[place(k, 0)]
-        p = place(v, f[0])
-        q = place(v, f[1])
-        r = place(v, f[2])
-        a = triangle(first[p], first[q], first[r])
-        b = triangle(second[p], second[q], second[r])
-        turn = about(t * half_turn(sense[place(s * faces.shape[0], k)] * quaternion(a, b)))
-        x = a.length + t * (b.length - a.length)
-        y = a.along + t * (b.along - a.along)
-        z = a.height + t * (b.height - a.height)
-        one = turned(turn, x * a.e1)
-        two = turned(turn, y * a.e1 + z * a.e2)
-        add_sides(
-            total,
-            s * n_edges,
-            sides[place(k, 0)],
-            signs[place(k, 0)],
-            a.length * a.height + b.length * b.height,
-            one,
-            two,
-        )
-
-
 @wp.kernel(enable_backward=False)
 def part_turned(
     quaternions: wp.array(dtype=vec4),
@@ -261,7 +218,7 @@ def part_turned(
     total: wp.array(dtype=vec4),
     threads: int,
 ):
-    """As :func:`turned_edges`, of turns that are known."""
+    """Sides of all triangles at their times, summed on the edges by area, and the areas, of turns that are known."""
     i = wp.tid()
     s = i // threads
     t = time[s]

@@ -30,7 +30,7 @@ SLACKNESS = wp.constant(real(SLACK))
 
 
 # ----------------------------------------------------------------------------------------------------------- references
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def sizes(
     first: wp.array(dtype=vec3),
     second: wp.array(dtype=vec3),
@@ -119,7 +119,7 @@ def bend_weight(e: vec3, n1: vec3, n2: vec3):
     return base / wp.max(area, base / RATIO)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def rest(
     first: wp.array(dtype=vec3),
     second: wp.array(dtype=vec3),
@@ -288,7 +288,7 @@ def volume(
     wp.atomic_add(total, s, found / real(6.0))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def linearise(
     x: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
