@@ -7,7 +7,8 @@ from conftest import Shapes, random_rotation
 from torch import Tensor
 
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.nn.frame import Directions, Frame, Pair
+from torch_modal.nn.columns import Directions
+from torch_modal.nn.frame import Frame, Pair
 from torch_modal.precompute.coarsening import coarsen
 
 

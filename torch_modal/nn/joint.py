@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch_modal.geometry.hermite import beyond
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
-from torch_modal.nn.frame import Columns, Frame, Pair, vertex_excess
+from torch_modal.nn.columns import Columns
+from torch_modal.nn.frame import Frame, Pair, vertex_excess
 from torch_modal.nn.guess import Guess
 from torch_modal.nn.levels import Levels, Stiffness
 from torch_modal.nn.modal_energy import Placement, SumOfEnergies

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch_modal.energy.energy import Energy, OnMesh, Reference, Rest
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.nn import trees
-from torch_modal.nn.frame import Columns, Frame
+from torch_modal.nn.columns import Columns
+from torch_modal.nn.frame import Frame
 from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
 from torch_modal.nn.fused_shell import FusedShell
 from torch_modal.nn.launch import Backend

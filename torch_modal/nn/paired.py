@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.nn import trees
-from torch_modal.nn.frame import Columns, Frame, Pair
+from torch_modal.nn.columns import Columns
+from torch_modal.nn.frame import Frame, Pair
 from torch_modal.nn.levels import Levels, Stiffness
 from torch_modal.nn.modal_energy import Derivatives, Placement, SumOfEnergies
 
