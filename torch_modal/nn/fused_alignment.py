@@ -1,12 +1,17 @@
 """What :class:`torch_modal.nn.frame.Alignment` does, by kernels of NVIDIA Warp, where no gradient is recorded."""
 
+import math
+
 import torch
 from torch import Tensor
 
 from torch_modal.geometry.functions import traced, transformed
-from torch_modal.geometry.rigid import RigidMotion, best_rotation, centroid
+from torch_modal.geometry.rigid import RigidMotion
 from torch_modal.nn.frame import Alignment, Pair
-from torch_modal.nn.launch import kernels, launch
+from torch_modal.nn.launch import kernels, launch, zeros
+
+# Of Jacobi's rotations of a 4 x 4 matrix: the last ones change nothing.
+N_SWEEPS = 8
 
 
 def serves(*given: Tensor) -> bool:
@@ -27,30 +32,26 @@ def place(frame: Alignment, x_a: Tensor, x_b: Tensor) -> tuple[Pair, Tensor] | N
         The pair, and the sizes of the smaller of both ends, *shape* ``(B,)``; None where something is not finite.
     """
     module, (b, n) = kernels("alignment"), x_a.shape[:2]
-    x_a, x_b, weights, scale = x_a.contiguous(), x_b.contiguous(), frame.weights, frame.scale
-    centres = x_a.new_zeros(2, b, 3)
-    launch(module.moments, (b, n), [x_a, x_b, weights, n, *centres])
-    first_centre, second_centre = centres = centres / weights.sum()
-    covariances = x_a.new_zeros(b, 2, 3, 3)
-    given = [x_a, x_b, frame.reference, weights, first_centre, second_centre, n, covariances]
-    launch(module.covariances, (b, n), given)
+    x_a, x_b, weights, reference = x_a.contiguous(), x_b.contiguous(), frame.weights, frame.reference
+    sums, total, covariances = zeros(x_a, (b, 3, 3), (b,), (b, 2, 3, 3))
+    launch(module.moments, (b, n), [x_a, x_b, reference, weights, n, sums, total])
+    launch(module.covariances, (b, n), [x_a, x_b, reference, weights, sums, total, n, covariances])
     # What is not finite anywhere is not finite here.
-    if not bool(covariances.sum().isfinite()):
+    if not math.isfinite(covariances.sum()):
         return None
-    turn, back = best_rotation(covariances).unbind(1)
-    target = centroid(frame.reference, weights).expand(b, 3).contiguous()
-    out = torch.empty(2, *x_a.shape, dtype=x_a.dtype, device=x_a.device)
-    reach = x_a.new_full((2, 2, b, 3), torch.inf)
-    reach[0] *= -1
-    unturned = turn @ back
-    both = (x_a, first_centre, turn), (x_b, second_centre, unturned)
-    for k, (x, centre, rotation) in enumerate(both):
-        given = [x, centre, (scale * rotation).contiguous(), target, n, out[k], reach[0, k], reach[1, k]]
-        launch(module.carried, (b, n), given)
-    apart = scale * (turn @ (second_centre - first_centre)[..., None]).squeeze(-1)
-    between = RigidMotion(turn @ (unturned).mT, target, target + apart)
-    placed = RigidMotion(turn, first_centre, target / scale)
-    return Pair(out[0], out[1], placed, between), (reach[0] - reach[1]).norm(dim=-1).amin(0)
+    turn, between = x_a.new_empty(2, b, 3, 3).unbind()
+    rotations, vectors = x_a.new_empty(2, b, 3, 3).unbind(), x_a.new_empty(9, b, 3)
+    centres, targets, highest, lowest = vectors.split([2, 3, 2, 2])
+    given = [covariances, sums, total, frame.scale.reshape(1), b, N_SWEEPS, turn, between, rotations[0]]
+    launch(module.aligned, (b,), [*given, centres, targets, highest, lowest])
+    first, second = torch.empty(2, *x_a.shape, dtype=x_a.dtype, device=x_a.device).unbind()
+    source, end, own_end = targets.unbind()
+    both = (x_a, first), (x_b, second)
+    each = zip(both, centres.unbind(), rotations, highest.unbind(), lowest.unbind(), strict=True)
+    for (x, moved), centre, rotation, *reach in each:
+        launch(module.carried, (b, n), [x, centre, rotation, source, n, moved, *reach])
+    motions = RigidMotion(turn, centres[0], own_end), RigidMotion(between, source, end)
+    return Pair(first, second, *motions), (highest - lowest).norm(dim=-1).amin(0)
 
 
 def restore(frame: Alignment, x: Tensor, pair: Pair, t: Tensor) -> Tensor:

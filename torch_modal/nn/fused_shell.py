@@ -4,7 +4,6 @@ Each kernel does in one pass over the elements what torch does in dozens. The to
 tested against, what runs where Warp is not, and what differentiates a gradient once more.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
-from torch_modal.nn.launch import Backend, has_kernels, kernels, launch
+from torch_modal.nn.launch import Backend, has_kernels, kernels, launch, zeros
 
 
 class ShellReference(NamedTuple):
@@ -213,7 +212,7 @@ class FusedShell(nn.Module):
         """Value and derivatives but for the constant. *Shape:* ``(B, V, 3)``."""
         (b, n), n_edges = x.shape[:2], len(self.record)
         # What starts as zeros lies together.
-        energy, volume, gradient, normal, diagonal = _parts(x, (b,), (b,), (b, n, 3), (b, n, 3), (b, n, 6))
+        energy, volume, gradient, normal, diagonal = zeros(x, (b,), (b,), (b, n, 3), (b, n, 3), (b, n, 6))
         edges, hinges = x.new_empty(b, n_edges, 5), x.new_empty(b, n_edges, 10)
         given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, n]
         given += [energy, gradient, diagonal, edges, hinges, volume, normal]
@@ -280,10 +279,3 @@ class FusedShell(nn.Module):
     @staticmethod
     def _of_volume(volume: Tensor, to: ShellReference) -> Tensor:
         return 0.5 * to.stiffness * (volume - to.volume) ** 2
-
-
-def _parts(like: Tensor, *shapes: tuple[int, ...]) -> tuple[Tensor, ...]:
-    """Tensors of zeros, one after the other in memory."""
-    sizes = [math.prod(shape) for shape in shapes]
-    parts = like.new_zeros(sum(sizes)).split(sizes)
-    return tuple(part.view(shape) for part, shape in zip(parts, shapes, strict=True))

@@ -3,6 +3,7 @@
 import ctypes
 import importlib
 import importlib.util
+import math
 import os
 import threading
 import warnings
@@ -12,6 +13,7 @@ from functools import cache
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from torch_modal.extras import require_installed, uncollected
 from torch_modal.progress import ProgressReport
@@ -219,3 +221,10 @@ def _stream(device: torch.device) -> Any:
     import warp as wp
 
     return wp.stream_from_torch(torch.cuda.current_stream(device))
+
+
+def zeros(like: Tensor, *shapes: tuple[int, ...]) -> tuple[Tensor, ...]:
+    """Tensors of zeros, one after the other in memory."""
+    sizes = [math.prod(shape) for shape in shapes]
+    parts = like.new_zeros(sum(sizes)).split(sizes)
+    return tuple(part.view(shape) for part, shape in zip(parts, shapes, strict=True))
