@@ -17,6 +17,9 @@ from torch_modal.nn.modal_energy import Derivatives, ModalEnergy, Placement, alo
 # Columns that a kernel takes at a time.
 _BLOCK = 8
 
+# Columns of a product with itself that are multiplied at a time.
+_BLOCKS_OF_PRODUCTS = 16
+
 
 def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
     """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
@@ -155,6 +158,15 @@ class FusedModalEnergy(ModalEnergy):
         found = self.shell.value(self._shapes(a, placement.base, placement.extra), to)
         return found.unflatten(0, a.shape[:-1]) + to.constant
 
+    def base_value(self, placement: Placement) -> Tensor:
+        """As the other's."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().base_value(plain).to(placement.base)
+        to: Any = placement.reference
+        found = self.shell.value(placement.base.flatten(0, -3), to)
+        return found.unflatten(0, placement.base.shape[:-2]) + to.constant
+
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
         """As the other's."""
         plain = self._plain(placement)
@@ -176,7 +188,7 @@ class FusedModalEnergy(ModalEnergy):
         last[:, n_all] = off
         last *= root
         last[:, n_all + 1 :] = 0
-        products = jacobian.mT @ jacobian
+        products = gram(jacobian)
         gradient, inner = products[:, :n_all, n_all], products[:, :n_all, :n_all]
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
@@ -251,3 +263,16 @@ class FusedModalEnergy(ModalEnergy):
 
         pulled = torch.func.vjp(run, *given)[1](tuple(trees.leaves(found)))
         return trees.filled(skeleton, pulled)  # type: ignore[no-any-return]
+
+
+def gram(x: Tensor) -> Tensor:
+    """``x^T x``; on a CPU in rows of blocks, from the diagonal on. *Shape:* ``(B, m, n) -> (B, n, n)``."""
+    n = x.shape[-1]
+    if x.device.type != "cpu":
+        return x.mT @ x
+    found = x.new_empty(len(x), n, n)
+    for i in range(0, n, _BLOCKS_OF_PRODUCTS):
+        own = slice(i, i + _BLOCKS_OF_PRODUCTS)
+        right = x[..., own].mT @ x[..., i:]
+        found[:, i:, own], found[:, own, i:] = right.mT, right
+    return found

@@ -79,7 +79,7 @@ class FusedRelax(FusedShell):
             kept: Receives what the way back needs.
         """
         to = self.reference(*rest)
-        lengths = x.new_zeros(n_steps, len(x))
+        lengths = x.new_ones(n_steps, len(x))
         at = self.at(x, to)
         for k in range(n_steps):
             done = self.solved(x, at, to, n_products, keep=kept is not None)
@@ -93,12 +93,12 @@ class FusedRelax(FusedShell):
                 energy = there[0]
             else:
                 there, energy = None, self.value(reached, to)
-            length = torch.where(energy < at[0], 1.0, 0.0).to(x)
-            if not bool(length.all()):
-                length = self._shortened(x, solution, at[0], length, to)
+            down = energy < at.energy
+            if not bool(down.all()):
+                length = lengths[k] = self._shortened(x, solution, at.energy, down.to(x), to)
                 reached = x + length[:, None, None] * solution
                 there = self.at(reached, to) if k < n_steps - 1 else None
-            x, lengths[k] = reached, length
+            x = reached
             at = at if there is None else there
         return x, lengths
 

@@ -271,11 +271,7 @@ class FusedShell(nn.Module):
         energy, volume = x.new_zeros(2, len(x)).unbind()
         given = [x, self.record, to.stretch, to.bend, self.n_vertices, len(to.volume), self.centre(x), self.walls]
         launch(kernels("shell").value, (len(x), len(self.record) + len(self.walls)), [*given, energy, volume])
-        if len(x) == len(to.volume):
-            return energy + self._of_volume(volume, to)
-        energy, volume = (value.unflatten(0, (-1, len(to.volume))) for value in (energy, volume))
-        return (energy + self._of_volume(volume, to)).flatten()
-
-    @staticmethod
-    def _of_volume(volume: Tensor, to: ShellReference) -> Tensor:
-        return 0.5 * to.stiffness * (volume - to.volume) ** 2
+        if len(x) != len(to.volume):
+            energy, volume = (value.unflatten(0, (-1, len(to.volume))) for value in (energy, volume))
+        off = volume - to.volume
+        return torch.addcmul(energy, to.stiffness * off, off, value=0.5).flatten()

@@ -164,10 +164,9 @@ class JointSpace(nn.Module):
             seen = levels.seen(blend, self.frame.coarsen(blend))
             turned = levels.place(self.energy, seen, references, extras, anchors)
             with torch.no_grad():
-                zeros = t.new_zeros(2, len(t), self.n_unknowns)
                 pairs = zip(turned, placement, strict=True)
                 both = [bent._replace(base=torch.stack([bent.base, straight.base])) for bent, straight in pairs]
-                energies = self.energy.value(zeros, both)
+                energies = self.energy.base_value(both)
                 better = energies[0] < energies[1]
                 energy = torch.where(better, energies[0], energies[1])
             base = torch.where(better[:, None, None], blend, base)

@@ -301,7 +301,10 @@ class GaussNewtonStep(nn.Module):
         usable = steps.isfinite().all(-1)
         candidates = a + torch.where(usable[..., None], steps, 0)
         energies = self.energy.value(candidates, placement)
-        lowest, index = torch.where(usable & energies.isfinite(), energies, torch.inf).min(0)
+        energies = torch.where(usable & energies.isfinite(), energies, torch.inf)
+        if len(steps) == 1:
+            return torch.where((energies[0] < torch.inf)[:, None], candidates[0], a), energies[0]
+        lowest, index = energies.min(0)
         return candidates.gather(0, index[None, :, None].expand(1, *a.shape)).squeeze(0), lowest
 
 
@@ -362,6 +365,9 @@ def minimise(
                 for own, value in zip(live, energy.tolist(), strict=True):
                     own.energy = value
             going = [still and own.status == Status.OUT_OF_STEPS for still, own in zip(going, live, strict=True)]
+        if not any(going) and len(live) == len(everyone):  # all at once, as one alone always is
+            found, inner = a.clone(), None if inner is None else derivatives.gauss_newton
+            break
         if not all(going):
             left = torch.tensor([not still for still in going], device=a.device)
             gone = [own.row for own, still in zip(live, going, strict=True) if not still]
