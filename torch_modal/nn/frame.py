@@ -274,9 +274,10 @@ class _ClusterMeans(torch.autograd.Function):
     @staticmethod
     def forward(x: Tensor, members: Tensor, first_member: Tensor, shares: Tensor, clusters: Tensor) -> Tensor:
         # As a matrix it is transposed in blocks, several times as fast as by its dimensions.
-        rows = x.detach().flatten(1).T.contiguous().view(x.shape[1], -1)
+        alone = len(x) == 1
+        rows = x.detach()[0].contiguous() if alone else x.detach().flatten(1).T.contiguous().view(x.shape[1], -1)
         means = nn.functional.embedding_bag(members, rows, first_member, mode="sum", per_sample_weights=shares.detach())
-        return means.unflatten(1, (3, len(x))).permute(2, 0, 1).contiguous()
+        return means[None] if alone else means.unflatten(1, (3, len(x))).permute(2, 0, 1).contiguous()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
