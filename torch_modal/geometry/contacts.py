@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, unit
+from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, Surface, dot
 
 # Lengths are parts of the diagonal.
 REACH = 0.06
@@ -60,7 +60,7 @@ class Search:
         self.crossings = crossings
         i, j = crossings.mesh.edges.T
         self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
-        self._known = [_Surface(crossings, x) for x in crossings.known]
+        self._known = [Surface(crossings, x) for x in crossings.known]
 
     def __call__(self, x: FloatArray, watched: BoolArray | None = None) -> Held:
         """What is to be held in a shape.
@@ -78,12 +78,13 @@ class Search:
         corners = np.zeros(len(x), dtype=bool)
         corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
         before = crossings.known_inside
-        winds = crossings.winds(x, crossings.within(corners, DEEP) | (seeds & before))
+        surface = Surface(crossings, x)
+        winds = crossings.winds(surface, crossings.within(corners, DEEP) | (seeds & before))
         inside = crossings.hanging(winds & ~before, corners)
         seeds |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
         # What was inside in a key-frame is not to go in elsewhere.
         stuck = winds & before & seeds
-        return Held(*self.opposite(x, seeds, inside, stuck), pairs, seeds)
+        return Held(*self.opposite(surface, seeds, inside, stuck), pairs, seeds)
 
     def tolerance(
         self, slack: FloatArray, t: float, acceleration: float, free: tuple[bool, bool] = (True, True)
@@ -133,12 +134,12 @@ class Search:
         return found
 
     def opposite(
-        self, x: FloatArray, seeds: BoolArray, inside: BoolArray, stuck: BoolArray
+        self, surface: Surface, seeds: BoolArray, inside: BoolArray, stuck: BoolArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
         """The nearest face before which, or of what is inside, behind which each vertex lies.
 
         Args:
-            x: *Shape:* ``(V, 3)``.
+            surface: The shape.
             seeds: Vertices that are asked for, and corners of faces that may be found. *Shape:* ``(V,)``.
             inside: Vertices that are inside the surface, and were not in any known shape. *Shape:* ``(V,)``.
             stuck: Vertices that are inside the surface, and were in a known shape. *Shape:* ``(V,)``.
@@ -148,7 +149,6 @@ class Search:
         """
         crossings, corners = self.crossings, self.crossings.mesh.faces
         reach, near = REACH * crossings.diagonal, NEAR * crossings.diagonal
-        surface = _Surface(crossings, x)
         some = np.flatnonzero(seeds[corners].any(1))
         tree = cKDTree(surface.centres[some])
         within = inside | stuck
@@ -157,23 +157,25 @@ class Search:
             own = np.flatnonzero(chosen)
             if len(own):
                 n = min(_NEAREST if chosen is not within else 4 * _NEAREST, len(some))
-                distance, found = tree.query(x[own], n, distance_upper_bound=radius)
+                distance, found = tree.query(surface.x[own], n, distance_upper_bound=radius)
                 there = np.isfinite(distance.reshape(-1))
                 parts.append((np.repeat(own, n)[there], some[found.reshape(-1)[there]]))
         if not parts:
             none = np.zeros(0, np.int64)
             return none, none, np.zeros((0, len(self._known)))
         v, f = (np.concatenate(part) for part in zip(*parts, strict=True))
-        v, f = _kept((surface.vertex_normals[v] * surface.normals[f]).sum(1) < FACING, v, f)
+        v, f = _kept(dot(surface.vertex_normals[v], surface.normals[f]) < FACING, v, f)
         v, f = _kept(~(corners[f] == v[:, None]).any(1), v, f)
-        distance, signed, _ = surface.to_faces(v, f)
-        before = (signed > -_BEHIND * self._edge) | within[v]
-        keep = (signed < near) & (signed > -reach) & (np.abs(signed) > _STRAIGHT * distance - 1e-9 * reach) & before
-        v, f, distance = _kept(keep, v, f, distance)
+        height = _heights(surface, v, f)
+        keep = (height < near) & (height > -reach) & ((height > -_BEHIND * self._edge) | within[v])
+        v, f, height = _kept(keep, v, f, height)
+        distance = _distances(surface, v, f)
+        v, f, distance = _kept(np.abs(height) > _STRAIGHT * distance - 1e-9 * reach, v, f, distance)
         slack: list[FloatArray] = []
         for known in self._known:
-            away, side, _ = known.to_faces(v, f)
-            behind = (away <= 1.5 * reach) & (side <= -1e-3 * self._edge)
+            side = _heights(known, v, f)
+            behind = side <= -1e-3 * self._edge
+            behind[behind] = _distances(known, v[behind], f[behind]) <= 1.5 * reach
             keep = ~behind | stuck[v]
             slack = [part[keep] for part in slack] + [np.where(behind, -side, 0.0)[keep]]
             v, f, distance = _kept(keep, v, f, distance)
@@ -209,38 +211,30 @@ class Search:
         patch[own] = connected_components(crossings.adjacency[own][:, own], directed=False)[1]
         # The patch of each face that is inside as a whole.
         of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
-        surface = _Surface(crossings, x)
+        surface = Surface(crossings, x)
         n = min(_NEAREST, len(faces))
         near = np.asarray(cKDTree(surface.centres).query(x[own], n)[1]).reshape(-1)
         v: Any = np.repeat(own, n)
         f: Any = near
-        facing = (surface.vertex_normals[v] * surface.normals[f]).sum(1) < FACING
+        facing = dot(surface.vertex_normals[v], surface.normals[f]) < FACING
         v, f = _kept(facing & (of_face[f] != patch[v]), v, f)
-        distance, signed, _ = surface.to_faces(v, f)
+        v, f = _kept(_heights(surface, v, f) < 0, v, f)
         least = np.full(len(x), np.inf)
-        np.minimum.at(least, v[signed < 0], distance[signed < 0])
+        np.minimum.at(least, v, _distances(surface, v, f))
         found = np.isfinite(least)
         deep[found] = least[found]
         return deep
 
 
-class _Surface:
-    """A shape with its normals."""
+def _heights(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
+    """Of vertices over the planes of faces. *Shape:* ``(n,), (n,) -> (n,)``."""
+    return dot(surface.x[v] - surface.x[surface.faces[f, 0]], surface.normals[f])
 
-    def __init__(self, crossings: Crossings, x: FloatArray) -> None:
-        self.x, self.faces = x, crossings.mesh.faces
-        corners = x[self.faces]
-        self.centres = corners.mean(1)
-        doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self.normals = unit(doubled)
-        self.vertex_normals = crossings.vertex_normals(doubled)
 
-    def to_faces(self, v: IntArray, f: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """From vertices to faces: distances, distances along the normals, nearest points."""
-        corners = self.x[self.faces[f]]
-        feet = nearest_on_triangles(self.x[v], corners)
-        apart = self.x[v] - feet
-        return np.linalg.norm(apart, axis=1), (apart * self.normals[f]).sum(1), feet
+def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
+    """From vertices to faces. *Shape:* ``(n,), (n,) -> (n,)``."""
+    apart = surface.x[v] - nearest_on_triangles(surface.x[v], surface.x[surface.faces[f]])
+    return np.sqrt(dot(apart, apart))  # type: ignore[no-any-return]
 
 
 def _kept(keep: BoolArray, *arrays: Any) -> list[Any]:
@@ -254,8 +248,7 @@ def nearest_on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
     """
     a, b, c = corners.transpose(1, 0, 2)
     u, v, w = b - a, c - a, points - a
-    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
-    uw, vw = (u * w).sum(1), (v * w).sum(1)
+    uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
     determinant = uu * vv - uv * uv
     flat = determinant <= 1e-300
     scale = np.where(flat, 1, determinant)
@@ -266,10 +259,10 @@ def nearest_on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
     p = points[outside]
     for start, end in ((a, b), (b, c), (c, a)):
         from_, along = start[outside], end[outside] - start[outside]
-        squared = (along * along).sum(1)
-        share = np.clip(((p - from_) * along).sum(1) / np.where(squared > 0, squared, 1), 0, 1)
+        squared = dot(along, along)
+        share = np.clip(dot(p - from_, along) / np.where(squared > 0, squared, 1), 0, 1)
         foot = from_ + share[:, None] * along
-        distance = ((p - foot) ** 2).sum(1)
+        distance = dot(p - foot, p - foot)
         nearer = distance < least
         best[outside[nearer]], least[nearer] = foot[nearer], distance[nearer]
     return best

@@ -70,8 +70,7 @@ class Crossings:
         mesh: The connectivity.
         known: Shapes whose own crossings are tolerated. *Shape:* ``(K, V, 3)``.
         like: The shape whose lengths say what is far along the surface. Default: the first of ``known``.
-        broad_phase: Finds the pairs of faces without a common vertex whose boxes overlap. *Shape:*
-            ``(V, 3) -> (P, 2)``. Default: that of ``ipctk``.
+        search: Finds what :meth:`pairs` does, in any order. *Shape:* ``(V, 3) -> (P, 2)``. Default: with ``ipctk``.
     """
 
     def __init__(
@@ -79,10 +78,10 @@ class Crossings:
         mesh: Connectivity,
         known: FloatArray,
         like: FloatArray | None = None,
-        broad_phase: Callable[[FloatArray], IntArray] | None = None,
+        search: Callable[[FloatArray], IntArray] | None = None,
     ) -> None:
         self.mesh, self.known = mesh, known
-        self.broad_phase = broad_phase or self._overlapping
+        self._search = search or self._crossing
         self.like = known[0] if like is None else like
         used = self.like[np.unique(mesh.faces)]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
@@ -106,12 +105,15 @@ class Crossings:
     @cached_property
     def _touching(self) -> sparse.csr_matrix:
         """One between faces that share a vertex, and of a face with itself. *Shape:* ``(F, F)``."""
+        return _ones(self.incidence.T @ self.incidence)
+
+    @cached_property
+    def incidence(self) -> sparse.csr_matrix:
+        """One of a vertex and a face around it. *Shape:* ``(V, F)``."""
         faces = self.mesh.faces
         owners = np.repeat(np.arange(len(faces)), 3)
-        corners = sparse.coo_matrix(
-            (np.ones(3 * len(faces)), (owners, faces.reshape(-1))), shape=(len(faces), self.mesh.n_vertices)
-        ).tocsr()
-        return _ones(corners @ corners.T)
+        shape = self.mesh.n_vertices, len(faces)
+        return sparse.coo_matrix((np.ones(3 * len(faces)), (faces.reshape(-1), owners)), shape=shape).tocsr()
 
     @cached_property
     def lengths(self) -> sparse.csr_matrix:
@@ -150,7 +152,7 @@ class Crossings:
         """Vertices that lie inside the surface in any of the known shapes. *Shape:* ``(V,)``."""
         inside = np.zeros(self.mesh.n_vertices, dtype=bool)
         for x in self.known:
-            inside |= self.winding(x, np.arange(len(x))) > 0.5
+            inside |= self.winds(Surface(self, x), np.ones(len(x), dtype=bool))
         return inside
 
     # ----------------------------------------------------------------------------------------------------- of one shape
@@ -166,12 +168,10 @@ class Crossings:
         Returns:
             *Shape:* ``(P, 2)``.
         """
-        candidates = self.broad_phase(x)
-        one, other = (x[self.mesh.faces[side]] for side in candidates.T)
-        crossing = candidates[pierces(one, other) | pierces(other, one)]
-        return np.unique(np.sort(crossing, axis=1), axis=0)
+        pairs = np.sort(self._search(x), axis=1)
+        return pairs[np.lexsort(pairs.T[::-1])]
 
-    def _overlapping(self, x: FloatArray) -> IntArray:
+    def _crossing(self, x: FloatArray) -> IntArray:
         tree = require("ipctk").LBVH()
         # Scaled and centred: the library's boxes are of single precision.
         centred = np.asfortranarray((x - self.like.mean(0)) / self.diagonal)
@@ -180,7 +180,9 @@ class Crossings:
         found = map(_FACES, tree.detect_face_face_candidates())
         candidates = np.fromiter(chain.from_iterable(found), np.int64).reshape(-1, 2)
         corners = self.mesh.faces[candidates]
-        return candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
+        candidates = candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
+        one, other = (centred[self.mesh.faces[side]] for side in candidates.T)
+        return np.unique(candidates[pierces(one, other) | pierces(other, one)], axis=0)
 
     def far_pairs(self, x: FloatArray) -> IntArray:
         """Those of :meth:`pairs` that are far, by :meth:`is_far`. *Shape:* ``(V, 3) -> (P, 2)``."""
@@ -241,30 +243,6 @@ class Crossings:
         reached = dijkstra(self.lengths, indices=np.flatnonzero(vertices), min_only=True, limit=limit)
         return np.asarray(np.isfinite(reached))
 
-    def winding(self, x: FloatArray, vertices: IntArray) -> FloatArray:
-        """How often the surface winds around a point just outside each vertex: about 1 inside, about 0 outside.
-
-        Args:
-            x: *Shape:* ``(V, 3)``.
-            vertices: *Shape:* ``(n,)``.
-        """
-        if not len(vertices):
-            return np.zeros(0)
-        faces = self.mesh.faces
-        corners = x[faces]
-        doubled = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        points = x[vertices] + _OFFSET * self.diagonal * self.vertex_normals(doubled)[vertices]
-        number = require("igl").fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
-        turned = (doubled * (corners.mean(1) - x.mean(0))).sum() < 0  # a surface that is inside out
-        return -number if turned else number  # type: ignore[no-any-return]
-
-    def vertex_normals(self, doubled: FloatArray) -> FloatArray:
-        """Unit normals of vertices, from those of the faces times twice their areas. *Shape:* ``(F, 3) -> (V, 3)``."""
-        corners = self.mesh.faces.reshape(-1)
-        n = self.mesh.n_vertices
-        summed: Any = [np.bincount(corners, np.repeat(c, 3), minlength=n) for c in doubled.T]
-        return unit(np.stack(summed, 1))
-
     def inside(self, x: FloatArray, pairs: IntArray) -> BoolArray:
         """Vertices that are inside since parts went through each other.
 
@@ -276,13 +254,19 @@ class Crossings:
         """
         corners = np.zeros(self.mesh.n_vertices, dtype=bool)
         corners[self.mesh.faces[pairs.reshape(-1)]] = True
-        inside = self.winds(x, np.ones(len(x), dtype=bool) if len(pairs) else corners)
+        inside = self.winds(Surface(self, x), np.ones(len(x), dtype=bool) if len(pairs) else corners)
         return self.hanging(inside & ~self.known_inside if len(self.known) else inside, corners)
 
-    def winds(self, x: FloatArray, asked: BoolArray) -> BoolArray:
-        """Which of some vertices are inside by winding number. *Shape:* ``(V, 3), (V,) -> (V,)``."""
-        inside, asked_ = np.zeros(len(x), dtype=bool), np.flatnonzero(asked)
-        inside[asked_] = self.winding(x, asked_) > 0.5
+    def winds(self, surface: "Surface", asked: BoolArray) -> BoolArray:
+        """Around which of some vertices a shape winds: around a point just outside. *Shape:* ``(V,) -> (V,)``."""
+        own, inside = np.flatnonzero(asked), np.zeros(len(asked), dtype=bool)
+        if len(own):
+            x, faces = surface.x, self.mesh.faces
+            points = x[own] + _OFFSET * self.diagonal * surface.vertex_normals[own]
+            # About 1 inside, about 0 outside.
+            number = require("igl").fast_winding_number(*(np.ascontiguousarray(a) for a in (x, faces, points)))
+            turned = (surface.doubled * (surface.centres - x.mean(0))).sum() < 0  # a surface that is inside out
+            inside[own] = (-number if turned else number) > 0.5
         return inside
 
     def hanging(self, vertices: BoolArray, seeds: BoolArray) -> BoolArray:
@@ -302,23 +286,50 @@ class Crossings:
         return chosen
 
 
+class Surface:
+    """A shape, with its normals.
+
+    Args:
+        crossings: Of its connectivity.
+        x: *Shape:* ``(V, 3)``.
+    """
+
+    def __init__(self, crossings: Crossings, x: FloatArray) -> None:
+        self.x, self.faces, self._incidence = x, crossings.mesh.faces, crossings.incidence
+        a, b, c = x[self.faces.T]
+        #: Of the faces. *Shape:* ``(F, 3)``.
+        self.centres = (a + b + c) / 3
+        #: Normals of the faces, times twice their areas. *Shape:* ``(F, 3)``.
+        self.doubled = cross(b - a, c - a)
+
+    @cached_property
+    def normals(self) -> FloatArray:
+        """Of the faces. *Shape:* ``(F, 3)``."""
+        return _unit(self.doubled)
+
+    @cached_property
+    def vertex_normals(self) -> FloatArray:
+        """*Shape:* ``(V, 3)``."""
+        return _unit(self._incidence @ self.doubled)
+
+
 def pierces(edges_of: FloatArray, through: FloatArray) -> BoolArray:
     """Whether an edge of each triangle passes through another one. *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``."""
     first = through[:, 0]
-    normal = _cross(through[:, 1] - first, through[:, 2] - first)
-    side = ((edges_of - first[:, None]) * normal[:, None]).sum(-1) > 0
+    normal = cross(through[:, 1] - first, through[:, 2] - first)
+    side = dot(edges_of - first[:, None], normal[:, None]) > 0
     crossing = np.zeros(len(edges_of), dtype=bool)
     for i, j in ((0, 1), (1, 2), (2, 0)):
         at = np.flatnonzero((side[:, i] != side[:, j]) & ~crossing)
         start, end = edges_of[at, i], edges_of[at, j]
         rays = through[at] - start[:, None]
         along = end - start
-        turns = [(_cross(rays[:, k], rays[:, (k + 1) % 3]) * along).sum(-1) > 0 for k in range(3)]
+        turns = [dot(cross(rays[:, k], rays[:, (k + 1) % 3]), along) > 0 for k in range(3)]
         crossing[at[(turns[0] == turns[1]) & (turns[1] == turns[2])]] = True
     return crossing
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """What ``np.cross`` is, which takes ten times as long for a few vectors. *Shape:* ``(n, 3)`` each."""
     found = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -326,9 +337,15 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return found
 
 
-def unit(vectors: FloatArray) -> FloatArray:
-    """Vectors of length one, or zero. *Shape:* ``(..., 3)``."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Inner products of vectors: sums along an axis of three take several times as long. *Shape:* ``(..., 3)``."""
+    found: FloatArray = np.einsum("...i,...i->...", a, b)
+    return found
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    """Vectors of length one, or zero. *Shape:* ``(n, 3)``."""
+    length = np.sqrt(dot(vectors, vectors))[:, None]
     return vectors / np.where(length > 0, length, 1)  # type: ignore[no-any-return]
 
 

@@ -15,7 +15,7 @@ from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.blend import Blends
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
-from torch_modal.nn.fused_crossings import FusedBroadPhase
+from torch_modal.nn.fused_crossings import FusedPairs
 from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
@@ -129,11 +129,11 @@ class Between(nn.Module):
         self.closed = len(mesh.connectivity.boundary_edges) == 0
 
     @cached_property
-    def broad_phase(self) -> FusedBroadPhase | None:
-        """Of searches for crossings, by kernels where there are some."""
+    def crossing_pairs(self) -> FusedPairs | None:
+        """A search for triangles that cross by kernels, where there are some."""
         if not has_kernels(self.solver.backend):
             return None
-        return FusedBroadPhase(self.mesh.connectivity, self.frame.reference.detach().cpu().double().numpy()[None])
+        return FusedPairs(self.mesh.connectivity, self.frame.reference.detach().cpu().double().numpy()[None])
 
     def prepare(self) -> None:
         """Make at once what would be made at the first minimisation."""

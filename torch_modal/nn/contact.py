@@ -110,7 +110,7 @@ class ContactSearch:
         acceleration: The largest that a vertex may have in the course that the samples are of; the time between the
             key-frames is the unit.
         free: Whether the course starts at the first key-frame, and ends at the second.
-        broad_phase: As for :class:`~torch_modal.geometry.crossings.Crossings`.
+        pairs: The ``search`` of :class:`~torch_modal.geometry.crossings.Crossings`.
     """
 
     def __init__(
@@ -122,10 +122,10 @@ class ContactSearch:
         t: Tensor,
         acceleration: float = math.inf,
         free: tuple[bool, bool] = (True, True),
-        broad_phase: Callable[[FloatArray], IntArray] | None = None,
+        pairs: Callable[[FloatArray], IntArray] | None = None,
     ) -> None:
         known = torch.stack([first, second], 1).detach().double().cpu().numpy()
-        self.searches = [Search(Crossings(mesh.connectivity, both, broad_phase=broad_phase)) for both in known]
+        self.searches = [Search(Crossings(mesh.connectivity, both, search=pairs)) for both in known]
         self.which = list(range(len(t))) if which is None else which.tolist()
         self.faces = mesh.faces
         self.areas = torch.stack([_areas(x.detach(), mesh.faces) for x in first])

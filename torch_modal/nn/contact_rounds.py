@@ -65,9 +65,7 @@ class ContactRounds(Between):
         It is looked again after each push; what left the fewest crossings is taken.
         """
         pair, samples = batch.pair, batch.samples
-        search = ContactSearch(
-            self.mesh, pair.first, pair.second, samples.which, samples.t, broad_phase=self.broad_phase
-        )
+        search = ContactSearch(self.mesh, pair.first, pair.second, samples.which, samples.t, pairs=self.crossing_pairs)
         held = search(x)
         n_crossing = search.n_far
         if held is None:

@@ -1,4 +1,4 @@
-"""The broad phase of a search for crossings by a kernel of NVIDIA Warp: one tree of faces serves all shapes."""
+"""Triangles that pass through each other, by a kernel of NVIDIA Warp: one tree of faces serves all shapes."""
 
 import torch
 
@@ -7,12 +7,12 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import FloatArray, IntArray
 from torch_modal.nn.launch import kernels, launch
 
-ROOM = 20_000
+ROOM = 4096
 """Pairs that there is room for at first."""
 
 
-class FusedBroadPhase:
-    """Pairs of faces without a common vertex whose boxes overlap.
+class FusedPairs:
+    """Pairs of triangles that cross and share no vertex.
 
     The tree is made once, of what lies together in given shapes; of others, only its boxes are made.
 
@@ -35,7 +35,7 @@ class FusedBroadPhase:
         while True:
             pairs = torch.empty(room, 2, dtype=torch.int32)
             given = [own, self._corners, n, *boxes, stack, room, pairs, number]
-            launch(kernels("crossings").overlapping, (1,), given)
+            launch(kernels("crossings").crossing, (1,), given)
             if int(number) <= room:
                 return self.order[pairs[: int(number)].numpy()]
             room = int(number)

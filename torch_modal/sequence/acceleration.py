@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import linalg, sparse
 from torch import Tensor
 
 STIFFNESS = 1e7
@@ -124,33 +123,35 @@ class AccelerationLimit:
             return wanted
         # In frames: the unit of time drops out.
         unit = float(self.differences.abs().max()) / 2
-        rows = sparse.csr_matrix(self.differences.double().cpu().numpy() / unit)
+        rows = self.differences.double().cpu().numpy() / unit
         goal, course = (
             x[..., own].double().cpu().numpy().swapaxes(0, 1).reshape(x.shape[1], -1) for x in (wanted, self.course)
         )
         course, most = course / unit, self.most / unit
         weight = weights.double().cpu().numpy()
         penalty = PENALTY * weight.max() ** 0.75
-        normal = (sparse.diags(weight) + penalty * rows.T @ rows).tocsc()
-        upper = np.stack([np.pad(normal.diagonal(k), (k, 0)) for k in (2, 1, 0) if k < len(goal)])
-        factor = linalg.cholesky_banded(upper)
-        split, dual = _clipped(rows @ goal + course, most), 0.0
+        inverse = np.linalg.inv(np.diag(weight) + penalty * rows.T @ rows)
+        # What is found, and the accelerations there, of what accelerations are pulled to.
+        pull, freely = penalty * inverse @ rows.T, inverse @ (weight[:, None] * goal)
+        reach, rest = rows @ pull, rows @ freely + course
+        split, dual = _clipped(rows @ goal + course, most), np.zeros_like(course)
         for _ in range(ROUNDS):
-            pulled = weight[:, None] * goal + penalty * (rows.T @ (split - dual - course))
-            found = linalg.cho_solve_banded((factor, False), pulled)
-            reached = rows @ found + course
+            pulled = split - dual - course
+            reached = reach @ pulled + rest
             if _lengths(reached).max() <= (1 + TOLERANCE) * most:
                 break
             relaxed = RELAXATION * reached + (1 - RELAXATION) * split + dual
             split = _clipped(relaxed, most)
             dual = relaxed - split
+        found = pull @ pulled + freely
         there = torch.from_numpy(found.reshape(len(goal), 3, -1).swapaxes(0, 1)).to(wanted)
         return wanted.index_copy(2, own, there)
 
 
 def _lengths(rows: np.ndarray) -> np.ndarray:
     """*Shape:* ``(N, 3 V) -> (N, V)``."""
-    return np.linalg.norm(rows.reshape(len(rows), 3, -1), axis=1)
+    x, y, z = rows.reshape(len(rows), 3, -1).swapaxes(0, 1)
+    return np.sqrt(x * x + y * y + z * z)  # type: ignore[no-any-return]
 
 
 def _clipped(rows: np.ndarray, most: float) -> np.ndarray:

@@ -45,7 +45,8 @@ LOOKED_AT = 8
 SEARCHED = 16
 """:func:`push_apart` has it."""
 BESIDE = 0.125
-ROUNDS = 4
+ROUNDS = 1, 4
+"""How often all shapes are pushed apart together, the second where a key-frame passes through itself, at most."""
 MODAL_STEPS = 2
 FINE_STEPS = 2
 FINE_PRODUCTS = 40
@@ -155,7 +156,9 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     start = frame.bring(shapes, trees.picked(pair, samples.which), t)
     limit = _limit(member, samples, pair, shapes, start)
     free = samples.before is None, samples.after is None
-    search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t, limit.most, free, member.broad_phase)
+    search = ContactSearch(
+        member.mesh, pair.first, pair.second, samples.which, t, limit.most, free, member.crossing_pairs
+    )
     every = -(-len(t) // LOOKED_AT)
     few = range(every - 1, len(t), every)
     if next(search.crossing(start, few), None) is None:
@@ -227,20 +230,20 @@ class _Course:
         solver = _Coupled(self.member, self.samples.rows(some), self.pair, rows, self.limit)
         at, functions = start.new_zeros(3, solver.basis.shape[1], start.shape[1]), splines(self.samples.t).values
         found: list[_Found] = []
-        for _ in range(ROUNDS):
+        for _ in range(ROUNDS[search.is_tolerant]):
             own = held.rows(some)
             at = solver.fine(solver.modal(at, own), own, search.near(REGION), FINE_STEPS)
-            x = start + (functions @ at).movedim(0, -1)
-            held = self.looked(x, held, some)
-            found.append(_Found(x, held, search.n_left, search.n_far))
+            here = _Found(start + (functions @ at).movedim(0, -1), held, search.n_left, search.n_far)
+            held = self.looked(here, torch.tensor([i for i in some.tolist() if search.watched[i] is not None]))
+            found.append(here._replace(held=held, n_left=search.n_left, n_far=search.n_far))
             if not bool(search.n_left[some].any()):
                 break
         return min(found, key=_left)
 
-    def looked(self, x: Tensor, held: Contacts, some: Tensor) -> Contacts:
-        """What is held after another search in those of some shapes that hold something, or are beside such ones."""
-        found = self.search(x, self.searched(some))
-        return held if found is None else found.of_all(held.samples).beside(held)
+    def looked(self, found: "_Found", some: Tensor) -> Contacts:
+        """What is held after another search in some shapes. *Shape:* ``(S,)``."""
+        fresh = self.search(found.x, some.tolist())
+        return found.held if fresh is None else fresh.of_all(found.held.samples).beside(found.held)
 
     def settled(self, found: "_Found", own: Tensor) -> Tensor:
         """Some shapes brought to rest, each on its own, and all as near to that as their accelerations allow.
@@ -253,27 +256,21 @@ class _Course:
             own: The shapes that come to rest on their own. *Shape:* ``(S,)``.
         """
         search, weights, tried = self.search, torch.ones_like(self.samples.t), []
-        for k in range(SETTLINGS):
-            x, held = self.at_rest(found, own, weights), found.held
-            if k + 1 >= LEAST_SETTLINGS:
-                search.count(x, sorted(set(range(len(x))) - set(self.searched(own))))
+        for k in range(1, SETTLINGS + 1):
+            x = self.at_rest(found, own, weights)
+            search.count(x, own.tolist() if k < LEAST_SETTLINGS else None)
+            found = _Found(x, found.held, search.n_left, search.n_far)
+            if k >= LEAST_SETTLINGS:
+                tried.append(found)
+                if not bool(search.n_left.any()):
+                    break
                 own = torch.nonzero((search.n_left > 0).index_fill(0, own, True)).flatten()
-            held = self.looked(x, held, own)
-            found = _Found(x, held, search.n_left, search.n_far)
-            if k + 1 < LEAST_SETTLINGS:
-                continue
-            tried.append(found)
-            if not bool(search.n_left.any()):
-                break
-            weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights)
+                weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights)
+            if k < SETTLINGS:
+                found = found._replace(held=self.looked(found, own[search.n_far[own] > 0]))
         best = min(tried, key=_left)
         search.n_left, search.n_far = best.n_left, best.n_far
         return best.x
-
-    def searched(self, some: Tensor) -> list[int]:
-        """Those of some shapes in which something is watched, or parts went through each other."""
-        search = self.search
-        return [i for i in some.tolist() if search.watched[i] is not None or int(search.n_far[i])]
 
     def at_rest(self, found: "_Found", own: Tensor, weights: Tensor) -> Tensor:
         """All shapes after some have taken steps of their own. *Shape:* ``(T, V, 3)``.

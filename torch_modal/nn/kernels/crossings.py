@@ -1,8 +1,8 @@
-"""Faces whose boxes overlap: a tree of boxes against itself."""
+"""Faces that pass through each other: a tree of boxes against itself."""
 
 import warp as wp
 
-from torch_modal.nn.kernels.elements import place, vec3
+from torch_modal.nn.kernels.elements import place, real, vec3
 
 
 @wp.func
@@ -29,8 +29,56 @@ def meet(a: wp.vec3i, b: wp.vec3i):
     return one or other or a[2] == b[0] or a[2] == b[1] or a[2] == b[2]
 
 
+@wp.func
+def turns(along: vec3, a: vec3, b: vec3) -> bool:
+    return wp.dot(wp.cross(a, b), along) > real(0.0)
+
+
+@wp.func
+def through(start: vec3, end: vec3, above: bool, end_above: bool, a: vec3, b: vec3, c: vec3) -> bool:
+    """Whether an edge passes through a triangle, of whose plane its ends may lie on two sides."""
+    found = above != end_above
+    if found:
+        along = end - start
+        first = turns(along, a - start, b - start)
+        found = first == turns(along, b - start, c - start) and first == turns(along, c - start, a - start)
+    return found
+
+
+@wp.func
+def pierces(p: vec3, q: vec3, r: vec3, a: vec3, b: vec3, c: vec3) -> bool:
+    """Whether an edge of the first triangle passes through the second."""
+    normal = wp.cross(b - a, c - a)
+    p_above = wp.dot(p - a, normal) > real(0.0)
+    q_above = wp.dot(q - a, normal) > real(0.0)
+    r_above = wp.dot(r - a, normal) > real(0.0)
+    found = p_above != q_above or q_above != r_above
+    if found:
+        found = (
+            through(p, q, p_above, q_above, a, b, c)
+            or through(q, r, q_above, r_above, a, b, c)
+            or through(r, p, r_above, p_above, a, b, c)
+        )
+    return found
+
+
+@wp.func
+def cross(x: wp.array(dtype=vec3), f: wp.vec3i, g: wp.vec3i) -> bool:
+    """Whether two faces without a common vertex pass through each other."""
+    found = not meet(f, g)
+    if found:
+        p = x[place(f[0], 0)]
+        q = x[place(f[1], 0)]
+        r = x[place(f[2], 0)]
+        a = x[place(g[0], 0)]
+        b = x[place(g[1], 0)]
+        c = x[place(g[2], 0)]
+        found = pierces(p, q, r, a, b, c) or pierces(a, b, c, p, q, r)
+    return found
+
+
 @wp.kernel(enable_backward=False)
-def overlapping(
+def crossing(
     x: wp.array(dtype=vec3),
     corners: wp.array(dtype=wp.vec3i),
     n: int,
@@ -41,7 +89,7 @@ def overlapping(
     pairs: wp.array(dtype=wp.vec2i),
     number: wp.array(dtype=int),
 ):
-    """Pairs of faces without a common vertex whose boxes overlap, as many as there is room for, and their number.
+    """Pairs of faces that cross and share no vertex, as many as there is room for, and their number.
 
     Node ``i`` has the nodes ``2 i`` and ``2 i + 1`` below it, and the last ``n`` are the faces. One thread goes down
     from the root, with the two nodes of each pair on the same level, or one above.
@@ -84,7 +132,7 @@ def overlapping(
                     if overlap(lower, upper, 2 * split + k, other):
                         stack[place(depth, 0)] = wp.vec2i(2 * split + k, other)
                         depth += 1
-            elif not meet(corners[place(i, -n)], corners[place(j, -n)]):
+            elif cross(x, corners[place(i, -n)], corners[place(j, -n)]):
                 if count < room:
                     pairs[place(count, 0)] = wp.vec2i(i - n, j - n)
                 count += 1
