@@ -86,11 +86,11 @@ class AccelerationLimit:
         return Excess((weights * over**2).sum(), gradient, vertices, hessian)
 
     def add_product(self, at: Excess, field: Tensor, to: Tensor) -> Tensor:
-        """The Hessian times a displacement, added to another. *Shape:* ``(3, J, V)`` each."""
+        """The Hessian times a displacement, added to another in place. *Shape:* ``(3, J, V)`` each."""
         if not len(at.vertices):
             return to
         found = self.second.T @ (at.hessian * (self.second @ field[..., at.vertices])).sum(1)
-        return to.index_add(2, at.vertices, found)
+        return to.index_add_(2, at.vertices, found)
 
     def add_diagonal(self, at: Excess, to: Tensor) -> Tensor:
         """The blocks of each function at each vertex, added to others. *Shape:* ``(3, 3, J, V)`` each."""

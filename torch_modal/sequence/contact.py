@@ -13,6 +13,7 @@ At last each shape comes to rest on its own, with what is held in it. The displa
 that among those that accelerate no vertex too much: where nothing is in the way, it is at rest.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -55,6 +56,8 @@ SETTLINGS = 4
 """How often all shapes come to rest, each on its own, and their displacement is fitted to what may be accelerated."""
 INSISTENCE = 10.0
 """How much more the displacement of a shape counts in the fit, each time that it is not free of crossings."""
+LEADING = 4
+"""Of the shapes that hold nothing, one of so many comes to rest the first time, and the others along with it."""
 SETTLING_STEPS = 2
 SETTLING_PRODUCTS = 20
 AROUND = 2
@@ -161,7 +164,8 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     )
     every = -(-len(t) // LOOKED_AT)
     few = range(every - 1, len(t), every)
-    if next(search.crossing(start, few), None) is None:
+    first = next(search.crossing(start, few), None)
+    if first is None:
         return Displacement(None, t, search.n_far, search.n_far)
     stride = max(1, (len(t) + 1) // SEARCHED)
     # The first and the last hardly cost energy, and would be bent by what is done to the next.
@@ -171,7 +175,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
         chosen |= set(torch.nonzero((t < BESIDE) | (t > 1 - BESIDE)).flatten().tolist())
     course = _Course(member, samples, pair, start, limit, search)
     some = torch.tensor(sorted(chosen), device=start.device)
-    held = search(start, some.tolist())
+    held = search(start, sorted(chosen - {i for i in few if i < first}))
     if held is None or not bool(search.n_left.any()):
         return Displacement(None, t, search.n_far, search.n_far)
     held = held.of_all(torch.arange(len(t), device=start.device))
@@ -234,15 +238,19 @@ class _Course:
             own = held.rows(some)
             at = solver.fine(solver.modal(at, own), own, search.near(REGION), FINE_STEPS)
             here = _Found(start + (functions @ at).movedim(0, -1), held, search.n_left, search.n_far)
-            held = self.looked(here, torch.tensor([i for i in some.tolist() if search.watched[i] is not None]))
+            held = self.looked(here, self.watched(some))
             found.append(here._replace(held=held, n_left=search.n_left, n_far=search.n_far))
             if not bool(search.n_left[some].any()):
                 break
         return min(found, key=_left)
 
-    def looked(self, found: "_Found", some: Tensor) -> Contacts:
-        """What is held after another search in some shapes. *Shape:* ``(S,)``."""
-        fresh = self.search(found.x, some.tolist())
+    def watched(self, some: Tensor) -> list[int]:
+        """Those of some shapes that hold something, or are beside such ones. *Shape:* ``(S,)``."""
+        return [i for i in some.tolist() if self.search.watched[i] is not None]
+
+    def looked(self, found: "_Found", some: Sequence[int]) -> Contacts:
+        """What is held after another search in some shapes."""
+        fresh = self.search(found.x, some)
         return found.held if fresh is None else fresh.of_all(found.held.samples).beside(found.held)
 
     def settled(self, found: "_Found", own: Tensor) -> Tensor:
@@ -256,9 +264,12 @@ class _Course:
             own: The shapes that come to rest on their own. *Shape:* ``(S,)``.
         """
         search, weights, tried = self.search, torch.ones_like(self.samples.t), []
+        # What holds nothing is near to its neighbours in time: some of these shapes lead the others.
+        leading = (found.held.weights[own] > 0).any(1)
+        leading[::LEADING] = True
         for k in range(1, SETTLINGS + 1):
-            x = self.at_rest(found, own, weights)
-            search.count(x, own.tolist() if k < LEAST_SETTLINGS else None)
+            x = self.at_rest(found, own[leading] if k == 1 else own, weights)
+            search.count(x, self.watched(own) if k < LEAST_SETTLINGS else None)
             found = _Found(x, found.held, search.n_left, search.n_far)
             if k >= LEAST_SETTLINGS:
                 tried.append(found)
@@ -267,7 +278,7 @@ class _Course:
                 own = torch.nonzero((search.n_left > 0).index_fill(0, own, True)).flatten()
                 weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights)
             if k < SETTLINGS:
-                found = found._replace(held=self.looked(found, own[search.n_far[own] > 0]))
+                found = found._replace(held=self.looked(found, own[search.n_far[own] > 0].tolist()))
         best = min(tried, key=_left)
         search.n_left, search.n_far = best.n_left, best.n_far
         return best.x

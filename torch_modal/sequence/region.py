@@ -79,9 +79,9 @@ class Region:
         """The convex Hessians times displacements. *Shape:* ``(3, T, R) -> (3, T, R)``."""
         hessian, at = hessians
         found: Tensor = self.energy.product(hessian, field)
-        if at is None:
-            return found
-        return found.flatten(1).index_add(1, at.corners, at.product(field.flatten(1))[0]).unflatten(1, field.shape[1:])
+        if at is not None:
+            found.flatten(1).index_add_(1, at.corners, at.product(field.flatten(1))[0])
+        return found
 
 
 class _ByTorch:
