@@ -5,19 +5,26 @@ import warp as wp
 from torch_modal.nn.kernels.elements import place, real, vec3
 
 
+box = wp.types.vector(length=6, dtype=real)
+"""Its lowest corner, and the opposite of its highest."""
+
+
 @wp.func
-def overlap(lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3), i: int, j: int) -> bool:
-    low = lower[place(i, 0)]
-    high = upper[place(i, 0)]
-    other_low = lower[place(j, 0)]
-    other_high = upper[place(j, 0)]
+def box_of(a: vec3, b: vec3, c: vec3):
+    low = wp.min(a, wp.min(b, c))
+    high = wp.max(a, wp.max(b, c))
+    return box(low[0], low[1], low[2], -high[0], -high[1], -high[2])
+
+
+@wp.func
+def overlap(a: box, b: box) -> bool:
     return (
-        low[0] <= other_high[0]
-        and low[1] <= other_high[1]
-        and low[2] <= other_high[2]
-        and high[0] >= other_low[0]
-        and high[1] >= other_low[1]
-        and high[2] >= other_low[2]
+        a[0] + b[3] <= real(0.0)
+        and a[1] + b[4] <= real(0.0)
+        and a[2] + b[5] <= real(0.0)
+        and b[0] + a[3] <= real(0.0)
+        and b[1] + a[4] <= real(0.0)
+        and b[2] + a[5] <= real(0.0)
     )
 
 
@@ -82,8 +89,7 @@ def crossing(
     x: wp.array(dtype=vec3),
     corners: wp.array(dtype=wp.vec3i),
     n: int,
-    lower: wp.array(dtype=vec3),
-    upper: wp.array(dtype=vec3),
+    boxes: wp.array(dtype=box),
     stack: wp.array(dtype=wp.vec2i),
     room: int,
     pairs: wp.array(dtype=wp.vec2i),
@@ -100,12 +106,10 @@ def crossing(
         a = x[place(face[0], 0)]
         b = x[place(face[1], 0)]
         c = x[place(face[2], 0)]
-        lower[place(n, f)] = wp.min(a, wp.min(b, c))
-        upper[place(n, f)] = wp.max(a, wp.max(b, c))
+        boxes[place(n, f)] = box_of(a, b, c)
     for above in range(1, n):
         node = n - above
-        lower[place(node, 0)] = wp.min(lower[place(node, node)], lower[place(node, node + 1)])
-        upper[place(node, 0)] = wp.max(upper[place(node, node)], upper[place(node, node + 1)])
+        boxes[place(node, 0)] = wp.min(boxes[place(node, node)], boxes[place(node, node + 1)])
     count = start
     depth = start + 1
     stack[0] = wp.vec2i(1, 1)
@@ -120,7 +124,7 @@ def crossing(
                 stack[place(depth, 0)] = wp.vec2i(one, one)
                 stack[place(depth, 1)] = wp.vec2i(one + 1, one + 1)
                 depth += 2
-                if overlap(lower, upper, one, one + 1):
+                if overlap(boxes[place(one, 0)], boxes[place(one, 1)]):
                     stack[place(depth, 0)] = wp.vec2i(one, one + 1)
                     depth += 1
         else:
@@ -128,8 +132,9 @@ def crossing(
             split = wp.min(i, j)
             other = wp.max(i, j)
             if split < n:
+                fixed = boxes[place(other, 0)]
                 for k in range(2):
-                    if overlap(lower, upper, 2 * split + k, other):
+                    if overlap(boxes[place(2 * split, k)], fixed):
                         stack[place(depth, 0)] = wp.vec2i(2 * split + k, other)
                         depth += 1
             elif cross(x, corners[place(i, -n)], corners[place(j, -n)]):
