@@ -4,7 +4,6 @@ import warp as wp
 
 from torch_modal.nn.kernels.elements import place, real, vec3
 
-
 box = wp.types.vector(length=6, dtype=real)
 """Its lowest corner, and the opposite of its highest."""
 
