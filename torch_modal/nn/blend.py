@@ -44,9 +44,17 @@ class RotationBlend(nn.Module):
         self.fused = fused
         self.register_buffer("ends", self.poisson.edges.int(), persistent=False)
 
-    def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """The shape at the time ``t``. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``."""
-        return self._reached(self.rotations(first, second, t), torch.lerp(first, second, t[:, None, None]))
+    def forward(self, first: Tensor, second: Tensor, t: Tensor, straight: Tensor | None = None) -> Tensor:
+        """The shape at the time ``t``.
+
+        Args:
+            first: *Shape:* ``(B, V, 3)``.
+            second: *Shape:* ``(B, V, 3)``.
+            t: *Shape:* ``(B,)``.
+            straight: What linear interpolation gives, where it is known. *Shape:* ``(B, V, 3)``.
+        """
+        near = torch.lerp(first, second, t[:, None, None]) if straight is None else straight
+        return self._reached(self.rotations(first, second, t), near)
 
     def along(self, course: Course, which: Tensor, straight: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t`` of a course.

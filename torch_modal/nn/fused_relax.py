@@ -53,11 +53,11 @@ class FusedRelax(FusedShell):
         given = [value.double() for value in (x, first, second, t, *stiffness)]
         # What fits into a cache is kept for the way back; of more, the steps are taken once more.
         keep = torch.is_grad_enabled() and any(value.requires_grad for value in given) and len(x) <= chunk
-        parts = [
-            applied(_Relaxed, self, n_steps, n_products, [] if keep else None, *(v[i : i + chunk] for v in given))[0]
-            for i in range(0, len(x), chunk)
-        ]
-        return torch.cat(parts).to(x)
+        if len(x) <= chunk:
+            return applied(_Relaxed, self, n_steps, n_products, [] if keep else None, *given)[0].to(x)
+        every = range(0, len(x), chunk)
+        parts = [applied(_Relaxed, self, n_steps, n_products, None, *(v[i : i + chunk] for v in given)) for i in every]
+        return torch.cat([moved for moved, _ in parts]).to(x)
 
     def oracle(self, n_steps: int, n_products: int, x: Tensor, first: Tensor, second: Tensor, *rest: Tensor) -> Tensor:
         """The same by torch."""

@@ -188,7 +188,7 @@ class InBetween(nn.Module):
             else:
                 result = self._of_several(samples, chosen.expand(own).reshape(-1), exact, report)
         shapes, solution = unflattened(result, lead)
-        return InBetweenResult(with_exact_ends(shapes, x_a, x_b, times), solution)
+        return InBetweenResult(with_exact_ends(shapes, x_a, x_b, t), solution)
 
     def _of_several(
         self, samples: Samples, chosen: Tensor, exact: bool, report: Callable[[Solution], None] | None
@@ -336,21 +336,24 @@ def unflattened(result: InBetweenResult, lead: torch.Size) -> InBetweenResult:
     return InBetweenResult(result.shapes.reshape(*lead, *result.shapes.shape[1:]), solution)
 
 
-def with_exact_ends(shapes: Tensor, x_a: Tensor, x_b: Tensor, t: Tensor) -> Tensor:
+def with_exact_ends(shapes: Tensor, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
     """In-betweens, at 0 and 1 the key-frames to the last bit; gradients stay those of the in-between there.
 
     Args:
         shapes: *Shape:* ``(..., V, 3)``.
         x_a: Key-frames at 0, whose dtype the result has. *Shape:* ``(..., V, 3)``.
         x_b: Key-frames at 1, likewise. *Shape:* ``(..., V, 3)``.
-        t: *Shape:* ``(...)``.
+        t: *Shape:* ``(...)``, or a number.
     """
     shapes = shapes.to(torch.promote_types(x_a.dtype, x_b.dtype))
     for end, x in ((0, x_a), (1, x_b)):
+        if not isinstance(t, Tensor) and t != end:
+            continue
         exactly = x.to(shapes).detach()
         if torch.is_grad_enabled():
             exactly = exactly + (shapes - shapes.detach())
-        shapes = torch.where((t == end)[..., None, None], exactly, shapes)
+        there = torch.as_tensor(t == end, device=shapes.device)
+        shapes = torch.where(there[..., None, None], exactly, shapes)
     return shapes
 
 

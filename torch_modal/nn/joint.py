@@ -160,7 +160,7 @@ class JointSpace(nn.Module):
             with torch.no_grad():
                 start = self.modal.guess(coarse_first, coarse_second, extras[0], t)
         if self.blend is not None:
-            blend = self.blend(first, second, t)
+            blend = self.blend(first, second, t, base)
             seen = levels.seen(blend, self.frame.coarsen(blend))
             turned = levels.place(self.energy, seen, references, extras, anchors)
             with torch.no_grad():
