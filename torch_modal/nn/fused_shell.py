@@ -79,7 +79,10 @@ class FusedShell(nn.Module):
         chain = torch.tensor(own.boundary_chain)
         cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], -1)], 1)
         self.register_buffer("walls", torch.cat([mesh.faces, cones]).int(), persistent=False)
-        self.register_buffer("used", energy.used, persistent=False)
+        used = torch.zeros(own.n_vertices, 1, dtype=torch.bool).index_fill(0, energy.used.cpu(), True)
+        self.n_used = len(energy.used)
+        #: Vertices of faces. *Shape:* ``(V, 1)``, bool.
+        self.register_buffer("used", used.to(energy.used.device), persistent=False)
 
     @staticmethod
     def serves(energy: Energy, backend: Backend) -> bool:
@@ -183,13 +186,12 @@ class FusedShell(nn.Module):
 
     def mean(self, x: Tensor) -> Tensor:
         """Of all vertices of faces. *Shape:* ``(B, V, 3) -> (B, 3)``."""
-        return x.mean(1) if len(self.used) == self.n_vertices else x[:, self.used].mean(1)
+        return x.mean(1) if self.n_used == self.n_vertices else (x * self.used).sum(1) / self.n_used
 
     def _spread(self, to_centre: Tensor | None, to_x: Tensor) -> None:
         """Add what shapes receive of the centre. *Shape:* ``(B, 3), (B, V, 3)``."""
         if to_centre is not None:
-            share = to_centre[:, None] / len(self.used)
-            to_x.index_add_(1, self.used, share.expand(-1, len(self.used), -1))
+            to_x.add_(to_centre[:, None] / self.n_used * self.used)
 
     def volume(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The volume about the centre, and its gradient. *Shape:* ``(B,), (B, V, 3)``."""
@@ -205,8 +207,7 @@ class FusedShell(nn.Module):
         """
         if self.closed:
             return normal
-        share = normal.sum(1, keepdim=True) / len(self.used)
-        return normal.index_add(1, self.used, -share.expand(-1, len(self.used), -1))
+        return normal - normal.sum(1, keepdim=True) / self.n_used * self.used
 
     def at(self, x: Tensor, to: ShellReference) -> ShellPoint:
         """Value and derivatives but for the constant. *Shape:* ``(B, V, 3)``."""
