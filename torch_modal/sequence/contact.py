@@ -182,7 +182,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     search.watch(held, AROUND)
     search.count(start, search.beside(some))
     n_before = search.n_far
-    x = course.settled(course.pushed(held, some), some)
+    x = course.settled(course.pushed(held, some), some, n_before)
     return Displacement((x - start).movedim(-1, 0), t, n_before, search.n_far)
 
 
@@ -253,22 +253,28 @@ class _Course:
         fresh = self.search(found.x, some)
         return found.held if fresh is None else fresh.of_all(found.held.samples).beside(found.held)
 
-    def settled(self, found: "_Found", own: Tensor) -> Tensor:
+    def settled(self, found: "_Found", own: Tensor, n_before: Tensor) -> Tensor:
         """Some shapes brought to rest, each on its own, and all as near to that as their accelerations allow.
 
         Those between follow along a cubic spline; what passes through itself there comes to rest on its own, too. What
-        leaves the fewest crossings is kept; the search counts them. *Shape:* ``(T, V, 3)``.
+        leaves the fewest crossings is kept; the search counts them. At last, shapes that are no better for it are put
+        back, as far as their neighbours in time allow: what cannot be freed need not be crumpled.
 
         Args:
             found: Where to start.
             own: The shapes that come to rest on their own. *Shape:* ``(S,)``.
+            n_before: Pairs that cross without contact. *Shape:* ``(T,)``.
+
+        Returns:
+            *Shape:* ``(T, V, 3)``.
         """
         search, weights, tried = self.search, torch.ones_like(self.samples.t), []
         # What holds nothing is near to its neighbours in time: some of these shapes lead the others.
         leading = (found.held.weights[own] > 0).any(1)
         leading[::LEADING] = True
+        back = torch.zeros_like(n_before, dtype=torch.bool)
         for k in range(1, SETTLINGS + 1):
-            x = self.at_rest(found, own[leading] if k == 1 else own, weights)
+            x = self.at_rest(found, own[leading] if k == 1 else own, weights, back)
             search.count(x, self.watched(own) if k < LEAST_SETTLINGS else None)
             found = _Found(x, found.held, search.n_left, search.n_far)
             if k >= LEAST_SETTLINGS:
@@ -277,19 +283,23 @@ class _Course:
                     break
                 own = torch.nonzero((search.n_left > 0).index_fill(0, own, True)).flatten()
                 weights = torch.where(search.n_left > 0, INSISTENCE * weights, weights)
+                if k + 1 == SETTLINGS:
+                    back = (search.n_far > 0) & (search.n_far >= n_before)
+                    weights = torch.where(back, INSISTENCE, weights)
             if k < SETTLINGS:
                 found = found._replace(held=self.looked(found, own[search.n_far[own] > 0].tolist()))
         best = min(tried, key=_left)
         search.n_left, search.n_far = best.n_left, best.n_far
         return best.x
 
-    def at_rest(self, found: "_Found", own: Tensor, weights: Tensor) -> Tensor:
+    def at_rest(self, found: "_Found", own: Tensor, weights: Tensor, back: Tensor) -> Tensor:
         """All shapes after some have taken steps of their own. *Shape:* ``(T, V, 3)``.
 
         Args:
             found: Where these start.
             own: Which. *Shape:* ``(S,)``.
             weights: How much each counts where not all can be had. *Shape:* ``(T,)``.
+            back: Those that are to be where they were without contact. *Shape:* ``(T,)``.
         """
         samples, t = self.samples.rows(own), self.samples.t
         rest = settled(
@@ -298,6 +308,7 @@ class _Course:
         moved = (rest - self.start[own]).movedim(-1, 0)
         if len(own) < len(t):
             moved = through(t[own], t) @ moved
+        moved = torch.where(back[:, None], 0, moved)
         return self.start + self.limit.nearest(moved, weights).movedim(0, -1)
 
 
