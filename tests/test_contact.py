@@ -316,11 +316,15 @@ def test_values_in_time_lie_on_a_curve_through_them() -> None:
     assert float(slope) == pytest.approx(float((line[301] - line[299]) * 500), rel=1e-4)
 
 
-def test_course_is_free_of_crossings_and_does_not_pop(hand: Shapes) -> None:
+def test_course_is_free_of_crossings_and_does_not_pop(hand: Shapes, caplog: pytest.LogCaptureFixture) -> None:
     options = {"bases": hand.bases, "progress": False}
-    plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
-    frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)
-    assert int((far(plain, hand) > 0).sum()) >= 3
+    plain = tm.subdivide(hand.keyframes, hand.faces, 5, **options)
+    with caplog.at_level("INFO"):
+        frames = tm.subdivide(hand.keyframes, hand.faces, 5, contact=True, **options)
+    before = int((far(plain, hand) > 0).sum())
+    assert before >= 6
+    # Half of them come to rest on their own: the others are counted, too.
+    assert f"in {before} of 31 in-betweens looked at, and do in 0 still" in caplog.text
     assert int(far(frames, hand).sum()) == 0
     assert torch.equal(frames[[0, -1]], hand.keyframes)
     assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)

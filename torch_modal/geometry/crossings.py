@@ -150,9 +150,12 @@ class Crossings:
     @cached_property
     def known_inside(self) -> BoolArray:
         """Vertices that lie inside the surface in any of the known shapes. *Shape:* ``(V,)``."""
-        inside = np.zeros(self.mesh.n_vertices, dtype=bool)
-        for x in self.known:
-            inside |= self.winds(Surface(self, x), np.ones(len(x), dtype=bool))
+        inside, mesh = np.zeros(self.mesh.n_vertices, dtype=bool), self.mesh
+        one_piece = len(np.unique(mesh.vertex_pieces[mesh.faces])) == 1 and len(mesh.boundary_edges) == 0
+        for x, pairs in zip(self.known, self.pairs_of_known, strict=True):
+            # One closed piece that does not cross itself has nothing inside.
+            if len(pairs) or not one_piece:
+                inside |= self.winds(Surface(self, x), np.ones(len(x), dtype=bool))
         return inside
 
     # ----------------------------------------------------------------------------------------------------- of one shape
