@@ -158,7 +158,7 @@ class Between(nn.Module):
         """
         space, t = self.space, samples.t
         pair, usable = self._placed_by_kernels(samples) or self._placed_by_torch(samples)
-        usable, placed = trees.picked((usable, pair), samples.which)
+        usable, placed = trees.picked((usable, pair.motions()), samples.which)
         usable = usable & (t >= 0) & (t <= 1)
         if pair.around is not None and self.bare:
             # The course is a shape at rest: there is nothing to minimise.
@@ -171,7 +171,7 @@ class Between(nn.Module):
             x, solution = self.solved(
                 Batch(problem, minimisation, start, problem.energy, usable, pair, samples, anchors)
             )
-        fused = self.fused is not None and fused_alignment.serves(x, placed.first, t)
+        fused = self.fused is not None and fused_alignment.serves(x, pair.first, t)
         shapes = (fused_alignment.restore if fused else Alignment.restore)(self.frame, x, placed, t)
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)

@@ -53,6 +53,11 @@ class Pair(NamedTuple):
     around: Around | None = None
     """What the neighbours in time say, where the course is to be smooth."""
 
+    def motions(self) -> "Pair":
+        """The same without vertices: what the way back to the caller is told by."""
+        around = None if self.around is None else self.around._replace(before=None, after=None)
+        return self._replace(first=self.first[:, :0], second=self.second[:, :0], around=around)
+
 
 class Alignment(nn.Module):
     """Between the caller's coordinates and a frame that is centred, scaled and turned to a reference.

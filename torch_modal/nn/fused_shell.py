@@ -264,8 +264,13 @@ class FusedShell(nn.Module):
 
     def gradient(self, x: Tensor, to: ShellReference) -> Tensor:
         """The gradient. *Shape:* ``(B, V, 3)``."""
-        at = self.at(x, to)
-        return torch.addcmul(at.gradient, at.moment[:, None, None], at.normal)
+        b, n = x.shape[:2]
+        volume, gradient, normal = zeros(x, (b,), (b, n, 3), (b, n, 3))
+        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, n]
+        given += [None, gradient, None, None, None, volume, normal]
+        launch(kernels("shell").linearise, (b, len(self.record) + len(self.walls)), given)
+        moment = to.stiffness * (volume - to.volume)
+        return torch.addcmul(gradient, moment[:, None, None], self.shared(normal))
 
     def value(self, x: Tensor, to: ShellReference) -> Tensor:
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""

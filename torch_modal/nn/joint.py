@@ -180,7 +180,9 @@ class JointSpace(nn.Module):
         """The shape that the motion passes through, by what the neighbours in time say. *Shape:* ``(B, V, 3)``."""
         around = pair.around
         assert around is not None
-        first, second, bend = trees.picked((pair.first, pair.second, vertex_excess(pair)), index)
+        # Of one pair for all there is no need of copies.
+        which = None if len(pair.first) == 1 else index
+        first, second, bend = trees.picked((pair.first, pair.second, vertex_excess(pair)), which)
         u = t[:, None, None]
         straight = torch.lerp(first, second, u) + beyond(bend, u)
         if self.blend is None:

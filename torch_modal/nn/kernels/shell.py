@@ -308,7 +308,8 @@ def linearise(
 ):
     """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and what a product with it needs.
 
-    The volume's are apart: the volume and its gradient, see there.
+    The volume's are apart: the volume and its gradient, see there. Without arrays for the others there are only these
+    and the gradient.
     """
     i = wp.tid()
     s = i // threads
@@ -333,14 +334,15 @@ def linearise(
         width = SLACKNESS * wanted[0] * length
         across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
         along = wanted[0] - across
-        edges[at] = stretched(unit[0], unit[1], unit[2], across, along)
-        block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
         pull = slope * unit
         own += slope * d
         wp.atomic_add(gradient, q0, -pull)
         wp.atomic_add(gradient, q1, pull)
-        wp.atomic_add(diagonal, q0, block)
-        wp.atomic_add(diagonal, q1, block)
+        if diagonal:
+            edges[at] = stretched(unit[0], unit[1], unit[2], across, along)
+            block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
+            wp.atomic_add(diagonal, q0, block)
+            wp.atomic_add(diagonal, q1, block)
         found = bent()
         if q[2] >= 0:
             q2 = place(v, q[2])
@@ -370,12 +372,15 @@ def linearise(
                 wp.atomic_add(gradient, q1, moment * ge)
                 wp.atomic_add(gradient, q2, moment * ga)
                 wp.atomic_add(gradient, q3, moment * gb)
-                wp.atomic_add(diagonal, q0, stiffness * squared(gi))
-                wp.atomic_add(diagonal, q1, stiffness * squared(ge))
-                wp.atomic_add(diagonal, q2, stiffness * squared(ga))
-                wp.atomic_add(diagonal, q3, stiffness * squared(gb))
-        hinges[at] = found
-    wp.atomic_add(energy, s, HALF * own)
+                if diagonal:
+                    wp.atomic_add(diagonal, q0, stiffness * squared(gi))
+                    wp.atomic_add(diagonal, q1, stiffness * squared(ge))
+                    wp.atomic_add(diagonal, q2, stiffness * squared(ga))
+                    wp.atomic_add(diagonal, q3, stiffness * squared(gb))
+        if diagonal:
+            hinges[at] = found
+    if energy:
+        wp.atomic_add(energy, s, HALF * own)
     middle = middle_of(x, centre, walls, s, v)
     sixfold = real(0.0)
     for k in range(i - s * threads, walls.shape[0], threads):
