@@ -273,6 +273,6 @@ def gram(x: Tensor) -> Tensor:
     found = x.new_empty(len(x), n, n)
     for i in range(0, n, _BLOCKS_OF_PRODUCTS):
         own = slice(i, i + _BLOCKS_OF_PRODUCTS)
-        right = x[..., own].mT @ x[..., i:]
+        right = torch.bmm(x[..., own].mT, x[..., i:])
         found[:, i:, own], found[:, own, i:] = right.mT, right
     return found
