@@ -28,8 +28,8 @@ from torch_modal.nn.held import Held, settled
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence import acceleration, contact
 from torch_modal.sequence.acceleration import AccelerationLimit
-from torch_modal.sequence.contact import splines, through
 from torch_modal.sequence.region import Region
+from torch_modal.sequence.splines import splines, through
 
 pytest.importorskip("ipctk")
 DOUBLE = torch.float64
