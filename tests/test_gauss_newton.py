@@ -12,10 +12,11 @@ from torch.func import jacfwd
 
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.nn import solver
+from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.modal_energy import Derivatives, Placement
 from torch_modal.nn.samples import ConvergenceError, report
-from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, minimise
+from torch_modal.nn.solver import Solution, Status, minimise
 
 
 class LeastSquares:

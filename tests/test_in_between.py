@@ -18,12 +18,13 @@ from torch.func import functional_call, grad, jacrev, vmap
 
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.nn import trees
+from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.samples import ConvergenceError, ConvergenceWarning, Samples
 from torch_modal.nn.settings import Solver
-from torch_modal.nn.solver import GaussNewtonStep, Status
+from torch_modal.nn.solver import Status
 
 DOUBLE = torch.float64
 

@@ -11,11 +11,12 @@ from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.nn.frame import Frame, Pair
+from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.levels import Levels, Stiffness
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.paired import PairedPlacement, PairedProblem, PairedSpace
-from torch_modal.nn.solver import GaussNewtonStep, minimise
+from torch_modal.nn.solver import minimise
 
 MU = 0.3
 

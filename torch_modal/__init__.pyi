@@ -34,6 +34,7 @@ from .keyframes.seams import weld_seams as weld_seams
 from .keyframes.self_contacts import SelfContacts as SelfContacts
 from .keyframes.self_contacts import self_contacts as self_contacts
 from .nn.adjoint import ConvergenceWarning as ConvergenceWarning
+from .nn.gauss_newton import GaussNewtonStep as GaussNewtonStep
 from .nn.in_between import InBetween as InBetween
 from .nn.mid_shape import MidShape as MidShape
 from .nn.modal_decoder import ModalDecoder as ModalDecoder
@@ -43,7 +44,6 @@ from .nn.samples import InBetweenResult as InBetweenResult
 from .nn.settings import PRESETS as PRESETS
 from .nn.settings import Objective as Objective
 from .nn.settings import Solver as Solver
-from .nn.solver import GaussNewtonStep as GaussNewtonStep
 from .nn.solver import Solution as Solution
 from .nn.solver import Status as Status
 from .precompute.basis import ModalBasis as ModalBasis

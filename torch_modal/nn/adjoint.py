@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torch_modal.geometry.functions import applied
 from torch_modal.nn import trees
-from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, minimise
+from torch_modal.nn.gauss_newton import GaussNewtonStep
+from torch_modal.nn.solver import Solution, Status, minimise
 
 
 class ConvergenceWarning(UserWarning):

@@ -17,6 +17,7 @@ from torch_modal.nn.blend import Blends
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
 from torch_modal.nn.fused_crossings import FusedPairs
 from torch_modal.nn.fused_relax import FusedRelax
+from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
 from torch_modal.nn.levels import Levels, Stiffness, coarse_values
@@ -24,7 +25,7 @@ from torch_modal.nn.paired import PairedSpace
 from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.settings import Objective, Solver
-from torch_modal.nn.solver import GaussNewtonStep, Solution, Status, unmoved
+from torch_modal.nn.solver import Solution, Status, unmoved
 
 # Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
 # of the gap in energy between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).

@@ -9,10 +9,11 @@ from torch import Tensor
 from torch_modal.nn import trees
 from torch_modal.nn.between import LOCAL_PRODUCTS, POLISH_PRODUCTS, Batch, Between
 from torch_modal.nn.contact import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
+from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import InBetweenResult, Samples
-from torch_modal.nn.solver import GaussNewtonStep, Solution
+from torch_modal.nn.solver import Solution
 
 
 class Apart(NamedTuple):
