@@ -1,7 +1,6 @@
 """Several key-frames at once, in threads: the mesher has processes of its own, and SuperLU and BLAS free the GIL."""
 
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
@@ -15,8 +14,6 @@ from threadpoolctl import OpenBLASController, ThreadpoolController
 
 Result = TypeVar("Result")
 
-HELD_AT_MOST = 2e-4
-"""Seconds for which a thread keeps the interpreter from others that ask for it."""
 MANY = 500
 """Points from which on a search of a tree is worth threads."""
 
@@ -45,8 +42,8 @@ def run_all(
         work: Looks at ``stop`` from time to time if it takes long, and then raises `StoppedError`.
         n: How many.
         stop: Set when the results are no longer wanted.
-        meanwhile: What the first processor does that has nothing else to do while others are at work, without keeping
-            the interpreter from them; left out where there is but one, or one result.
+        meanwhile: What the first processor does that has nothing else to do while others are at work; left out where
+            there is but one, or one result.
     """
 
     def alone(index: int) -> Result:
@@ -63,7 +60,7 @@ def run_all(
             for index in range(n):
                 futures.append(pool.submit(alone, index))
             if meanwhile is not None:
-                futures.append(pool.submit(handed_on_often()(meanwhile)))
+                futures.append(pool.submit(meanwhile))
             for future in as_completed(futures):
                 future.result()
         except BaseException:
@@ -72,35 +69,6 @@ def run_all(
                 future.cancel()
             raise
     return [future.result() for future in futures[:n]]
-
-
-class _HandedOn:
-    """How many calls are inside `handed_on_often` now, and the interval before the first."""
-
-    lock = threading.Lock()
-    count = 0
-    before = 0.0
-
-
-@contextmanager
-def handed_on_often() -> Iterator[None]:
-    """Inside, threads hand on the interpreter after :data:`HELD_AT_MOST`; a decorator too.
-
-    Who imports modules keeps it for 5 ms, and others ask for it after each call of NumPy: an eigenproblem beside that
-    would wait for longer than it works. The interval belongs to the process, so the last that leaves puts it back.
-    """
-    with _HandedOn.lock:
-        if _HandedOn.count == 0:
-            _HandedOn.before = sys.getswitchinterval()
-            sys.setswitchinterval(min(HELD_AT_MOST, _HandedOn.before))
-        _HandedOn.count += 1
-    try:
-        yield
-    finally:
-        with _HandedOn.lock:
-            _HandedOn.count -= 1
-            if _HandedOn.count == 0:
-                sys.setswitchinterval(_HandedOn.before)
 
 
 class _Inside:

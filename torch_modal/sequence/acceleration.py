@@ -10,7 +10,6 @@ are differences of shapes that follow each other: what one sees.
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -123,38 +122,34 @@ class AccelerationLimit:
             return wanted
         # In frames: the unit of time drops out.
         unit = float(self.differences.abs().max()) / 2
-        rows = self.differences.double().cpu().numpy() / unit
-        goal, course = (
-            x[..., own].double().cpu().numpy().swapaxes(0, 1).reshape(x.shape[1], -1) for x in (wanted, self.course)
-        )
+        rows, weight = self.differences.double() / unit, weights.double()
+        goal, course = (x[..., own].double().movedim(0, 1).flatten(1) for x in (wanted, self.course))
         course, most = course / unit, self.most / unit
-        weight = weights.double().cpu().numpy()
-        penalty = PENALTY * weight.max() ** 0.75
-        inverse = np.linalg.inv(np.diag(weight) + penalty * rows.T @ rows)
+        penalty = PENALTY * float(weight.max()) ** 0.75
+        inverse = torch.linalg.inv(torch.diag(weight) + penalty * rows.T @ rows)
         # What is found, and the accelerations there, of what accelerations are pulled to.
         pull, freely = penalty * inverse @ rows.T, inverse @ (weight[:, None] * goal)
         reach, rest = rows @ pull, rows @ freely + course
-        split, dual = _clipped(rows @ goal + course, most), np.zeros_like(course)
+        split, dual = _clipped(rows @ goal + course, most), torch.zeros_like(course)
         for _ in range(ROUNDS):
             pulled = split - dual - course
-            reached = reach @ pulled + rest
-            if _lengths(reached).max() <= (1 + TOLERANCE) * most:
+            reached = torch.addmm(rest, reach, pulled)
+            if float(_lengths(reached).max()) <= (1 + TOLERANCE) * most:
                 break
             relaxed = RELAXATION * reached + (1 - RELAXATION) * split + dual
             split = _clipped(relaxed, most)
             dual = relaxed - split
-        found = pull @ pulled + freely
-        there = torch.from_numpy(found.reshape(len(goal), 3, -1).swapaxes(0, 1)).to(wanted)
-        return wanted.index_copy(2, own, there)
+        found = torch.addmm(freely, pull, pulled)
+        return wanted.index_copy(2, own, found.unflatten(1, (3, -1)).movedim(1, 0).to(wanted))
 
 
-def _lengths(rows: np.ndarray) -> np.ndarray:
+def _lengths(rows: Tensor) -> Tensor:
     """*Shape:* ``(N, 3 V) -> (N, V)``."""
-    x, y, z = rows.reshape(len(rows), 3, -1).swapaxes(0, 1)
-    return np.sqrt(x * x + y * y + z * z)  # type: ignore[no-any-return]
+    x, y, z = rows.unflatten(1, (3, -1)).unbind(1)
+    return (x * x + y * y + z * z).sqrt()
 
 
-def _clipped(rows: np.ndarray, most: float) -> np.ndarray:
+def _clipped(rows: Tensor, most: float) -> Tensor:
     """Vectors shortened to a length where they are longer. *Shape:* ``(N, 3 V)``."""
-    part = np.minimum(1, most / np.maximum(_lengths(rows), 1e-300))
-    return (rows.reshape(len(rows), 3, -1) * part[:, None]).reshape(rows.shape)
+    part = (most / _lengths(rows).clamp_min(torch.finfo(rows.dtype).tiny)).clamp_max(1)
+    return (rows.unflatten(1, (3, -1)) * part[:, None]).flatten(1)

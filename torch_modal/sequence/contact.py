@@ -38,7 +38,7 @@ ROOM = 1.15
 """A vertex may be accelerated so many times as much as the one that is most without contact."""
 LEAST_LIMIT = 30.0
 """That is never less than this, at a diagonal of 100: a straight course has to be left, too."""
-REGION = 0.17
+REGION = 0.18
 """Of the diagonal, along the surface: how far from what is held vertices move on their own, beside the modes."""
 LOOKED_AT = 8
 SEARCHED = 16
