@@ -26,7 +26,7 @@ from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.held import Held, settled
 from torch_modal.nn.samples import Samples
-from torch_modal.sequence import acceleration, contact
+from torch_modal.sequence import acceleration, coupled
 from torch_modal.sequence.acceleration import AccelerationLimit
 from torch_modal.sequence.region import Region
 from torch_modal.sequence.splines import splines, through
@@ -439,7 +439,7 @@ def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> No
 @pytest.mark.filterwarnings("ignore:in .* in-betweens looked at")
 def test_limit_keeps_a_course_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     # Three times the peak acceleration, if nothing but this little weight held it.
-    monkeypatch.setattr(contact, "SMOOTHNESS", 0.02)
+    monkeypatch.setattr(coupled, "SMOOTHNESS", 0.02)
     options = {"bases": hand.bases, "progress": False}
     plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
     frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)

@@ -156,11 +156,13 @@ class ContactSearch:
 
     def _counted(self, i: int, x: Tensor) -> tuple[int, int]:
         """Pairs of triangles that went through each other in a sample, and those of them that are not tolerated."""
-        search = self._search(i)
         if not bool(x.isfinite().all()):
             return 0, 0
-        pairs = search.crossings.far_pairs(x.detach().double().cpu().numpy())
-        return len(pairs), search.n_left(pairs, *self._when(i))
+        return self._told(i, self._search(i).crossings.far_pairs(x.detach().double().cpu().numpy()))
+
+    def _told(self, i: int, pairs: IntArray) -> tuple[int, int]:
+        """The number of pairs in a sample, and of those that are not tolerated. *Shape:* ``(P, 2)``."""
+        return len(pairs), self._search(i).n_left(pairs, *self._when(i))
 
     def __call__(self, x: Tensor, some: Sequence[int] | None = None) -> Contacts | None:
         """Contacts of the samples; None where nothing has gone through anything, now or before.
@@ -176,7 +178,7 @@ class ContactSearch:
             if bool(x[i].isfinite().all()):
                 held = found[i] = self._search(i)(x[i].detach().double().cpu().numpy(), self.watched[i])
                 self.watched[i] = held.watched if held.watched.any() else None
-                counts[k] = len(held.far), self._search(i).n_left(held.far, *self._when(i))
+                counts[k] = self._told(i, held.far)
         self._keep(some, counts)
         if not any(held is not None and len(held.vertices) for held in found):
             return None

@@ -52,8 +52,8 @@ class FusedRelax(FusedShell):
             return self.oracle(n_steps, n_products, x, first, second, t, *stiffness)
         given = [value.double() for value in (x, first, second, t, *stiffness)]
         # What fits into a cache is kept for the way back; of more, the steps are taken once more.
-        keep = torch.is_grad_enabled() and any(value.requires_grad for value in given) and len(x) <= chunk
         if len(x) <= chunk:
+            keep = torch.is_grad_enabled() and any(value.requires_grad for value in given)
             return applied(_Relaxed, self, n_steps, n_products, [] if keep else None, *given)[0].to(x)
         every = range(0, len(x), chunk)
         parts = [applied(_Relaxed, self, n_steps, n_products, None, *(v[i : i + chunk] for v in given)) for i in every]

@@ -113,6 +113,14 @@ def weigh(
 
 
 @wp.func
+def edge_weight(pull: real, length: real, shortest: real):
+    found = real(0.0)
+    if length > shortest:
+        found = pull / length
+    return found
+
+
+@wp.func
 def bend_weight(e: vec3, n1: vec3, n2: vec3):
     base = wp.dot(e, e)
     area = HALF * (length_of(n1) + length_of(n2))
@@ -153,12 +161,8 @@ def rest(
         e2 = second[place(v, q[1])] - origin2
         l1 = length_of(e1)
         l2 = length_of(e2)
-        w1 = real(0.0)
-        w2 = real(0.0)
-        if l1 > short[0]:
-            w1 = both[0] / l1
-        if l2 > short[1]:
-            w2 = both[1] / l2
+        w1 = edge_weight(both[0], l1, short[0])
+        w2 = edge_weight(both[1], l2, short[1])
         whole = w1 + w2
         share = real(0.0)
         if whole > real(0.0):

@@ -23,7 +23,7 @@ from torch_modal.nn.kernels.elements import (
     vec4,
     wrapped,
 )
-from torch_modal.nn.kernels.shell import RATIO, SLACKNESS
+from torch_modal.nn.kernels.shell import RATIO, SLACKNESS, edge_weight
 
 TWO = wp.constant(real(2.0))
 
@@ -129,12 +129,8 @@ def from_reference(
         e2 = second[q1] - origin2
         l1 = length_of(e1)
         l2 = length_of(e2)
-        w1 = real(0.0)
-        w2 = real(0.0)
-        if l1 > short[0]:
-            w1 = both[0] / l1
-        if l2 > short[1]:
-            w2 = both[1] / l2
+        w1 = edge_weight(both[0], l1, short[0])
+        w2 = edge_weight(both[1], l2, short[1])
         whole = w1 + w2
         per_whole = real(0.0)
         if whole > real(0.0):
