@@ -26,7 +26,7 @@ from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.held import Held, settled
 from torch_modal.nn.samples import Samples
-from torch_modal.sequence import acceleration, coupled
+from torch_modal.sequence import acceleration, contact, coupled
 from torch_modal.sequence.acceleration import AccelerationLimit
 from torch_modal.sequence.region import Region
 from torch_modal.sequence.splines import splines, through
@@ -498,3 +498,36 @@ def test_scanned_like_figure_walks_without_new_crossings(women: Shapes) -> None:
     with torch.no_grad():
         _, solution = tm.InBetween(pair.bases, pair.faces, contact=True).solve(*pair.keyframes, 0.5)
     assert int(solution.n_crossing) == 0
+
+
+def test_shapes_that_are_no_better_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two that cross as before are put back the last time, the free one is not."""
+    before = torch.tensor([3, 0, 2])
+    counts = iter([[3, 0, 2], [3, 0, 2], [3, 0, 2], [2, 0, 2]])
+    start = torch.zeros(3, 4, 3)
+
+    class Fake:
+        watched = [None] * 3
+        n_left = n_far = before
+
+        def count(self, x: Tensor, some: object = None) -> None:
+            self.n_left = self.n_far = torch.tensor(next(counts))
+
+        def __call__(self, x: Tensor, some: object = None) -> None:
+            return None
+
+        def rows(self, chosen: Tensor) -> "Fake":
+            return self
+
+        def nearest(self, moved: Tensor, weights: Tensor) -> Tensor:
+            return moved
+
+    class Given(Fake):
+        t = torch.tensor([0.25, 0.5, 0.75])
+        weights = torch.ones(3, 1)
+
+    monkeypatch.setattr(contact, "settled", lambda *given: given[3] + 1)
+    course = contact._Course(*[Given()] * 2, None, start, *[Fake()] * 2)  # type: ignore[arg-type]
+    found = contact._Found(start, Given(), before, before)  # type: ignore[arg-type]
+    x = course.settled(found, torch.arange(3), before)
+    assert torch.equal(x[[0, 2]], start[[0, 2]]) and bool((x[1] > 0).all())
