@@ -107,6 +107,17 @@ def test_local_steps(case: Case) -> None:
     assert_alike(gradients(partial(case.by_warp, chunk=2), case.given), truth, 1e-6)  # steps are kept
 
 
+def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 0.3)
+    one, other = case.mesh.edges[0].tolist()
+    case.given[1][:, other] = case.given[1][:, one] + 1e-7
+    given = [value.contiguous() for value in case.given[1:]]
+    found, truth = (run(*given) for run in (case.fused.reference, case.fused.reference_by_torch))
+    for got, wanted in zip(found, truth, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-9)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
+
+
 def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     case = Case(small_bars, small_bars.faces, 10.0)
     case.given[5] *= 1e5
