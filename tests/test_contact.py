@@ -15,6 +15,7 @@ from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.contact import Contact
 from torch_modal.energy.energy import Energy, Reference
+from torch_modal.energy.position import Position
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import Search
@@ -24,11 +25,10 @@ from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.frame import Pair
-from torch_modal.nn.held import Held, settled
+from torch_modal.nn.held import Held, Pull, settled
 from torch_modal.nn.samples import Samples
-from torch_modal.sequence import acceleration, contact, coupled
+from torch_modal.sequence import contact, together
 from torch_modal.sequence.acceleration import AccelerationLimit
-from torch_modal.sequence.region import Region
 from torch_modal.sequence.splines import splines, through
 
 pytest.importorskip("ipctk")
@@ -76,6 +76,17 @@ def test_term_has_the_derivatives_of_torch_func(generator: torch.Generator) -> N
     spokes = torch.randn(3, 3, 2, 5, dtype=DOUBLE, generator=generator)
     term = Contact(torch.zeros(5, 4, dtype=torch.int64))
     torch.testing.assert_close(term.gradients(spokes), Term.gradients(term, spokes), rtol=1e-12, atol=1e-12)
+
+
+def test_positions_pull_to_places(generator: torch.Generator) -> None:
+    x, places = torch.randn(2, 2, 3, 5, dtype=DOUBLE, generator=generator)
+    weights = torch.rand(2, 5, dtype=DOUBLE, generator=generator)
+    energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [2, 3, 4]]), 5), [Position(5)])
+    rows = x.transpose(0, 1).contiguous()
+    reference = Reference((places.flatten(1)[:, None],), (weights.repeat(1, 3)[:, None],), 0.0)
+    at = energy.linearise(energy.extend(rows), reference)
+    torch.testing.assert_close(energy.value_at(at, reference), (weights * ((x - places) ** 2).sum(1)).sum(1))
+    torch.testing.assert_close(energy.fold(energy.gradient(at)), (2 * weights[:, None] * (x - places)).transpose(0, 1))
 
 
 def test_term_is_one_sided(generator: torch.Generator) -> None:
@@ -220,7 +231,7 @@ def test_counting_finds_what_searching_finds(hand: Shapes) -> None:
     assert search.of(torch.tensor([1])).n_far.tolist() == found[1:]
 
 
-# -------------------------------------------------------------------------------------------------------------- region
+# ------------------------------------------------------------------------------------------------ steps of each shape
 def first_interval(hand: Shapes, t: Tensor, smooth: bool, backend: Any) -> tuple[Between, Samples, Pair]:
     """Times between the first two key-frames of a hand that closes and opens."""
     three = hand.pick(0, 1, 0)
@@ -228,38 +239,6 @@ def first_interval(hand: Shapes, t: Tensor, smooth: bool, backend: Any) -> tuple
     member = path.layer.members[0]
     samples = path.samples(three.keyframes[None], 0, torch.zeros(len(t), dtype=torch.int64), t)
     return member, samples, member.placed(samples)
-
-
-@pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
-def test_kernels_and_torch_see_the_same_region(hand: Shapes, smooth: bool, generator: torch.Generator) -> None:
-    pytest.importorskip("warp")
-    x_a = hand.keyframes[0]
-    near = x_a[:, 1] > x_a[:, 1].median()
-    t = torch.tensor([0.3, 0.6], dtype=DOUBLE)
-    results = []
-    for backend in ("torch", "warp"):
-        member, samples, pair = first_interval(hand, t, smooth, backend)
-        region = Region(member, samples, pair, near)
-        touching = torch.cat([hand.faces[:4], region.vertices[-4:, None]], 1)
-        touching[:, :3] = region.vertices[:12].reshape(4, 3)
-        weights = torch.tensor([[3.0, 0, 1, 2], [0, 2, 1, 0]], dtype=DOUBLE)
-        region.hold(Contacts(torch.arange(2), touching, weights, torch.full_like(weights, 90.0)))
-        rows = trees.picked(pair.first, samples.which)[:, region.vertices].movedim(-1, 0)
-        generator.manual_seed(0)
-        field = torch.randn(rows.shape, dtype=DOUBLE, generator=generator)
-        rows = rows + 0.05 * field
-        value, gradient, blocks, at = region.linearised(rows)
-        flat = rows.flatten(1)
-        (exact,) = torch.autograd.grad(region.held.value(x := flat.clone().requires_grad_()).sum(), x)
-        held = region.held.linearised(flat)
-        assert held.gradient.abs().max() > 0
-        torch.testing.assert_close(torch.zeros_like(flat).index_add(1, held.corners, held.gradient), exact)
-        whole = region.value(rows)
-        results.append([value, gradient, blocks, region.product(at, field), whole - region.value(rows + 0.01 * field)])
-        torch.testing.assert_close(value, whole)
-    for name, a, b in zip(["value", "gradient", "blocks", "product", "fall"], *results, strict=True):
-        if name != "value":  # kernels leave out the constant
-            torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8 * float(b.abs().max()), msg=name)
 
 
 @pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
@@ -275,10 +254,14 @@ def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
         assert held is not None and held.samples.tolist() == [1]
         held = held.of_all(torch.arange(2))
         flat = x.movedim(-1, 0).flatten(1)
-        y = settled(member, samples, pair, x, held, 2, 10)
-        term = Held(held, None, x.shape[1])
+        # One shape is free, the other is held, and a corner of both is pulled elsewhere.
+        corner = (x[0] - x[0].amin(0)).norm(dim=-1) < 20
+        pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas[0])
+        y = settled(member, samples, pair, x, held, 2, 10, pull)
+        term = Held(held, x.shape[1])
         pushed = term.value(y.movedim(-1, 0).flatten(1))
         assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(term.value(flat)[1])
+        assert corner.sum() > 20 and bool((pull.value(y) < 0.5 * pull.value(x)).all())
         results.append(y)
     torch.testing.assert_close(*results, rtol=0, atol=1e-6)
 
@@ -353,14 +336,10 @@ def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> N
     assert depth[:, 1].max() == 0 < depth[:, 0].max() < 0.1 and depth[tip, 0] > 0
     assert np.linalg.norm(known[0][depth[:, 0] > 0] - known[0][tip], axis=1).max() < 0.5 * search.crossings.diagonal
     slack = np.array([[2.0, 0.0]])
-    course = [float(search.tolerance(slack, t, 10.0)[0, 0]) for t in (0.0, 0.1, 0.19, 0.21, 0.5)]
+    course = [float(search.tolerance(slack, t)[0, 0]) for t in (0.0, 0.02, 0.05, 0.07, 0.5)]
     assert course[0] == 1 and course[3:] == [0, 0] and sorted(course, reverse=True) == course
-    # Where all else is slow it takes longer, at most half of the time; where the course goes on beyond the key-frame,
-    # which it then does not leave with a velocity, too.
-    assert search.tolerance(slack, 0.4, 0.1)[0, 0] > 0 == search.tolerance(slack, 0.51, 1e-6)[0, 0]
-    assert search.tolerance(slack, 0.4, 10.0, (False, True))[0, 0] > 0 == search.tolerance(slack, 0.4, 10.0)[0, 0]
     pairs = np.array([[int(face) for face in torch.nonzero((hand.faces == tip).any(1)).flatten()[:2]]])
-    assert search.n_left(pairs, 0.02, 10.0) == 0 and search.n_left(pairs, 0.5, 10.0) == 1
+    assert search.n_left(pairs, 0.02) == 0 and search.n_left(pairs, 0.5) == 1
 
 
 def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
@@ -376,70 +355,45 @@ def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
     np.testing.assert_array_equal(held.slack[beside > 0], beside[beside > 0])
 
 
-def test_limit_sees_the_accelerations_of_frames(generator: torch.Generator) -> None:
-    t = torch.linspace(0, 1, 11, dtype=DOUBLE)
-    values = splines(t, 5).values
-    differences = 100 * torch.eye(11, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
-    course = torch.randn(3, 9, 4, dtype=DOUBLE, generator=generator)
-    at = 0.1 * torch.randn(3, values.shape[1], 4, dtype=DOUBLE, generator=generator)
-    area = torch.tensor([1.0, 2.0, 0.5, 0.5], dtype=DOUBLE)
-    there = course + 100 * torch.stack([values @ x for x in at]).diff(n=2, dim=1)
-    lengths = there.norm(dim=0)
-    most = float(lengths.quantile(0.6))
-    limit = AccelerationLimit(course, differences, values[1:-1], area, most)
-    excess = limit.linearised(at)
-    expected = acceleration.STIFFNESS / 9 * (area * (lengths - most).clamp_min(0) ** 2).sum()
-    torch.testing.assert_close(excess.value, expected)
-    torch.testing.assert_close(limit.value(at), expected)
-    gradient, hessian = torch.func.grad(limit.value)(at), torch.func.hessian(limit.value)(at)
-    torch.testing.assert_close(excess.gradient, gradient)
-    field = torch.randn(at.shape, dtype=DOUBLE, generator=generator)
-    nothing = torch.zeros_like(at)
-    torch.testing.assert_close(
-        limit.add_product(excess, field, nothing), torch.einsum("abcdef,def->abc", hessian, field)
-    )
-    blocks = limit.add_diagonal(excess, nothing.new_zeros(3, *at.shape))
-    torch.testing.assert_close(blocks, torch.einsum("ajvbjv->abjv", hessian))
-    columns = torch.randn(2, 4, 3, dtype=DOUBLE, generator=generator)
-    expected = torch.einsum("mva,ajvbkw,nwb->jmkn", columns, hessian, columns)
-    torch.testing.assert_close(limit.in_columns(excess, columns), expected)
-    still = AccelerationLimit(course, differences, values[1:-1], area, 1e3).linearised(at)
-    assert float(still.value) == 0 == len(still.vertices)
-
-
 def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> None:
     differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
     differences = 64 * torch.cat([differences, 2 * torch.eye(7, dtype=DOUBLE)[:1]])  # and it goes on at the start
     course = 8 * torch.randn(3, 8, 5, dtype=DOUBLE, generator=generator)
-    wanted = torch.randn(3, 7, 5, dtype=DOUBLE, generator=generator)
-    wanted[..., 4] *= 1e-3
-    limit = AccelerationLimit(course, differences, torch.eye(7, dtype=DOUBLE), torch.ones(5, dtype=DOUBLE), 25.0)
-    weights = torch.tensor([1.0, 1, 20, 1, 3, 1, 1], dtype=DOUBLE)
-    found = limit.nearest(wanted, weights)
+    seen = torch.randn(3, 7, 5, dtype=DOUBLE, generator=generator)
+    seen[..., 4] *= 1e-3
+    # The coordinates of displacements turn as time goes on; accelerations are seen from outside.
+    angle = torch.linspace(0, 1.2, 7, dtype=DOUBLE)
+    turns = torch.eye(3, dtype=DOUBLE).repeat(7, 1, 1)
+    turns[:, 0, 0], turns[:, 1, 1] = angle.cos(), angle.cos()
+    turns[:, 1, 0], turns[:, 0, 1] = angle.sin(), -angle.sin()
+    wanted = torch.einsum("tij,itv->jtv", turns, seen)
+    found, kept = AccelerationLimit(course, differences, turns, 25.0).nearest(wanted)
+    assert kept.tolist() == [0, 1, 2, 3]
     assert torch.equal(found[..., 4], wanted[..., 4]) and not torch.equal(found[..., 0], wanted[..., 0])
-    assert float((course + differences @ found).norm(dim=0).max()) < 25.0 * 1.02
+    turned = torch.einsum("tij,jtv->itv", turns, found)
+    assert float((course + differences @ turned).norm(dim=0).max()) < 25.0 * 1.02
     for v in range(4):
 
         def room(x: np.ndarray, v: int = v) -> np.ndarray:
             rows = course[..., v].numpy() + x.reshape(3, 7) @ differences.numpy().T
             return 25.0**2 - (rows**2).sum(0)
 
-        goal, weight = wanted[..., v].numpy().ravel(), np.tile(weights.numpy(), 3)
+        goal = seen[..., v].numpy().ravel()
         best = minimize(
-            lambda x, goal=goal, weight=weight: (weight * (x - goal) ** 2).sum(),
+            lambda x, goal=goal: ((x - goal) ** 2).sum(),
             goal,
-            jac=lambda x, goal=goal, weight=weight: 2 * weight * (x - goal),
+            jac=lambda x, goal=goal: 2 * (x - goal),
             constraints={"type": "ineq", "fun": room},
             method="SLSQP",
             options={"maxiter": 300},
         )
-        assert float((weights * (found[..., v] - wanted[..., v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
+        assert float(((turned[..., v] - seen[..., v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
 
 
 @pytest.mark.filterwarnings("ignore:in .* in-betweens looked at")
 def test_limit_keeps_a_course_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     # Three times the peak acceleration, if nothing but this little weight held it.
-    monkeypatch.setattr(coupled, "SMOOTHNESS", 0.02)
+    monkeypatch.setattr(together, "SMOOTHNESS", 0.02)
     options = {"bases": hand.bases, "progress": False}
     plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
     frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)
@@ -500,34 +454,50 @@ def test_scanned_like_figure_walks_without_new_crossings(women: Shapes) -> None:
     assert int(solution.n_crossing) == 0
 
 
-def test_shapes_that_are_no_better_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two that cross as before are put back the last time, the free one is not."""
-    before = torch.tensor([3, 0, 2])
-    counts = iter([[3, 0, 2], [3, 0, 2], [3, 0, 2], [2, 0, 2]])
-    start = torch.zeros(3, 4, 3)
+def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shapes on springs of different stiffness, held below the limit: SciPy finds the same rest."""
+    n, places = 7, 2 * torch.randn(7, 3, 3, dtype=DOUBLE, generator=generator)
+    springs = torch.tensor([1.0, 30, 1, 5, 1, 0.2, 3], dtype=DOUBLE)
+    differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
+    limit = AccelerationLimit(torch.zeros(3, 7, 3, dtype=DOUBLE), differences, torch.eye(3).repeat(7, 1, 1).double(), 1)
 
     class Fake:
-        watched = [None] * 3
-        n_left = n_far = before
+        t = torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1]
+        areas = torch.ones(1, 3, dtype=DOUBLE)
+        n_far = torch.full((n,), 99)
 
-        def count(self, x: Tensor, some: object = None) -> None:
-            self.n_left = self.n_far = torch.tensor(next(counts))
+        def is_watched(self, some: Tensor) -> Tensor:
+            return torch.ones(len(some), dtype=torch.bool)
 
-        def __call__(self, x: Tensor, some: object = None) -> None:
+        def count(self, x: Tensor, some: object) -> None:
+            self.n_far = self.n_far - 1  # the last is the best
+
+        def __call__(self, x: Tensor, some: object) -> None:
             return None
 
-        def rows(self, chosen: Tensor) -> "Fake":
-            return self
+        def rows(self, some: Tensor) -> Tensor:
+            return some
 
-        def nearest(self, moved: Tensor, weights: Tensor) -> Tensor:
-            return moved
+    def rest(
+        member: Any, own: Tensor, pair: Any, x: Tensor, held: Any, steps: int, products: int, pull: Pull
+    ) -> Tensor:
+        own_springs = springs[own, None, None]
+        pulls = pull.weights[:, None]
+        found: Tensor = (own_springs * places[own] + pulls * pull.to) / (own_springs + pulls)
+        return found
 
-    class Given(Fake):
-        t = torch.tensor([0.25, 0.5, 0.75])
-        weights = torch.ones(3, 1)
-
-    monkeypatch.setattr(contact, "settled", lambda *given: given[3] + 1)
-    course = contact._Course(*[Given()] * 2, None, start, *[Fake()] * 2)  # type: ignore[arg-type]
-    found = contact._Found(start, Given(), before, before)  # type: ignore[arg-type]
-    x = course.settled(found, torch.arange(3), before)
-    assert torch.equal(x[[0, 2]], start[[0, 2]]) and bool((x[1] > 0).all())
+    monkeypatch.setattr(contact, "settled", rest)
+    monkeypatch.setattr(contact, "ROUNDS", (4, 90))
+    monkeypatch.setattr(contact, "PULL", 3.0)
+    start = torch.zeros_like(places)
+    fake: Any = Fake()
+    x, _ = contact._at_rest(fake, fake, fake, start, start, fake, torch.arange(n), fake, limit)
+    for v in range(3):
+        best = minimize(
+            lambda d, v=v: float((springs.numpy()[:, None] * (d.reshape(n, 3) - places[:, v].numpy()) ** 2).sum()),
+            np.zeros(3 * n),
+            constraints={"type": "ineq", "fun": lambda d: 1 - ((differences.numpy() @ d.reshape(n, 3)) ** 2).sum(1)},
+            method="SLSQP",
+            options={"maxiter": 500},
+        )
+        np.testing.assert_allclose(x[:, v].numpy(), best.x.reshape(n, 3), rtol=0, atol=0.03)

@@ -31,7 +31,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
-from torch_modal.sequence.contact import FINE_STEPS, SETTLING_STEPS, SETTLINGS
+from torch_modal.sequence.contact import ROUNDS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LEVELS = 5
@@ -114,9 +114,7 @@ def run(case: Case) -> Run:
     subdivided(case, bases, contact=False)  # what is made once
     plain, without = subdivided(case, bases, contact=False)
     apart, with_ = subdivided(case, bases, contact=True)
-    polished, _ = subdivided(
-        case, bases, solver=tm.Solver(polish=2 * FINE_STEPS + SETTLINGS * SETTLING_STEPS), contact=False
-    )
+    polished, _ = subdivided(case, bases, solver=tm.Solver(polish=ROUNDS[1]), contact=False)
     return Run(plain, apart, polished, (without, with_))
 
 

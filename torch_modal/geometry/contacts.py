@@ -24,8 +24,8 @@ DEEP = 0.12
 """Along the surface: how far from where it crosses what went in is looked for."""
 SPREAD = 0.05
 """How far along the surface from where a key-frame passes through itself the same depth is tolerated."""
-LENIENT = 0.06, 0.5
-"""Least and largest part of the time between two key-frames over which what crosses in one of them is pushed out."""
+LENIENT = 0.06
+"""Part of the time between two key-frames over which what crosses in one of them is pushed out of a shape alone."""
 _STRAIGHT = 0.7
 """Least part of the distance that lies along the face's normal; less is beside the face, not before it."""
 _BEHIND = 0.02
@@ -86,35 +86,25 @@ class Search:
         stuck = winds & before & seeds
         return Held(*self.opposite(surface, seeds, inside, stuck), pairs, seeds)
 
-    def tolerance(
-        self, slack: FloatArray, t: float, acceleration: float, free: tuple[bool, bool] = (True, True)
-    ) -> FloatArray:
-        r"""How much of what crosses in both key-frames is tolerated between them: all at their times, nothing later.
-
-        It is what cannot be out yet. Two sides that are pushed from each other, each with the acceleration :math:`a`,
-        are :math:`a \tau^2` farther apart at the time :math:`\tau` beside the key-frame. If the course starts there,
-        they may leave it with a velocity, and be pushed back until the other key-frame: :math:`a \tau (1 - \tau)`.
+    def tolerance(self, slack: FloatArray, t: float) -> FloatArray:
+        """How much of what crosses in both key-frames is tolerated between them: all at their times, nothing later.
 
         Args:
             slack: Depths in the key-frames. *Shape:* ``(..., 2)``.
             t: The time, from 0 to 1.
-            acceleration: The largest that a vertex may have.
-            free: Whether the course starts at the first key-frame, and ends at the second.
 
         Returns:
             From 0 to 1; 0 where there is no depth. *Shape:* ``(..., 2)``.
         """
-        power = np.where(free, 1, 2)
-        lasting = np.clip((slack / max(acceleration, 1e-9)) ** (1 / power), *LENIENT)
-        part = np.clip(1 - (np.array([t, 1 - t]) / lasting) ** power, 0, 1)
+        part = np.clip(1 - np.array([t, 1 - t]) / LENIENT, 0, 1)
         return (slack > 0) * part  # type: ignore[no-any-return]
 
-    def n_left(self, pairs: IntArray, t: float, acceleration: float, free: tuple[bool, bool] = (True, True)) -> int:
+    def n_left(self, pairs: IntArray, t: float) -> int:
         """How many pairs of faces are not beside what is tolerated. *Shape:* ``(P, 2)``."""
         if not len(pairs) or not self._known:
             return len(pairs)
         slack = self.tolerated[self.crossings.mesh.faces[pairs]].max((1, 2))
-        return int((self.tolerance(slack, t, acceleration, free) <= 0).all(1).sum())
+        return int((self.tolerance(slack, t) <= 0).all(1).sum())
 
     @cached_property
     def tolerated(self) -> FloatArray:

@@ -1,6 +1,5 @@
 """Contacts of a batch of in-betweens: what is held in each, as a term of the modal solve and of the fine steps."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from typing import Any, NamedTuple
@@ -107,10 +106,8 @@ class ContactSearch:
         second: Likewise.
         which: The pair of each sample; each its own where None. *Shape:* ``(B,)``.
         t: Times. *Shape:* ``(B,)``.
-        acceleration: The largest that a vertex may have in the course that the samples are of; the time between the
-            key-frames is the unit.
-        free: Whether the course starts at the first key-frame, and ends at the second.
         pairs: The ``search`` of :class:`~torch_modal.geometry.crossings.Crossings`.
+        is_tolerant: Whether what a key-frame has is tolerated close to it.
     """
 
     def __init__(
@@ -120,9 +117,8 @@ class ContactSearch:
         second: Tensor,
         which: Tensor | None,
         t: Tensor,
-        acceleration: float = math.inf,
-        free: tuple[bool, bool] = (True, True),
         pairs: Callable[[FloatArray], IntArray] | None = None,
+        is_tolerant: bool = True,
     ) -> None:
         known = torch.stack([first, second], 1).detach().double().cpu().numpy()
         self.searches = [Search(Crossings(mesh.connectivity, both, search=pairs)) for both in known]
@@ -130,7 +126,7 @@ class ContactSearch:
         self.faces = mesh.faces
         self.areas = torch.stack([_areas(x.detach(), mesh.faces) for x in first])
         self.t = t.detach()
-        self.acceleration, self.free = acceleration, free
+        self.is_tolerant = is_tolerant
         self.watched: list[Any] = [None] * len(t)
         #: Pairs of triangles that went through each other in the shapes that were searched last. *Shape:* ``(B,)``.
         self.n_far = torch.zeros_like(t, dtype=torch.int64)
@@ -162,7 +158,7 @@ class ContactSearch:
 
     def _told(self, i: int, pairs: IntArray) -> tuple[int, int]:
         """The number of pairs in a sample, and of those that are not tolerated. *Shape:* ``(P, 2)``."""
-        return len(pairs), self._search(i).n_left(pairs, *self._when(i))
+        return len(pairs), self._search(i).n_left(pairs, float(self.t[i])) if self.is_tolerant else len(pairs)
 
     def __call__(self, x: Tensor, some: Sequence[int] | None = None) -> Contacts | None:
         """Contacts of the samples; None where nothing has gone through anything, now or before.
@@ -193,24 +189,21 @@ class ContactSearch:
         for i, (code, held) in enumerate(zip(codes, found, strict=True)):
             places = torch.searchsorted(every, code)
             weights[i, places] = STIFFNESS * self.areas[self.which[i]].cpu()[vertices[places]].to(x.dtype)
-            if held is not None and held.slack.any():
+            if self.is_tolerant and held is not None and held.slack.any():
                 slack = torch.from_numpy(held.slack).to(x.dtype)
-                ramps = torch.from_numpy(self._search(i).tolerance(held.slack, *self._when(i))).to(x.dtype)
+                ramps = torch.from_numpy(self._search(i).tolerance(held.slack, float(self.t[i]))).to(x.dtype)
                 gaps[i, places] = GAP * (1 - ramps.amax(1)) - (slack * ramps).amax(1)
         own = torch.nonzero((weights > 0).any(1)).flatten()
         to = x.device
         return Contacts(own.to(to), elements.to(to), weights[own].to(to), gaps[own].to(to))
 
     @property
-    def is_tolerant(self) -> bool:
-        """Whether a key-frame has parts that went through each other, which is tolerated beside it."""
+    def has_crossed(self) -> bool:
+        """Whether parts went through each other in a key-frame."""
         return any(bool(search.tolerated.any()) for search in self.searches)
 
     def _search(self, i: int) -> Search:
         return self.searches[self.which[i]]
-
-    def _when(self, i: int) -> tuple[float, float, tuple[bool, bool]]:
-        return float(self.t[i]), self.acceleration, self.free
 
     def watch(self, held: Contacts, around: int) -> None:
         """Watch what is held in a sample, and beside it, in that one and its neighbours in time."""
@@ -227,10 +220,9 @@ class ContactSearch:
         chosen = set(some.tolist())
         return [i for i, watched in enumerate(self.watched) if watched is not None and i not in chosen]
 
-    def near(self, part: float) -> Tensor:
-        """Vertices within a part of the diagonal of those that were ever watched, of one pair. *Shape:* ``(V,)``."""
-        watched = [own for own in self.watched if own is not None]
-        return torch.from_numpy(self.searches[0].crossings.within(sum(watched[1:], watched[0]) > 0, part))
+    def is_watched(self, some: Tensor) -> Tensor:
+        """Whether something is watched in samples. *Shape:* ``(S,) -> (S,)``."""
+        return torch.tensor([self.watched[i] is not None for i in some.tolist()], device=some.device)
 
     def of(self, some: Tensor) -> "ContactSearch":
         """A search in some of the samples, with what is known of them. *Shape:* ``(S,)``."""

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.energy.contact import Contact
+from torch_modal.energy.energy import Reference
+from torch_modal.energy.position import Position
 from torch_modal.geometry.vectors import pick
 from torch_modal.nn import trees
 from torch_modal.nn.between import Between, fine_chunk
@@ -37,7 +39,7 @@ class AtHeld(NamedTuple):
         return (self.stiffness.repeat(4) * self.on_corners)[:, None] * self.on_corners
 
     def product(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """The Hessian times displacements, at the corners, and its form. *Shape:* ``(3, T R) -> (3, 4 N), (N,)``."""
+        """The Hessian times displacements, at the corners, and its form. *Shape:* ``(3, T V) -> (3, 4 N), (N,)``."""
         rate = (pick(field, self.corners) * self.on_corners).sum(0).unflatten(0, (4, -1)).sum(0)
         return (self.stiffness * rate).repeat(4) * self.on_corners, self.stiffness * rate**2
 
@@ -47,16 +49,14 @@ class Held:
 
     Args:
         held: Of all shapes.
-        numbers: Of each vertex among those that are seen, negative for others. Default: all are. *Shape:* ``(V,)``.
-        n: How many these are, R.
+        n: How many vertices a shape has, V.
     """
 
-    def __init__(self, held: Contacts, numbers: Tensor | None, n: int) -> None:
-        local = held.elements if numbers is None else numbers[held.elements]
+    def __init__(self, held: Contacts, n: int) -> None:
         #: The shape of each, and which element it is. *Shape:* ``(N,)``.
-        self.shapes, which = torch.nonzero((held.weights > 0) & (local >= 0).all(1), as_tuple=True)
+        self.shapes, which = torch.nonzero(held.weights > 0, as_tuple=True)
         #: The vertices of each, in rows of all shapes. *Shape:* ``(4, N)``.
-        self.corners = (local[which] + (self.shapes * n)[:, None]).T.contiguous()
+        self.corners = (held.elements[which] + (self.shapes * n)[:, None]).T.contiguous()
         self.weights, self.gaps = held.weights[self.shapes, which], held.gaps[self.shapes, which]
         self.term, self.n_shapes = Contact(held.elements), len(held.weights)
 
@@ -66,12 +66,12 @@ class Held:
         return spokes, self.term.difference(self.term.measures(spokes), self.gaps)
 
     def value(self, flat: Tensor) -> Tensor:
-        """Of each shape. *Shape:* ``(3, T R) -> (T,)``."""
+        """Of each shape. *Shape:* ``(3, T V) -> (T,)``."""
         each = self.weights * self._missing(flat)[1] ** 2
         return each.new_zeros(self.n_shapes).index_add(0, self.shapes, each)
 
     def linearised(self, flat: Tensor) -> AtHeld:
-        """*Shape:* ``(3, T R)``."""
+        """*Shape:* ``(3, T V)``."""
         spokes, missing = self._missing(flat)
         near = torch.nonzero(missing).flatten()
         each = self.weights * missing**2
@@ -83,9 +83,43 @@ class Held:
         return AtHeld(value, gradient, on_corners, stiffness, self.corners[:, near].flatten())
 
 
+class Pull(NamedTuple):
+    """A term that pulls vertices to places."""
+
+    to: Tensor
+    """The places. *Shape:* ``(T, V, 3)``."""
+    weights: Tensor
+    """Of the squared distances. *Shape:* ``(V,)``."""
+
+    def rows(self, some: slice) -> "Pull":
+        """Of some shapes."""
+        return self._replace(to=self.to[some])
+
+    def joined(self, reference: Reference) -> Reference:
+        """A reference with that of :class:`~torch_modal.energy.position.Position`, which comes last."""
+        places = self.to.mT.flatten(1)[:, None]
+        weights = self.weights.repeat(3).expand_as(places)
+        return Reference((*reference.measures, places), (*reference.weights, weights), reference.constant)
+
+    def value(self, x: Tensor) -> Tensor:
+        """Of each shape. *Shape:* ``(T, V, 3) -> (T,)``."""
+        return (self.weights * ((x - self.to) ** 2).sum(-1)).sum(-1)
+
+    def product(self, field: Tensor) -> Tensor:
+        """The Hessian times displacements. *Shape:* ``(T, V, 3) -> (T, V, 3)``."""
+        return 2 * self.weights[:, None] * field
+
+
 @torch.no_grad()
 def settled(
-    member: Between, samples: Samples, pair: Pair, x: Tensor, held: Contacts, n_steps: int, n_products: int
+    member: Between,
+    samples: Samples,
+    pair: Pair,
+    x: Tensor,
+    held: Contacts,
+    n_steps: int,
+    n_products: int,
+    pull: Pull,
 ) -> Tensor:
     """Newton steps of all vertices of each shape, with what is held in it, never uphill.
 
@@ -97,17 +131,21 @@ def settled(
         held: Of all shapes.
         n_steps: How many.
         n_products: Iterations of conjugate gradients in each.
+        pull: What pulls them elsewhere.
     """
     if member.fused is not None:
-        return _by_kernels(member, member.fused, samples, pair, x, held, n_steps, n_products)
-    energy, fixed = held.fine(member.mesh, member.terms), member.anchors(trees.picked(pair, samples.which), samples.t)
+        return _by_kernels(member, member.fused, samples, pair, x, held, n_steps, n_products, pull)
+    energy = held.fine(member.mesh, [*member.terms, Position(member.mesh.n_vertices)])
+    fixed, origin = member.anchors(trees.picked(pair, samples.which), samples.t), x.new_zeros(len(x), 1, 3)
+    fixed = origin if fixed is None else torch.cat([fixed, origin], 1)
     every = torch.arange(member.mesh.n_vertices, device=x.device)
     reference = member.fine_reference(samples, pair, member.fine, every, samples.stiffness)
     size, parts = fine_chunk(len(every), x.device), []
     for i in range(0, len(x), size):
         own = slice(i, i + size)
         rest, anchors = trees.rows((reference, fixed), own)
-        parts.append(relax(energy, x[own], held.rows(own).joined(rest), n_steps, n_products, anchors))
+        rest = held.rows(own).joined(pull.rows(own).joined(rest))
+        parts.append(relax(energy, x[own], rest, n_steps, n_products, anchors))
     return torch.cat(parts)
 
 
@@ -129,26 +167,40 @@ def _by_kernels(
     held: Contacts,
     n_steps: int,
     n_products: int,
+    pull: Pull,
 ) -> Tensor:
     size, n = fine_chunk(x.shape[1], x.device), x.shape[1]
     given = [*rest_shapes(member, samples, pair), samples.t, *samples.stiffness]
+    double = Pull(pull.to.double(), pull.weights.double())
     parts = []
     for i in range(0, len(x), size):
         own = slice(i, i + size)
         to = fused.reference(*(value[own].double().contiguous() for value in given))
         parts.append(
-            _steps(fused, x[own].double().contiguous(), to, Held(held.rows(own), None, n), n_steps, n_products)
+            _steps(
+                fused,
+                x[own].double().contiguous(),
+                to,
+                Held(held.rows(own), n),
+                n_steps,
+                n_products,
+                double.rows(own),
+            )
         )
     return torch.cat(parts).to(x)
 
 
-def _steps(fused: FusedRelax, x: Tensor, to: ShellReference, held: Held, n_steps: int, n_products: int) -> Tensor:
+def _steps(
+    fused: FusedRelax, x: Tensor, to: ShellReference, held: Held, n_steps: int, n_products: int, pull: Pull
+) -> Tensor:
     def value(x: Tensor) -> Tensor:
-        return fused.value(x, to) + held.value(_flat(x))
+        return fused.value(x, to) + held.value(_flat(x)) + pull.value(x)
 
     for _ in range(n_steps):
         at, own = fused.at(x, to), held.linearised(_flat(x))
-        before = at.energy + own.value
+        before = at.energy + own.value + pull.value(x)
+        at.gradient.add_(pull.product(x - pull.to))
+        at.diagonal[..., [0, 3, 5]] += 2 * pull.weights[:, None]
         _flat(at.gradient).index_add_(1, own.corners, own.gradient)
         _flat(at.diagonal).index_add_(1, own.corners, own.blocks.flatten(0, 1)[[0, 1, 2, 4, 5, 8]])
 
@@ -156,6 +208,9 @@ def _steps(fused: FusedRelax, x: Tensor, to: ShellReference, held: Held, n_steps
             pushed, forms = own.product(_flat(direction))  # noqa: B023
             _flat(product).index_add_(1, own.corners, pushed)  # noqa: B023
             form.index_add_(0, own.corners[: len(forms)] // x.shape[1], forms)  # noqa: B023
+            pulled = pull.product(direction)
+            product.add_(pulled)
+            form.add_((pulled * direction).sum((1, 2)))
 
         step = fused.solved(x, at, to, n_products, beyond=beyond)
         length = torch.zeros_like(before)
