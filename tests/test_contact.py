@@ -257,7 +257,8 @@ def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
         # One shape is free, the other is held, and a corner of both is pulled elsewhere.
         corner = (x[0] - x[0].amin(0)).norm(dim=-1) < 20
         pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas[0])
-        y = settled(member, samples, pair, x, held, 2, 10, pull)
+        y = settled(member, samples, pair, x, held, pull, 10)
+        y = settled(member, samples, pair, y, held, pull, 10)
         term = Held(held, x.shape[1])
         pushed = term.value(y.movedim(-1, 0).flatten(1))
         assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(term.value(flat)[1])
@@ -478,9 +479,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
         def rows(self, some: Tensor) -> Tensor:
             return some
 
-    def rest(
-        member: Any, own: Tensor, pair: Any, x: Tensor, held: Any, steps: int, products: int, pull: Pull
-    ) -> Tensor:
+    def rest(member: Any, own: Tensor, pair: Any, x: Tensor, held: Any, pull: Pull, n_products: int) -> Tensor:
         own_springs = springs[own, None, None]
         pulls = pull.weights[:, None]
         found: Tensor = (own_springs * places[own] + pulls * pull.to) / (own_springs + pulls)

@@ -217,18 +217,14 @@ class Between(nn.Module):
             pair = frame.surround(pair, before, after, samples.spacing)
         return pair, finite
 
-    def fine_reference(
-        self, samples: Samples, pair: Pair, energy: Energy, vertices: Tensor, stiffness: list[Tensor]
-    ) -> Reference:
-        """What an energy on a part of the fine mesh compares shapes with. *Shape of the vertices:* ``(R,)``."""
-
-        def rest(x: Tensor) -> Rest:
-            return energy.rest(energy.extend(x[:, vertices.to(x.device)].movedim(-1, 0).contiguous()))
-
+    def fine_reference(self, samples: Samples, pair: Pair) -> Reference:
+        """What shapes on the fine mesh are compared with."""
         if pair.around is not None:
-            return Energy.against(rest(self.space.on_course(pair, samples.which, samples.t)), stiffness)
-        first, second = trees.picked([rest(end) for end in (pair.first, pair.second)], samples.which)
-        return energy.between(first, second, samples.t, stiffness)
+            return Energy.against(
+                self._fine_rest(self.space.on_course(pair, samples.which, samples.t)), samples.stiffness
+            )
+        first, second = trees.picked([self._fine_rest(end) for end in (pair.first, pair.second)], samples.which)
+        return self.fine.between(first, second, samples.t, samples.stiffness)
 
     def coarse_reference(self, samples: Samples, pair: Pair) -> Any:
         """What shapes on the coarse mesh are compared with."""

@@ -112,16 +112,9 @@ class Pull(NamedTuple):
 
 @torch.no_grad()
 def settled(
-    member: Between,
-    samples: Samples,
-    pair: Pair,
-    x: Tensor,
-    held: Contacts,
-    n_steps: int,
-    n_products: int,
-    pull: Pull,
+    member: Between, samples: Samples, pair: Pair, x: Tensor, held: Contacts, pull: Pull, n_products: int
 ) -> Tensor:
-    """Newton steps of all vertices of each shape, with what is held in it, never uphill.
+    """A Newton step of all vertices of each shape, with what is held in it, never uphill.
 
     Args:
         member: In-betweens of the pair of key-frames.
@@ -129,33 +122,28 @@ def settled(
         pair: The key-frames in the frame.
         x: Where to start. *Shape:* ``(T, V, 3)``.
         held: Of all shapes.
-        n_steps: How many.
-        n_products: Iterations of conjugate gradients in each.
         pull: What pulls them elsewhere.
+        n_products: Iterations of conjugate gradients.
     """
-    if member.fused is not None:
-        return _by_kernels(member, member.fused, samples, pair, x, held, n_steps, n_products, pull)
+    if member.fused is None:
+        return _by_torch(member, samples, pair, x, held, pull, n_products)
+    return _by_kernels(member, member.fused, samples, pair, x, held, pull, n_products)
+
+
+def _by_torch(
+    member: Between, samples: Samples, pair: Pair, x: Tensor, held: Contacts, pull: Pull, n_products: int
+) -> Tensor:
     energy = held.fine(member.mesh, [*member.terms, Position(member.mesh.n_vertices)])
     fixed, origin = member.anchors(trees.picked(pair, samples.which), samples.t), x.new_zeros(len(x), 1, 3)
     fixed = origin if fixed is None else torch.cat([fixed, origin], 1)
-    every = torch.arange(member.mesh.n_vertices, device=x.device)
-    reference = member.fine_reference(samples, pair, member.fine, every, samples.stiffness)
-    size, parts = fine_chunk(len(every), x.device), []
+    reference = member.fine_reference(samples, pair)
+    size, parts = fine_chunk(x.shape[1], x.device), []
     for i in range(0, len(x), size):
         own = slice(i, i + size)
         rest, anchors = trees.rows((reference, fixed), own)
         rest = held.rows(own).joined(pull.rows(own).joined(rest))
-        parts.append(relax(energy, x[own], rest, n_steps, n_products, anchors))
+        parts.append(relax(energy, x[own], rest, 1, n_products, anchors))
     return torch.cat(parts)
-
-
-def rest_shapes(member: Between, samples: Samples, pair: Pair) -> tuple[Tensor, Tensor]:
-    """Both shapes that each is compared with. *Shape of each:* ``(T, V, 3)``."""
-    if pair.around is not None:
-        course = member.space.on_course(pair, samples.which, samples.t)
-        return course, course
-    first, second = trees.picked((pair.first, pair.second), samples.which)
-    return first, second
 
 
 def _by_kernels(
@@ -165,62 +153,51 @@ def _by_kernels(
     pair: Pair,
     x: Tensor,
     held: Contacts,
-    n_steps: int,
-    n_products: int,
     pull: Pull,
+    n_products: int,
 ) -> Tensor:
+    first, second = trees.picked((pair.first, pair.second), samples.which)
+    if pair.around is not None:
+        first = second = member.space.on_course(pair, samples.which, samples.t)
+    given = [value.double() for value in (first, second, samples.t, *samples.stiffness)]
+    moving, pull = x.double(), Pull(pull.to.double(), pull.weights.double())
     size, n = fine_chunk(x.shape[1], x.device), x.shape[1]
-    given = [*rest_shapes(member, samples, pair), samples.t, *samples.stiffness]
-    double = Pull(pull.to.double(), pull.weights.double())
     parts = []
     for i in range(0, len(x), size):
         own = slice(i, i + size)
-        to = fused.reference(*(value[own].double().contiguous() for value in given))
-        parts.append(
-            _steps(
-                fused,
-                x[own].double().contiguous(),
-                to,
-                Held(held.rows(own), n),
-                n_steps,
-                n_products,
-                double.rows(own),
-            )
-        )
+        to = fused.reference(*(value[own].contiguous() for value in given))
+        held_here = Held(held.rows(own), n)
+        parts.append(_step(fused, moving[own].contiguous(), to, held_here, pull.rows(own), n_products))
     return torch.cat(parts).to(x)
 
 
-def _steps(
-    fused: FusedRelax, x: Tensor, to: ShellReference, held: Held, n_steps: int, n_products: int, pull: Pull
-) -> Tensor:
+def _step(fused: FusedRelax, x: Tensor, to: ShellReference, held: Held, pull: Pull, n_products: int) -> Tensor:
     def value(x: Tensor) -> Tensor:
         return fused.value(x, to) + held.value(_flat(x)) + pull.value(x)
 
-    for _ in range(n_steps):
-        at, own = fused.at(x, to), held.linearised(_flat(x))
-        before = at.energy + own.value + pull.value(x)
-        at.gradient.add_(pull.product(x - pull.to))
-        at.diagonal[..., [0, 3, 5]] += 2 * pull.weights[:, None]
-        _flat(at.gradient).index_add_(1, own.corners, own.gradient)
-        _flat(at.diagonal).index_add_(1, own.corners, own.blocks.flatten(0, 1)[[0, 1, 2, 4, 5, 8]])
+    at, own = fused.at(x, to), held.linearised(_flat(x))
+    before = at.energy + own.value + pull.value(x)
+    at.gradient.add_(pull.product(x - pull.to))
+    at.diagonal[..., [0, 3, 5]] += 2 * pull.weights[:, None]
+    _flat(at.gradient).index_add_(1, own.corners, own.gradient)
+    _flat(at.diagonal).index_add_(1, own.corners, own.blocks.flatten(0, 1)[[0, 1, 2, 4, 5, 8]])
 
-        def beyond(direction: Tensor, product: Tensor, form: Tensor) -> None:
-            pushed, forms = own.product(_flat(direction))  # noqa: B023
-            _flat(product).index_add_(1, own.corners, pushed)  # noqa: B023
-            form.index_add_(0, own.corners[: len(forms)] // x.shape[1], forms)  # noqa: B023
-            pulled = pull.product(direction)
-            product.add_(pulled)
-            form.add_((pulled * direction).sum((1, 2)))
+    def beyond(direction: Tensor, product: Tensor, form: Tensor) -> None:
+        pushed, forms = own.product(_flat(direction))
+        _flat(product).index_add_(1, own.corners, pushed)
+        form.index_add_(0, own.corners[: len(forms)] // x.shape[1], forms)
+        pulled = pull.product(direction)
+        product.add_(pulled)
+        form.add_((pulled * direction).sum((1, 2)))
 
-        step = fused.solved(x, at, to, n_products, beyond=beyond)
-        length = torch.zeros_like(before)
-        for shorter in STEP_LENGTHS:
-            downhill = (length == 0) & (value(x + shorter * step.solution) < before)
-            length = torch.where(downhill, shorter, length)
-            if bool((length > 0).all()):
-                break
-        x = x + length[:, None, None] * step.solution
-    return x
+    step = fused.solved(x, at, to, n_products, beyond=beyond)
+    length = torch.zeros_like(before)
+    for shorter in STEP_LENGTHS:
+        downhill = (length == 0) & (value(x + shorter * step.solution) < before)
+        length = torch.where(downhill, shorter, length)
+        if bool((length > 0).all()):
+            break
+    return x + length[:, None, None] * step.solution
 
 
 def _flat(x: Tensor) -> Tensor:
