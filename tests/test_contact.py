@@ -470,7 +470,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
         def is_watched(self, some: Tensor) -> Tensor:
             return torch.ones(len(some), dtype=torch.bool)
 
-        def count(self, x: Tensor, some: object) -> None:
+        def count(self, x: Tensor, some: object = None) -> None:
             self.n_far = self.n_far - 1  # the last is the best
 
         def __call__(self, x: Tensor, some: object) -> None:

@@ -169,31 +169,41 @@ def _at_rest(
         search: Finds what crosses.
         limit: Of the displacement from ``start``.
     """
-    t, best = samples.t, None
+    t, n_least, all_times = samples.t, ROUNDS[0], torch.arange(len(samples.t), device=samples.t.device)
+    best: tuple[int, Tensor] | None = None
     # Where each shape would rest alone, what it was kept from in all rounds, and the vertices that ever were.
     alone, dual, stiffness = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
-    searched = every[search.is_watched(every)]
     # What holds nothing is near to its neighbours in time: some of these shapes lead the others at first.
     leading = search.is_watched(every)
+    searched = every[leading]
     leading[::LEADING] = True
     for k in range(1, ROUNDS[1] + 1):
-        is_last = k >= ROUNDS[0]
-        own = every if is_last else every[leading]
-        fresh = search(x, searched.tolist())
-        held = held if fresh is None else fresh.of_all(held.samples).beside(held)
+        if k % 2:  # one step changes little of what is held
+            fresh = search(x, searched.tolist())
+            held = held if fresh is None else fresh.of_all(held.samples).beside(held)
+        # Those whose rest is known, and those that take a step to it now.
+        known = every[leading] if k < n_least else every
+        own = known if k <= n_least else every[search.is_watched(every)]
         pull = Pull((x - dual)[own], stiffness)
         rest = settled(member, samples.rows(own), pair, alone[own], held.rows(own), pull, PRODUCTS)
-        wanted = (rest + dual[own] - start[own]).movedim(-1, 0)
-        moved, kept = limit.nearest(wanted if len(own) == len(t) else through(t[own], t) @ wanted)
+        alone = alone.index_copy(0, own, rest)
+        wanted = (alone + dual - start)[known].movedim(-1, 0)
+        moved, kept = limit.nearest(wanted if len(known) == len(t) else through(t[known], t) @ wanted)
         x = start + moved.movedim(0, -1)
-        alone, dual = x.index_copy(0, own, rest), dual.index_add(0, own, rest - x[own])
+        alone, dual = x.index_copy(0, known, alone[known]), dual.index_add(0, known, (alone - x)[known])
         stiffness[kept] = PULL * search.areas[0][kept]
-        search.count(x, None if is_last else every[search.is_watched(every)].tolist())
-        if is_last:
-            best = min((best or (x, search.n_far)), (x, search.n_far), key=lambda found: int(found[1].sum()))
-            if not bool(search.n_far.any()):
+        if k >= n_least or k % 2 == 0:
+            among = every if k < n_least else all_times
+            search.count(x, among.tolist() if k == n_least else among[search.is_watched(among)].tolist())
+        if k >= n_least:
+            n_left = int(search.n_far.sum())
+            if best is None or n_left < best[0]:
+                best = n_left, x
+            if not n_left:
                 break
             every = torch.nonzero((search.n_far > 0).index_fill(0, every, True)).flatten()
         searched = every[search.n_far[every] > 0]
     assert best is not None
-    return best
+    if k > n_least:
+        search.count(best[1])
+    return best[1], search.n_far
