@@ -202,6 +202,23 @@ def edges(case: Case, found: Run) -> None:
         )
 
 
+def singles(names: list[str]) -> None:
+    """Far pairs of one ``InBetween`` at each eighth, without and with contact."""
+    t = torch.arange(1, 8, dtype=torch.float64) / 8
+    print("\nfar pairs of single in-betweens at t = 1/8 to 7/8, without and with contact")
+    for name in names:
+        case = CASES[name]()
+        if case is None:
+            continue
+        bases = tm.extract_bases(case.keyframes, case.faces, 30, progress=False)
+        found = []
+        for contact in (False, True):
+            with torch.no_grad():
+                shapes = tm.InBetween(bases, case.faces, contact=contact)(*case.keyframes, t)
+            found.append(tm.self_contacts(shapes, case.faces, ignore=case.keyframes).n_far.tolist())
+        print(f"{case.name:16s} {found[0]} {found[1]}", flush=True)
+
+
 def untouched() -> None:
     """What the search costs where it finds nothing."""
     sample = load_sample("creature")
@@ -324,7 +341,9 @@ if __name__ == "__main__":
     limit_threads()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--rows", nargs="+", default=["crossings", "cost", "keyframes", "draws", "gradients"])
+    parser.add_argument(
+        "--rows", nargs="+", default=["crossings", "singles", "cost", "keyframes", "draws", "gradients"]
+    )
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the sample hand and the legs")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -334,6 +353,8 @@ if __name__ == "__main__":
                 edges(case, found)
             if given.pictures and case.name in ("sample hand", "swapped legs"):
                 pictures(given.pictures, case, found)
+    if "singles" in given.rows:
+        singles(given.cases)
     if "cost" in given.rows:
         untouched()
     if "keyframes" in given.rows:
