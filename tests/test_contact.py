@@ -343,6 +343,17 @@ def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> N
     assert search.n_left(pairs, 0.02) == 0 and search.n_left(pairs, 0.5) == 1
 
 
+def test_in_a_course_nothing_is_tolerated(hand: Shapes) -> None:
+    stuck = stuck_in_first(hand)
+    first, second = (100 * x[None] for x in stuck.keyframes)
+    mesh, t = Mesh.of(hand.faces, hand.keyframes.shape[1]), torch.tensor([0.02], dtype=DOUBLE)
+    at_tip = torch.nonzero((hand.faces == hand.keyframes[0, :, 0].argmin()).any(1)).flatten()
+    pairs = at_tip[:2].numpy()[None]
+    alone, course = (ContactSearch(mesh, first, second, None, t, is_tolerant=each) for each in (True, False))
+    assert alone.has_crossed and course.has_crossed
+    assert alone._told(0, pairs) == (1, 0) and course._told(0, pairs) == (1, 1)
+
+
 def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
     # A vertex in the finger beside it is also behind faces on that finger's far side.
     stuck = stuck_in_first(hand)
