@@ -54,7 +54,8 @@ import torch
 from tables import geometric_mean, number
 from threads import limit_threads
 from tqdm import tqdm
-from wild_bodies import BODIES, WildBody, bent_and_twisted
+from wild_bodies import bent_and_twisted
+from wild_making import BODIES, WildBody
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
@@ -66,6 +67,7 @@ PRESETS = ("accurate", "fast", "paper")
 WORSE = 1.1  # times linear interpolation's edge error
 SHORT = 0.01  # of the mean edge; shorter ones are measured by this
 LIMITS = {"modes": 400.0, "in-between": 200.0, "contact": 400.0}  # seconds on the clock
+START = 600.0  # seconds until a child process answers
 REPEATED = 5.0  # seconds; what takes less is called again for its time
 
 OUTCOMES = ("good", "fell back", "not converged", "refused", "silent", "foreign", "hang", "died")
@@ -174,27 +176,26 @@ def in_between(row: Row, bases: list[tm.ModalBasis], faces: torch.Tensor, poses:
 
 
 def guarded(function: Callable[[], Any]) -> tuple[Any, tuple[str, str] | None]:
-    """What a function returns, or how it failed: refused if the package raised the error, foreign otherwise."""
+    """What a function returns, or how it failed: refused if a statement of the package raised it, foreign otherwise."""
     try:
         return function(), None
     except Exception as error:
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__)]
-        place = frames[-1]
+        frames = traceback.extract_tb(error.__traceback__)
         package = str(Path(tm.__file__).parent)
-        own = place.filename.startswith(package) and isinstance(error, (ValueError, ImportError, RuntimeError))
-        inner = [frame for frame in frames if frame.filename.startswith(package)][-1:]
-        where = "".join(f" ({Path(frame.filename).name} {frame.lineno})" for frame in inner)
-        return None, (
-            "refused" if own else "foreign",
-            f"{type(error).__name__}: {' '.join(str(error).split())[:200]}{where}",
-        )
+        own = frames[-1].filename.startswith(package) and (frames[-1].line or "").startswith("raise ")
+        own &= isinstance(error, (ValueError, ImportError, RuntimeError))  # not an AssertionError, for instance
+        where = [
+            f" ({Path(frame.filename).name} {frame.lineno})" for frame in frames if frame.filename.startswith(package)
+        ]
+        said = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        return None, ("refused" if own else "foreign", said + "".join(where[-1:]))
 
 
-def straight(x_a: torch.Tensor, x_b: torch.Tensor, faces: np.ndarray) -> torch.Tensor:
-    """Linear interpolation half-way, the second shape laid upon the first. *Shape:* ``(V, 3)``."""
+def straight(x_a: torch.Tensor, x_b: torch.Tensor, faces: np.ndarray, time: float = 0.5) -> torch.Tensor:
+    """Linear interpolation, the second shape laid upon the first. *Shape:* ``(V, 3)``."""
     weights = torch.zeros(len(x_a), dtype=x_a.dtype)
     weights[np.unique(faces)] = 1
-    return blend(x_a, x_b, torch.tensor([0.5], dtype=x_a.dtype), weights)[0]
+    return blend(x_a, x_b, torch.tensor([time], dtype=x_a.dtype), weights)[0]
 
 
 def edge_error(found: torch.Tensor, truth: torch.Tensor, faces: np.ndarray) -> float:
@@ -232,8 +233,8 @@ def serve(pipe: Connection) -> None:
 class Worker:
     """A child process that tries bodies, started when it is needed."""
 
-    def __init__(self, patience: float) -> None:
-        self.patience = patience
+    def __init__(self, patience: float, serve: Callable[[Connection], None] = serve, method: str = "spawn") -> None:
+        self.patience, self.serve, self.method = patience, serve, method
         self.process: Any = None
 
     def try_body(self, body: WildBody, ways: Sequence[tuple[str, bool]]) -> Iterator[Row]:
@@ -244,7 +245,7 @@ class Worker:
             self.pipe.send((body.name, left))
             step, outcome = "start", ""
             while not outcome:
-                limit = self.patience * LIMITS.get(step, LIMITS["modes"])
+                limit = self.patience * LIMITS[step] if step in LIMITS else START
                 try:
                     said = self.pipe.recv() if self.pipe.poll(limit) else f"no answer in {limit:.0f} s"
                 except (EOFError, OSError):
@@ -268,9 +269,9 @@ class Worker:
 
     def _start(self) -> None:
         if self.process is None:
-            context = multiprocessing.get_context("spawn")
+            context = multiprocessing.get_context(self.method)
             self.pipe, other = context.Pipe()
-            self.process = context.Process(target=serve, args=(other,))
+            self.process = context.Process(target=self.serve, args=(other,))
             self.process.start()
             other.close()
 
