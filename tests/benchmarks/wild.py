@@ -355,9 +355,11 @@ def table(rows: list[Row]) -> str:
             mine = [row for row in mine if row.ratio > 1]
         if mine:
             lines += ["", f"{outcome}{', worse than linear' * (outcome == 'good')}:"]
-            lines += [
-                f"  {r.kind}: {r.body} ({r.faces} faces), {r.way}: {number(r.ratio, '.2f')} {r.reason}" for r in mine
-            ]
+            for r in mine:
+                means = f"(lengths' mean {number(r.means, '.2f')})"
+                lines.append(
+                    f"  {r.kind}: {r.body}, {r.faces} faces, {r.way}: {number(r.ratio, '.2f')} {means} {r.reason}"
+                )
     return "\n".join(lines)
 
 
