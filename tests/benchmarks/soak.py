@@ -5,9 +5,10 @@
 Each takes two key-frames of a sample or of the data beside the project, decimates them alike to a random number of
 faces, turns and perturbs their vertices by a small part of the edges, and asks for the bases of both, 5 to 60 modes,
 with nothing taken from a cache, and for an in-between at a random time, all by default settings. An exception of any
-kind is an error, and so is a shape with a good status that is not finite, or whose edge lengths are further from those
-that lie between both key-frames' than linear interpolation's (by 10 %, and by a thousandth). A mesh that the check of
-the input refuses is no healthy one, and is drawn again. The exit code is 1 if there was an error.
+kind is an error, and so is a shape with a good status that is not finite, or whose energy on the fine mesh is more than
+1.1 times that of linear interpolation. (Edge lengths alone would be no measure: the perturbations of both key-frames
+differ, and bending has its part in what is best.) A mesh that the check of the input refuses is no healthy one, and is
+drawn again. The exit code is 1 if there was an error.
 """
 
 import argparse
@@ -24,9 +25,10 @@ from precompute import MORE, ROOT, sample
 from scipy.spatial.transform import Rotation
 from threads import limit_threads
 from tqdm import tqdm
-from wild import FELL_BACK, WORSE, edge_lengths, error_of, straight
+from wild import FELL_BACK, WORSE, straight
 
 import torch_modal as tm
+from torch_modal.energy.shell import DIAGONAL
 from torch_modal.errors import MeshError
 from torch_modal.nn.settings import PRESETS
 from torch_modal.nn.solver import Status
@@ -38,8 +40,6 @@ IntArray = NDArray[np.int64]
 FACES = (800, 2500)
 NOISE = (0.0, 0.02)
 """Standard deviation of the perturbation, as a part of the mean edge."""
-SLACK = 1e-3
-"""Relative error of edge lengths that is never called worse."""
 
 
 def sources(data: Path) -> dict[str, tuple[FloatArray, IntArray]]:
@@ -76,11 +76,15 @@ def in_between(
     with torch.no_grad():
         result = layer.solve(x_a, x_b, time)
     status = Status(int(result.solution.status))
-    wanted = torch.lerp(edge_lengths(x_a, faces), edge_lengths(x_b, faces), time)
-    drifts = [error_of(edge_lengths(x, faces), wanted) for x in (result.shapes, straight(x_a, x_b, faces, time))]
-    said = status == FELL_BACK or not bool(result.solution.usable)
-    good = said or drifts[0] <= WORSE * drifts[1] + SLACK  # not so with NaN
-    return status.name, "" if good else f"silent: edges {drifts[0]:.5f} off, linear interpolation's {drifts[1]:.5f}"
+    shell, scale = tm.ShellEnergy(layer.faces), DIAGONAL / torch.linalg.norm(x_a.amax(0) - x_a.amin(0))
+
+    def energy(x: torch.Tensor) -> float:
+        first, second = shell(x * scale, torch.stack([x_a, x_b]) * scale).tolist()
+        return (1 - time) * first + time * second
+
+    ratio = energy(result.shapes) / energy(straight(x_a, x_b, faces, time))
+    good = status == FELL_BACK or not bool(result.solution.usable) or ratio <= WORSE  # not so with NaN
+    return status.name, "" if good else f"silent: {ratio:.2f} times the energy of linear interpolation"
 
 
 def main() -> int:
@@ -117,7 +121,10 @@ def main() -> int:
             failed = f"{type(error).__name__}: {error}"
         if failed:
             errors[failed.split(":")[0]] += 1
-            print(f"{name}, {keyframes.shape[1]} vertices, {len(faces)} faces, {n_modes} modes, t = {at:.2f}: {failed}")
+            print(
+                f"{name}, {keyframes.shape[1]} vertices, {len(faces)} faces, {n_modes} modes, t = {at:.2f}: {failed}",
+                flush=True,
+            )
         seconds.append(time.perf_counter() - start)
         bar.update()
     print(
