@@ -355,11 +355,15 @@ def table(rows: list[Row]) -> str:
             mine = [row for row in mine if row.ratio > 1]
         if mine:
             lines += ["", f"{outcome}{', worse than linear' * (outcome == 'good')}:"]
-            for r in mine:
-                means = f"(lengths' mean {number(r.means, '.2f')})"
-                lines.append(
-                    f"  {r.kind}: {r.body}, {r.faces} faces, {r.way}: {number(r.ratio, '.2f')} {means} {r.reason}"
+            alike: dict[tuple[str, str], list[Row]] = {}
+            for row in mine:
+                alike.setdefault((row.body, row.reason), []).append(row)
+            for (name, reason), found in alike.items():
+                ratios = ", ".join(f"{row.way} {number(row.ratio, '.2f')}" for row in found)
+                about = (
+                    f"{found[0].kind}: {name}, {found[0].faces} faces, mean of lengths {number(found[0].means, '.2f')}"
                 )
+                lines.append(f"  {about}; {ratios}: {reason}")
     return "\n".join(lines)
 
 
