@@ -85,7 +85,12 @@ def _limbs() -> None:
         lambda: level_set(limbs([([0, 0, 0], p, 0.15, 0.06) for p in circle(5, 1)]), (1.2, 1.2, 0.4), 0.04),
     )
     add("spider", kind, lambda: fewer(level_set(limbs(_spider()), (1.2, 1.2, 0.7), 0.025), 3000), contact=True)
-    add("tree", kind, lambda: fewer(level_set(limbs(_tree(4), 0.015), (1.4, 1.4, 1.4), 0.03), 5000))
+    add("tree", kind, lambda: fewer(level_set(limbs(_tree(4, 0.8), 0.015), (1.4, 1.4, 1.4), 0.03), 5000), closed=None)
+    add(
+        "tree, a twig broken off",
+        kind,
+        lambda: fewer(level_set(limbs(_tree(4, 0.65), 0.015), (1.4, 1.4, 1.4), 0.03), 5000),
+    )
     add("figure", kind, lambda: fewer(level_set(limbs(_figure()), (1.1, 0.5, 1.2), 0.03), 3000))
     add("figure, 600 faces", kind, lambda: fewer(level_set(limbs(_figure()), (1.1, 0.5, 1.2), 0.03), 600))
     add("snake", kind, lambda: tube(lambda u: np.stack([3 * u, 0.4 * np.sin(9 * u), 0 * u], 1), 0.06, 160, 10))
@@ -106,7 +111,7 @@ def _spider() -> list[tuple]:
     return [([0, 0, 0], [0.15, 0, 0], 0.2, 0.15), ([-0.35, 0, 0], [-0.4, 0, 0.05], 0.25, 0.2), *legs]
 
 
-def _tree(depth: int) -> list[tuple]:
+def _tree(depth: int, thinner: float) -> list[tuple]:
     random, found = np.random.default_rng(3), []
 
     def grow(start: FloatArray, way: FloatArray, radius: float, left: int) -> None:
@@ -114,7 +119,7 @@ def _tree(depth: int) -> list[tuple]:
         found.append((start, end, radius, 0.75 * radius))
         for _ in range(2 * (left > 0)):
             turn = way + 0.75 * np.linalg.norm(way) * random.normal(size=3)
-            grow(end, 0.7 * np.linalg.norm(way) * turn / np.linalg.norm(turn), 0.65 * radius, left - 1)
+            grow(end, 0.7 * np.linalg.norm(way) * turn / np.linalg.norm(turn), thinner * radius, left - 1)
 
     grow(np.array([0, 0, -1.2]), np.array([0, 0, 0.8]), 0.13, depth)
     return found
@@ -131,7 +136,7 @@ def _figure() -> list[tuple]:
         )
     ]
     legs = [([0.12 * s, 0, -0.2], [0.2 * s, 0, -1.05], 0.13, 0.07) for s in sides]
-    return [([0, 0, 0.4], [0, 0, -0.15], 0.22, 0.2), ([0, 0, 0.85], [0, 0, 0.88], 0.17, 0.15), *arms, *legs]
+    return [([0, 0, 0.4], [0, 0, -0.15], 0.22, 0.2), ([0, 0, 0.75], [0, 0, 0.8], 0.17, 0.15), *arms, *legs]
 
 
 # --------------------------------------------------------------------------------------------------------------- pieces
