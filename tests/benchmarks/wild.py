@@ -333,7 +333,7 @@ def line(rows: list[Row]) -> list[str]:
         str(len(rows)),
         *counts,
         number(geometric_mean(ratios), ".3f"),
-        number(worst, ".2f"),
+        number(worst, ".3g"),
         number(modes, ".1f"),
         number(1e3 * seconds, ".0f"),
     ]
