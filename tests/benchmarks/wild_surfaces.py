@@ -1,0 +1,202 @@
+"""Thin, open and non-manifold surfaces of the wild set."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pyvista
+import trimesh
+from pyvista import examples
+from trimesh import creation
+from wild_making import (
+    Surface,
+    add,
+    ball,
+    block,
+    joined,
+    moved,
+    of,
+    of_vtk,
+    patch,
+    plate,
+    split,
+    stretched,
+    thick,
+    turned,
+    welded,
+)
+
+# -------------------------------------------------------------------------------------------------------- thin and open
+
+
+def _thin() -> None:
+    kind = "thin shells"
+    for thickness in (0.05, 0.01, 0.001):
+        add(f"plate {thickness}", kind, partial(plate, thickness), contact=thickness == 0.01)
+    add("wavy plate", kind, lambda: thick(lambda u, v: (3 * u, v, 0.15 * np.sin(9 * u)), 0.01, 40, 12))
+    add(
+        "disc",
+        kind,
+        lambda: turned(
+            [
+                (0, 0),
+                *[(r, 0) for r in np.linspace(0.1, 1, 10)],
+                *[(r, 0.01) for r in np.linspace(1, 0.1, 10)],
+                (0, 0.01),
+            ],
+            40,
+        ),
+    )
+    add(
+        "cup with walls",
+        kind,
+        lambda: turned(
+            [
+                (0, 0),
+                (0.5, 0),
+                *[(0.5 + 0.02 * k, 0.1 * k) for k in range(1, 13)],
+                *[(0.46 + 0.02 * k, 0.1 * k) for k in range(12, 0, -1)],
+                (0.46, 0.04),
+                (0, 0.04),
+            ],
+            32,
+        ),
+        contact=True,
+    )
+    add("tube with walls", kind, lambda: of(creation.annulus(0.45, 0.5, 3, sections=24)))
+    add("fine tube with walls", kind, lambda: split(of(creation.annulus(0.47, 0.5, 3, sections=24)), 2))
+    add("hollow ball", kind, lambda: hollow(ball(3), 0.97))
+    add(
+        "ribbon",
+        kind,
+        lambda: thick(
+            lambda u, v: (2 * u, 0.3 * (v - 0.5) * np.cos(3 * u), 0.3 * (v - 0.5) * np.sin(3 * u)), 0.005, 60, 6
+        ),
+    )
+    add("needle", kind, lambda: stretched(ball(3), 1, 0.01, 0.01))
+
+
+def hollow(surface: Surface, part: float) -> Surface:
+    return joined(surface, (part * surface[0], surface[1][:, ::-1]))
+
+
+def _open() -> None:
+    kind = "open"
+    flat = partial(add, kind=kind, closed=False)
+    flat("hemisphere", make=lambda: _hemisphere(3))
+    flat(
+        "cup",
+        make=lambda: turned([(0, 0), (0.5, 0), *[(0.5 + 0.02 * k, 0.1 * k) for k in range(1, 15)]], 32),
+        contact=True,
+    )
+    flat(
+        "open cylinder",
+        make=lambda: welded(*patch(lambda u, v: (np.cos(2 * np.pi * v), np.sin(2 * np.pi * v), 4 * u), 30, 24)),
+    )
+    flat("curved sheet", make=lambda: patch(lambda u, v: (3 * u, v, 0.5 * np.sin(2 * u)), 40, 14))
+    flat("flat sheet", make=lambda: patch(lambda u, v: (3 * u, v, 0 * u), 40, 14))
+    flat("saddle", make=lambda: patch(lambda u, v: (2 * u, v, (u - 0.5) ** 2 - (v - 0.5) ** 2), 30, 20))
+    flat("hills", make=lambda: of_vtk(pyvista.ParametricRandomHills(u_res=40, v_res=30, w_res=30)))
+    flat("Enneper", make=lambda: of_vtk(pyvista.ParametricEnneper(u_res=40, v_res=40, w_res=10)))
+    flat("Moebius strip", make=lambda: of_vtk(pyvista.ParametricMobius(u_res=40, v_res=12, w_res=10)))
+    flat(
+        "helicoid",
+        make=lambda: patch(lambda u, v: (4 * u, (v - 0.5) * np.cos(6 * u), (v - 0.5) * np.sin(6 * u)), 50, 10),
+    )
+    flat("sieve", make=lambda: _sieve(0.3))
+    flat(
+        "skirt",
+        make=lambda: patch(
+            lambda u, v: (
+                (0.3 + u) * np.cos(2 * np.pi * v),
+                (0.3 + u) * np.sin(2 * np.pi * v),
+                2 * u + 0.1 * u * np.sin(40 * v),
+            ),
+            20,
+            60,
+        ),
+    )
+    flat("airplane", make=lambda: of_vtk(pyvista.read(f"{examples.dir_path}/airplane.ply")), contact=True)
+
+
+def _hemisphere(level: int) -> Surface:
+    vertices, faces = ball(level)
+    faces = faces[vertices[faces].mean(1)[:, 2] > 0]
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used] * [1.5, 1, 1], faces.reshape(-1, 3)
+
+
+def _sieve(part: float) -> Surface:
+    vertices, faces = patch(lambda u, v: (3 * u, v, 0.2 * np.sin(3 * u)), 50, 18)
+    return vertices, faces[np.random.default_rng(4).random(len(faces)) > part / 2]
+
+
+# --------------------------------------------------------------------------------------------------------- non-manifold
+
+
+def _non_manifold() -> None:
+    broken = partial(add, kind="non-manifold", closed=False)
+    broken("boxes at an edge", make=lambda: welded(*joined(block((1, 1, 3), 2), moved(block((1, 1, 3), 2), 1, 1, 0))))
+    broken(
+        "boxes at a corner",
+        make=lambda: welded(*joined(block((1, 1, 1), 2), moved(block((1, 1, 1), 2), 1, 1, 1))),
+        closed=True,
+    )
+    broken("box with inner wall", make=lambda: welded(*joined(block((2, 1, 1), 2), _wall())))
+    broken("T of sheets", make=lambda: welded(*joined(_page(0), _page(1), _page(2))))
+    broken("book of five pages", make=lambda: welded(*joined(*[_page(k, 5) for k in range(5)])), contact=True)
+    broken("bow-tie of cones", make=_bow_tie, closed=True)
+    broken("repeated faces", make=lambda: (ball(2)[0] * [2, 1, 1], np.concatenate([ball(2)[1], ball(2)[1][:30]])))
+    broken("mixed winding", make=lambda: _mixed_winding())
+    broken("triangle soup", make=lambda: _soup(stretched(ball(2), 2, 1, 1)))
+    broken("Klein bottle", make=lambda: of_vtk(pyvista.ParametricKlein(u_res=40, v_res=30, w_res=30)))
+    broken("Roman surface", make=lambda: of_vtk(pyvista.ParametricRoman(u_res=30, v_res=30, w_res=30)))
+    broken("ball with a fin", make=lambda: _fin())
+
+
+def _wall() -> Surface:
+    return patch(lambda u, v: (0 * u, u - 0.5, v - 0.5), 5, 5)
+
+
+def _page(k: int, n: int = 3) -> Surface:
+    angle = 2 * np.pi * k / n
+    return patch(lambda u, v: (3 * u, v * np.cos(angle), v * np.sin(angle)), 24, 8)
+
+
+def _bow_tie() -> Surface:
+    cone = of(creation.cone(radius=0.6, height=1.5, sections=16))
+    return welded(
+        *joined(
+            moved(split(cone, 2), 0, 0, -1.5),
+            (split(cone, 2)[0] * [1, 1, -1] + [0, 0, 1.5], split(cone, 2)[1][:, ::-1]),
+        )
+    )
+
+
+def _mixed_winding() -> Surface:
+    vertices, faces = stretched(ball(3), 2, 1, 1)
+    faces = faces.copy()
+    faces[::3] = faces[::3, ::-1]
+    return vertices, faces
+
+
+def _soup(surface: Surface) -> Surface:
+    vertices, faces = surface
+    return vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+
+
+def _fin() -> Surface:
+    vertices, faces = stretched(ball(3), 2, 1, 1)
+    edges = trimesh.Trimesh(vertices, faces, process=False).edges_unique
+    ridge = edges[(np.abs(vertices[edges][:, :, 1]) < 1e-9).all(1) & (vertices[edges][:, :, 2] > 0).all(1)]
+    ends, number = np.unique(ridge, return_inverse=True)
+    number = number.reshape(-1, 2) + len(vertices)
+    fin = np.concatenate(
+        [np.column_stack([ridge, number[:, 1]]), np.column_stack([ridge[:, 0], number[:, 1], number[:, 0]])]
+    )
+    return np.concatenate([vertices, vertices[ends] + [0, 0, 0.5]]), np.concatenate([faces, fin])
+
+
+for _make in (_thin, _open, _non_manifold):
+    _make()
