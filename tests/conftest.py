@@ -146,7 +146,7 @@ def modal(
     """Settings of the bare modal solve, to the tolerance; what is named here changes them."""
     of_solver = {name: changes.pop(name) for name in set(changes) & set(Solver.__dataclass_fields__)}
     objective = Objective(base="rotations" if rotations else "linear", space=space, **changes)
-    return {"objective": objective, "solver": Solver(**{"least_gain": 0.0, "local_steps": 2 * local, **of_solver})}
+    return {"objective": objective, "solver": Solver(**{"local_steps": 2 * local, **of_solver})}
 
 
 def problem_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:

@@ -43,7 +43,7 @@ def test_of_nothing_nothing(small_bars: Shapes, preset: str) -> None:
 
 def test_derivatives_by_torch_func_give_the_same(small_bars: Shapes) -> None:
     """As ``tests/benchmarks/presets.py --terms`` has it: only the derivatives differ."""
-    solver = tm.Solver(least_gain=0.0)
+    solver = tm.Solver()
     x_a, x_b = small_bars.keyframes[:2]
     weights = torch.sin(torch.arange(x_a.numel(), dtype=F64)).view_as(x_a)
     found = []

@@ -26,13 +26,10 @@ from timing import timed
 
 import torch_modal as tm
 
-STRAIGHT, TURNED = tm.Objective(base="linear"), tm.Objective()
-TO_THE_END, TO_THREE_PERCENT = tm.Solver(least_gain=0.0, local_steps=0), tm.Solver(local_steps=0)
+STRAIGHT, TURNED, MODAL = tm.Objective(base="linear"), tm.Objective(), tm.Solver(local_steps=0)
 WAYS = {
-    "joint": (STRAIGHT, TO_THE_END),
-    "joint, to 3 %": (STRAIGHT, TO_THREE_PERCENT),
-    "joint + rotations, to 1e-10": (TURNED, TO_THE_END),
-    "joint + rotations": (TURNED, TO_THREE_PERCENT),
+    "joint": (STRAIGHT, MODAL),
+    "joint + rotations": (TURNED, MODAL),
     "subdivide": (TURNED, tm.Solver()),
 }
 DEFAULT = (30, 1000, "joint")
@@ -64,7 +61,7 @@ def main() -> None:
         yardstick = Yardstick(case)
         halfway = case.at([cases.HALF])
         straight = linear(halfway).frames[0]
-        most_of_all = {"objective": tm.Objective(coarse_faces=3000), "solver": tm.Solver(least_gain=0.0, polish=40)}
+        most_of_all = {"objective": tm.Objective(coarse_faces=3000), "solver": tm.Solver(polish=40)}
         best = InBetweens(halfway, 80, most_of_all)().shapes[0]
         most, least = yardstick.energy(straight), yardstick.energy(best)
         for n_modes, coarse_faces, way in choices:

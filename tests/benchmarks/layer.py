@@ -54,7 +54,7 @@ class Case:
             layer = tm.InBetween(bases, faces, arguments.preset)
         else:
             objective = tm.Objective(base="linear", coarse_faces=arguments.coarse_faces)
-            layer = tm.InBetween(bases, faces, objective=objective, solver=tm.Solver(least_gain=0.0, local_steps=0))
+            layer = tm.InBetween(bases, faces, objective=objective, solver=tm.Solver(local_steps=0))
         self.layer = layer.to(arguments.device, dtype)
         generator = torch.Generator().manual_seed(0)
         times = torch.rand(batch, generator=generator, dtype=torch.float64) * 0.8 + 0.1

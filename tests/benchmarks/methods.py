@@ -27,7 +27,7 @@ from torch_modal.geometry.rigid import blend
 
 PEER_SECONDS = 180
 # The modes alone, in two ways: as plain as can be, to the last digit, and as the preset "accurate" has it.
-BARE = {"objective": tm.Objective(base="linear"), "solver": tm.Solver(least_gain=0.0, local_steps=0)}
+BARE = {"objective": tm.Objective(base="linear"), "solver": tm.Solver(local_steps=0)}
 MODES_ONLY = {"solver": tm.Solver(local_steps=0)}
 MOST_VERTICES = 15_000  # over all vertices: more take minutes a step
 # One thread, as for all others; with more, jax 0.10 waits for itself for ever on few cores and large meshes.
@@ -139,7 +139,7 @@ def polished(case: Case) -> Outcome:
 @method("full", half_only=True)
 def full(case: Case) -> Outcome:
     """The optimum over all vertices: the best of what a modal and a linear start lead to."""
-    starts = InBetweens(case, 30, {"solver": tm.Solver(least_gain=0.0)})()
+    starts = InBetweens(case, 30, {"solver": tm.Solver()})()
     return by_full_space(
         case,
         lambda x_a, x_b, t, k: min(

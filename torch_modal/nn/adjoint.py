@@ -10,7 +10,8 @@ from torch import Tensor
 from torch_modal.geometry.functions import applied
 from torch_modal.nn import trees
 from torch_modal.nn.gauss_newton import GaussNewtonStep
-from torch_modal.nn.solver import Solution, Status, minimise
+from torch_modal.nn.quasi_newton import descend
+from torch_modal.nn.solver import Solution, Status
 
 
 class ConvergenceWarning(UserWarning):
@@ -23,11 +24,8 @@ class Minimisation(NamedTuple):
     step: GaussNewtonStep
     max_steps: int
     tolerance: float
-    least_gain: float
     guessed: bool
     """Whether the start is a guess, which may be worse than zeros."""
-    differentiated: bool
-    """Whether a gradient is recorded."""
     require: Callable[[Tensor], None]
     """Raises where there is no minimum at some of the times."""
     report: Callable[[Solution], None] | None
@@ -59,13 +57,12 @@ class _ArgMin(torch.autograd.Function):
             # Never a start that is worse than linear interpolation: what comes out must not be, either.
             zeros = torch.zeros_like(start)
             start, energy = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
-        limits = minimisation.max_steps, minimisation.tolerance, minimisation.least_gain
-        hessians: list[Tensor] | None = [] if minimisation.differentiated else None
-        solution = minimise(minimisation.step, start, placement, *limits, energy=energy, hessians=hessians)
+        limits = minimisation.max_steps, minimisation.tolerance
+        solution = descend(minimisation.step, start, placement, *limits, energy=energy)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         if minimisation.report is not None:
             minimisation.report(solution)
-        return *(value for value in solution if value is not None), *(hessians or [])
+        return tuple(value for value in solution if value is not None)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -73,18 +70,16 @@ class _ArgMin(torch.autograd.Function):
         amplitudes, *diagnostics = output
         ctx.mark_non_differentiable(*diagnostics)
         ctx.minimisation, ctx.tree = minimisation, tree
-        _, _, _, status, *hessian = diagnostics
-        ctx.save_for_backward(amplitudes, status, hessian[0] if hessian else None, *tensors)
+        ctx.save_for_backward(amplitudes, diagnostics[-1], *tensors)
 
     @staticmethod
     def backward(ctx: Any, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         step = ctx.minimisation.step
-        amplitudes, status, inner, *tensors = ctx.saved_tensors
+        amplitudes, status, *tensors = ctx.saved_tensors
         placement = trees.filled(ctx.tree, tensors)
         converged = (status == Status.CONVERGED)[:, None]
-        if inner is None or torch.is_grad_enabled():  # of a gradient there may be another
-            inner = step.energy.derivatives(amplitudes, placement, second_order=False).gauss_newton
-        hessian = step.ridged(inner + step.energy.second_order(amplitudes, placement))
+        derivatives = step.energy.derivatives(amplitudes, placement)
+        hessian = step.ridged(derivatives.gauss_newton + derivatives.second_order)
         eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
         adjoint, info = torch.linalg.solve_ex(torch.where(converged[..., None], hessian, eye), to_amplitudes)
         singular = (info != 0)[:, None]
@@ -145,8 +140,7 @@ def solve_implicit(
     # Kernels compute in float64, whatever goes in and comes out.
     batched = (usable, times, energy, start.detach().to(tensors[0].dtype), *tensors)
     found = applied(_ArgMin, minimisation, trees.skeleton(placement), *batched)
-    kept = found[:5]  # and not the Hessian
-    return Solution(*(value.to(start.dtype) if value.is_floating_point() else value for value in kept))
+    return Solution(*(value.to(start.dtype) if value.is_floating_point() else value for value in found))
 
 
 def solve_unrolled(

@@ -1,5 +1,6 @@
 """In-betweens of one pair of bases, for flat batches: what all layers share."""
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -10,10 +11,13 @@ from torch import Tensor, nn
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Mesh, Term
+from torch_modal.errors import MeshWarning
+from torch_modal.geometry.functions import traced, transformed
 from torch_modal.geometry.vectors import cross, pick
 from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.blend import Blends
+from torch_modal.nn.comparison import Distortion, no_worse
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
 from torch_modal.nn.fused_crossings import FusedPairs
 from torch_modal.nn.fused_relax import FusedRelax
@@ -23,7 +27,7 @@ from torch_modal.nn.launch import has_kernels
 from torch_modal.nn.levels import Levels, Stiffness, coarse_values
 from torch_modal.nn.paired import PairedSpace
 from torch_modal.nn.relax import relax
-from torch_modal.nn.samples import InBetweenResult, Samples
+from torch_modal.nn.samples import InBetweenResult, Samples, warn_of_starts
 from torch_modal.nn.settings import Objective, Solver
 from torch_modal.nn.solver import Solution, Status, unmoved
 
@@ -39,6 +43,9 @@ FINE_CHUNK_OF_GPU = 1_000_000
 
 # A key-frame smaller than this part of the basis' reference is a point.
 SMALLEST_SIZE = 1e-6
+
+# A key-frame that is larger or smaller than the basis' reference by this factor is in other units, or another body.
+OTHER_SIZE = 3.0
 
 
 def fine_chunk(n_vertices: int, device: torch.device) -> int:
@@ -67,6 +74,8 @@ class Shared(NamedTuple):
     """On the caller's mesh."""
     fused: FusedRelax | None
     """Its kernels, where there are some."""
+    distortion: Distortion
+    """Judges results."""
     weights: Tensor
     """Of the vertices in alignments, so that a motion through several has one course. *Shape:* ``(V,)``."""
     collapses: Callable[..., Collapsing]
@@ -82,7 +91,8 @@ class Shared(NamedTuple):
         energy = Energy(mesh, terms)
         fused = FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None
         blends = Blends(mesh.connectivity, shapes, pairs[0], has_kernels(solver.backend))
-        return cls(energy, fused, mean_areas(shapes, mesh.faces), shared_collapses(mesh.faces), blends)
+        weights, collapses = mean_areas(shapes, mesh.faces), shared_collapses(mesh.faces)
+        return cls(energy, fused, Distortion(mesh, terms, has_kernels(solver.backend)), weights, collapses, blends)
 
 
 class Between(nn.Module):
@@ -114,7 +124,7 @@ class Between(nn.Module):
         #: Whether Eq. 5 has no company: what has no strain then stays as it is.
         self.bare = not objective.terms
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
-        self.fine, self.fused = shared.energy, shared.fused
+        self.fine, self.fused, self.distortion = shared.energy, shared.fused, shared.distortion
         collapses = partial(shared.collapses, places)
         self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses)
         # Steps that are unrolled are differentiated like any other expression: by torch.
@@ -128,6 +138,7 @@ class Between(nn.Module):
         else:
             self.space = PairedSpace(self.frame, levels(), modes)
         self.closed = len(mesh.connectivity.boundary_edges) == 0
+        self.size_warned = False
 
     @cached_property
     def crossing_pairs(self) -> FusedPairs | None:
@@ -149,12 +160,11 @@ class Between(nn.Module):
             self.prepare()
         return super()._apply(fn, recurse)
 
-    def forward(self, samples: Samples, exact: bool, report: Callable[[Solution], None] | None) -> InBetweenResult:
+    def forward(self, samples: Samples, report: Callable[[Solution], None] | None) -> InBetweenResult:
         """Solve.
 
         Args:
             samples: The batch.
-            exact: Whether the minimisation goes on to the tolerance, whatever ``least_gain`` says.
             report: Told how it went.
         """
         space, t = self.space, samples.t
@@ -162,18 +172,22 @@ class Between(nn.Module):
         usable, placed = trees.picked((usable, pair.motions()), samples.which)
         usable = usable & (t >= 0) & (t <= 1)
         if pair.around is not None and self.bare:
-            # The course is a shape at rest: there is nothing to minimise.
-            x, solution = space.on_course(pair, samples.which, t), unmoved(t, 0, usable)
+            # The path is a shape at rest: there is nothing to minimise.
+            x, *starts = space.on_course(pair, samples.which, t)
+            x, solution = self.compared(x, starts, unmoved(t, 0, usable), pair, samples, None)
         else:
             anchors = self.anchors(placed, t)
             problem = self.problem(pair, samples, anchors)
             start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
-            minimisation = self._minimisation(exact, problem.start is not None, report)
+            limits = self.solver.max_steps, self.solver.tolerance
+            minimisation = Minimisation(self.step, *limits, problem.start is not None, space.require, report)
             x, solution = self.solved(
                 Batch(problem, minimisation, start, problem.energy, usable, pair, samples, anchors)
             )
         fused = self.fused is not None and fused_alignment.serves(x, pair.first, t)
         shapes = (fused_alignment.restore if fused else Alignment.restore)(self.frame, x, placed, t)
+        if report is not None:
+            warn_of_starts(solution)
         valid = solution.status != Status.INVALID
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
 
@@ -182,7 +196,27 @@ class Between(nn.Module):
         x, solution = self.modal(batch)
         if len(x) and (self.solver.local_steps or self.solver.polish):
             x = self._refine(x, batch)
-        return x, solution
+        return self.compared(x, batch.problem.starts, solution, batch.pair, batch.samples, batch.anchors)
+
+    def compared(
+        self,
+        x: Tensor,
+        starts: Sequence[Tensor],
+        solution: Solution,
+        pair: Pair,
+        samples: Samples,
+        anchors: Tensor | None,
+    ) -> tuple[Tensor, Solution]:
+        """Shapes that are no worse than their starts, by what is the same for all of them; solutions that say so."""
+        if not starts or not len(x):
+            return x, solution
+        with torch.no_grad():
+            ends = pair.first, pair.second
+            given = ends, samples.which, samples.t, samples.stiffness, anchors
+            distortion = self.distortion([x, *starts], *given)
+        x, worse = no_worse(x, starts, distortion)
+        fell = worse & (solution.status != Status.INVALID)
+        return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
 
     def modal(self, batch: Batch) -> tuple[Tensor, Solution]:
         """The shapes of the modal space that have the least energy, likewise."""
@@ -191,12 +225,6 @@ class Between(nn.Module):
         given = problem.placement, batch.start, batch.usable, batch.samples.t, batch.energy
         solution = solve(batch.minimisation, *given)
         return self.space.lift(solution.amplitudes, problem), solution
-
-    def _minimisation(self, exact: bool, guessed: bool, report: Callable[[Solution], None] | None) -> Minimisation:
-        space, solver = self.space, self.solver
-        least_gain = 0.0 if exact or isinstance(space, PairedSpace) else solver.least_gain
-        limits = solver.max_steps, solver.tolerance, least_gain
-        return Minimisation(self.step, *limits, guessed, exact, space.require, report)
 
     def placed(self, samples: Samples) -> Pair:
         """The pairs of key-frames in the frame, with their neighbours in time."""
@@ -221,7 +249,7 @@ class Between(nn.Module):
         """What shapes on the fine mesh are compared with."""
         if pair.around is not None:
             return Energy.against(
-                self._fine_rest(self.space.on_course(pair, samples.which, samples.t)), samples.stiffness
+                self._fine_rest(self.space.on_course(pair, samples.which, samples.t)[0]), samples.stiffness
             )
         first, second = trees.picked([self._fine_rest(end) for end in (pair.first, pair.second)], samples.which)
         return self.fine.between(first, second, samples.t, samples.stiffness)
@@ -230,7 +258,7 @@ class Between(nn.Module):
         """What shapes on the coarse mesh are compared with."""
         levels, stiffness = self.space.levels, self._levelled(samples.stiffness)
         if pair.around is not None:
-            course = self.space.on_course(pair, samples.which, samples.t)
+            course = self.space.on_course(pair, samples.which, samples.t)[0]
             return levels.against(course, self.frame.coarsen(course), stiffness)[0]
         ends = [levels.seen(x, self.frame.coarsen(x)) for x in (pair.first, pair.second)]
         return levels.between(*ends, samples.which, samples.t, stiffness)[0]
@@ -324,10 +352,29 @@ class Between(nn.Module):
         if found is None:
             return None
         pair, sizes = found
+        self._warn_of_size(sizes)
         usable = sizes > SMALLEST_SIZE * DIAGONAL
         if self.closed:
             usable = usable & ~(self.fused.volumes(pair.first, pair.second).prod(-1) < 0)
         return pair, usable
+
+    def _warn_of_size(self, sizes: Tensor) -> None:
+        """Say, once for a layer, that key-frames and bases seem to be in different units. *Shape:* ``(P,)``."""
+        if self.size_warned or traced(sizes) or transformed(sizes):
+            return
+        reference = self.frame.reference
+        ratios = sizes.detach() / (reference.amax(0) - reference.amin(0)).norm()
+        other = (ratios > SMALLEST_SIZE) & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE))
+        if not bool(other.any()):
+            return
+        self.size_warned = True
+        warnings.warn(
+            f"key-frames are {float(ratios[other][0]):.3g} times as large as the shapes that the bases were made from; "
+            "Eq. 5 depends on the size, so that the in-betweens differ from those of bases in the same units: "
+            "scale the key-frames, or make the bases from them",
+            MeshWarning,
+            stacklevel=2,
+        )
 
     def _solvable(self, pair: Pair) -> Tensor:
         """Whether both ends have a size, and, where closed, the same side out: else the volume would vanish on the way.
@@ -337,6 +384,7 @@ class Between(nn.Module):
         # Rows that lie together in memory are looked through several times as fast.
         ends = [x.detach().movedim(-1, 0).contiguous() for x in (pair.first, pair.second)]
         sizes = [(x.amax(-1) - x.amin(-1)).norm(dim=0) for x in ends]
+        self._warn_of_size(torch.minimum(*sizes))
         usable = torch.minimum(*sizes) > SMALLEST_SIZE * DIAGONAL
         if not self.closed:
             return usable

@@ -12,7 +12,7 @@ from torch_modal.nn.contact import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, 
 from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.relax import relax
-from torch_modal.nn.samples import InBetweenResult, Samples
+from torch_modal.nn.samples import InBetweenResult, Samples, warn_of_starts
 from torch_modal.nn.solver import Solution
 
 
@@ -34,11 +34,12 @@ class Apart(NamedTuple):
 class ContactRounds(Between):
     """In-betweens of one pair of bases whose parts do not go through each other. Arguments as for :class:`Between`."""
 
-    def forward(self, samples: Samples, exact: bool, report: Callable[[Solution], None] | None) -> InBetweenResult:
+    def forward(self, samples: Samples, report: Callable[[Solution], None] | None) -> InBetweenResult:
         """Solve. Arguments as there; however many rounds it takes, one report."""
-        result = super().forward(samples, exact, None)
+        result = super().forward(samples, None)
         if report is not None and self.solver.gradient == "implicit":
             report(result.solution)
+            warn_of_starts(result.solution)
         return result
 
     def solved(self, batch: Batch) -> tuple[Tensor, Solution]:

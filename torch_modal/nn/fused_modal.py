@@ -195,14 +195,15 @@ class FusedModalEnergy(ModalEnergy):
         curved = self._second(x, to.stiffness * off, placement) if second_order else None
         return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
-    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
+    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """As the other's."""
         plain = self._plain(placement)
         if plain is not None:
-            return super().gradient(a.to(plain.base), plain).to(placement.base)
+            value, gradient = super().value_and_gradient(a.to(plain.base), plain)
+            return value.to(placement.base), gradient.to(placement.base)
         to: Any = placement.reference
-        x = self.shell.gradient(self._shapes(a, placement.base, placement.extra), to)
-        return along_columns(x, self.flat.double(), placement.extra)
+        value, x = self.shell.value_and_gradient(self._shapes(a, placement.base, placement.extra), to)
+        return value + to.constant, along_columns(x, self.flat.double(), placement.extra)
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """As the other's."""

@@ -262,15 +262,17 @@ class FusedShell(nn.Module):
         to_reference.stiffness.add_(to_moment * off)
         to_reference.volume.sub_(to_volume)
 
-    def gradient(self, x: Tensor, to: ShellReference) -> Tensor:
-        """The gradient. *Shape:* ``(B, V, 3)``."""
+    def value_and_gradient(self, x: Tensor, to: ShellReference) -> tuple[Tensor, Tensor]:
+        """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""
         b, n = x.shape[:2]
-        volume, gradient, normal = zeros(x, (b,), (b, n, 3), (b, n, 3))
+        energy, volume, gradient, normal = zeros(x, (b,), (b,), (b, n, 3), (b, n, 3))
         given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, n]
-        given += [None, gradient, None, None, None, volume, normal]
+        given += [energy, gradient, None, None, None, volume, normal]
         launch(kernels("shell").linearise, (b, len(self.record) + len(self.walls)), given)
-        moment = to.stiffness * (volume - to.volume)
-        return torch.addcmul(gradient, moment[:, None, None], self.shared(normal))
+        off = volume - to.volume
+        moment = to.stiffness * off
+        gradient.addcmul_(moment[:, None, None], self.shared(normal))
+        return torch.addcmul(energy, moment, off, value=0.5), gradient
 
     def value(self, x: Tensor, to: ShellReference) -> Tensor:
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""

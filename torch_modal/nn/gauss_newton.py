@@ -16,10 +16,6 @@ GOOD_AGREEMENT = 0.5
 # Of saddle-free Newton steps, relative to Gauss-Newton's Hessian.
 LEAST_CURVATURE = 0.1
 
-# With the Hessian of the last step there are further ones, which cost a gradient each, while that falls by this factor.
-FALLS = 0.25
-MOST_WITH_ONE_HESSIAN = 12
-
 # Rounding errors add up along the sum over edges and hinges; this many times their size is as far as a gradient goes.
 ROUNDING_MARGIN = 4.0
 ENERGY_ROUNDING = 64.0
@@ -34,8 +30,8 @@ class AmplitudeEnergy(Protocol):
     def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
         """Derivatives. *Shape:* ``(B, n)``."""
 
-    def gradient(self, a: Tensor, placement: Any) -> Tensor:
-        """The gradient alone. *Shape:* ``(B, n)``."""
+    def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+        """Energy and gradient. *Shape:* ``(B, n) -> (B,), (B, n)``."""
 
     def second_order(self, a: Tensor, placement: Any) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
@@ -62,8 +58,6 @@ class Step(NamedTuple):
 
     *Shape:* ``(B, n)``.
     """
-    factor: Tensor | None
-    """Of the full Hessian, where one was asked for. *Shape:* ``(B, n, n)``."""
 
 
 class GaussNewtonStep(nn.Module):
@@ -109,10 +103,6 @@ class GaussNewtonStep(nn.Module):
         Returns:
             NaN for a sample whose Hessian is not positive definite. *Shape:* ``(D, B, n)``.
         """
-        return self._factored(derivatives)[0]
-
-    def _factored(self, derivatives: Derivatives) -> tuple[Tensor, Tensor]:
-        """The same, with the factors of the Hessians. *Shape:* ``(D, B, n), (D, B, n, n)``."""
         hessians = derivatives.gauss_newton[None]
         if derivatives.second_order is not None:
             hessians = torch.cat([hessians, hessians + derivatives.second_order])
@@ -125,7 +115,7 @@ class GaussNewtonStep(nn.Module):
             factor, _ = torch.linalg.cholesky_ex(torch.where(definite[..., None, None], hessians, eye))
         gradient = derivatives.gradient.expand(len(hessians), -1, -1)[..., None]
         direction = -torch.cholesky_solve(gradient, factor).squeeze(-1)
-        return torch.where(definite[..., None], direction, torch.nan), factor
+        return torch.where(definite[..., None], direction, torch.nan)
 
     @staticmethod
     def floor(derivatives: Derivatives) -> Tensor:
@@ -134,7 +124,7 @@ class GaussNewtonStep(nn.Module):
 
     def take(self, a: Tensor, energy: Tensor, derivatives: Derivatives, placement: Any) -> Step:
         """The best of the candidate steps from a point whose derivatives are known."""
-        plain, factors = self._factored(derivatives)
+        plain = self.directions(derivatives)
         directions = self._past_saddles(plain, derivatives)
         best, lowest = self.lowest(a, directions, placement)
         promised = self._promised(directions, derivatives)
@@ -145,7 +135,7 @@ class GaussNewtonStep(nn.Module):
             best = torch.where(improves[:, None], shorter, best)
             lowest = torch.where(improves, energies, lowest)
         found = self._unless_uphill(a, energy, best, lowest, promised, derivatives)
-        return found if derivatives.second_order is None else found._replace(newton=a + plain[1], factor=factors[1])
+        return found if derivatives.second_order is None else found._replace(newton=a + plain[1])
 
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, trying both directions at all lengths, without a branch that depends on data.
@@ -213,35 +203,7 @@ class GaussNewtonStep(nn.Module):
         norm = derivatives.gradient.norm(dim=-1)
         reached = torch.where(moved[:, None], best, a)
         newton = torch.full_like(a, torch.nan)
-        return Step(reached, torch.where(moved, lowest, energy), norm, promised, moved, newton, None)
-
-    def settled(self, a: Tensor, taken: Step, near: Tensor, small: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
-        """Further steps with the Hessian of the last one, never uphill.
-
-        Args:
-            a: Where that one led. *Shape:* ``(B, n)``.
-            taken: That one.
-            near: Which samples go further. *Shape:* ``(B,)``, bool.
-            small: Gradient norms from which on there is one more step. *Shape:* ``(B,)``.
-            placement: What the energy knows of each sample.
-
-        Returns:
-            Where they lead, and the energy there.
-        """
-        assert taken.factor is not None
-        start, energy, norm = a, taken.energy, taken.gradient_norm
-        for _ in range(MOST_WITH_ONE_HESSIAN):
-            gradient = self.energy.gradient(a, placement)
-            found = gradient.norm(dim=-1)
-            near = near & (found <= FALLS * norm)
-            further = torch.cholesky_solve(gradient[..., None], taken.factor).squeeze(-1)
-            a, norm = torch.where(near[:, None], a - further, a), torch.where(near, found, norm)
-            near = near & (found > small)
-            if not bool(near.any()):
-                break
-        reached = self.energy.value(a, placement)
-        downhill = reached <= energy + ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
-        return torch.where(downhill[:, None], a, start), torch.where(downhill, reached, energy)
+        return Step(reached, torch.where(moved, lowest, energy), norm, promised, moved, newton)
 
     def lowest(self, a: Tensor, steps: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
         """Where the energy is lowest after one of the steps ``(D, B, n)``, and how low; ``a`` if nowhere finite."""

@@ -158,7 +158,7 @@ def _by_kernels(
 ) -> Tensor:
     first, second = trees.picked((pair.first, pair.second), samples.which)
     if pair.around is not None:
-        first = second = member.space.on_course(pair, samples.which, samples.t)
+        first = second = member.space.on_course(pair, samples.which, samples.t)[0]
     given = [value.double() for value in (first, second, samples.t, *samples.stiffness)]
     moving, pull = x.double(), Pull(pull.to.double(), pull.weights.double())
     size, n = fine_chunk(x.shape[1], x.device), x.shape[1]

@@ -181,17 +181,16 @@ class InBetween(nn.Module):
             self.mu_of(times, lead),
             self.stiffness_of(times, lead),
         )
-        exact = self.records(x_a, x_b, times)
         with full_precision(times.device.type):
             if chosen is None:
-                result = self.members[0 if isinstance(pair, Tensor) else pair](samples, exact, report)
+                result = self.members[0 if isinstance(pair, Tensor) else pair](samples, report)
             else:
-                result = self._of_several(samples, chosen.expand(own).reshape(-1), exact, report)
+                result = self._of_several(samples, chosen.expand(own).reshape(-1), report)
         shapes, solution = unflattened(result, lead)
         return InBetweenResult(with_exact_ends(shapes, x_a, x_b, t), solution)
 
     def _of_several(
-        self, samples: Samples, chosen: Tensor, exact: bool, report: Callable[[Solution], None] | None
+        self, samples: Samples, chosen: Tensor, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
         """Samples that lie between different pairs of bases."""
         index = torch.arange(len(chosen), device=chosen.device) if samples.which is None else samples.which
@@ -211,20 +210,15 @@ class InBetween(nn.Module):
                 [values[mine] for values in samples.stiffness],
             )
             order.append(mine)
-            parts.append(member(picked, exact, report))
+            parts.append(member(picked, report))
         if not parts:
-            return self.members[0](samples, exact, report)  # of nothing, nothing
+            return self.members[0](samples, report)  # of nothing, nothing
         return joined(parts, order)
 
     def report(self) -> Callable[[Solution], None]:
         """What ``forward`` says of samples that did not converge."""
         forbid = self.solver.unconverged == "raise" and torch.is_grad_enabled()
         return partial(report, max_steps=self.solver.max_steps, forbid=forbid)
-
-    def records(self, *given: Tensor) -> bool:
-        """Whether gradients of these, or of what is minimised, are recorded."""
-        own = [self.mu, *(term.stiffness for term in self.terms)]
-        return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in [*given, *own])
 
     # ------------------------------------------------------------------------------------------------------ the border
     def _chosen(self, pair: Tensor | int) -> Tensor | None:
@@ -351,7 +345,9 @@ def with_exact_ends(shapes: Tensor, x_a: Tensor, x_b: Tensor, t: Tensor | float)
             continue
         exactly = x.to(shapes).detach()
         if torch.is_grad_enabled():
-            exactly = exactly + (shapes - shapes.detach())
+            # No number comes of the other end where that is not finite, and no gradient.
+            known = shapes.detach()
+            exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)
         there = torch.as_tensor(t == end, device=shapes.device)
         shapes = torch.where(there[..., None, None], exactly, shapes)
     return shapes

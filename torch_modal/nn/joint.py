@@ -39,6 +39,8 @@ class JointProblem(NamedTuple):
     """Where the minimisation may start; None: at zeros. *Shape:* ``(B, n)``."""
     base: Tensor
     """The fine shape that the modes are added to. *Shape:* ``(B, V, 3)``."""
+    starts: tuple[Tensor, ...]
+    """Shapes that the result must not be worse than. *Shape of each:* ``(B, V, 3)``."""
     difference: Difference
     """The column of the last amplitude."""
     energy: Tensor | None = None
@@ -142,17 +144,19 @@ class JointSpace(nn.Module):
         difference, extras = trees.picked((difference, extras), index)
         start = None
         if pair.around is not None:
-            base = self.on_course(pair, index, t)
+            starts = self.on_course(pair, index, t)
+            base = starts[0]
             coarse = self.frame.coarsen(base)
             references = levels.against(base, coarse, stiffness)
             placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
-            return JointProblem(placement, start, base, difference)
+            return JointProblem(placement, start, base, starts, difference)
         seen_first, seen_second = levels.seen(pair.first, coarse_first), levels.seen(pair.second, coarse_second)
         references = levels.between(seen_first, seen_second, index, t, stiffness)
         first, second, coarse_first, coarse_second = trees.picked(
             (pair.first, pair.second, coarse_first, coarse_second), index
         )
-        base = torch.lerp(first, second, t[:, None, None])
+        base = straight = torch.lerp(first, second, t[:, None, None])
+        starts = (straight,)
         coarse = torch.lerp(coarse_first, coarse_second, t[:, None, None])
         placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
         energy = None
@@ -161,6 +165,7 @@ class JointSpace(nn.Module):
                 start = self.modal.guess(coarse_first, coarse_second, extras[0], t)
         if self.blend is not None:
             blend = self.blend(first, second, t, base)
+            starts = (blend, straight)
             seen = levels.seen(blend, self.frame.coarsen(blend))
             turned = levels.place(self.energy, seen, references, extras, anchors)
             with torch.no_grad():
@@ -174,10 +179,13 @@ class JointSpace(nn.Module):
                 straight._replace(base=torch.where(better[:, None, None], bent.base, straight.base))
                 for bent, straight in zip(turned, placement, strict=True)
             )
-        return JointProblem(placement, start, base, difference, energy)
+        return JointProblem(placement, start, base, starts, difference, energy)
 
-    def on_course(self, pair: Pair, index: Tensor | None, t: Tensor) -> Tensor:
-        """The shape that the motion passes through, by what the neighbours in time say. *Shape:* ``(B, V, 3)``."""
+    def on_course(self, pair: Pair, index: Tensor | None, t: Tensor) -> tuple[Tensor, ...]:
+        """The shape on the smooth path through the neighbours in time, then what it is compared with.
+
+        *Shape of each:* ``(B, V, 3)``.
+        """
         around = pair.around
         assert around is not None
         # Of one pair for all there is no need of copies.
@@ -186,10 +194,10 @@ class JointSpace(nn.Module):
         u = t[:, None, None]
         straight = torch.lerp(first, second, u) + beyond(bend, u)
         if self.blend is None:
-            return straight
+            return (straight,)
         course = self.blend.rotations.course(around.before, pair.first, pair.second, around.after, around.spacing)
         which = torch.arange(len(t), device=t.device) if index is None else index
-        return self.blend.along(course, which, straight, t)
+        return self.blend.along(course, which, straight, t), straight
 
     @staticmethod
     def require(t: Tensor) -> None:

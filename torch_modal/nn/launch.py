@@ -29,8 +29,9 @@ Module = Literal[
     "rotations",
     "rotations_adjoint",
     "crossings",
+    "distortion",
 ]
-IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps")
+IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps", "distortion")
 """What in-betweens need that record no gradient."""
 
 

@@ -150,10 +150,11 @@ class ModalEnergy(nn.Module):
         curved = self._curved(at, extra) if second_order else None
         return Derivatives(reduce(torch.add, gradient), inner, curved, rounding * (stiffest * stiffness).sqrt())
 
-    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
-        """The gradient alone. *Shape:* ``(B, n)``."""
+    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
         at = self.energy.linearise(self.rows(a, placement), placement.reference)
-        return along_columns(self.energy.gradient(at).transpose(0, 1), self.columns, placement.extra)
+        gradient = along_columns(self.energy.gradient(at).transpose(0, 1), self.columns, placement.extra)
+        return self.energy.value_at(at, placement.reference), gradient
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
@@ -281,9 +282,10 @@ class SumOfEnergies(nn.Module):
         sums = (None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True))
         return Derivatives(*sums)  # type: ignore[arg-type]
 
-    def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
-        """The gradient alone. *Shape:* ``(B, n)``."""
-        return reduce(torch.add, [part.gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)])
+    def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        found = [part.value_and_gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        return reduce(torch.add, [value for value, _ in found]), reduce(torch.add, [gradient for _, gradient in found])
 
     def second_order(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""

@@ -37,6 +37,8 @@ class PairedProblem(NamedTuple):
     """*Shape:* ``(B, V, 3)``."""
     second: Tensor
     """*Shape:* ``(B, V, 3)``."""
+    starts: tuple[Tensor, ...]
+    """Linear interpolation, which the result must not be worse than. *Shape of each:* ``(B, V, 3)``."""
     energy: None = None
     """At zeros, it is not known."""
 
@@ -82,10 +84,13 @@ class PairedEnergy(nn.Module):
         curved = self.second_order(a, placement) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
 
-    def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
-        """The gradient alone. *Shape:* ``(B, n)``."""
-        strain = torch.cat([energy.gradient(part, place) for energy, part, place in self._ends(a, placement)], -1)
-        return strain + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
+    def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        first, second = (energy.value_and_gradient(part, place) for energy, part, place in self._ends(a, placement))
+        similar = a @ self.gap_gram + placement.linear
+        similarity = (a * (similar + placement.linear)).sum(-1) + placement.constant
+        value = first[0] + second[0] + placement.mu * similarity
+        return value, torch.cat([first[1], second[1]], -1) + 2 * placement.mu[:, None] * similar
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: PairedPlacement) -> PairedPlacement:
         """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
@@ -146,7 +151,7 @@ class PairedSpace(nn.Module):
         places = place(first, self.energy.first), place(second, self.energy.second)
         apart = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)
         placement = PairedPlacement(places[0], places[1], apart @ self.energy.gap.mT, (apart**2).sum(-1), mu)
-        return PairedProblem(placement, None, first, second)
+        return PairedProblem(placement, None, first, second, (torch.lerp(first, second, t[:, None, None]),))
 
     @staticmethod
     def require(t: Tensor) -> None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.functions import traced, transformed
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.nn.adjoint import ConvergenceWarning
 from torch_modal.nn.solver import Solution, Status
@@ -68,7 +69,7 @@ def report(solution: Solution, max_steps: int, forbid: bool) -> None:
     if not bool(missed.any()):
         return
     counts = {status.name: int((solution.status == status).sum()) for status in Status if status}
-    counts.pop(Status.ENOUGH.name)
+    counts.pop(Status.FELL_BACK.name)
     message = (
         f"{int(missed.sum())} of {missed.numel()} in-betweens did not converge in {max_steps} steps "
         f"({', '.join(f'{n} {name}' for name, n in counts.items() if n)}): no gradient flows through their amplitudes; "
@@ -77,3 +78,21 @@ def report(solution: Solution, max_steps: int, forbid: bool) -> None:
     if forbid:
         raise ConvergenceError(message)
     warnings.warn(message, ConvergenceWarning, stacklevel=2)
+
+
+def warn_of_starts(solution: Solution) -> None:
+    """Say how many shapes are the ones that they started from.
+
+    Args:
+        solution: One value per sample.
+    """
+    fell = solution.status == Status.FELL_BACK
+    if traced(fell) or transformed(fell) or not bool(fell.any()):
+        return
+    warnings.warn(
+        f"{int(fell.sum())} of {fell.numel()} in-betweens came out worse than what they started from, the blend by "
+        "local rotations or linear interpolation, which is returned in their place (status FELL_BACK); more coarse "
+        "faces or local steps may help: Objective(coarse_faces=...), Solver(local_steps=...)",
+        ConvergenceWarning,
+        stacklevel=2,
+    )

@@ -73,12 +73,9 @@ class Solver:
     """How it is solved.
 
     Attributes:
-        max_steps: Newton steps at most in the modal space; exactly that many with ``gradient="unroll"``.
-        tolerance: Bound on the gradient norm there, relative to the one at the start.
-        least_gain: A step that promises less than this part of the energy is the last one, where no gradient is
-            recorded: further steps change nothing that one could see (docs/quality.md). Where one is, the solve always
-            goes on to the tolerance, on which exact gradients rest. 0 goes on to it everywhere. Of no effect in the
-            paired space, which starts too far away.
+        max_steps: Steps at most in the modal space; with ``gradient="unroll"`` exactly that many Newton steps.
+        tolerance: Bound on the gradient norm there, relative to the one at the start. Gradients of the layer are as
+            exact as that. It is the same whether gradients are recorded or not, and so is the result.
         gradient: ``"implicit"`` (by the implicit function theorem with the full Hessian; memory does not grow with the
             steps) or ``"unroll"`` (through all steps).
         unconverged: What happens when samples did not converge: ``"warn"`` warns and lets no gradient flow through
@@ -95,9 +92,8 @@ class Solver:
         ValueError: A choice that does not exist, or a number out of range.
     """
 
-    max_steps: int = 40
-    tolerance: float = 1e-10
-    least_gain: float = 0.03
+    max_steps: int = 80
+    tolerance: float = 1e-8
     gradient: Literal["implicit", "unroll"] = "implicit"
     unconverged: Literal["warn", "raise"] = "warn"
     local_steps: int = 2
@@ -112,8 +108,6 @@ class Solver:
             _whole(name, getattr(self, name), lowest)
         if not self.tolerance >= 0:
             raise ValueError(f"tolerance bounds a relative gradient norm and is 0 or more; got {self.tolerance!r}")
-        if not 0 <= self.least_gain < 1:
-            raise ValueError(f"least_gain is a part of the energy, from 0 to less than 1; got {self.least_gain!r}")
 
 
 class Settings(NamedTuple):

@@ -16,9 +16,6 @@ GOOD_DECREASE = 0.8
 # Where the gradient has grown by this factor after what should have been the last Newton step, it was not the last.
 GROWN = 10.0
 
-# A Newton step that promises less than this part of the energy is followed by steps with the same Hessian.
-NEAR = 0.01
-
 
 class Status(IntEnum):
     """How the minimisation of a sample ended."""
@@ -31,8 +28,9 @@ class Status(IntEnum):
     """No step went downhill any more."""
     INVALID = 3
     """No in-between exists: NaN or infinite entries, no size, or one key-frame of a closed mesh is a mirror image."""
-    ENOUGH = 4
-    """The next step promised less than ``least_gain`` of the energy: a good shape, and no exact gradient."""
+    FELL_BACK = 4
+    """What was found is worse than what it started from, which is returned: the blend by local rotations, or linear
+    interpolation. Gradients are those of the shape returned; amplitudes and energy are those of what was found."""
 
 
 class Solution(NamedTuple):
@@ -52,14 +50,14 @@ class Solution(NamedTuple):
     """With contact, the pairs of triangles of parts that still go through each other. *Shape:* ``(B,)``, int64."""
 
     @property
+    def usable(self) -> Tensor:
+        """Whether the shape can be relied on: it converged, or is what it started from. *Shape:* ``(B,)``, bool."""
+        return self.converged | (self.status == Status.FELL_BACK)
+
+    @property
     def converged(self) -> Tensor:
         """Whether the gradient is within the tolerance. *Shape:* ``(B,)``, bool."""
         return self.status == Status.CONVERGED
-
-    @property
-    def usable(self) -> Tensor:
-        """Whether the shape is what was asked for: converged, or close enough by ``least_gain``. *Shape:* ``(B,)``."""
-        return self.converged | (self.status == Status.ENOUGH)
 
 
 def minimise(
@@ -68,9 +66,9 @@ def minimise(
     placement: Any,
     max_steps: int = 40,
     tolerance: float = 1e-8,
-    least_gain: float = 0.0,
     energy: Tensor | None = None,
-    hessians: list[Tensor] | None = None,
+    start: Tensor | None = None,
+    n_steps: Tensor | None = None,
 ) -> Solution:
     """Repeat the step until every sample has converged, or cannot go on.
 
@@ -83,23 +81,24 @@ def minimise(
         placement: What the energy knows of each sample.
         max_steps: Give up after that many.
         tolerance: Bound on the gradient norm, relative to its value at the start.
-        least_gain: Where a step promises less than this part of the energy, it is the last one. The gradient norm of
-            the solution is then the one before that step.
-        energy: At the start, where it is known. *Shape:* ``(B,)``.
-        hessians: Receives Gauss-Newton's at the amplitudes of those that converged. *Shape:* ``(B, n, n)``.
+        energy: At ``a``, where it is known. *Shape:* ``(B,)``.
+        start: The gradient norm that the tolerance is relative to. Default: that at ``a``. *Shape:* ``(B,)``.
+        n_steps: Steps that led to ``a``, which count. Default: none. *Shape:* ``(B,)``.
     """
     energy = step.energy.value(a, placement) if energy is None else energy
     eps, tiny = torch.finfo(energy.dtype).eps, torch.finfo(energy.dtype).tiny
     found, blank = torch.zeros_like(a), energy.new_zeros(len(a))
-    inner = None if hessians is None else a.new_zeros(*a.shape, a.shape[-1])
     # What decides are a few numbers of each sample: on the host, where a GPU is waited for twice in a step.
-    everyone = live = [_Course(row, value) for row, value in enumerate(energy.tolist())]
-    for k in range(max_steps + 1):
+    norms = [None] * len(a) if start is None else start.tolist()
+    taken_before = [0] * len(a) if n_steps is None else n_steps.tolist()
+    each = enumerate(zip(energy.tolist(), norms, taken_before, strict=True))
+    everyone = live = [_Course(row, *known) for row, known in each]
+    for _ in range(max_steps + 1):
         derivatives = step.energy.derivatives(a, placement, second_order=False)
         told = torch.stack([derivatives.gradient.norm(dim=-1), step.floor(derivatives)], 1).tolist()
         for own, (norm, floor) in zip(live, told, strict=True):
-            own.look(norm, floor, tolerance, k == 0)
-        going = [own.status == Status.OUT_OF_STEPS and k < max_steps for own in live]
+            own.look(norm, floor, tolerance)
+        going = [own.status == Status.OUT_OF_STEPS and own.n_steps < max_steps for own in live]
         if any(going):
             needing = [still and own.slow for still, own in zip(going, live, strict=True)]
             if any(needing):
@@ -108,37 +107,25 @@ def minimise(
             energy, promised, moved, newton = taken.energy, taken.promised, taken.moved, taken.newton.sum(-1)
             numbers = torch.stack([energy, promised, moved.to(energy), newton], 1).tolist()
             pairs = zip(live, going, numbers, strict=True)
-            ways = [own.go(each, eps, least_gain) if still else _STAY for own, still, each in pairs]
+            ways = [own.go(each, eps) if still else _STAY for own, still, each in pairs]
             a = _chosen(ways, [a, taken.amplitudes, taken.newton])
-            near = [still and own.near and not least_gain for still, own in zip(going, live, strict=True)]
-            if any(near):
-                small = a.new_tensor(
-                    [max(tolerance * own.start, floor) for own, (_, floor) in zip(live, told, strict=True)]
-                )
-                a, energy = step.settled(a, taken, torch.tensor(near, device=a.device), small, placement)
-                for own, value in zip(live, energy.tolist(), strict=True):
-                    own.energy = value
             going = [still and own.status == Status.OUT_OF_STEPS for still, own in zip(going, live, strict=True)]
         if not any(going) and len(live) == len(everyone):  # all at once, as one alone always is
-            found, inner = a.clone(), None if inner is None else derivatives.gauss_newton
+            found = a.clone()
             break
         if not all(going):
             left = torch.tensor([not still for still in going], device=a.device)
             gone = [own.row for own, still in zip(live, going, strict=True) if not still]
             found[gone] = a[left]
-            if inner is not None:
-                inner[gone] = derivatives.gauss_newton[left]
             live = [own for own, still in zip(live, going, strict=True) if still]
             if not live:
                 break
             a, energy, placement = trees.rows((a, energy, placement), torch.nonzero(~left).flatten())
-    if hessians is not None and inner is not None:
-        hessians.append(inner)
     values = [[own.energy, own.norm / max(own.start, tiny)] for own in everyone]
     counts = [[own.n_steps, own.status] for own in everyone]
-    reached, norms = blank.new_tensor(values).reshape(-1, 2).unbind(1)
-    n_steps, status = torch.tensor(counts, dtype=torch.int64, device=a.device).reshape(-1, 2).unbind(1)
-    return Solution(found, reached, norms, n_steps, status)
+    reached, relative = blank.new_tensor(values).reshape(-1, 2).unbind(1)
+    counted, status = torch.tensor(counts, dtype=torch.int64, device=a.device).reshape(-1, 2).unbind(1)
+    return Solution(found, reached, relative, counted, status)
 
 
 # Which amplitudes a sample has next: those that it has, those of the step, those of the whole Newton step.
@@ -148,43 +135,39 @@ _STAY, _STEP, _NEWTON = range(3)
 class _Course:
     """What one sample has gone through."""
 
-    def __init__(self, row: int, energy: float) -> None:
-        self.row, self.energy = row, energy
-        self.norm = self.start = math.inf
-        self.n_steps = 0
+    def __init__(self, row: int, energy: float, start: float | None, n_steps: int) -> None:
+        self.row, self.energy, self.n_steps = row, energy, n_steps
+        self.norm = math.inf
+        #: The gradient norm that the tolerance is relative to.
+        self.start = math.inf if start is None else start
         self.status = Status.OUT_OF_STEPS
         #: Whether it needs the full Hessian, and whether its next Newton step was to be the last.
         self.slow = self.last = False
-        #: Whether the Hessian of the last step is good for others.
-        self.near = False
 
-    def look(self, norm: float, floor: float, tolerance: float, first: bool) -> None:
+    def look(self, norm: float, floor: float, tolerance: float) -> None:
         """Whether it has arrived."""
         before, self.norm = self.norm, norm
-        if first:
+        if self.start == math.inf:
             self.start = norm
         if not (math.isfinite(norm) and math.isfinite(self.energy)):
             self.status = Status.INVALID
         elif norm <= max(tolerance * self.start, floor) or (self.last and norm <= GROWN * before):
             self.status = Status.CONVERGED
 
-    def go(self, told: list[float], eps: float, least_gain: float) -> int:
+    def go(self, told: list[float], eps: float) -> int:
         """Which way it goes from here, or the status with which it ends, by what is told of a step."""
         energy, promised, moved, newton = told
         # Where all that is left to gain drowns in the rounding of the energy, nothing compares steps any more: a whole
         # Newton step is taken, and is the last.
         drowned = promised <= ENERGY_ROUNDING * eps * abs(self.energy)
         self.last = self.slow and drowned and math.isfinite(newton)
-        self.near = bool(moved) and not self.last and math.isfinite(newton) and promised < NEAR * abs(self.energy)
         if self.slow and not moved and not self.last:
             self.status = Status.CONVERGED if drowned else Status.STALLED
             return _STAY
-        if moved and promised < least_gain * abs(self.energy):
-            self.status = Status.ENOUGH
         self.slow = self.slow or not moved or energy > GOOD_DECREASE * self.energy
         self.n_steps += bool(moved or self.last)
         self.energy = energy
-        return _NEWTON if self.last and self.status != Status.ENOUGH else _STEP
+        return _NEWTON if self.last else _STEP
 
 
 def _chosen(ways: list[int], amplitudes: list[Tensor]) -> Tensor:

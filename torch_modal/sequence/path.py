@@ -167,12 +167,11 @@ class Path(nn.Module):
         flat = keyframes.reshape(-1, *keyframes.shape[-3:])
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = located(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
-        exact = layer.records(keyframes, t)
         order, parts = [], []
         for i in segment.unique().tolist() or [0]:  # of nothing, nothing
             mine = torch.nonzero(segment == i).flatten()
             order.append(mine)
-            parts.append(self._between(flat, i, which[mine], u[mine], exact, report))
+            parts.append(self._between(flat, i, which[mine], u[mine], report))
         return unflattened(joined(parts, order), lead)
 
     def _between(
@@ -181,14 +180,13 @@ class Path(nn.Module):
         i: int,
         which: Tensor,
         u: Tensor,
-        exact: bool,
         report: Callable[[Solution], None] | None,
     ) -> InBetweenResult:
         """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
         member = self.layer.members[self.members[i]]
         samples = self.samples(keyframes, i, which, u)
         with full_precision(u.device.type):
-            result = member(samples, exact, report)
+            result = member(samples, report)
             if self.contact:
                 result = self._in_contact(keyframes, i, samples, result)
         ends = keyframes[which, i], keyframes[which, (i + 1) % self.n_keyframes]
@@ -218,7 +216,7 @@ class Path(nn.Module):
             own = keyframes[motion : motion + 1]
             grid = self.samples(own, i, torch.zeros(len(even), dtype=torch.int64, device=which.device), even)
             with torch.no_grad():
-                found = push_apart(member, grid, member(grid, False, None).shapes)
+                found = push_apart(member, grid, member(grid, None).shapes)
             mine = torch.nonzero(which == motion).flatten()
             at = self.samples(own, i, torch.zeros_like(mine), samples.t[mine])
             shapes = shapes.index_copy(0, mine, found.apply(member, at, result.shapes[mine]))
