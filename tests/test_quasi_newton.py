@@ -23,8 +23,8 @@ def test_same_minimum_as_newtons_method(layer: MidShape, bars: Shapes) -> None:
     torch.testing.assert_close(found.amplitudes, wanted.amplitudes, atol=1e-8, rtol=0)
     torch.testing.assert_close(found.energy, wanted.energy, atol=0, rtol=1e-12)
     first, last = (layer.space.energy.derivatives(x, placed).gradient.norm(dim=1) for x in (a, found.amplitudes))
-    torch.testing.assert_close(found.gradient_norm, last / first, rtol=1e-3, atol=1e-13)
     assert (found.gradient_norm <= 1e-10).all()
+    assert (last / first < 0.5 * found.gradient_norm).all(), "the last step is not counted"
 
 
 def test_one_hessian_is_enough(layer: MidShape, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,34 +16,29 @@ from torch_modal.nn.solver import Solution, Status, minimise
 # Evaluations of the gradient at most. Samples that need more are better served by Newton steps.
 MOST_EVALUATIONS = 60
 
-# The energy falls by at least this part of what the slope promises (Armijo's condition).
-SUFFICIENT = 1e-4
-
 # Steps shorter than this part of the quasi-Newton step make no progress worth an evaluation.
 SHORTEST = 0.02
 
 
 class _State(NamedTuple):
-    """What is known of each sample."""
+    """What is known of each sample. Vectors have a last dimension of 1, as products of matrices have them."""
 
     row: Tensor
     """Which sample of the batch it is. *Shape:* ``(B,)``."""
     a: Tensor
-    """*Shape:* ``(B, n)``."""
+    """*Shape:* ``(B, n, 1)``."""
     energy: Tensor
     """*Shape:* ``(B,)``."""
-    bound: Tensor
-    """The energy and its rounding. *Shape:* ``(B,)``."""
     gradient: Tensor
-    """*Shape:* ``(B, n)``."""
+    """*Shape:* ``(B, n, 1)``."""
+    norm: Tensor
+    """Of the gradient. *Shape:* ``(B,)``."""
     inverse: Tensor
     """The approximate inverse of the Hessian. *Shape:* ``(B, n, n)``."""
     length: Tensor
-    """Of the next step, relative to the quasi-Newton step. *Shape:* ``(B,)``."""
+    """Of the next step, relative to the quasi-Newton step; 0 of what has converged. *Shape:* ``(B,)``."""
     goal: Tensor
     """The gradient norm at which it has converged. *Shape:* ``(B,)``."""
-    active: Tensor
-    """Whether it has further to go. *Shape:* ``(B,)``, bool."""
     n_steps: Tensor
     """Steps taken. *Shape:* ``(B,)``, int64."""
     placement: Any
@@ -55,13 +50,14 @@ def descend(
     a: Tensor,
     placement: Any,
     max_steps: int = 80,
-    tolerance: float = 1e-8,
+    tolerance: float = 1e-7,
     energy: Tensor | None = None,
 ) -> Solution:
     """Minimise by the BFGS method, whose first Hessian is Gauss-Newton's, then by Newton steps what did not converge.
 
-    A step is taken if the energy falls; otherwise the next one is half as long. A sample's result does not depend on
-    its batch. Arguments as for :func:`torch_modal.nn.solver.minimise`.
+    A step is taken if the energy falls; otherwise the next one is half as long. What has converged takes one more step,
+    whose gradient is not evaluated: the gradient norm of the solution is the one before. A sample's result does not
+    depend on its batch. Arguments as for :func:`torch_modal.nn.solver.minimise`.
     """
     energy = step.energy.value(a, placement) if energy is None else energy
     derivatives = step.energy.derivatives(a, placement, second_order=False)
@@ -70,27 +66,20 @@ def descend(
     factor, info = torch.linalg.cholesky_ex(step.ridged(derivatives.gauss_newton))
     regular = (info == 0) & start.isfinite() & energy.isfinite()
     eye = torch.eye(a.shape[-1], dtype=factor.dtype, device=a.device)
-    state = _State(
-        torch.arange(len(a), device=a.device),
-        a,
-        energy,
-        energy + _rounding(energy),
-        derivatives.gradient,
-        torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye)),
-        torch.ones_like(start),
-        goal,
-        regular & (start > goal),
-        torch.zeros_like(info, dtype=torch.int64),
-        placement,
-    )
-    whole = found, reached, norm, n_steps = a.clone(), energy.clone(), start.clone(), state.n_steps.clone()
+    inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye))
+    length = (regular & (start > goal)).to(start)
+    n_steps = torch.zeros_like(info, dtype=torch.int64)
+    rows = torch.arange(len(a), device=a.device)
+    gradient = derivatives.gradient[..., None]
+    state = _State(rows, a[..., None], energy, gradient, start, inverse, length, goal, n_steps, placement)
+    whole = found, reached, norm, n_steps = a.clone(), energy.clone(), start.clone(), n_steps.clone()
     for _ in range(min(MOST_EVALUATIONS, max_steps)):
-        n_active = int(state.active.sum())
+        n_active = int(torch.count_nonzero(state.length))
         if not n_active:
             break
         if 2 * n_active <= len(state.row):
             _put(whole, state)
-            state = trees.rows(state, torch.nonzero(state.active).flatten())
+            state = trees.rows(state, torch.nonzero(state.length).flatten())
         state = _advanced(step.energy, state)
     _put(whole, state)
     left = torch.nonzero(~(norm <= goal)).flatten()
@@ -105,45 +94,45 @@ def descend(
 
 def _put(whole: tuple[Tensor, ...], state: _State) -> None:
     """Write the amplitudes, energies, gradient norms and numbers of steps of some samples into those of all."""
-    parts = state.a, state.energy, state.gradient.norm(dim=-1), state.n_steps
+    last = torch.baddbmm(state.a, state.inverse, state.gradient, alpha=-1)
+    # At a start that has converged there is nothing to gain, and perhaps only rounding to follow.
+    ended = ((state.norm <= state.goal) & (state.n_steps > 0))[:, None, None]
+    parts = torch.where(ended, last, state.a).squeeze(-1), state.energy, state.norm, state.n_steps
     for values, own in zip(whole, parts, strict=True):
         values[state.row] = own
 
 
 def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
     """One evaluation: a step where the energy falls, a shorter one next where it does not."""
-    gradient, inverse, active = state.gradient, state.inverse, state.active
-    move = torch.bmm(inverse, gradient[..., None]).squeeze(-1) * torch.where(active, -state.length, 0)[:, None]
+    gradient, inverse, length = state.gradient, state.inverse, state.length
+    move = torch.bmm(inverse, gradient) * -length[:, None, None]
     there = state.a + move
-    value, slope = energy.value_and_gradient(there, state.placement)
-    expected = (move * gradient).sum(-1)
-    better = active & (value <= state.bound + SUFFICIENT * expected)
+    value, slope = energy.value_and_gradient(there.squeeze(-1), state.placement)
+    slope = slope[..., None]
+    # Energies are sums of squares. They may rise by their rounding.
+    better = (length > 0) & (value <= state.energy * (1 + ENERGY_ROUNDING * torch.finfo(value.dtype).eps))
     change = slope - gradient
-    length = torch.ones_like(state.length)
-    if not bool(better.all()):
-        taken = better[:, None]
+    if bool(better.all()):
+        length = torch.ones_like(length)
+    else:
+        taken = better[:, None, None]
         there, move, change = torch.where(taken, there, state.a), move * taken, torch.where(taken, change, 0)
         value, slope = torch.where(better, value, state.energy), torch.where(taken, slope, gradient)
-        length = torch.where(better, length, 0.5 * state.length)
-        active = active & (length >= SHORTEST)
+        shorter = torch.where(length > SHORTEST, 0.5 * length, 0)
+        length = torch.where(better, 1, shorter)
     # The update keeps the inverse positive definite where the gradient grows along the step; elsewhere it is left out.
-    pushed = torch.bmm(inverse, change[..., None]).squeeze(-1)
-    curvature = (change * move).sum(-1, keepdim=True)
+    pushed, across = torch.bmm(inverse, change), change.mT
+    curvature = torch.bmm(across, move)
     share = torch.where(curvature > 0, 1 / curvature, 0)
-    other = share * ((0.5 + 0.5 * share * (change * pushed).sum(-1, keepdim=True)) * move - pushed)
-    update = torch.bmm(move[:, :, None], other[:, None])
+    other = share * ((0.5 + 0.5 * share * torch.bmm(across, pushed)) * move - pushed)
+    update = torch.bmm(move, other.mT)
+    norm = slope.flatten(1).norm(dim=-1)
     return state._replace(
         a=there,
         energy=value,
-        bound=value + _rounding(value),
         gradient=slope,
+        norm=norm,
         inverse=inverse.add_(update).add_(update.mT),
-        length=length,
-        active=active & (slope.norm(dim=-1) > state.goal),
+        length=length * (norm > state.goal),
         n_steps=state.n_steps + better,
     )
-
-
-def _rounding(energy: Tensor) -> Tensor:
-    """How far an energy may rise by rounding alone. *Shape:* ``(B,)``."""
-    return ENERGY_ROUNDING * torch.finfo(energy.dtype).eps * energy.abs()
