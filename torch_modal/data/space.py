@@ -16,6 +16,7 @@ from torch_modal.data.recent import Recent
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
 from torch_modal.geometry.crossings import require_contact
+from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
@@ -79,6 +80,7 @@ class ShapeSpace:
             those of a motion.
     """
 
+    @lasting
     def __init__(
         self,
         bases: ModalBasis | Sequence[ModalBasis],
