@@ -392,10 +392,10 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
     walls = torch.zeros(2, 3, dtype=torch.int32)
     volume = launch.kernels("shell").volume
     for wrong in (x.float(), torch.zeros(3, 4, dtype=DOUBLE).T):
-        with pytest.raises(ValueError, match="contiguous tensor of torch.float64"):
+        with pytest.raises(ValueError, match=r"contiguous tensor of torch\.float64"):
             launch.launch(volume, (1, 2), [wrong, None, walls, 4, total, normal])
     huge = torch.empty(2**31, 3, dtype=DOUBLE, device="meta")
-    with pytest.raises(ValueError, match="2147483648 entries.* fewer samples"):
+    with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):
         launch._length(huge, 3, DOUBLE)
     assert launch._length(huge[1:], 3, DOUBLE) == 2**31 - 1
 

@@ -1,6 +1,6 @@
 """Eq. 5 in the amplitudes of a modal space by kernels of NVIDIA Warp, where that is installed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -178,7 +178,10 @@ class FusedModalEnergy(ModalEnergy):
             return trees.mapped(found, lambda value: value.to(placement.base))
         chunks = self._chunks(a, placement)
         parts = [self._derivatives(*chunk, second_order) for chunk in chunks]
-        return parts[0] if len(parts) == 1 else Derivatives(*map(_joined, zip(*parts, strict=True)))
+        if len(parts) == 1:
+            return parts[0]
+        joined = [None if each[0] is None else torch.cat(each) for each in zip(*parts, strict=True)]
+        return Derivatives(*joined)  # type: ignore[arg-type]
 
     def _chunks(self, a: Tensor, placement: Placement) -> list[tuple[Tensor, Placement]]:
         """Samples whose derivatives are taken at a time."""
@@ -284,11 +287,6 @@ class FusedModalEnergy(ModalEnergy):
 
         pulled = torch.func.vjp(run, *given)[1](tuple(trees.leaves(found)))
         return trees.filled(skeleton, pulled)  # type: ignore[no-any-return]
-
-
-def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
-    """The same of several chunks."""
-    return None if parts[0] is None else torch.cat(parts)  # type: ignore[arg-type]
 
 
 def gram(x: Tensor) -> Tensor:
