@@ -218,7 +218,7 @@ class ShapeAugmentation(nn.Module):
         if pool is None:
             others = Pool(batch, chosen)
         elif len(pool.shapes) == len(space):
-            others = Pool(pool, mine.nearest, None if space.motion is None else space.motion.neighbours)
+            others = Pool(pool.located(space), mine.nearest, None if space.motion is None else space.motion.neighbours)
         else:
             raise ValueError(f"a pool holds the {len(space)} key-frames of the space; got {len(pool.shapes)} shapes")
         return batch.put(chosen, self.apply_transform(mine, own, space, others))
