@@ -55,8 +55,8 @@ class ModalDecoder(nn.Module):
     Amplitudes of zero give the path through the key-frames (:class:`torch_modal.Path`; with two key-frames, their blend
     by local rotations). An amplitude of 1 moves the vertices by 1 % of the diagonal in the root mean square.
 
-    The state holds all but the faces: a decoder of the same faces that loads it gives the same shapes. Key-frames, times
-    and the reference may also be edited in place.
+    The state holds all but the faces: a decoder of the same faces that loads it gives the same shapes. Key-frames,
+    times and the reference may also be edited in place.
 
     Args:
         keyframes: Two or more of one connectivity, with faces that can be used. *Shape:* ``(K, V, 3)``.
