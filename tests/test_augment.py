@@ -191,6 +191,15 @@ def test_key_frames_of_a_pool_are_interpolated_from_a_table(bars: Shapes, space:
         assert torch.equal(batch.shapes[row], expected)
 
 
+def test_a_pool_may_be_plain_shapes(bars: Shapes, space: tm.ShapeSpace) -> None:
+    """Nobody needs to say which key-frame each is near to: that is found."""
+    transform = tm.RandomInBetween(p=1.0)
+    x = bars.keyframes[:1]
+    found = transform(x, space=space, pool=tm.ShapeBatch(bars.keyframes))
+    known = transform(x, transform.params, space=space, pool=tm.ShapeBatch.of_keyframes(space, x))
+    torch.testing.assert_close(found, known, rtol=0, atol=1e-3)  # solved, and from the table
+
+
 def test_interpolation_is_cubic() -> None:
     t = torch.linspace(0, 1, 9, dtype=F64)
     curve = torch.stack([t**3 - t, 2 * t**2, 1 + t], 1)[:, None]

@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
-from torch.func import vmap
+from torch.func import functional_call, grad, vmap
 
 import torch_modal as tm
 from torch_modal.energy.energy import Energy
@@ -25,7 +26,7 @@ from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.sparse import SparseSolver
-from torch_modal.nn import fused_alignment, launch, trees
+from torch_modal.nn import fused_alignment, fused_modal, launch, trees
 from torch_modal.nn.blend import FusedSolver
 from torch_modal.nn.frame import Frame
 from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
@@ -33,6 +34,7 @@ from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.fused_rotations import FusedRotations
 from torch_modal.nn.fused_shell import FusedShell
 from torch_modal.nn.modal_energy import ModalEnergy, Placement
+from torch_modal.nn.settings import PRESETS
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
@@ -190,6 +192,30 @@ class TestModal:
             found = trees.leaves(fused.pull_back(a, direction, own))
         assert_alike(found, trees.leaves(fused.pull_back(a, direction, own)), 1e-10)  # by torch, to be differentiated
 
+    @pytest.mark.parametrize("extra", [False, True])
+    @torch.no_grad()
+    def test_samples_that_are_too_many_at_a_time(
+        self, case: Case, extra: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """No array of all samples outgrows what kernels count: they are taken in chunks."""
+        a = 0.1 * torch.randn(2, 5 + extra, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), _ = self.both(case, extra)
+        several, many = torch.cat([a, -a, 2 * a])[:5], trees.rows(own, torch.tensor([0, 1, 0, 1, 0]))
+        truth = [*fused.derivatives(several, many), fused.second_order(several, many)]
+        largest = len(fused.blocks) * fused.blocks.shape[1] * 8
+        monkeypatch.setattr(fused_modal, "MOST_NUMBERS", largest)
+        sizes: list[int] = []
+
+        def watched(kernel: Any, dim: tuple[int, ...], given: list[Any]) -> None:
+            sizes.extend(x.numel() for x in given if isinstance(x, Tensor))
+            launch.launch(kernel, dim, given)
+
+        monkeypatch.setattr(fused_modal, "launch", watched)
+        found = [*fused.derivatives(several, many), fused.second_order(several, many)]
+        assert max(sizes) <= largest
+        assert_alike(tuple(found), tuple(truth), 1e-13)
+        assert fused.derivatives(several, many, second_order=False).second_order is None
+
     def test_references(self, case: Case) -> None:
         shell, given = FusedShell(case.energy, case.mesh), case.given[1:]
 
@@ -323,6 +349,30 @@ class TestLayers:
         found, truth = (path(bars.keyframes, times) for path in paths)
         torch.testing.assert_close(found, truth, rtol=0, atol=1e-9)
 
+    @pytest.mark.parametrize("over", ["t", "terms.0.stiffness", "terms.1.stiffness", "terms.2.stiffness"])
+    @pytest.mark.parametrize("preset", ["accurate", "fast"])
+    def test_vmap(self, small_bars: Shapes, preset: Any, over: str) -> None:
+        """Over what not every tensor of a solve depends on; with its gradients, with and without recording."""
+        stiffness = {"alpha": torch.tensor(500.0), "beta": torch.tensor(10.0), "gamma": torch.tensor(1e3)}
+        objective = replace(PRESETS[preset].objective, **stiffness)
+        layer = tm.InBetween(small_bars.bases[:2], small_bars.faces, preset, objective=objective).double()
+        ends = small_bars.keyframes[:2]
+        given = torch.tensor([0.3, 0.5, 0.8] if over == "t" else [100.0, 500.0, 900.0], dtype=DOUBLE)
+
+        def at(value: Tensor) -> Tensor:
+            return layer(*ends, value) if over == "t" else functional_call(layer, {over: value}, (*ends, 0.5))
+
+        def slope(value: Tensor) -> Tensor:
+            return grad(lambda value: at(value).square().sum())(value)
+
+        for recorded in (True, False):
+            with torch.set_grad_enabled(recorded):
+                truth = torch.stack([at(value) for value in given])
+                assert float((truth[0] - truth[1]).abs().max()) > 1e-6
+                torch.testing.assert_close(vmap(at)(given), truth, rtol=0, atol=1e-9)
+        slopes = torch.stack([slope(value) for value in given])
+        torch.testing.assert_close(vmap(slope)(given), slopes, rtol=1e-7, atol=1e-9 * float(slopes.abs().max()))
+
     def test_a_term_of_ones_own_is_torchs(self, bars: Shapes) -> None:
         objective = tm.Objective(terms=(Volume(1.0),))
         layer = tm.InBetween(bars.bases[:2], bars.faces, objective=objective)
@@ -336,6 +386,21 @@ class TestLayers:
         with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
             x = mode.from_tensor(small_bars.keyframes[:1])
             assert member.space.blend.rotations(x, x, mode.from_tensor(torch.zeros(1, dtype=DOUBLE))).shape[0] == 3
+
+
+def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
+    """Also by ``python -O``. Indices have 32 bits: beyond, they would wrap."""
+    x = torch.zeros(4, 3, dtype=DOUBLE)
+    normal, total = torch.zeros_like(x), torch.zeros(1, dtype=DOUBLE)
+    walls = torch.zeros(2, 3, dtype=torch.int32)
+    volume = launch.kernels("shell").volume
+    for wrong in (x.float(), torch.zeros(3, 4, dtype=DOUBLE).T):
+        with pytest.raises(ValueError, match=r"contiguous tensor of torch\.float64"):
+            launch.launch(volume, (1, 2), [wrong, None, walls, 4, total, normal])
+    huge = torch.empty(2**31, 3, dtype=DOUBLE, device="meta")
+    with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):
+        launch._length(huge, 3, DOUBLE)
+    assert launch._length(huge[1:], 3, DOUBLE) == 2**31 - 1
 
 
 def test_the_first_of_a_thread_may_have_nothing_to_do() -> None:

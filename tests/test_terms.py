@@ -53,6 +53,27 @@ class Spring(Term):
         return torch.zeros_like(measures)
 
 
+class Pull(Term):
+    """All vertices of the mesh that the energy is evaluated on, pulled to one point of the caller's coordinates."""
+
+    def __init__(self, point: Tensor, stiffness: float = 1.0) -> None:
+        super().__init__(stiffness)
+        self.register_buffer("points", point[None])
+
+    @property
+    def anchors(self) -> Tensor:
+        return self.points
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        vertices = torch.arange(mesh.n_vertices)
+        return torch.stack([torch.full_like(vertices, mesh.first_anchor), vertices], 1)
+
+    def measure(self, spokes: Tensor) -> Tensor:
+        return spokes[0].norm()
+
+    at_rest = Spring.at_rest
+
+
 def by_torch_func(kind: type[Term]) -> type[Term]:
     """The same term without what it writes out."""
     names = ("gradients", "pairs", "blocks")
@@ -208,3 +229,42 @@ def test_exception_elements(bars: Shapes) -> None:
         tm.InBetween(bars.bases[1:], bars.faces, objective=tm.Objective(terms=(Wrong(),)))
     with pytest.raises(ValueError, match="terms holds a type"):
         tm.Objective(terms=(Area,))  # type: ignore[arg-type]
+
+
+class TestAnchors:
+    """Points of the caller's coordinates, wherever the energy is evaluated."""
+
+    def test_shell_energy_by_hand(self, bars: Shapes) -> None:
+        points = torch.tensor([[30.0, 0.0, 0.0], [0.0, 20.0, 0.0]], dtype=DOUBLE)
+        terms = Spring([3], points[:1], 2.0), Spring([5, 3], points.flip(0), 0.5)
+        shell, plain = tm.ShellEnergy(bars.faces, terms=terms), tm.ShellEnergy(bars.faces)
+        x, rest = bars.keyframes[1:], bars.keyframes[:1]
+        first, other = ((x[:, i] - point).square().sum(-1) for i, point in ((3, points[0]), (5, points[1])))
+        by_hand = 2.0 * first + 0.5 * (other + first)
+        torch.testing.assert_close(shell(x, rest) - plain(x, rest), by_hand)
+        torch.testing.assert_close(shell(x[0], rest[0]), shell(x, rest)[0])
+        torch.testing.assert_close(shell.residuals(x, rest).square().sum(-1), shell(x, rest))
+        assert shell(x.float(), rest.float()).dtype == torch.float32
+
+    def test_modal_energy_is_that_of_the_shell(self, bars: Shapes) -> None:
+        shell = tm.ShellEnergy(bars.faces, terms=(Spring([3], torch.full((1, 3), 30.0, dtype=DOUBLE)),))
+        rest, modes = bars.keyframes[:1], bars.bases[0].modes
+        energy, a = tm.ModalEnergy(shell, modes), torch.full((1, 8), 0.1, dtype=DOUBLE)
+        placement = energy.place(rest, shell.against(rest))
+        moved = rest + torch.tensordot(a, modes, 1)
+        truth = tm.ShellEnergy(bars.faces)(moved, rest) + (moved[:, 3] - 30).square().sum(-1)
+        torch.testing.assert_close(energy.value(a, placement), truth)
+
+    @pytest.mark.parametrize("beside", [False, True])
+    def test_of_terms_on_the_coarse_mesh(self, bars: Shapes, beside: bool) -> None:
+        """They come beside those of sampled terms, and move the shape towards themselves, not to the origin."""
+        ends = bars.keyframes[:2]
+        plain = tm.InBetween(bars.bases[:2], bars.faces, **modal())(*ends, 0.5)
+        spring, pulled = Spring([3], plain[3:4], 1e-3), []
+        for height in (40.0, -40.0):
+            point = torch.tensor([0.0, 0.0, height], dtype=DOUBLE)
+            terms = (spring, Pull(point)) if beside else (Pull(point),)
+            pulled.append(tm.InBetween(bars.bases[:2], bars.faces, **modal(terms=terms))(*ends, 0.5))
+            before, after = ((x - point).square().sum(-1).mean() for x in (plain, pulled[-1]))
+            assert float(before - after) > 1e-3
+        assert float((pulled[0] - pulled[1]).abs().max()) > 1e-3

@@ -1,12 +1,14 @@
 """What all random transforms of shapes share; the conventions are those of kornia's augmentations."""
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal.data.space import ShapeSpace
+from torch_modal.geometry.functions import lasting
 
 Parameters = dict[str, Tensor]
 
@@ -170,8 +172,12 @@ class ShapeAugmentation(nn.Module):
         generator = self.generator if generator is None else generator
         same = self.same_on_batch if same_on_batch is None else same_on_batch
         drawn = 1 if same and n else n
-        params = {"batch_prob": uniform(drawn, generator) < self.p, **self.generate_parameters(drawn, space, generator)}
+        draw = partial(self._drawn, drawn, space, generator)
+        params = lasting(draw)() if torch.is_inference_mode_enabled() else draw()
         return {name: value.expand(n, *value.shape[1:]) for name, value in params.items()}
+
+    def _drawn(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+        return {"batch_prob": uniform(n, generator) < self.p, **self.generate_parameters(n, space, generator)}
 
     def transform(
         self,
@@ -212,7 +218,7 @@ class ShapeAugmentation(nn.Module):
         if pool is None:
             others = Pool(batch, chosen)
         elif len(pool.shapes) == len(space):
-            others = Pool(pool, mine.nearest, None if space.motion is None else space.motion.neighbours)
+            others = Pool(pool.located(space), mine.nearest, None if space.motion is None else space.motion.neighbours)
         else:
             raise ValueError(f"a pool holds the {len(space)} key-frames of the space; got {len(pool.shapes)} shapes")
         return batch.put(chosen, self.apply_transform(mine, own, space, others))

@@ -4,6 +4,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import Any
 
+from torch_modal.geometry.functions import lasting
+
 
 class Recent:
     """The few most recently used of what is expensive to make."""
@@ -13,11 +15,11 @@ class Recent:
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The thing of this key, made where it is not kept."""
+        """The thing of this key, made where it is not kept; see :func:`lasting`."""
         if key not in self._kept:
             while len(self._kept) >= self.limit:  # before making, so that there are never more
                 self._kept.popitem(last=False)
-            self._kept[key] = make()
+            self._kept[key] = lasting(make)()
         self._kept.move_to_end(key)
         return self._kept[key]
 

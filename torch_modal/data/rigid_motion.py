@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
 from torch_modal.data.space import ShapeSpace
+from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.rigid import RigidMotion
 from torch_modal.geometry.rotations import exp
 
@@ -85,8 +86,7 @@ class RandomRigidMotion(ShapeAugmentation):
     ) -> ShapeBatch:
         """Move those shapes of a batch that the parameters say, and keep :attr:`transform_matrix`."""
         out = super().transform(batch, params, space, pool)
-        with torch.no_grad():
-            self._matrix = self.compute_transformation(batch.shapes, params)
+        self._matrix = lasting(self.compute_transformation)(batch.shapes, params)
         return out
 
     @property

@@ -1,6 +1,5 @@
 """What augmentations know of a connectivity: its key-frames, their modes, and what is made from them when needed."""
 
-import hashlib
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -16,10 +15,13 @@ from torch_modal.data.recent import Recent
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
 from torch_modal.geometry.crossings import require_contact
+from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
 from torch_modal.geometry.vectors import norm, pick
+from torch_modal.io.cache import CacheWarning
+from torch_modal.io.content import ContentError, code_digest, content_digest
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.nn.adjoint import ConvergenceWarning
 from torch_modal.nn.in_between import InBetween
@@ -79,6 +81,7 @@ class ShapeSpace:
             those of a motion.
     """
 
+    @lasting
     def __init__(
         self,
         bases: ModalBasis | Sequence[ModalBasis],
@@ -244,11 +247,11 @@ class ShapeSpace:
 
     def table(self, i: int, j: int) -> Tensor:
         """In-betweens of two key-frames at even times, from disk where they are. *Shape:* ``(T, V, 3)``."""
-        assert self.times is not None
+        if self.times is None:
+            raise ValueError("a space of times=None solves each in-between anew: it has no tables")
 
         def make() -> Tensor:
-            key = {"times": str(self.times), "dtype": str(self.dtype), "content": self._content(i, j)}
-            path = None if self.folder is None else self.folder / f"between-{i}-{j}.safetensors"
+            path, key = self._place(i, j)
             kept = None if path is None else read_table(path, key)
             if kept is not None:
                 return kept
@@ -263,26 +266,33 @@ class ShapeSpace:
 
         return self._tables.get((i, j), make)
 
+    def _place(self, i: int, j: int) -> tuple[Path | None, dict[str, str]]:
+        """The file of a table, and what it must have been made of; None where it is not to be kept.
+
+        Warns:
+            CacheWarning: What the energy is made of cannot be looked through: tables are made anew by each process.
+        """
+        if self.folder is None:
+            return None, {}
+        try:
+            content = self._content(i, j)
+        except ContentError as error:
+            warnings.warn(
+                f"tables of in-betweens are not kept in {self.folder}, as a term of the objective has no key: {error}",
+                CacheWarning,
+                stacklevel=5,
+            )
+            return None, {}
+        key = {"times": str(self.times), "dtype": str(self.dtype), "content": content}
+        return self.folder / f"between-{i}-{j}.safetensors", key
+
     def _content(self, i: int, j: int) -> str:
         """A hash of all that a table follows from: bases, times, faces, settings, and what made it."""
-        digest = hashlib.sha256(f"{__version__} {torch.__version__}".encode())
         span = self._span(i, j)
         bases = [self.bases[key] for key in (span.keyframes if span else (i, j))]
-        tensors = [part for basis in bases for part in (basis.reference, basis.eigenvalues, basis.modes)]
-        values = [self.faces, *tensors, *([span.times] if span else [])]
-        for name, value in sorted({**vars(self.settings.objective), **vars(self.settings.solver)}.items()):
-            if isinstance(value, tuple):
-                for term in value:
-                    own = {key: part for key, part in vars(term).items() if not key.startswith("_")}
-                    digest.update(f"{type(term).__module__} {type(term).__qualname__} {own}".encode())
-                    values += [*term.parameters(), *term.buffers()]
-            elif isinstance(value, Tensor):
-                values.append(value)
-            else:
-                digest.update(f"{name} {value}".encode())
-        for tensor in values:
-            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
+        code = __version__, torch.__version__, code_digest()
+        return content_digest([*code, tensors, self.faces, span and span.times, tuple(self.settings)])
 
     # -------------------------------------------------------------------------------------------------- in-betweens
     def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:

@@ -27,6 +27,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from torch_modal.data.motion import Motion
+from torch_modal.geometry.functions import lasting
 from torch_modal.precompute.basis import FORMAT as BASIS_FORMAT
 from torch_modal.precompute.basis import VERSION as BASIS_VERSION
 from torch_modal.precompute.basis import ModalBasis
@@ -295,6 +296,7 @@ def _read_header(
         return meta, {name: tuple(file.get_slice(name).get_shape()) for name in wanted}
 
 
+@lasting
 def _map(path: Path, names: Sequence[str]) -> list[Tensor]:
     """Tensors of a file, mapped into memory; the mapping outlives the handle."""
     with _opened(path) as file:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh, Term
+from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.vectors import inverse, pick
 
 
@@ -48,6 +49,14 @@ class Linearised(NamedTuple):
     """First derivative of the energy in each measure. *Shape:* ``(B, M)``."""
     curvature: Tensor
     """Second derivative. *Shape:* ``(B, M)``."""
+
+
+def _outlasting_buffers(module: nn.Module) -> None:
+    """Terms may have been made in inference mode, or of tensors that were."""
+    for part in module.modules():
+        for name, buffer in part.named_buffers(recurse=False):
+            if buffer.is_inference():
+                setattr(part, name, lasting(buffer.clone)())
 
 
 class OnMesh(nn.Module):
@@ -118,6 +127,8 @@ class Energy(nn.Module):
 
     def __init__(self, mesh: Mesh, terms: Sequence[Term], sampled: bool = False) -> None:
         super().__init__()
+        for term in terms:
+            _outlasting_buffers(term)
         n, n_anchors, meshes = mesh.n_vertices, 0, []
         for term in terms:
             meshes.append(replace(mesh, n_anchors=n_anchors))
@@ -140,6 +151,12 @@ class Energy(nn.Module):
         corners = torch.cat(local) if local else torch.zeros(0, dtype=torch.int64)
         #: The vertices of all elements of terms that are not totals.
         self.register_buffer("corners", corners, persistent=False)
+
+    @property
+    def anchors(self) -> Tensor | None:
+        """Those of all terms, in the caller's coordinates; None where there are none. *Shape:* ``(P, 3)``."""
+        points = [part.term.anchors for part in self.parts if part.term.anchors is not None]
+        return torch.cat(points) if points else None
 
     # ------------------------------------------------------------------------------------------------------- vertices
     def extend(self, rows: Tensor, anchors: Tensor | None = None) -> Tensor:

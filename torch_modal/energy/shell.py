@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Term, Volume
-from torch_modal.geometry.functions import broadcast_shapes
+from torch_modal.geometry.functions import broadcast_shapes, lasting
 from torch_modal.keyframes.arrays import as_faces
 
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
@@ -58,11 +58,12 @@ class ShellEnergy(nn.Module):
             and whose others broadcast against the shapes. *Shape:* ``()``, ``(..., E)`` or ``(..., 1)``.
         beta: Bending stiffness, likewise with the hinges. *Shape:* ``()``, ``(..., H)`` or ``(..., 1)``.
         gamma: Volume stiffness. *Shape:* ``()`` or ``(..., 1)``.
-        terms: Further terms; the energy is the sum of all.
+        terms: Further terms; the energy is the sum of all. Their anchors are in the coordinates of the shapes.
     """
 
     faces: Tensor
 
+    @lasting
     def __init__(
         self,
         faces: Tensor,
@@ -78,7 +79,12 @@ class ShellEnergy(nn.Module):
 
     def _rows(self, x: Tensor) -> Tensor:
         """Vertices of faces, components first, extended. *Shape:* ``(..., V, 3) -> (3, ..., V)``."""
-        return self.energy.extend(x[..., : self.energy.n_vertices, :].movedim(-1, 0).contiguous())
+        rows = x[..., : self.energy.n_vertices, :].movedim(-1, 0).contiguous()
+        points = self.energy.anchors
+        if points is None:
+            return self.energy.extend(rows)
+        lead = [1] * (rows.dim() - 2)
+        return self.energy.extend(rows, points.to(rows).mT.reshape(3, *lead, -1))
 
     def rest(self, x_rest: Tensor) -> Rest:
         """Measures and weights of rest shapes. *Shape:* ``(..., V, 3)``."""

@@ -1,13 +1,15 @@
 """What torch does too, at less: functions with a derivative of their own where none is recorded, shapes together."""
 
 from collections.abc import Callable, Sequence
+from functools import wraps
 from itertools import zip_longest
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 Made = TypeVar("Made")
+Given = ParamSpec("Given")
 
 
 def traced(x: Tensor) -> bool:
@@ -18,6 +20,28 @@ def traced(x: Tensor) -> bool:
 def transformed(x: Tensor) -> bool:
     """Whether a tensor stands for others in a transform of ``torch.func``."""
     return torch.func.debug_unwrap(x, recurse=False) is not x
+
+
+def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
+    """The same function, whose new tensors serve later calls: no gradient is recorded, and none is an inference tensor.
+
+    Autograd refuses inference tensors for good, so nothing that is kept may be made of ``torch.inference_mode()``.
+    """
+
+    @wraps(make)
+    def run(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+        if not torch.is_inference_mode_enabled():
+            with torch.no_grad():
+                return make(*args, **kwargs)
+        with torch.inference_mode(False), torch.no_grad():  # in this order: the first turns gradients on
+            return make(*args, **kwargs)
+
+    return run
+
+
+def outlasting(x: Tensor) -> Tensor:
+    """The tensor, or a copy if it is an inference tensor; within :func:`lasting`."""
+    return x.clone() if x.is_inference() else x
 
 
 def made_outside(make: Callable[[], Made]) -> Made:
@@ -32,8 +56,7 @@ class _Outside(torch.autograd.Function):
 
     @staticmethod
     def forward(work: Callable[[], None], nothing: Tensor) -> Tensor:
-        with torch.no_grad():
-            work()
+        lasting(work)()
         return nothing.clone()
 
     @staticmethod

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
-from torch_modal.geometry.functions import applied
+from torch_modal.geometry.functions import applied, lasting
 
 # An inverse of so many unknowns takes 3.2 GB.
 MOST_DENSE = 20_000
@@ -80,11 +80,14 @@ class SparseSolver:
         """Whether tensors there are multiplied by the inverse."""
         return device.type != "cpu" and len(self.free) <= MOST_DENSE
 
+    def _inverse(self, device: torch.device) -> Tensor:
+        dense = torch.from_numpy(self._inner.toarray()).to(device)
+        return torch.cholesky_inverse(torch.linalg.cholesky(dense))
+
     def times_inverse(self, right: Tensor) -> Tensor:
         """The same by the dense inverse, in float64, on the device. *Shape:* ``(..., V, m) -> (..., V, m)``."""
         if right.device not in self._inverses:
-            dense = torch.from_numpy(self._inner.toarray()).to(right.device)
-            self._inverses[right.device] = torch.cholesky_inverse(torch.linalg.cholesky(dense))
+            self._inverses[right.device] = lasting(self._inverse)(right.device)
         free = torch.from_numpy(self.free).to(right.device)
         columns = right.double().movedim(-2, 0)
         solved = self._inverses[right.device] @ columns.index_select(0, free).flatten(1)

@@ -290,6 +290,8 @@ def _digest(arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     total = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
+        if array.dtype.hasobject or array.dtype.names:
+            raise ValueError(f"{name} is an array of {array.dtype}; a key is made of numbers")
         total.update(json.dumps([name, array.dtype.str, list(array.shape)]).encode())
         total.update(array.tobytes())
     return np.frombuffer(total.digest(), dtype=np.uint8).copy()

@@ -106,7 +106,7 @@ def flattened(n: int, in_dims: Sequence[int | None], tensors: Sequence[Any]) -> 
     flat = []
     for tensor, dim in zip(tensors, in_dims, strict=True):
         batched = tensor.expand(n, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
-        flat.append(batched.flatten(0, 1))
+        flat.append(batched.flatten(0, 1).contiguous())  # as kernels want them
     return flat
 
 

@@ -333,10 +333,8 @@ class Between(nn.Module):
 
     def anchors(self, placed: Pair, t: Tensor) -> Tensor | None:
         """Those of all terms, in the frame. *Shape:* ``(B, P, 3)``."""
-        points = [part.term.anchors for part in self.fine.parts if part.term.anchors is not None]
-        if not points:
-            return None
-        return self.frame.bring(torch.cat(points).to(t).expand(len(t), -1, -1), placed, t)
+        points = self.fine.anchors
+        return None if points is None else self.frame.bring(points.to(t).expand(len(t), -1, -1), placed, t)
 
     def _placed_by_torch(self, samples: Samples) -> tuple[Pair, Tensor]:
         """The pairs in the frame, and whether there is something between them."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.functions import applied, traced
+from torch_modal.geometry.functions import applied, lasting, traced
 from torch_modal.geometry.local_rotations import Course, LocalRotations, weights_per_length
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.sparse import SparseSolver
@@ -97,11 +97,13 @@ class Blends:
         self._pair = first
 
     @cached_property
+    @lasting
     def first(self) -> RotationBlend:
         """That of the first pair."""
         others = [k for k in range(len(self.shapes)) if k not in self._pair]
         return RotationBlend(self.mesh, self.shapes[[*self._pair, *others]], self.fused)
 
+    @lasting
     def of(self, i: int, j: int) -> RotationBlend:
         """That of two of the shapes; several have the same."""
         if (i, j) == self._pair or self._is_plain(i, j):
@@ -137,7 +139,7 @@ class FusedSolver(SparseSolver):
         if right.device.type != "cpu":
             return super().times_inverse(right)
         if self._columns is None:
-            self._columns = self.factors()
+            self._columns = lasting(self.factors)()
         own = right.detach().double().reshape(-1, self.n, 3).contiguous()
         work, out = own.new_empty(len(own), len(self.free), 3), torch.zeros_like(own)
         launch(kernels("rotations").substituted, (len(own),), [own, *self._columns, self.n, work, out])

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.geometry.functions import lasting
+
 
 class Directions(NamedTuple):
     """Displacements of the fine vertices, as they were given."""
@@ -62,8 +64,7 @@ class Columns(nn.Module):
     def fine(self) -> Tensor:
         """On the fine mesh, kept. *Shape:* ``(n, V, 3)``."""
         if self._fine is None:
-            with torch.no_grad():
-                self._fine = self.combine(torch.eye(len(self)).to(self.coarse))
+            self._fine = lasting(self.combine)(torch.eye(len(self)).to(self.coarse))
         return self._fine
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Columns":

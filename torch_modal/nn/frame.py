@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import vertex_areas
-from torch_modal.geometry.functions import applied
+from torch_modal.geometry.functions import applied, lasting
 from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, squared_length
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
@@ -223,8 +223,7 @@ class Frame(Alignment):
     def coarse(self) -> Coarse:
         """What a smooth path does without, made at the first use."""
         if self._coarse is None:
-            with torch.no_grad():
-                self._coarse, self._make = self._make(), None
+            self._coarse, self._make = lasting(self._make)(), None
         return self._coarse  # type: ignore[no-any-return]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Frame":

@@ -5,6 +5,7 @@ import torch
 from torch_modal.geometry.box_tree import leaves
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import FloatArray, IntArray
+from torch_modal.geometry.functions import lasting
 from torch_modal.nn.launch import kernels, launch
 
 ROOM = 4096
@@ -21,6 +22,7 @@ class FusedPairs:
         shapes: One or more. *Shape:* ``(K, V, 3)``.
     """
 
+    @lasting
     def __init__(self, mesh: Connectivity, shapes: FloatArray) -> None:
         self.order = leaves(mesh.faces, shapes)
         self._corners = torch.from_numpy(mesh.faces[self.order]).int()

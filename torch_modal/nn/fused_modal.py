@@ -20,6 +20,9 @@ _BLOCK = 8
 # Columns of a product with itself that are multiplied at a time.
 _BLOCKS_OF_PRODUCTS = 16
 
+MOST_NUMBERS = 2**27
+"""Of an array that all samples of a batch have at a time (1 GiB): kernels index with 32 bits, and memory is finite."""
+
 
 def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
     """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
@@ -128,7 +131,7 @@ class FusedModalEnergy(ModalEnergy):
         """The placement for torch; None where it is for kernels."""
         if not isinstance(placement.reference, ShellReference):
             return placement
-        if torch.is_grad_enabled() or traced(placement.base) or transformed(placement.base):
+        if torch.is_grad_enabled() or any(traced(x) or transformed(x) for x in trees.leaves(placement)):
             base, extra, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
             return super().place(base, self.shell.unpacked(reference), extra)
         return None
@@ -173,6 +176,24 @@ class FusedModalEnergy(ModalEnergy):
         if plain is not None:
             found = super().derivatives(a.to(plain.base), plain, second_order)
             return trees.mapped(found, lambda value: value.to(placement.base))
+        chunks = self._chunks(a, placement)
+        parts = [self._derivatives(*chunk, second_order) for chunk in chunks]
+        if len(parts) == 1:
+            return parts[0]
+        joined = [None if each[0] is None else torch.cat(each) for each in zip(*parts, strict=True)]
+        return Derivatives(*joined)  # type: ignore[arg-type]
+
+    def _chunks(self, a: Tensor, placement: Placement) -> list[tuple[Tensor, Placement]]:
+        """Samples whose derivatives are taken at a time."""
+        shell, width = self.shell, self.blocks.shape[1]
+        rows = len(shell.record) + len(shell.interior) + 1, len(self.blocks)
+        most = max(1, MOST_NUMBERS // max(width * max(rows), 18 * len(self.pairs)))
+        if len(a) <= most:
+            return [(a, placement)]
+        every = [slice(i, i + most) for i in range(0, len(a), most)]
+        return [(a[own], trees.rows(placement, own)) for own in every]
+
+    def _derivatives(self, a: Tensor, placement: Placement, second_order: bool) -> Derivatives:
         to: Any = placement.reference
         x, extra, shell = self._shapes(a, placement.base, placement.extra), placement.extra, self.shell
         (b, n), blocks = (len(x), len(self.columns)), self.blocks.double()
@@ -210,9 +231,12 @@ class FusedModalEnergy(ModalEnergy):
         plain = self._plain(placement)
         if plain is not None:
             return super().second_order(a.to(plain.base), plain).to(placement.base)
-        x, to = self._shapes(a, placement.base, placement.extra), placement.reference
-        volume, _ = self.shell.volume(x)
-        return self._second(x, to.stiffness * (volume - to.volume), placement)  # type: ignore[attr-defined]
+        found = []
+        for own, there in self._chunks(a, placement):
+            x, to = self._shapes(own, there.base, there.extra), there.reference
+            volume, _ = self.shell.volume(x)
+            found.append(self._second(x, to.stiffness * (volume - to.volume), there))  # type: ignore[attr-defined]
+        return found[0] if len(found) == 1 else torch.cat(found)
 
     def _second(self, x: Tensor, moment: Tensor, placement: Placement) -> Tensor:
         to: Any = placement.reference

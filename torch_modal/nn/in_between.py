@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.crossings import require_contact
-from torch_modal.geometry.functions import broadcast_shapes
+from torch_modal.geometry.functions import broadcast_shapes, lasting, outlasting
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import checked_surface
 from torch_modal.nn.between import Between, Shared
@@ -54,6 +54,7 @@ class InBetween(nn.Module):
     bases: Any
     members: Any
 
+    @lasting
     def __init__(
         self,
         bases: ModalBasis | Sequence[ModalBasis],
@@ -81,7 +82,7 @@ class InBetween(nn.Module):
         self.terms = nn.ModuleList(self.objective.all_terms())
         mu = self.objective.mu
         if isinstance(mu, Tensor) and not isinstance(mu, nn.Parameter):
-            self.register_buffer("mu", mu)
+            self.register_buffer("mu", outlasting(mu))
         else:
             self.mu = mu
         self.bases = nn.ModuleList(_Basis(basis) for basis in bases)
@@ -89,6 +90,7 @@ class InBetween(nn.Module):
         self._build()
         self.register_load_state_dict_post_hook(_rebuild)
 
+    @lasting
     def _build(self) -> None:
         """What follows from the bases, on their device and in their dtype."""
         like = self.bases[0].reference
@@ -120,6 +122,7 @@ class InBetween(nn.Module):
         for member in self.members:
             member.prepare()
 
+    @lasting
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "InBetween":
         """Never below float32."""
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.hermite import beyond
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
@@ -99,8 +100,7 @@ class JointSpace(nn.Module):
     def modal(self) -> "_Modal":
         """What a smooth path does without, made at the first use."""
         if self._modal is None:
-            with torch.no_grad():
-                self._modal, self._make = self._make(), None
+            self._modal, self._make = lasting(self._make)(), None
         return self._modal
 
     @property

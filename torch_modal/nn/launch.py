@@ -33,6 +33,8 @@ Module = Literal[
 ]
 IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps", "distortion")
 """What in-betweens need that record no gradient."""
+MOST_ENTRIES = 2**31 - 1
+"""Kernels index with 32 bits: no array of theirs, and no launch, may be longer."""
 
 
 @cache
@@ -179,9 +181,26 @@ class _Command:
             elif value is None:
                 address.value = number.value = 0
             else:
-                assert value.dtype is dtype and value.is_contiguous()
-                address.value, number.value = value.data_ptr(), value.numel() // width
+                number.value = _length(value, width, dtype)
+                address.value = value.data_ptr()
         self.run(stream)
+
+
+def _length(value: Tensor, width: int, dtype: torch.dtype) -> int:
+    """Number of entries of an array of vectors of a width.
+
+    Raises:
+        ValueError: A kernel would read other numbers than those of the tensor.
+    """
+    if value.dtype is not dtype or not value.is_contiguous():
+        raise ValueError(f"a kernel needs a contiguous tensor of {dtype}; got {value.dtype}, strides {value.stride()}")
+    length = value.numel() // width
+    if length > MOST_ENTRIES:
+        raise ValueError(
+            f"a tensor of shape {tuple(value.shape)} has {length} entries, and a kernel counts to {MOST_ENTRIES}: "
+            "pass fewer samples at a time"
+        )
+    return length
 
 
 _CPU = torch.device("cpu")
@@ -199,6 +218,9 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
             kernel's last argument. Each takes the first of what is left, then every so many-th. On a CPU there is one.
         given: What it takes but for that, a tensor first; tensors are contiguous and of the types that it declares.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
+
+    Raises:
+        ValueError: A tensor is not contiguous, of another type, or has more entries than 32 bits count.
     """
     if 0 in dim:
         return  # Warp would not, either, but has no command to tell of it
@@ -206,6 +228,8 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
     if len(dim) == 2:
         threads = 1 if device == _CPU else dim[1]
         dim, given, adjoints = (dim[0] * threads,), [*given, threads], [*adjoints, None] if adjoints else ()
+        if dim[0] > MOST_ENTRIES:
+            raise ValueError(f"{dim[0]} threads are more than a kernel counts, {MOST_ENTRIES}: pass fewer samples")
     key, known = (kernel, dim, device, bool(adjoints)), _COMMANDS.known
     command = known.get(key)
     if command is None:

@@ -42,6 +42,7 @@ class Levels(nn.Module):
         numbers = range(len(terms))
         #: Which terms each level has.
         self.members = [[i for i in numbers if not terms[i].sampled], [i for i in numbers if terms[i].sampled]]
+        self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
         coarse, sampled = ([terms[i] for i in members] for members in self.members)
         energy = Energy(self.mesh, coarse)
         self.energies: Any = nn.ModuleList([energy])
@@ -111,9 +112,16 @@ class Levels(nn.Module):
     ) -> tuple[Placement, ...]:
         """The affine space of each sample, as each energy sees it. *Shape of bases and extras:* ``(B, V, 3)``."""
         extras = [None] * len(bases) if extras is None else extras
-        fixed = [None, anchors][: len(bases)]
+        fixed = [self._own_anchors(members, anchors) for members in self.members[: len(bases)]]
         parts = zip(modal.parts, bases, references, extras, fixed, strict=True)
         return tuple(energy.place(base, reference, extra, own) for energy, base, reference, extra, own in parts)
+
+    def _own_anchors(self, members: Sequence[int], anchors: Tensor | None) -> Tensor | None:
+        """Those of some of the terms. *Shape:* ``(B, P, 3)``."""
+        if anchors is None:
+            return None
+        each = anchors.split(self.n_anchors, 1)
+        return torch.cat([each[i] for i in members], 1) if members else None
 
 
 def _rest(energy: Energy, x: Tensor) -> Rest:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.functions import broadcast_shapes
+from torch_modal.geometry.functions import broadcast_shapes, lasting, outlasting
 from torch_modal.geometry.hermite import Excess, Spacing, around, beyond, located
 from torch_modal.geometry.local_rotations import Course
 from torch_modal.geometry.rotations import exp
@@ -55,6 +55,9 @@ class ModalDecoder(nn.Module):
     Amplitudes of zero give the path through the key-frames (:class:`torch_modal.Path`; with two key-frames, their blend
     by local rotations). An amplitude of 1 moves the vertices by 1 % of the diagonal in the root mean square.
 
+    The state holds all but the faces: a decoder of the same faces that loads it gives the same shapes. Key-frames,
+    times and the reference may also be edited in place.
+
     Args:
         keyframes: Two or more of one connectivity, with faces that can be used. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
@@ -70,11 +73,13 @@ class ModalDecoder(nn.Module):
 
     keyframes: Tensor
     times: Tensor
+    reference: Tensor
     columns: Tensor
     moves: Tensor
     faces: Tensor
     size: Tensor
 
+    @lasting
     def __init__(
         self, keyframes: Tensor, faces: Tensor, times: Tensor | Sequence[float], reference: Tensor, modes: Tensor
     ) -> None:
@@ -82,64 +87,79 @@ class ModalDecoder(nn.Module):
         keyframes, _, indices = checked_arrays(keyframes, faces, 2)
         reference, modes = (_finite(*one, keyframes) for one in (("reference", reference, 2), ("modes", modes, 3)))
         times = checked_times(times, len(keyframes), len(times) > len(keyframes))
-        keyframes, reference, modes = (x.detach().double().cpu() for x in (keyframes, reference, modes))
+        keyframes, reference, modes = (outlasting(x.detach().double().cpu()) for x in (keyframes, reference, modes))
         faces, mesh = torch.from_numpy(indices), Connectivity(indices, len(reference))
         self._mesh = mesh
-        used = reference[faces.unique()]
-        size = torch.linalg.norm(used.amax(0) - used.amin(0))
-        placed = reference * (DIAGONAL / size)
         self.register_buffer("faces", faces, persistent=False)
-        #: Diagonal of the reference's bounding box.
-        self.register_buffer("size", size, persistent=False)
-        self._start(keyframes, times, placed)
+        self._start(keyframes, times, reference)
         rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
         displaced = (modes * (UNIT * DIAGONAL / rms)[:, None, None]).movedim(-1, 0).contiguous()
+        placed = reference * (DIAGONAL / self.size)
         own = frames(sides(placed.T[:, None].contiguous(), faces))
         #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
         self.register_buffer("columns", _bounded(convected(bend(sides(displaced, faces), own), own), own))
         n_pieces = int(mesh.vertex_pieces.max()) + 1
         #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
         centres = self.blend(0).poisson.centres(displaced) if n_pieces > 1 else displaced[..., :0]
-        self.register_buffer("moves", centres.permute(1, 2, 0).flatten(1).contiguous(), persistent=False)
+        self.register_buffer("moves", centres.permute(1, 2, 0).flatten(1).contiguous())
 
-    def _start(self, keyframes: Tensor, times: Tensor, placed: Tensor) -> None:
-        """What depends on the key-frames."""
-        self.cyclic = len(times) > len(keyframes)
+    def _start(self, keyframes: Tensor, times: Tensor, reference: Tensor) -> None:
         self.register_buffer("keyframes", keyframes.clone())
         self.register_buffer("times", times.clone())
-        weights = mean_areas(keyframes.cpu(), self.faces.cpu()).to(keyframes)
+        self.register_buffer("reference", reference.clone())
+        self._align()
+
+    @lasting
+    def _align(self) -> None:
+        """Make what follows from the key-frames, their times and the reference."""
+        keyframes, reference = self.keyframes.detach(), self.reference.detach()
+        self.cyclic = len(self.times) > len(keyframes)
+        used = reference[self.faces.unique()]
+        #: Diagonal of the reference's bounding box.
+        self.register_buffer("size", torch.linalg.norm(used.amax(0) - used.amin(0)), persistent=False)
+        placed = reference * (DIAGONAL / self.size)
+        weights = mean_areas(keyframes.double().cpu(), self.faces.cpu()).to(keyframes)
         centre = (weights[:, None] * placed).sum(0) / weights.sum()
         self.alignment = Alignment(placed - centre, DIAGONAL / self.size, weights)
         self._forget()
 
+    def _current(self) -> None:
+        """Align again where the buffers hold other numbers: they were loaded, edited in place, or replaced."""
+        own = self.keyframes, self.times, self.reference
+        if not all(_same(now, then) for now, then in zip(own, self._made_of, strict=True)):
+            self._align()
+
     def _forget(self) -> None:
+        self._made_of = [x.detach().clone() for x in (self.keyframes, self.times, self.reference)]
         self._known: list[Interval | None] = [None] * self.n_intervals
-        self._shared = Blends(self._mesh, self.keyframes.double().cpu(), (0, 1))
+        self._shared = Blends(self._mesh, self._made_of[0].double().cpu(), (0, 1))
         self._blends: list[RotationBlend | None] = [None] * self.n_intervals
         self._made: list[int] = []
 
+    @lasting
     def through(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
         """The same modes beside a path through other key-frames, of the same connectivity."""
         other = ModalDecoder.__new__(ModalDecoder)
         nn.Module.__init__(other)
         other._mesh = self._mesh
-        for name in ("faces", "size", "columns", "moves"):
-            other.register_buffer(name, getattr(self, name), persistent=name == "columns")
-        other._start(keyframes.detach().to(self.keyframes), times.detach().to(self.times), self.alignment.reference)
+        for name in ("faces", "columns", "moves"):
+            other.register_buffer(name, getattr(self, name), persistent=name != "faces")
+        other._start(keyframes.detach().to(self.keyframes), times.detach().to(self.times), self.reference)
         return other
 
     def blend(self, i: int) -> RotationBlend:
         """Of an interval; made at the first use, and again if many others were made since."""
         known = self._blends[i]
         if known is None:
-            with torch.no_grad():
-                blend = self._shared.of(i, (i + 1) % len(self.keyframes))
-                known = self._blends[i] = blend.to(self.keyframes)
+            known = self._blends[i] = lasting(self._blend)(i)
             self._made.append(i)
             while len(self._made) > max(2, KEPT // self.keyframes.shape[1]):
                 oldest = self._made.pop(0)
                 self._blends[oldest] = self._known[oldest] = None
         return known
+
+    def _blend(self, i: int) -> RotationBlend:
+        return self._shared.of(i, (i + 1) % len(self.keyframes)).to(self.keyframes)
 
     @property
     def n_intervals(self) -> int:
@@ -151,6 +171,7 @@ class ModalDecoder(nn.Module):
         """Number of amplitudes, k."""
         return len(self.columns)
 
+    @lasting
     def _apply(self, *args: object, **kwargs: object) -> "ModalDecoder":
         moved = super()._apply(*args, **kwargs)  # type: ignore[arg-type]
         self._forget()
@@ -180,13 +201,14 @@ class ModalDecoder(nn.Module):
             raise ValueError(f"keyframes have the shape {tuple(self.keyframes.shape)}; got {tuple(keyframes.shape)}")
         if motions is not None and motions.shape[-1:] != (6,):
             raise ValueError(f"motions have the shape (..., 6); got {tuple(motions.shape)}")
+        self._current()
         t = torch.as_tensor(t, dtype=self.times.dtype, device=amplitudes.device)
         lead = broadcast_shapes(amplitudes.shape[:-1], t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
         segment, u = self.located(t.expand(lead).reshape(-1))
         order, parts = [], []
         for i in segment.unique().tolist():
-            interval = self.interval(i, keyframes)
+            interval = self._kept(i) if keyframes is None else self._interval(i, keyframes)
             for rows in torch.nonzero(segment == i).flatten().split(max(1, CHUNK // self.keyframes.shape[1])):
                 order.append(rows)
                 parts.append(self.alignment.restore(self.bent(i, interval, a[rows], u[rows]), interval.pair, u[rows]))
@@ -213,12 +235,13 @@ class ModalDecoder(nn.Module):
 
     def interval(self, i: int, keyframes: Tensor | None = None) -> Interval:
         """What does not depend on the time; kept, of the decoder's own key-frames."""
-        if keyframes is not None:
-            return self._interval(i, keyframes)
+        self._current()
+        return self._kept(i) if keyframes is None else self._interval(i, keyframes)
+
+    def _kept(self, i: int) -> Interval:
         known = self._known[i]
         if known is None:
-            with torch.no_grad():
-                known = self._known[i] = self._interval(i, self.keyframes)
+            known = self._known[i] = lasting(self._interval)(i, self._made_of[0])
         return known
 
     def _interval(self, i: int, keyframes: Tensor) -> Interval:
@@ -241,6 +264,11 @@ class ModalDecoder(nn.Module):
         before, after, spacing = around(i, self.times, self.cyclic)
         earlier, later = (None if j is None else x[j] for j in (before, after))
         return self.alignment.surround(pair, earlier, later, Spacing(*(h.to(x)[None] for h in spacing)))
+
+
+def _same(x: Tensor, y: Tensor) -> bool:
+    """Whether two tensors hold the same numbers, in the same place."""
+    return (x.dtype, x.device) == (y.dtype, y.device) and torch.equal(x, y)
 
 
 def _finite(name: str, x: Tensor, n_dimensions: int, keyframes: Tensor) -> Tensor:

@@ -72,6 +72,8 @@ class ModalEnergy(nn.Module):
 
     def __init__(self, energy: Energy | ShellEnergy, columns: Tensor) -> None:
         super().__init__()
+        #: Whether the shapes are in the caller's coordinates, as the anchors of terms are.
+        self.unscaled = isinstance(energy, ShellEnergy)
         self.energy = energy.energy if isinstance(energy, ShellEnergy) else energy
         rows = self.energy.extend(columns.movedim(-1, 0))
         self.curvature = Curvature(self.energy)
@@ -98,8 +100,11 @@ class ModalEnergy(nn.Module):
             base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
             reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.against`.
             extra: One more direction, of each sample's own. *Shape:* ``(B, V, 3)``.
-            anchors: Of the energy's terms, where there are some. *Shape:* ``(B, P, 3)``.
+            anchors: Of the energy's terms, where there are some; by default those of a
+                :class:`torch_modal.ShellEnergy` as they are. *Shape:* ``(B, P, 3)``.
         """
+        if anchors is None and self.unscaled and self.energy.anchors is not None:
+            anchors = self.energy.anchors.to(base)[None]
         return Placement(self._extended(base, anchors), None if extra is None else self._extended(extra), reference)
 
     def _extended(self, x: Tensor, anchors: Tensor | None = None) -> Tensor:

@@ -11,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
+from torch_modal.geometry.functions import lasting, outlasting
 from torch_modal.io.files import write_atomically
 
 FORMAT = "torch_modal.precompute.basis"
@@ -43,6 +44,7 @@ class ModalBasis:
     modes: torch.Tensor
     rigid_eigenvalues: torch.Tensor
 
+    @lasting
     def __post_init__(self) -> None:
         shapes = {name: tuple(tensor.shape) for name, tensor in self._tensors().items()}
         v, k = shapes["reference"][:1], shapes["eigenvalues"][:1]
@@ -61,7 +63,7 @@ class ModalBasis:
         if len(kinds) > 1 or not self.reference.is_floating_point():
             raise ValueError(f"the tensors of a basis share one floating-point dtype and one device; got {kinds}")
         for name, tensor in self._tensors().items():
-            object.__setattr__(self, name, tensor.detach())
+            object.__setattr__(self, name, outlasting(tensor.detach()))
 
     def _tensors(self) -> dict[str, torch.Tensor]:
         return {field.name: getattr(self, field.name) for field in fields(self)}

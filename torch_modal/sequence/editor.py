@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.functions import lasting
 from torch_modal.sequence.path import Path
 
 
@@ -18,6 +19,7 @@ class PathEditor:
         ValueError: The key-frames do not fit the path, or ``steps`` is below 1.
     """
 
+    @lasting
     def __init__(self, path: Path, keyframes: Tensor, steps: int = 16) -> None:
         if keyframes.dim() != 3 or len(keyframes) != path.n_keyframes:
             raise ValueError(
@@ -46,6 +48,7 @@ class PathEditor:
         self.keyframes[i] = self._checked(shape)
         self._forget(i % len(self.keyframes))
 
+    @lasting
     def insert(self, t: float, shape: Tensor | None = None) -> int:
         """Pin the motion at a time: the shape becomes a key-frame.
 
@@ -60,8 +63,7 @@ class PathEditor:
             ValueError: The time is outside, or that of a key-frame; the shape does not fit.
         """
         if shape is None:
-            with torch.no_grad():
-                shape = self.path(self.keyframes, t)
+            shape = lasting(self.path)(self.keyframes, t)
         shape = self._checked(shape)
         path = self.path.insert(t)
         i = int((path.times < t).sum())
@@ -83,9 +85,8 @@ class PathEditor:
         at = self.times()
         for i, kept in enumerate(self._shapes):
             if kept is None:
-                with torch.no_grad():
-                    own = at[i * self.steps : (i + 1) * self.steps]
-                    self._shapes[i] = self.path(self.keyframes, own)
+                own = at[i * self.steps : (i + 1) * self.steps]
+                self._shapes[i] = lasting(self.path)(self.keyframes, own)
         found = [part for part in self._shapes if part is not None]
         return torch.cat(found if self.path.cyclic else [*found, self.keyframes[-1:]])
 

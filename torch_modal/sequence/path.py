@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.crossings import require_contact
-from torch_modal.geometry.functions import broadcast_shapes
+from torch_modal.geometry.functions import broadcast_shapes, lasting
 from torch_modal.geometry.hermite import Spacing, around, located
 from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
@@ -62,6 +62,7 @@ class Path(nn.Module):
 
     times: Tensor
 
+    @lasting
     def __init__(
         self,
         bases: Sequence[ModalBasis],
@@ -101,6 +102,7 @@ class Path(nn.Module):
         """Number of key-frames, K."""
         return len(self.members) + (not self.cyclic)
 
+    @lasting
     def insert(self, t: float) -> "Path":
         """The same motion with one more key-frame, which borrows the modes of those around it, as in the paper.
 
