@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_modal.errors import MeshWarning
 from torch_modal.io.cache import Cache, cache_content, clear_cache
 from torch_modal.precompute import filling, tetrahedra
-from torch_modal.precompute.modes import extract_bases, extract_modes
+from torch_modal.precompute.modes import extract_modes
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
 

@@ -99,9 +99,11 @@ def extract_bases(
 ) -> list[ModalBasis]:
     """Lowest vibration modes of each key-frame.
 
-    The key-frame that touches itself least is filled with tetrahedra, which are carried to the others. The as-rigid-as-possible stiffness and a mass of density 1 give ``K phi = lambda M phi``, and the
-    lowest elastic modes are restricted to the surface. Constants of the autograd graph: nothing here is
-    differentiated.
+    The key-frame that touches itself least is filled with tetrahedra, which are carried to the others. The
+    as-rigid-as-possible stiffness and a mass of density 1 give ``K phi = lambda M phi``, and the lowest elastic modes
+    are restricted to the surface. Small loose pieces follow the body beside them. Modes do not move larger ones against
+    each other: such motions have no energy, and in-betweens take them from the interpolation of the key-frames.
+    Constants of the autograd graph: nothing here is differentiated.
 
     Args:
         keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
@@ -225,9 +227,9 @@ def _warn(name: str, solved: Solved) -> None:
     """Say what a caller should know about a key-frame, when all threads have ended."""
     if solved.n_zero > N_RIGID:
         warnings.warn(
-            f"{name}the shape has {solved.n_pieces} loose pieces, or parts hung on an edge or a vertex: modes deform each "
-            "of them, and how they move against each other is left to the interpolation of the key-frames; join them "
-            "if they belong together",
+            f"{name}the shape has {solved.n_pieces} loose pieces, or parts hung on an edge or a vertex: modes deform "
+            "each of them, and how they move against each other is left to the interpolation of the key-frames; join "
+            "them if they belong together",
             MeshWarning,
             stacklevel=4,
         )

@@ -167,8 +167,8 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
             modes = np.concatenate([deforming(modes[:n_zero], surface), modes[n_zero:]])
             if len(modes) < n_modes:
                 raise ModalAnalysisError(
-                    f"only {len(modes)} modes deform the {n_pieces} loose pieces of the tetrahedra, {n_modes} are asked "
-                    "for; ask for fewer, or give a smaller edge_length_fac"
+                    f"only {len(modes)} modes deform the {n_pieces} loose pieces of the tetrahedra, {n_modes} are "
+                    "asked for; ask for fewer, or give a smaller edge_length_fac"
                 )
             eigenvalues = solid.eigenvalues[len(solid.eigenvalues) - len(modes) :]
         except ModalAnalysisError:
