@@ -191,8 +191,7 @@ def bases_of_checked(
 
         work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, report, bar.update, meanwhile)
         solved = work.solve_carried() if carry and len(shapes) > 1 else work.solve_each()
-    for index, one in enumerate(solved):
-        _warn(f"key-frame {index}: " if len(shapes) > 1 else "", one)
+    _warn_of_pieces(solved)
     return [
         ModalBasis(
             reference=torch.from_numpy(shape.copy()),
@@ -223,13 +222,15 @@ def _check_n_modes(n_modes: int, n_used: int) -> None:
         )
 
 
-def _warn(name: str, solved: Solved) -> None:
-    """Say what a caller should know about a key-frame, when all threads have ended."""
-    if solved.n_zero > N_RIGID:
+def _warn_of_pieces(solved: list[Solved]) -> None:
+    """Say once if a set has loose pieces, when all threads have ended."""
+    loose = [one for one in solved if one.n_zero > N_RIGID]
+    if loose:
+        n_pieces = max(one.n_pieces for one in loose)
         warnings.warn(
-            f"{name}the shape has {solved.n_pieces} loose pieces, or parts hung on an edge or a vertex: modes deform "
-            "each of them, and how they move against each other is left to the interpolation of the key-frames; join "
-            "them if they belong together",
+            f"the shape has {n_pieces} loose pieces, or parts hung on an edge or a vertex: modes deform each of them, and "
+            "how they move against each other is left to the interpolation of the key-frames; join them if they "
+            "belong together",
             MeshWarning,
             stacklevel=4,
         )
