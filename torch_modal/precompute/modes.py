@@ -228,8 +228,8 @@ def _warn_of_pieces(solved: list[Solved]) -> None:
     if loose:
         n_pieces = max(one.n_pieces for one in loose)
         warnings.warn(
-            f"the shape has {n_pieces} loose pieces, or parts hung on an edge or a vertex: modes deform each of them, and "
-            "how they move against each other is left to the interpolation of the key-frames; join them if they "
+            f"the shape has {n_pieces} loose pieces, or parts hung on an edge or a vertex: modes deform each of them, "
+            "and how they move against each other is left to the interpolation of the key-frames; join them if they "
             "belong together",
             MeshWarning,
             stacklevel=4,
