@@ -198,11 +198,11 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     n = piece.max() + 1
     vertex, user = np.divmod(np.unique(tets.reshape(-1) * n + np.repeat(piece, 4)), n)
     hinge = np.bincount(vertex)[vertex] > 1  # a vertex of two pieces or more
-    debris = (is_small(tetrahedra, piece) & (np.bincount(user, hinge, n) > 0))[piece]
-    volumes = np.abs(tet_volumes(tetrahedra))
+    volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
+    debris = (volumes < SMALL_VOLUME * volumes.sum()) & (np.bincount(user, hinge, n) > 0)
     if volumes[debris].sum() > MOST_DEBRIS * volumes.sum():
         return tetrahedra
-    return kept_tetrahedra(tetrahedra, ~debris)
+    return kept_tetrahedra(tetrahedra, ~debris[piece])
 
 
 def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> NDArray[np.bool_]:
