@@ -9,7 +9,7 @@ from solids import box, surface
 from torch_modal.io.cache import Cache
 from torch_modal.precompute import filling, modes, solving
 from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, nearest_rotations
-from torch_modal.precompute.eigen import lowest_modes
+from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
 from torch_modal.precompute.embedding import embed_surface
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
 from torch_modal.precompute.proximity import clearances, parting, self_proximity
@@ -171,17 +171,16 @@ def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
 
     monkeypatch.setattr(filling, "tetrahedralize", fill)
-    monkeypatch.setattr(filling, "is_resolved", lambda *_: False)  # no body is left to the lattice
     return asked
 
 
 def test_the_mesher_runs_once_for_a_set(meshed: list[np.ndarray]) -> None:
     poses = np.stack([bent(POINTS, 1.0), POINTS, bent(POINTS, 2.0)])
-    bases = modes.extract_bases(poses[[1, 0, 2]], COMPACT, 5, cache=False)
+    bases = modes.extract_bases(poses[[1, 0, 2]], COMPACT, 5, mesher="tetwild", cache=False)
     assert len(meshed) == 1
     for basis, pose in zip(bases, poses[[1, 0, 2]], strict=True):
         np.testing.assert_array_equal(basis.reference, pose)
-    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, carry=False, cache=False)
+    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, mesher="tetwild", carry=False, cache=False)
     assert len(meshed) == 3
 
 
@@ -189,7 +188,7 @@ def test_a_keyframe_that_cannot_be_carried_to_has_its_own(
     meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torch_modal.precompute.carrying.MAX_FIT", -1.0)
-    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, cache=False)
+    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, mesher="tetwild", cache=False)
     assert len(meshed) == 2
 
 
@@ -229,9 +228,41 @@ def test_carried_tetrahedra_come_from_the_cache(
 
 def test_equal_poses_have_equal_modes(meshed: list[np.ndarray]) -> None:
     """The same key-frame twice, the second turned: the same modes, turned."""
-    first, second = modes.extract_bases(np.stack([POINTS, POINTS @ TURN.T]), COMPACT, 6, cache=False)
+    first, second = modes.extract_bases(np.stack([POINTS, POINTS @ TURN.T]), COMPACT, 6, mesher="tetwild", cache=False)
     torch.testing.assert_close(first.eigenvalues, second.eigenvalues, rtol=1e-6, atol=0)
     a = (first.modes @ torch.from_numpy(TURN).T).flatten(1)
     b = second.modes.flatten(1)
     overlap = torch.linalg.svdvals(torch.linalg.qr(a.T).Q.T @ torch.linalg.qr(b.T).Q)
     assert overlap.min() > 0.999
+
+
+def test_a_singular_matrix_is_not_carried(meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What SciPy raises then counts as not carried: each key-frame has tetrahedra of its own."""
+
+    def singular(*_: object) -> None:
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr("torch_modal.precompute.carrying.factorize", singular)
+    bases = modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, mesher="tetwild", cache=False)
+    assert len(meshed) == 2
+    assert all(torch.isfinite(basis.modes).all() for basis in bases)
+
+
+def test_carried_tetrahedra_that_are_too_distorted_for_modes(
+    meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The key-frame has its own then, and progress counts it once."""
+    solve, counted = solving.solve, []
+
+    def fails_if_carried(n_vertices: int, filling: Filling, *others: object) -> Solved:
+        if filling.surface is not filling.body.surface:
+            raise ModalAnalysisError("the stiffness is indefinite")
+        return solve(n_vertices, filling, *others)
+
+    monkeypatch.setattr(solving, "solve", fails_if_carried)
+    poses = np.stack([POINTS, POINTS + 1.0])
+    modes.extract_bases(
+        poses, COMPACT, 5, mesher="tetwild", cache=False, progress=lambda done, *_: counted.append(done)
+    )
+    assert len(meshed) == 2
+    assert max(counted) == 4

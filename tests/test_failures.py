@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_modal.errors import MeshWarning
 from torch_modal.io.cache import Cache, cache_content, clear_cache
 from torch_modal.precompute import filling, tetrahedra
-from torch_modal.precompute.modes import extract_bases, extract_modes
+from torch_modal.precompute.modes import extract_modes
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
 
@@ -179,22 +178,6 @@ def test_success_after_a_failure_lasts(
     modes_of(capsule, tmp_path, timeout=100.0, settings=COARSE)
     monkeypatch.setattr(tetrahedra, "WORKER", tmp_path / "gone")
     modes_of(capsule, tmp_path, timeout=0.5, settings=COARSE)  # the tetrahedra are kept: no failure stands before them
-
-
-def test_the_lattice_takes_over_at_once(
-    worker: Worker, capsule: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(filling, "is_resolved", lambda *_: False)  # as if the capsule had thin parts
-    worker.does(CRASH)
-    vertices, faces = capsule
-    keyframes = np.stack([vertices, vertices * (1, 1, 1.2)])
-    found = []
-    for words in ("SIGSEGV", "An earlier run found this"):
-        with pytest.warns(MeshWarning, match=rf"lattice of cubes takes its place: .*{words}"):
-            found.append(extract_bases(keyframes, faces, 4, cache_dir=str(tmp_path)))
-    assert worker.runs == 1
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one.modes, other.modes)
 
 
 def test_a_damaged_entry_is_tried_again(worker: Worker, capsule: Mesh, tmp_path: Path) -> None:

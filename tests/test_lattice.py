@@ -3,20 +3,21 @@
 import os
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from bodies import body
+from scipy.spatial import cKDTree
 from solids import box, surface
 
-from torch_modal.errors import MeshWarning
+from torch_modal.io.cache import Cache
 from torch_modal.precompute import filling
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.lattice import is_resolved, lattice
+from torch_modal.precompute.filling import Filler
+from torch_modal.precompute.lattice import is_resolved, is_too_fine, lattice
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.proximity import clearances
 from torch_modal.precompute.stiffness import arap_hessian, lumped_mass, mass_matrix
@@ -95,22 +96,48 @@ def test_the_same_in_every_process_with_any_threads() -> None:
     assert len(found) == 1
 
 
-def test_auto_takes_it_for_bodies_without_thin_parts(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+def test_it_is_the_only_default(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A capsule, and one as thin as a plate, which fTetWild used to get."""
 
     def fail(*args: object, **kwargs: object) -> None:
-        asked.append(args)
-        raise TetrahedralizationError("none here")
+        raise AssertionError("fTetWild was asked")
 
     monkeypatch.setattr(filling, "tetrahedralize", fail)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        extract_modes(*capsule, 6, cache=False)
-    assert not asked
     vertices, faces = capsule
-    with pytest.warns(MeshWarning, match="lattice of cubes takes its place"):
-        extract_modes(vertices * (1.0, 0.02, 1.0), faces, 6, cache=False)
-    assert asked
+    for shape in (vertices, vertices * (1.0, 0.02, 1.0)):
+        default, named = (extract_modes(shape, faces, 6, cache=False, **way) for way in ({}, {"mesher": "lattice"}))
+        np.testing.assert_array_equal(default.modes, named.modes)
+    assert filling.MESHERS == ("lattice", "tetwild")
+
+
+def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
+    """A thin box; its flat sides lie along sides of the lattice's cubes."""
+    solid = box((*cells, 1), size)
+    used, faces = np.unique(surface(solid), return_inverse=True)
+    return solid.vertices[used], faces.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("thickness", [0.05, 0.005, 0.0005])
+def test_thin_plates_are_filled(thickness: float) -> None:
+    """By tetrahedra in one piece, all over."""
+    vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
+    whole = Surface.of(vertices, faces)
+    filled = Filler(TetrahedraSettings(), "lattice", 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    assert pieces_by_sides(filled.tets).max() == 0
+    assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
+    basis = extract_modes(vertices, faces, 6, cache=False)
+    across = (basis.modes[0, :, 2] ** 2).sum() / (basis.modes[0] ** 2).sum()
+    assert across > 0.9
+
+
+def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
+    """What fTetWild could still fill, the lattice fills with as many cubes as it may have."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    settings = TetrahedraSettings(edge_length_fac=0.012)
+    whole = Surface.of(ball.vertices, ball.faces)
+    assert is_too_fine(whole, filling.CUBE * 0.012)
+    filled = Filler(settings, "lattice", 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
 
 
 def of_body(name: str) -> Surface:
@@ -205,21 +232,7 @@ def test_too_fine_a_lattice_is_refused(capsule: Mesh) -> None:
         lattice(Surface.of(*capsule), 0.002)
 
 
-def test_it_takes_over_with_a_warning(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*args: object, **kwargs: object) -> None:
-        raise TetrahedralizationError("signal SIGSEGV")
-
-    monkeypatch.setattr(filling, "tetrahedralize", fail)
-    monkeypatch.setattr(filling, "is_resolved", lambda *_: False)  # as if the capsule had thin parts
-    with pytest.warns(MeshWarning, match="lattice of cubes takes its place: signal SIGSEGV"):
-        basis = extract_modes(*capsule, 6, cache=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        same = extract_modes(*capsule, 6, mesher="lattice", cache=False)
-    np.testing.assert_array_equal(basis.modes, same.modes)
-
-
-@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("settings", "best")])
+@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("mesher", "auto"), ("settings", "best")])
 def test_unknown_names(capsule: Mesh, name: str, value: str) -> None:
     with pytest.raises(ValueError, match=f"{value}.*give"):
         extract_bases([capsule[0]], capsule[1], 5, **{name: value})
@@ -234,6 +247,6 @@ def test_settings_reach_the_mesher(capsule: Mesh, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(filling, "lattice", note)
     for settings in ("fast", "fine", TetrahedraSettings(edge_length_fac=0.07)):
-        extract_modes(*capsule, 5, settings=settings, mesher="lattice", cache=False)
+        extract_modes(*capsule, 5, settings=settings, cache=False)
     assert seen[0] > seen[1]
     assert seen[2] == filling.CUBE * 0.07

@@ -221,12 +221,6 @@ def test_untrustworthy_problems_are_refused() -> None:
 # -------------------------------------------------------------------------------- from key-frames to bases
 
 
-@pytest.fixture(autouse=True)
-def _nothing_for_the_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The box has no thin parts, and would not come to the mesher that is replaced below."""
-    monkeypatch.setattr(filling, "is_resolved", lambda *_: False)
-
-
 @pytest.fixture
 def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
     """A box as a surface, and a mesher that fills it (the surface comes centred, with a diagonal of 100)."""
@@ -237,6 +231,7 @@ def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
     def fill(points: np.ndarray, *args: object, **kwargs: object) -> Tetrahedra:
         return Tetrahedra((BOX.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BOX.tets)
 
+    monkeypatch.setattr(filling, "lattice", lambda whole, _: fill(whole.points))
     monkeypatch.setattr(filling, "tetrahedralize", fill)
     return BOX.vertices[used], compact.reshape(-1, 3)
 
@@ -282,9 +277,9 @@ def test_cached_modes_are_the_same_and_not_recomputed(
 ) -> None:
     keyframes = np.stack([boxed[0], boxed[0] * (1.0, 1.0, 1.01)])
     first = extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path))
-    assert len(list(tmp_path.iterdir())) == 5  # of the lattice, which is not used, of the mesher, carried, modes
+    assert len(list(tmp_path.iterdir())) == 4  # tetrahedra, carried ones, modes
     monkeypatch.setattr(solving, "lowest_modes", None)
-    monkeypatch.setattr(filling, "tetrahedralize", None)
+    monkeypatch.setattr(filling, "lattice", None)
     for basis, again in zip(first, extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path)), strict=True):
         np.testing.assert_array_equal(basis.modes, again.modes)
         np.testing.assert_array_equal(basis.eigenvalues, again.eigenvalues)
@@ -292,18 +287,106 @@ def test_cached_modes_are_the_same_and_not_recomputed(
         extract_bases(keyframes, boxed[1], 5, cache_dir=str(tmp_path))
 
 
+def as_mesh(solid: Tetrahedra) -> Mesh:
+    """Its surface."""
+    used, faces = np.unique(surface(solid), return_inverse=True)
+    return solid.vertices[used], faces.reshape(-1, 3)
+
+
+def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: np.ndarray) -> None:
+    """Have the lattice give these tetrahedra, placed as a surface with these points is."""
+    low, high = like.min(axis=0), like.max(axis=0)
+    vertices = (solid.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low))
+    monkeypatch.setattr(filling, "lattice", lambda *_: solid._replace(vertices=vertices))
+
+
 def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    two = together(box((4, 2, 2), (2.0, 1.0, 1.0)), box((4, 2, 2), (2.0, 1.0, 1.0)))
+    """Their motions against each other cost nothing, whatever their size: they are no modes."""
+    piece = box((4, 2, 2), (2.0, 1.0, 1.0), jitter=0.1)
+    two = together(piece, piece)
     two.vertices[45:, 2] += 3.0
-    center, scale = (1.0, 0.5, 2.0), 100 / np.linalg.norm([2.0, 1.0, 4.0])
-    monkeypatch.setattr(
-        filling, "tetrahedralize", lambda *a, **k: Tetrahedra((two.vertices - center) * scale, two.tets)
-    )
-    faces = surface(two)
-    used, compact = np.unique(faces, return_inverse=True)
-    with pytest.warns(MeshWarning, match=r"has 2 loose pieces.* 6 of its first modes"):
-        basis = extract_modes(two.vertices[used], compact.reshape(-1, 3), 8, cache=False)
-    assert basis.eigenvalues[5] < 1e-8 * basis.eigenvalues[6]
+    vertices, faces = as_mesh(two)
+    filled_with(monkeypatch, two, vertices)
+    with pytest.warns(MeshWarning, match=r"has 2 loose pieces.* left to the interpolation") as said:
+        basis = extract_bases(np.stack([vertices, vertices]), faces, 8, cache=False)[0]
+    assert len(said) == 1
+    each = solve(piece, 4).eigenvalues
+    np.testing.assert_allclose(basis.eigenvalues, np.repeat(each, 2), rtol=1e-6)
+
+
+def test_more_pieces_than_modes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their 54 motions against each other used to leave no room for modes."""
+    many = together(*[box((2, 1, 1), (2.0, 1.0, 1.0))] * 10)
+    many.vertices[:, 2] += np.repeat(3.0 * np.arange(10), 12)
+    vertices, faces = as_mesh(many)
+    filled_with(monkeypatch, many, vertices)
+    with pytest.warns(MeshWarning, match="has 10 loose pieces"):
+        basis = extract_modes(vertices, faces, 20, cache=False)
+    assert basis.eigenvalues[0] > 0.01
+
+
+@pytest.mark.parametrize("mesher", ["lattice", "tetwild"])
+def test_a_stray_clump_is_no_body(mesher: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six tetrahedra beside the corner of a box, which some of its surface hangs on."""
+    clump = box((1, 1, 1), (0.1, 0.1, 0.1))
+    clump.vertices[:] += [3.01, 1.4, 0.9]
+    vertices, faces = as_mesh(BOX)
+    found = []
+    for solid in (BOX, together(BOX, clump)):
+        filled_with(monkeypatch, solid, vertices)
+        monkeypatch.setattr(filling, "tetrahedralize", lambda *_, **__: filling.lattice())
+        found.append(extract_modes(vertices, faces, 10, mesher=mesher, cache=False))
+    plain, stray = found
+    np.testing.assert_allclose(stray.eigenvalues, plain.eigenvalues, rtol=1e-6)
+    assert stray.modes.abs().max() < 2 * plain.modes.abs().max()
+    apart = (stray.modes - plain.modes).flatten(1).norm(dim=1) / plain.modes.flatten(1).norm(dim=1)
+    assert apart.max() < 0.1
+
+
+def test_a_small_piece_goes_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A button of a body: as the body moves beside it, and without modes of its own."""
+    button = box((1, 1, 1), (0.1, 0.1, 0.1))
+    button.vertices[:] += [1.5, 1.6, 0.5]
+    both = together(BOX, button)
+    vertices, faces = as_mesh(both)
+    filled_with(monkeypatch, both, vertices)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        basis = extract_modes(vertices, faces, 10, cache=False)
+    np.testing.assert_allclose(basis.eigenvalues, solve(BOX, 10).eigenvalues, rtol=1e-6)
+    near = np.linalg.norm(vertices - [1.5, 1.5, 0.5], axis=1).argsort()
+    body = basis.modes[:, near[near < len(vertices) - 8][:4]].mean(dim=1)
+    own = basis.modes[:, -8:].mean(dim=1)
+    # The lowest, which change little over the distance.
+    assert (own - body)[:4].norm() < 0.5 * body[:4].norm()
+    assert basis.modes[:, -8:].abs().max() < 2 * basis.modes[:, :-8].abs().max()
+
+
+def test_tetrahedra_without_surface_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many they are."""
+    far = box((4, 2, 2), (2.0, 1.0, 1.0))
+    far.vertices[:] += 30.0
+    vertices, faces = as_mesh(BOX)
+    filled_with(monkeypatch, together(BOX, far), vertices)
+    keyframes = np.stack([vertices, vertices * (1.0, 1.1, 1.0)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bases = extract_bases(keyframes, faces, 6, cache=False)
+    np.testing.assert_allclose(bases[0].eigenvalues, solve(BOX, 6).eigenvalues, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("Factor is exactly singular"), np.linalg.LinAlgError("Singular matrix")]
+)
+def test_errors_of_libraries_become_own_ones(boxed: Mesh, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    for name in ("arap_hessian", "lowest_modes"):
+        with monkeypatch.context() as patch:
+            patch.setattr(solving, name, fail)
+            with pytest.raises(ModalAnalysisError, match=f"{error}.*check the surface"):
+                extract_modes(*boxed, 4, cache=False)
 
 
 def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,7 +428,8 @@ def test_keyframes_are_meshed_at_the_same_time(boxed: Mesh, monkeypatch: pytest.
 
     monkeypatch.setattr(parallel, "n_cpus", lambda: 3)
     monkeypatch.setattr(filling, "tetrahedralize", wait_for_the_others)
-    assert len(extract_bases(np.stack([vertices] * 3), faces, 4, carry=False, cache=False)) == 3
+    three = np.stack([vertices] * 3)
+    assert len(extract_bases(three, faces, 4, mesher="tetwild", carry=False, cache=False)) == 3
 
 
 def test_one_failure_ends_the_other_workers(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:

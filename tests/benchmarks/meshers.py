@@ -32,7 +32,6 @@ WAYS: dict[str, dict[str, Any]] = {
         "settings": TetrahedraSettings(epsilon=4e-3, stop_energy=200.0, max_surface_faces=1500),
     },
     "lattice": {"mesher": "lattice"},
-    "auto": {"mesher": "auto"},
 }
 SOURCES = ("samples", "shared", "bodies", "slender")
 PRESETS: tuple[Any, ...] = ("accurate", "fast")
@@ -71,7 +70,9 @@ def main() -> None:
     for name in SOURCES:
         parser.add_argument(f"--{name}", action="store_true")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT")
-    parser.add_argument("--ways", nargs="+", choices=[w for w in WAYS if w != REFERENCE], default=["coarser", "auto"])
+    parser.add_argument(
+        "--ways", nargs="+", choices=[w for w in WAYS if w != REFERENCE], default=["coarser", "lattice"]
+    )
     arguments = parser.parse_args()
     limit_threads()
     warnings.simplefilter("ignore")

@@ -50,8 +50,8 @@ Compute the vibration modes of key-frames: the lowest elastic modes of the solid
 that each surface encloses, restricted to the surface.
 
 They are what `subdivide` computes first. Read the files with
-torch_modal.ModalBasis.load. The mesher is not deterministic: without the cache,
-two runs give slightly different modes."""
+torch_modal.ModalBasis.load. With --mesher tetwild, which is not deterministic, two
+runs without the cache give slightly different modes."""
 
 MODES_EXAMPLES = """\
 examples:
@@ -366,10 +366,10 @@ def _add_modes(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--mesher",
-        choices=("auto", "tetwild", "lattice"),
-        default="auto",
-        help="what fills the surfaces: fTetWild, a lattice of cubes (deterministic, takes open surfaces), or auto: the "
-        "second for bodies without thin parts and where the first fails (default: %(default)s)",
+        choices=("lattice", "tetwild"),
+        default="lattice",
+        help="what fills the surfaces: a lattice of cubes (deterministic, takes every surface), or fTetWild (default: "
+        "%(default)s)",
     )
     sub.add_argument(
         "--quality",

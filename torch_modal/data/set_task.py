@@ -48,7 +48,7 @@ class Options:
     """How sets are worked on: as for `extract_bases`, and whether to try again or to replace sets of others."""
 
     n_modes: int = 30
-    mesher: str = "auto"
+    mesher: str = "lattice"
     quality: str = "fast"
     cache_dir: str | None = None
     """None keeps nothing but the results."""

@@ -21,7 +21,7 @@ from safetensors.numpy import save as save_arrays
 
 from torch_modal.io.files import write_atomically
 
-CACHE_VERSION = 4
+CACHE_VERSION = 5
 """Part of every key: raise it when an algorithm changes whose results are kept, and old entries are left."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"

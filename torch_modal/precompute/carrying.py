@@ -61,6 +61,10 @@ class Carrier:
         faces: Its faces. *Shape:* ``(F, 3)``.
         weights: How the surface hangs on the tetrahedra
             (:func:`~torch_modal.precompute.embedding.embed_surface`). *Shape:* ``(U, N)``.
+
+    Raises:
+        RuntimeError: The matrix is singular, as where nothing of the surface hangs on a piece of the tetrahedra.
+        LinAlgError: A tetrahedron is flat.
     """
 
     def __init__(self, tetrahedra: Tetrahedra, points: FloatArray, faces: IntArray, weights: sp.csr_matrix) -> None:
@@ -87,6 +91,9 @@ class Carrier:
 
         Args:
             points: The surface in the new pose. *Shape:* ``(U, 3)``.
+
+        Raises:
+            LinAlgError: The result is not finite.
         """
         areas = vertex_areas(points, self._faces)
         # The bounding box, and with it the unit here, changes with the pose; the size of the shape hardly does.

@@ -140,7 +140,7 @@ def _next_of(spans: Iterator[FloatArray]) -> FloatArray | None:
     """The next span, or None after the last."""
     try:
         return next(spans, None)
-    except RuntimeError as error:  # of Lanczos, or of SuperLU on a singular matrix
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # of Lanczos, of SuperLU on a singular matrix, of LAPACK
         raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
 
 

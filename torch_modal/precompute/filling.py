@@ -3,7 +3,7 @@
 import contextlib
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal
@@ -12,11 +12,12 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
-from torch_modal.precompute.lattice import is_resolved, is_too_fine, lattice
-from torch_modal.precompute.proximity import clearances, parting, self_proximity
+from torch_modal.precompute.lattice import is_too_fine, lattice
+from torch_modal.precompute.proximity import parting, self_proximity
 from torch_modal.precompute.stiffness import mass_matrix
 from torch_modal.precompute.surface import Surface
 from torch_modal.precompute.tetrahedra import (
@@ -24,20 +25,26 @@ from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
     TetrahedraSettings,
+    kept_tetrahedra,
+    loose_pieces,
+    pieces_by_sides,
     solid_volumes,
     tetrahedralize,
 )
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Mesher = Literal["auto", "tetwild", "lattice"]
-MESHERS: tuple[Mesher, ...] = ("auto", "tetwild", "lattice")
+Mesher = Literal["lattice", "tetwild"]
+MESHERS: tuple[Mesher, ...] = ("lattice", "tetwild")
 
-LATTICE_VERSION = "graded"
+LATTICE_VERSION = "whole"
 """Tetrahedra that other versions of the package have kept are not those of this one."""
 CUBE = 0.75
 """Edge of the lattice's cubes at the surface, over the largest that fTetWild is asked for."""
-
+COARSER = 1.1
+"""Factor of that edge until there are not too many cubes."""
+TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+"""A turn after which no axis is along or across another."""
 
 MOST_PARTING = 0.014
 """Where parts that touch come further apart, carrying is not tried (:func:`~torch_modal.precompute.proximity.parting`).
@@ -51,12 +58,10 @@ class Body:
     Attributes:
         surface: The key-frame.
         tetrahedra: In the units of the surface.
-        problem: Why they are not those of the mesher that was wanted first; None if they are.
     """
 
     surface: Surface
     tetrahedra: Tetrahedra
-    problem: str | None = None
     _lock: threading.RLock = field(default_factory=threading.RLock, init=False, repr=False, compare=False)
 
     @property
@@ -120,8 +125,7 @@ class Filler:
 
     Attributes:
         settings: How fine the tetrahedra are.
-        mesher: ``"tetwild"``, ``"lattice"``, or ``"auto"``: the lattice where it resolves the body, and elsewhere
-            fTetWild, or the lattice again where that fails.
+        mesher: ``"lattice"`` or ``"tetwild"``.
         timeout: Seconds that the child process of fTetWild may take.
         cache: Where tetrahedra are kept.
         stop: Set when they are no longer wanted: children are killed then.
@@ -139,34 +143,27 @@ class Filler:
         Raises:
             TetrahedralizationError: No mesher could fill it.
         """
-        if self.mesher == "lattice":
-            return Body(surface, self._by_lattice(surface)[0])
-        if self.mesher == "auto" and not is_too_fine(surface, self._cube()):
-            tetrahedra, resolved = self._by_lattice(surface)
-            if resolved:
-                return Body(surface, tetrahedra)
-        try:
-            kept = self._kept("tetwild", surface, lambda: _as_arrays(self._by_tetwild(surface)))
-            return Body(surface, Tetrahedra(**kept))
-        except TetrahedralizationError as error:
-            if self.mesher == "tetwild":
-                raise
-            return Body(surface, self._by_lattice(surface)[0], str(error))
+        make = self._by_lattice if self.mesher == "lattice" else self._by_tetwild
+        kept = self._kept(surface, lambda: _as_arrays(make(surface)))
+        return _without_idle(Body(surface, Tetrahedra(**kept)))
 
-    def _by_lattice(self, surface: Surface) -> tuple[Tetrahedra, bool]:
-        """By the lattice, and whether that resolves the body."""
+    def _by_lattice(self, surface: Surface) -> Tetrahedra:
+        """By the lattice; in another direction, too, where that falls into pieces.
 
-        def compute() -> Arrays:
-            near = clearances(surface)
-            made = lattice(surface, self._cube(), near)
-            return {**_as_arrays(made), "resolved": np.array([is_resolved(made, surface, near)])}
-
-        kept = self._kept("lattice", surface, compute)
-        resolved = kept.pop("resolved")
-        return Tetrahedra(**kept), bool(resolved[0])
-
-    def _cube(self) -> float:
-        return CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
+        A thin wall that lies along the cubes' sides is in tetrahedra that hardly share any.
+        """
+        cube = CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
+        while is_too_fine(surface, cube):
+            cube *= COARSER
+        found = lattice(surface, cube)
+        pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
+        most = connected_pieces(pairs, len(surface.points)).max()
+        if pieces_by_sides(found.tets).max() <= most:
+            return found
+        turned = lattice(replace(surface, points=surface.points @ TURN.T), cube)
+        if pieces_by_sides(turned.tets).max() >= pieces_by_sides(found.tets).max():
+            return found
+        return turned._replace(vertices=turned.vertices @ TURN)
 
     def _by_tetwild(self, surface: Surface) -> Tetrahedra:
         """By fTetWild, unless it is known to fail: nobody should wait for the same failure twice."""
@@ -195,16 +192,19 @@ class Filler:
             "--clear), or do without it"
         )
 
-    def _kept(self, mesher: str, surface: Surface, make: Callable[[], Arrays]) -> Arrays:
-        versions = _mesher_versions() if mesher == "tetwild" else {"lattice": LATTICE_VERSION}
-        parameters = {**asdict(self.settings), **versions, "mesher": mesher}
+    def _kept(self, surface: Surface, make: Callable[[], Arrays]) -> Arrays:
+        versions = _mesher_versions() if self.mesher == "tetwild" else {"lattice": LATTICE_VERSION}
+        parameters = {**asdict(self.settings), **versions, "mesher": self.mesher}
         return dict(self.cache.get("tetrahedra", _content(surface), parameters, make))
 
     def carried(self, body: Body, surface: Surface) -> Filling | None:
         """The body in the pose of another key-frame, or None if its tetrahedra do not survive that."""
 
         def compute() -> dict[str, NDArray[Any]]:
-            result = body.carrier.carry(surface.points)
+            try:
+                result = body.carrier.carry(surface.points)
+            except (RuntimeError, np.linalg.LinAlgError):  # of SuperLU, NumPy or SciPy: a matrix that is singular
+                return {"vertices": body.tetrahedra.vertices, "is_good": np.array([False])}
             return {"vertices": result.tetrahedra.vertices, "is_good": np.array([result.is_good])}
 
         inputs = {"points": surface.points, "faces": surface.faces, "rest_points": body.surface.points}
@@ -212,6 +212,18 @@ class Filler:
         if not kept["is_good"][0]:
             return None
         return Filling(body, surface, body.tetrahedra._replace(vertices=kept["vertices"]))
+
+
+def _without_idle(body: Body) -> Body:
+    """The body without pieces of tetrahedra that nothing of its surface hangs on."""
+    piece = loose_pieces(body.tetrahedra)
+    if piece.max() == 0:
+        return body
+    bears = np.zeros(piece.max() + 1, dtype=bool)
+    bears[piece[body.neighbours.vertex[body.neighbours.kernel > 0]]] = True
+    if bears.all():
+        return body
+    return Body(body.surface, kept_tetrahedra(body.tetrahedra, bears[piece[body.tetrahedra.tets[:, 0]]]))
 
 
 def _mesher_versions() -> dict[str, str | None]:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.io.cache import Cache
 from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
 from torch_modal.precompute.basis import ModalBasis
@@ -17,7 +16,7 @@ from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings
+from torch_modal.precompute.tetrahedra import TetrahedraSettings
 from torch_modal.progress import Progress, ProgressReport
 
 QUALITIES = {
@@ -37,7 +36,7 @@ def extract_modes(
     *,
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
-    mesher: Mesher = "auto",
+    mesher: Mesher = "lattice",
     tolerance: float = ENOUGH,
     timeout: float = TIMEOUT,
     cache_dir: str | None = None,
@@ -51,9 +50,8 @@ def extract_modes(
         n_modes: Number of elastic modes, k.
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
-        mesher: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts every surface;
-            ``"tetwild"``; ``"auto"`` takes the first where it resolves the body, which is nearly always, the second
-            for wires and walls that are too thin for it, and the first again where the second fails.
+        mesher: What fills the surface: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts
+            every surface; or ``"tetwild"``, fTetWild in a child process.
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
             more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
         timeout: Seconds that the child process of fTetWild may take.
@@ -91,7 +89,7 @@ def extract_bases(
     *,
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
-    mesher: Mesher = "auto",
+    mesher: Mesher = "lattice",
     tolerance: float = ENOUGH,
     carry: bool = True,
     timeout: float = TIMEOUT,
@@ -101,10 +99,11 @@ def extract_bases(
 ) -> list[ModalBasis]:
     """Lowest vibration modes of each key-frame.
 
-    The key-frame that touches itself least is filled with tetrahedra (in a child process), which are carried to the
-    others. The as-rigid-as-possible stiffness and a mass of density 1 give ``K phi = lambda M phi``, and the
-    lowest elastic modes are restricted to the surface. Constants of the autograd graph: nothing here is
-    differentiated.
+    The key-frame that touches itself least is filled with tetrahedra, which are carried to the others. The
+    as-rigid-as-possible stiffness and a mass of density 1 give ``K phi = lambda M phi``, and the lowest elastic modes
+    are restricted to the surface. Small loose pieces follow the body beside them. Modes do not move larger ones against
+    each other: such motions have no energy, and in-betweens take them from the interpolation of the key-frames.
+    Constants of the autograd graph: nothing here is differentiated.
 
     Args:
         keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
@@ -112,9 +111,8 @@ def extract_bases(
         n_modes: Number of elastic modes of each, k.
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
-        mesher: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts every surface;
-            ``"tetwild"``; ``"auto"`` takes the first where it resolves the body, which is nearly always, the second
-            for wires and walls that are too thin for it, and the first again where the second fails.
+        mesher: What fills the surface: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts
+            every surface; or ``"tetwild"``, fTetWild in a child process.
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
             more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
         carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each has its own.
@@ -134,8 +132,7 @@ def extract_bases(
         ModalAnalysisError: The modes failed a check.
 
     Warns:
-        MeshWarning: What `check_keyframes` warns about; a shape of several loose pieces; fTetWild failed, and the
-            lattice took its place.
+        MeshWarning: What `check_keyframes` warns about; a shape of several loose pieces.
     """
     if form not in HESSIAN_FORMS:
         raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
@@ -175,7 +172,7 @@ def bases_of_checked(
         progress: As there.
         meanwhile: Called while this goes on, by a processor that has nothing else to do, if there is one.
     """
-    filler = filler or Filler(QUALITIES["fast"], "auto", TIMEOUT, Cache.at(None))
+    filler = filler or Filler(QUALITIES["fast"], "lattice", TIMEOUT, Cache.at(None))
     shapes = keyframes.detach().cpu().double().numpy()
     triangles = faces.cpu().numpy()
     _check_n_modes(n_modes, len(np.unique(triangles)))
@@ -194,8 +191,7 @@ def bases_of_checked(
 
         work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, report, bar.update, meanwhile)
         solved = work.solve_carried() if carry and len(shapes) > 1 else work.solve_each()
-    for index, one in enumerate(solved):
-        _warn(f"key-frame {index}: " if len(shapes) > 1 else "", one)
+    _warn_of_pieces(solved)
     return [
         ModalBasis(
             reference=torch.from_numpy(shape.copy()),
@@ -226,25 +222,15 @@ def _check_n_modes(n_modes: int, n_used: int) -> None:
         )
 
 
-def _warn(name: str, solved: Solved) -> None:
-    """Say what a caller should know about a key-frame, when all threads have ended."""
-    filling, n_zero = solved.filling, solved.n_zero
-    if filling.body.problem is not None and filling.surface is filling.body.surface:
+def _warn_of_pieces(solved: list[Solved]) -> None:
+    """Say once if a set has loose pieces, when all threads have ended."""
+    loose = [one for one in solved if one.n_zero > N_RIGID]
+    if loose:
+        n_pieces = max(one.n_pieces for one in loose)
         warnings.warn(
-            f"{name}fTetWild failed, so a lattice of cubes takes its place: {filling.body.problem}",
+            f"the shape has {n_pieces} loose pieces, or parts hung on an edge or a vertex: modes deform each of them, "
+            "and how they move against each other is left to the interpolation of the key-frames; join them if they "
+            "belong together",
             MeshWarning,
             stacklevel=4,
         )
-    if n_zero > N_RIGID:
-        warnings.warn(
-            f"{name}the shape has {_n_pieces(filling.tetrahedra)} loose pieces, or parts hung on an edge or a vertex: "
-            f"{n_zero - N_RIGID} of its first modes move them without deforming them; join them, or ask for that many "
-            "more modes",
-            MeshWarning,
-            stacklevel=4,
-        )
-
-
-def _n_pieces(tetrahedra: Tetrahedra) -> int:
-    pairs = np.stack([np.repeat(tetrahedra.tets[:, 0], 3), tetrahedra.tets[:, 1:].reshape(-1)], axis=1)
-    return int(connected_pieces(pairs, len(tetrahedra.vertices)).max()) + 1

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
 from torch_modal.io.cache import Cache
-from torch_modal.precompute.eigen import ModalAnalysisError, VolumeModes, lowest_modes
+from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.filling import Filler, Filling, is_torn, meshing_order
+from torch_modal.precompute.following import deforming, larger_pieces
 from torch_modal.precompute.parallel import Budget, run_all
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian
 from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import TetrahedralizationError
+from torch_modal.precompute.tetrahedra import TetrahedralizationError, loose_pieces
 
 FloatArray = NDArray[np.float64]
 
@@ -33,6 +34,7 @@ class Solved(NamedTuple):
         rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
         filling: The tetrahedra that they are the modes of.
         n_zero: How many eigenvalues are zero, the six rigid ones included.
+        n_pieces: How many loose pieces the tetrahedra have, small ones left out.
     """
 
     eigenvalues: FloatArray
@@ -40,6 +42,7 @@ class Solved(NamedTuple):
     rigid_eigenvalues: FloatArray
     filling: Filling
     n_zero: int
+    n_pieces: int = 1
 
 
 @dataclass(frozen=True)
@@ -82,21 +85,26 @@ class KeyframeSet:
         own = dict(zip(alone, made, strict=True))
 
         def solve(index: int) -> Solved:
-            filling = own.get(index) or self._carried(own[first], index) or self._own(index)
-            return self._solved(index, filling)
+            if index in own:
+                return self._solved(index, own[index])
+            if (carried := self._carried(own[first], index)) is not None:
+                with contextlib.suppress(ModalAnalysisError):  # they are distorted: others may do
+                    return self._solved(index, carried)
+            return self._solved(index, self._own(index, counted=carried is None))
 
         return self._all(solve)
 
     def _all(self, solve: Callable[[int], Solved]) -> list[Solved]:
         return run_all(solve, len(self.surfaces), self.filler.stop, self.meanwhile)
 
-    def _own(self, index: int) -> Filling:
-        """A key-frame with tetrahedra of its own."""
+    def _own(self, index: int, counted: bool = True) -> Filling:
+        """A key-frame with tetrahedra of its own; not counted as done if it has had others."""
         surface = self.surfaces[index]
         with self._naming(index):
             self.report(index, "tetrahedra")
             body = self.filler.body(surface)
-        self.done()
+        if counted:
+            self.done()
         return Filling(body, surface, body.tetrahedra)
 
     def _carried(self, other: Filling, index: int) -> Filling | None:
@@ -148,12 +156,34 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
     tetrahedra, surface = filling.tetrahedra, filling.surface
 
     def compute() -> dict[str, NDArray[Any]]:
-        solid = lowest_modes(arap_hessian(tetrahedra, form), filling.mass(), tetrahedra.vertices, n_modes, tolerance)
+        try:
+            larger, vertices, weights = larger_pieces(tetrahedra)
+            mass = filling.mass()[vertices][:, vertices]
+            n_pieces = loose_pieces(larger).max() + 1
+            n_wanted = min(n_modes + N_RIGID * (n_pieces - 1), max(n_modes, larger.vertices.size - N_RIGID))
+            solid = lowest_modes(arap_hessian(larger, form), mass, larger.vertices, n_wanted, tolerance)
+            modes = _restrict(sp.csr_matrix(filling.weights() @ weights), solid)
+            n_zero = min(solid.n_zero - N_RIGID, len(modes))
+            modes = np.concatenate([deforming(modes[:n_zero], surface), modes[n_zero:]])
+            if len(modes) < n_modes:
+                raise ModalAnalysisError(
+                    f"only {len(modes)} modes deform the {n_pieces} loose pieces of the tetrahedra, {n_modes} are "
+                    "asked for; ask for fewer, or give a smaller edge_length_fac"
+                )
+            eigenvalues = solid.eigenvalues[len(solid.eigenvalues) - len(modes) :]
+        except ModalAnalysisError:
+            raise
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            raise ModalAnalysisError(
+                f"the modes cannot be computed: {error}; the tetrahedra are likely degenerate: check the surface for "
+                "parts without thickness, or try another mesher"
+            ) from error
         return {
-            "eigenvalues": solid.eigenvalues,
-            "modes": _restrict(filling.weights(), solid),
+            "eigenvalues": eigenvalues[:n_modes],
+            "modes": modes[:n_modes],
             "rigid_eigenvalues": solid.rigid_eigenvalues,
             "n_zero": np.array([solid.n_zero]),
+            "n_pieces": np.array([n_pieces]),
         }
 
     result = cache.get(
@@ -168,6 +198,7 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
         result["rigid_eigenvalues"] * surface.scale**2,
         filling,
         int(result["n_zero"][0]),
+        int(result["n_pieces"][0]),
     )
 
 

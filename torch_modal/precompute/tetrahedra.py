@@ -35,8 +35,12 @@ _OWN_FAILURES = {MESHER_RAISED, *(-getattr(signal, name, 0) for name in ("SIGSEG
 """Ends that the surface brings about. Others may not come again: SIGKILL is sent from outside, and SIGABRT is how C++
 ends where memory or threads run out."""
 
-DEBRIS = 0.01
-"""Largest volume of a piece that is dropped if it only hangs on others, as a fraction of the whole."""
+SMALL_VOLUME = 0.01
+"""Of a small piece, as a fraction of the whole, and"""
+SMALL_SIZE = 0.1
+"""its extent, as a fraction of the bounding-box diagonal; a long piece is a limb or a wire, however thin."""
+MOST_DEBRIS = 0.2
+"""Of the volume: where more hangs on other pieces, the body itself is in pieces."""
 
 
 class Tetrahedra(NamedTuple):
@@ -59,7 +63,8 @@ class TetrahedraSettings:
 
     Attributes:
         edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two
-            thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04.
+            thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04. The lattice has cubes of
+            three quarters of it, or of the largest of these; larger ones where there would be too many.
         epsilon: How far the tetrahedra may leave the surface, as a fraction of the bounding-box diagonal.
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is
             10).
@@ -178,7 +183,7 @@ def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
     edges = tetrahedra.vertices[tets[:, 1:]] - tetrahedra.vertices[tets[:, :1]]
     # A volume below rounding in units of the tetrahedron's own size has no usable gradients.
     flat = np.abs(volumes) <= 1e-12 * np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) ** 3
-    return _kept(Tetrahedra(tetrahedra.vertices, tets, tetrahedra.inside), ~flat)
+    return kept_tetrahedra(Tetrahedra(tetrahedra.vertices, tets, tetrahedra.inside), ~flat)
 
 
 def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
@@ -190,12 +195,43 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     if len(tets) == 0:
         return tetrahedra
     piece = pieces_by_sides(tets)
-    volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
-    vertex, user = np.divmod(np.unique(tets.reshape(-1) * len(volumes) + np.repeat(piece, 4)), len(volumes))
+    n = piece.max() + 1
+    vertex, user = np.divmod(np.unique(tets.reshape(-1) * n + np.repeat(piece, 4)), n)
     hinge = np.bincount(vertex)[vertex] > 1  # a vertex of two pieces or more
-    hangs = np.bincount(user, hinge, len(volumes)) > 0
-    debris = hangs & (volumes < DEBRIS * volumes.sum())
-    return _kept(tetrahedra, ~debris[piece])
+    volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
+    debris = (volumes < SMALL_VOLUME * volumes.sum()) & (np.bincount(user, hinge, n) > 0)
+    if volumes[debris].sum() > MOST_DEBRIS * volumes.sum():
+        return tetrahedra
+    return kept_tetrahedra(tetrahedra, ~debris[piece])
+
+
+def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> NDArray[np.bool_]:
+    """Which pieces have little volume and are short; never the largest.
+
+    Args:
+        tetrahedra: Of ``P`` pieces.
+        piece: The piece of each tetrahedron. *Shape:* ``(T,)``.
+
+    Returns:
+        *Shape:* ``(P,)``.
+    """
+    volumes = np.bincount(piece, solid_volumes(tetrahedra))
+    low, high = (np.full((len(volumes), 3), bound) for bound in (np.inf, -np.inf))
+    corners = tetrahedra.vertices[tetrahedra.tets]
+    np.minimum.at(low, piece, corners.min(axis=1))
+    np.maximum.at(high, piece, corners.max(axis=1))
+    extent = np.linalg.norm(high - low, axis=1)
+    small = (volumes < SMALL_VOLUME * volumes.sum()) & (
+        extent < SMALL_SIZE * np.linalg.norm(high.max(axis=0) - low.min(axis=0))
+    )
+    small[volumes.argmax()] = False
+    return small
+
+
+def loose_pieces(tetrahedra: Tetrahedra) -> IntArray:
+    """Which piece each vertex belongs to; pieces share no vertex. *Shape:* ``(N,)``."""
+    pairs = np.stack([np.repeat(tetrahedra.tets[:, 0], 3), tetrahedra.tets[:, 1:].reshape(-1)], axis=1)
+    return connected_pieces(pairs, len(tetrahedra.vertices))
 
 
 def pieces_by_sides(tets: IntArray) -> IntArray:
@@ -210,7 +246,7 @@ def pieces_by_sides(tets: IntArray) -> IntArray:
     return connected_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
 
 
-def _kept(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:
+def kept_tetrahedra(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:
     """Some of the tetrahedra, with the vertices that they use."""
     used, compact = np.unique(tetrahedra.tets[kept], return_inverse=True)
     inside = None if tetrahedra.inside is None else tetrahedra.inside[kept]

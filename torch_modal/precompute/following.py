@@ -1,0 +1,107 @@
+"""Loose pieces of tetrahedra: small ones follow the body around them, and motions of whole ones are no modes."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from torch_modal.geometry.connectivity import connected_pieces
+from torch_modal.precompute.embedding import N_NEIGHBOURS, Neighbours, fit_weights
+from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.tetrahedra import Tetrahedra, is_small, kept_tetrahedra, loose_pieces
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+DEFORMS = 1e-6
+"""Part of a motion that is not rigid on each piece of a surface, from which on it deforms that."""
+REACH = 2.0
+"""Size of the part of the body that a piece follows, over its distance from the body or its own size."""
+
+
+class Larger(NamedTuple):
+    """Tetrahedra without small loose pieces.
+
+    Attributes:
+        tetrahedra: The larger pieces.
+        vertices: Which vertices of all theirs are. *Shape:* ``(M,)``.
+        weights: How all vertices move with these; exact for linear displacements. *Shape:* ``(N, M)``.
+    """
+
+    tetrahedra: Tetrahedra
+    vertices: IntArray
+    weights: sp.csr_matrix
+
+
+def larger_pieces(tetrahedra: Tetrahedra) -> Larger:
+    """The tetrahedra without small loose pieces, and how these follow the others.
+
+    A small piece has little mass. Its six rigid motions would be modes of unit mass like all others, and so be larger
+    by orders of magnitude.
+    """
+    n, piece = len(tetrahedra.vertices), loose_pieces(tetrahedra)
+    of_tets = piece[tetrahedra.tets[:, 0]]
+    small = is_small(tetrahedra, of_tets)
+    stays = np.flatnonzero(~small[piece])
+    if len(stays) == n:
+        return Larger(tetrahedra, stays, sp.identity(n, format="csr"))
+    kept = kept_tetrahedra(tetrahedra, ~small[of_tets])
+    rows, weights = [stays], [sp.identity(len(stays), format="csr")]
+    for own in (np.flatnonzero(piece == index) for index in np.flatnonzero(small)):
+        points = tetrahedra.vertices[own]
+        around = np.tile(_around(points, kept.vertices, piece[stays]), (len(own), 1))
+        rows.append(own)
+        weights.append(fit_weights(points, kept.vertices, Neighbours(around, np.ones(around.shape))))
+    order = np.argsort(np.concatenate(rows))
+    return Larger(kept, stays, sp.csr_matrix(sp.vstack(weights, format="csr")[order]))
+
+
+def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArray:
+    """Vertices of one piece near some points, spread over a part of it that is as large as they are far away.
+
+    *Shape:* ``(n, 3), (N, 3), (N,) -> (12,)``.
+    """
+    center = points.mean(axis=0)
+    nearest = int(np.linalg.norm(vertices - center, axis=1).argmin())
+    reach = REACH * max(np.linalg.norm(vertices[nearest] - center), np.linalg.norm(np.ptp(points, axis=0)))
+    distance = np.linalg.norm(vertices - vertices[nearest], axis=1)
+    distance[piece != piece[nearest]] = np.inf
+    near = np.argsort(distance, kind="stable")
+    near = near[: max(int((distance <= reach).sum()), min(N_NEIGHBOURS, int(np.isfinite(distance).sum())))]
+    # Each next one is the furthest from those before.
+    found, apart = [0], distance[near]
+    while len(found) < N_NEIGHBOURS:
+        found.append(int(apart.argmax()))
+        apart = np.minimum(apart, np.linalg.norm(vertices[near] - vertices[near[found[-1]]], axis=1))
+    return near[found]
+
+
+def deforming(motions: FloatArray, surface: Surface) -> FloatArray:
+    """Combinations of motions that deform a surface, without those that only move its pieces against each other.
+
+    Those have no energy at any size, so nothing would say how far in-betweens follow them. Interpolation of the
+    key-frames does. What is one piece of the surface but several of the tetrahedra is deformed by rigid motions of
+    these.
+
+    Args:
+        motions: Orthonormal in the solid. *Shape:* ``(k, U, 3)``.
+        surface: Of ``U`` points.
+
+    Returns:
+        *Shape:* ``(m, U, 3)`` with ``m <= k``.
+    """
+    if len(motions) == 0:
+        return motions
+    pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
+    piece = connected_pieces(pairs, len(surface.points))
+    left = motions.copy()
+    for own in (np.flatnonzero(piece == index) for index in range(piece.max() + 1)):
+        arms = surface.points[own] - surface.points[own].mean(axis=0)
+        turns = np.cross(np.eye(3)[:, None], arms[None])
+        rigid = np.concatenate([np.broadcast_to(np.eye(3)[:, None], turns.shape), turns]).reshape(2 * 3, -1)
+        flat = motions[:, own].reshape(len(motions), -1)
+        left[:, own] = (flat - flat @ np.linalg.pinv(rigid) @ rigid).reshape(len(motions), -1, 3)
+    size = np.linalg.norm(motions)
+    mixes, sizes, _ = np.linalg.svd(left.reshape(len(motions), -1), full_matrices=False)
+    return np.tensordot(mixes[:, sizes > DEFORMS * size].T, motions, 1)
