@@ -454,7 +454,7 @@ def test_an_insert_that_fails_changes_nothing(bars: Shapes, cyclic: bool, t: flo
         with pytest.raises(ValueError, match="finite numbers"):
             editor.insert(t, own.keyframes[0] * math.nan)
     else:
-        with pytest.raises(ValueError, match="lies between|already|finite"):
+        with pytest.raises(ValueError, match=r"lies between|already"):
             editor.insert(t, own.keyframes[0])
     assert editor.path is path
     assert torch.equal(editor.keyframes, own.keyframes)
