@@ -163,6 +163,27 @@ def sheet_surface(cells: tuple[int, int], size: tuple[float, float]) -> tuple[Fl
     return np.stack([x, np.zeros_like(x), z - size[1] / 2], axis=-1).reshape(-1, 3), faces
 
 
+def twisted_plate(thickness: float) -> tuple[FloatArray, FloatArray, IntArray]:
+    """A plate of two sheets and a rim, flat and twisted by 60 degrees, and its faces.
+
+    The sheets are cut along other diagonals, so that the twist moves them through each other if the plate is thin.
+    """
+    u, v = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.5, 0.5, 6), indexing="ij")
+    sheets = [np.stack([u, v, np.full_like(u, z)], -1).reshape(-1, 3) for z in (0.5 * thickness, -0.5 * thickness)]
+    grid = np.arange(u.size).reshape(u.shape)
+    a, b, c, d = (part.reshape(-1) for part in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
+    top = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    bottom = np.concatenate([np.stack([a, d, b], 1), np.stack([b, d, c], 1)]) + u.size
+    loop = np.concatenate([grid[:, 0], grid[-1, 1:], grid[-2::-1, -1], grid[0, -2:0:-1]])
+    after = np.roll(loop, -1)
+    rim = [np.stack([loop, loop + u.size, after + u.size], 1), np.stack([loop, after + u.size, after], 1)]
+    flat = np.concatenate(sheets)
+    x, y, z = flat.T
+    angle = -np.pi / 6 * x
+    turned = np.stack([x, np.cos(angle) * y - np.sin(angle) * z, np.sin(angle) * y + np.cos(angle) * z], 1)
+    return flat, turned, np.concatenate([top, bottom, *rim])
+
+
 def irregular(vertices: FloatArray, faces: IntArray, jitter: float = 0.35) -> tuple[FloatArray, IntArray]:
     """The same surface with vertices moved about within it and some edges turned round.
 

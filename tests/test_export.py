@@ -16,6 +16,7 @@ import trimesh
 
 from torch_modal.io import glb
 from torch_modal.io.frames import save_frames
+from torch_modal.io.read import open_asset
 from torch_modal.view.animation import save_animation
 
 HAND = Path(__file__).parents[1].parent / "shared" / "data" / "mh-hand-path"
@@ -148,6 +149,37 @@ def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypa
     with pytest.raises(OSError):
         save_animation(tetrahedra(), FACES, tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == [old] and old.read_text() == "old"
+
+
+@pytest.mark.parametrize("with_asset", [False, True])
+def test_a_full_disk_leaves_no_part_of_a_sequence(tmp_path, monkeypatch, with_asset):
+    """The disk is full at the fourth frame: those before it are not there either, and older ones stay."""
+    source, out = tmp_path / "source", tmp_path / "out"
+    source.mkdir()
+    (source / "m.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in tetrahedra(1)[0])
+    triangles = "".join("f " + " ".join(map(str, face + 1)) + "\n" for face in np.asarray(FACES))
+    (source / "a.obj").write_text(f"mtllib m.mtl\n{corners}usemtl red\n{triangles}")
+    asset = open_asset(source / "a.obj") if with_asset else None
+    out.mkdir()
+    (out / "frame-001.obj").write_text("old")
+    written, write = [], Path.write_bytes
+
+    def full(self, data):
+        if len(written) == 3 + with_asset:
+            write(self, data[:10])
+            raise OSError(28, "No space left on device", str(self))
+        written.append(self)
+        return write(self, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=r"No space left on device: '[^']*out/frame-003\.obj'"):
+        save_frames(tetrahedra(), FACES, out, "obj", overwrite=True, asset=asset)
+    assert [path.name for path in out.iterdir()] == ["frame-001.obj"]
+    assert (out / "frame-001.obj").read_text() == "old"
+    monkeypatch.undo()
+    assert len(save_frames(tetrahedra(), FACES, out, "obj", overwrite=True, asset=asset)) == 5
+    assert len(list(out.iterdir())) == 5 + with_asset and (out / "frame-001.obj").read_text() != "old"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file modes are a POSIX matter")

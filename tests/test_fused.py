@@ -23,6 +23,7 @@ from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
+from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.sparse import SparseSolver
@@ -403,13 +404,21 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
     assert launch._length(huge[1:], 3, DOUBLE) == 2**31 - 1
 
 
-def test_the_first_of_a_thread_may_have_nothing_to_do() -> None:
+def test_the_first_of_a_thread_may_have_nothing_to_do(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     """Warp gives no command for no threads, so there was none to use again."""
-    record = torch.zeros(5, 4, dtype=torch.int32)
-    x, stretch, bend, energy = (torch.zeros(0, *shape, dtype=DOUBLE) for shape in ((4, 3), (5, 2), (5, 4), ()))
+    shell = tm.InBetween(bars.bases[:2], bars.faces).members[0].fused
+    assert shell is not None
+    none = bars.keyframes[:0]
+    given: list[tuple[Any, ...]] = []
+    monkeypatch.setattr("torch_modal.nn.fused_shell.launch", lambda *call: given.append(call) or launch.launch(*call))
     launch._COMMANDS.known.clear()
-    launch.launch(launch.kernels("shell").value, (0, 5), [x, record, stretch, bend, 4, 1, energy])
-    assert not launch._COMMANDS.known
+    assert shell.volumes(none, none).shape == (0, 2)
+    assert given and not launch._COMMANDS.known
+    # The same kernels take what they are given here.
+    some = bars.keyframes[:2].contiguous()
+    truth = torch.tensor([signed_volume(x.numpy(), bars.faces.numpy()) for x in some], dtype=DOUBLE)
+    torch.testing.assert_close(shell.volumes(some, some), truth[:, None].expand(2, 2).clone())
+    assert len(launch._COMMANDS.known) == 1
 
 
 class TestBackend:

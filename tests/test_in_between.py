@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from bodies import twisted_plate
 from conftest import Shapes, bent_bar, modal, placement_of, random_rotation
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -25,6 +26,7 @@ from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.samples import ConvergenceError, ConvergenceWarning, Samples
 from torch_modal.nn.settings import Solver
 from torch_modal.nn.solver import Status
+from torch_modal.precompute.basis import ModalBasis
 
 DOUBLE = torch.float64
 
@@ -394,6 +396,22 @@ class TestSingleSamples:
         assert x_a.grad is not None and t.grad is not None
         assert bool(x_a.grad[[0, 2]].isfinite().all())
         assert bool(t.grad.isfinite().all())
+
+    @pytest.mark.parametrize("backend", ["torch", "auto"])
+    def test_a_thin_plate_whose_volume_turns_over_has_an_in_between(self, backend: Any) -> None:
+        """One sample beside a mirrored body: the volumes of both turn over."""
+        flat, twisted, faces = map(torch.from_numpy, twisted_plate(1e-3))
+        x, y = flat[:, 0], flat[:, 1]
+        modes = torch.zeros(2, len(flat), 3, dtype=DOUBLE)
+        modes[0, :, 2], modes[1, :, 2] = x * y, x * x - 1 / 3
+        basis = ModalBasis(flat, times(1.0, 2.0), modes, times(*[0.0] * 6))
+        layer = InBetween([basis, basis], faces, solver=Solver(backend=backend))
+        deep = flat * times(1.0, 1.0, 1000.0)
+        firsts, seconds = torch.stack([flat, deep, flat]), torch.stack([twisted, deep * times(1.0, 1.0, -1.0), flat])
+        for after in (seconds, seconds.clone().requires_grad_()):
+            found = layer.solve(firsts, after, 0.5)
+            assert found.solution.usable.tolist() == [True, False, True]
+            assert bool(found.shapes[[0, 2]].isfinite().all())
 
     def test_coincident_key_frames_stay(self, layer: InBetween, bars: Shapes) -> None:
         x = bars.keyframes[0].clone().requires_grad_()

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from bodies import twisted_plate
 
+from torch_modal.geometry import inspect
 from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes, require_solid
 from torch_modal.keyframes.load import load_keyframes
 
@@ -590,6 +593,29 @@ def test_mirrored_pair_is_refused():
         check_keyframes(mirrored, CUBE_FACES)
     rotated = np.stack([CUBE, CUBE * [-1, -1, 1] + 3])  # half a turn is no mirror
     check_keyframes(rotated, CUBE_FACES)
+
+
+@pytest.mark.parametrize("thickness", [1e-4, 1e-3])
+def test_a_thin_plate_whose_volume_turns_over_is_not_mirrored(thickness):
+    flat, twisted, faces = twisted_plate(thickness)
+    volumes = [signed_volume(x, faces) / inspect.diagonals(x[None])[0] ** 3 for x in (flat, twisted)]
+    assert volumes[0] > 1e-6 and volumes[1] < -1e-6
+    both = check_keyframes(np.stack([flat, twisted]), faces)
+    assert not looks_mirrored(both.keyframes[:1], both.keyframes[1:], both.faces).any()
+
+
+def test_mirrored_bodies_in_any_pose_are_refused():
+    """After the best motion, most normals of a hand and its mirror image agree: it is flat."""
+    if not DATA.exists():
+        pytest.skip("needs the meshes in ../shared/data")
+    keyframes, faces = load_keyframes(sorted((DATA / "mh-hand").glob("*.obj")))
+    mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    turn = torch.from_numpy(trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3])
+    i, j = torch.cartesian_prod(*2 * [torch.arange(len(keyframes))]).T
+    assert looks_mirrored(keyframes[i], (5 * mirror * keyframes[j]) @ turn + 3, faces).all()
+    assert not looks_mirrored(keyframes[i], (5 * keyframes[j]) @ turn + 3, faces).any()
+    with pytest.raises(MeshError, match="key-frame 1 is mirrored"):
+        check_keyframes(torch.stack([keyframes[0], mirror * keyframes[2]]), faces)
 
 
 def test_mirrored_open_surface_is_not_seen():

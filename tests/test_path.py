@@ -430,6 +430,41 @@ def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> N
         editor.replace(0, moved * math.nan)
 
 
+@pytest.mark.parametrize("turns", [-2, -1, 1, 3])
+def test_a_key_frame_of_another_period_is_that_of_the_first(motion: Shapes, turns: int) -> None:
+    """Times of a cycle are taken modulo the period: an inserted key-frame too."""
+    own = motion.pick(0, 1, 2)
+    path = Path(own.bases, own.faces, times(0.0, 1.0, 2.0, 4.0), cyclic=True)
+    inside, outside = (tm.PathEditor(path, own.keyframes, steps=2) for _ in range(2))
+    moved = own.keyframes[1] + 0.1
+    assert inside.insert(2.5, moved) == outside.insert(2.5 + 4 * turns, moved) == 3
+    assert outside.path.times.tolist() == [0.0, 1.0, 2.0, 2.5, 4.0]
+    assert torch.equal(outside.path(outside.keyframes, 2.5 + 4 * turns), moved)
+    assert torch.equal(outside.shapes(), inside.shapes())
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+@pytest.mark.parametrize("t", [math.nan, math.inf, -math.inf, 0.2, 0.2 + 1e-16, 0.8, -0.4, 5.0])
+def test_an_insert_that_fails_changes_nothing(bars: Shapes, cyclic: bool, t: float) -> None:
+    own = bars.pick(0, 1, 2)
+    path = Path(own.bases, own.faces, times(0.2, 0.6, 0.8, 1.4)[: 3 + cyclic], cyclic=cyclic)
+    editor = tm.PathEditor(path, own.keyframes, steps=2)
+    before, at = editor.shapes(), editor.times()
+    if cyclic and t == 5.0:
+        with pytest.raises(ValueError, match="finite numbers"):
+            editor.insert(t, own.keyframes[0] * math.nan)
+    else:
+        with pytest.raises(ValueError, match=r"lies between|already"):
+            editor.insert(t, own.keyframes[0])
+    assert editor.path is path
+    assert torch.equal(editor.keyframes, own.keyframes)
+    assert torch.equal(editor.times(), at)
+    assert torch.equal(editor.shapes(), before)
+    moved = own.keyframes[0] + 0.1
+    assert editor.insert(0.7, moved) == 2
+    assert torch.equal(editor.path(editor.keyframes, 0.7), moved)
+
+
 def test_solve_tells_how_it_went(motion: Shapes, path: Path) -> None:
     t = times(0.0, 3.5, 1.2, 0.4)
     with torch.no_grad():

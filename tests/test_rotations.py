@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.nn.blend import Blends, RotationBlend
+from torch_modal.nn.fused_rotations import FusedRotations
 from torch_modal.nn.mid_shape import MidShape
 
 T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
@@ -58,6 +59,32 @@ def test_pieces_have_a_sense_of_their_own() -> None:
     found = rotations(both[None], moved[None], T[2:3])[:, 0].mT
     wanted = torch.cat([ribbon(math.radians(125))[0], ribbon(math.radians(-125))[0]])
     torch.testing.assert_close(found, edges(wanted, mesh), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_most_of_the_area_of_a_piece_says_which_way_it_turns(fused: bool) -> None:
+    """Many small plates turn by more than half a turn, few large ones by less. A tree has its root at either end."""
+    if fused:
+        pytest.importorskip("warp")
+    angles = torch.tensor([*range(300, 190, -10), 160, 120, 80, 40, 0], dtype=torch.float64).deg2rad()
+    lengths = torch.tensor([1.0] * 11 + [10.0] * 5, dtype=torch.float64)
+
+    def rolled(part: float, backwards: bool) -> Tensor:
+        own, long = (x.flip(0) if backwards else x for x in (part * angles, lengths))
+        spine = torch.stack([long * own.cos(), 0 * own, long * own.sin()], -1).cumsum(0)
+        spine = torch.cat([torch.zeros_like(spine[:1]), spine])
+        return torch.cat([spine, spine + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)])
+
+    n_vertices, faces = 2 * len(angles) + 2, ribbon(0.0, len(angles))[1]
+    first, second = (torch.cat([rolled(part, False), rolled(part, True)]) for part in (0.0, 1.0))
+    kind = FusedRotations if fused else LocalRotations
+    mesh = Connectivity(torch.cat([faces, faces + n_vertices]).numpy())
+    rotations = kind(mesh, torch.stack([first, second]))
+    wanted = torch.cat([angles, angles, angles.flip(0), angles.flip(0)])
+    roots = wanted[rotations.ancestors[0] == torch.arange(len(wanted))]
+    assert len(roots) == 2 and float(roots.min()) < math.pi < float(roots.max())
+    found = rotations.turns(first[None], second[None])[0, 0]
+    torch.testing.assert_close(found, (0.5 * wanted).cos(), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -22,12 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from torch_modal.data.motion import Motion
 from torch_modal.geometry.functions import lasting
+from torch_modal.io.tensors import opened, to_bytes
 from torch_modal.precompute.basis import FORMAT as BASIS_FORMAT
 from torch_modal.precompute.basis import VERSION as BASIS_VERSION
 from torch_modal.precompute.basis import ModalBasis
@@ -49,8 +48,8 @@ _PARTS = tuple(field.name for field in fields(ModalBasis))
 class StoredSet:
     """A key-frame set on disk. Opening reads two headers; tensors are mapped into memory when they are asked for.
 
-    The mapping is private: pages that nobody touches are never read, those that are read can be dropped again by the
-    system, and writing into a tensor does not change the file. Pickling keeps the path alone, so that a set can be
+    Each is then compared with its digest. The mapping is private: pages can be dropped again by the system, and writing
+    into a tensor does not change the file. Pickling keeps the path alone, so that a set can be
     handed to worker processes, forked or spawned.
 
     Args:
@@ -67,9 +66,12 @@ class StoredSet:
         self._shape = shapes["keyframes"]
         if len(self._shape) != 3 or self._shape[2] != 3 or len(shapes["faces"]) != 2 or shapes["faces"][1] != 3:
             raise ValueError(f"{self.folder / KEYFRAMES_FILE} needs keyframes (K, V, 3) and faces (F, 3); has {shapes}")
+        try:
+            names, times = json.loads(meta.get("names", "[]")), json.loads(meta.get("times", "null"))
+        except ValueError as error:
+            raise ValueError(f"{self.folder / KEYFRAMES_FILE} is damaged: {error}") from error
         #: Names of the source files, one for each key-frame.
-        self.names: tuple[str, ...] = tuple(json.loads(meta.get("names", "[]")))
-        times = json.loads(meta.get("times", "null"))
+        self.names: tuple[str, ...] = tuple(names)
         #: When the key-frames are, if they are a motion; if cyclic, with the time when the first comes again.
         self.times: tuple[float, ...] | None = times and tuple(times)
         wanted = [f"{i}.{part}" for i in range(len(self)) for part in _PARTS]
@@ -167,10 +169,10 @@ def write_set(
         if motion is not None:
             metadata["times"] = json.dumps(motion.times.tolist())
         # Not safetensors' own save_file: its files are for the owner's eyes alone, whatever the umask says.
-        (fresh / KEYFRAMES_FILE).write_bytes(save_tensors(shapes, metadata))
+        (fresh / KEYFRAMES_FILE).write_bytes(to_bytes(shapes, metadata))
         parts = {f"{i}.{part}": _plain(getattr(basis, part)) for i, basis in enumerate(bases) for part in _PARTS}
         metadata = {"format": BASIS_FORMAT, "version": BASIS_VERSION}
-        (fresh / BASES_FILE).write_bytes(save_tensors(parts, metadata))
+        (fresh / BASES_FILE).write_bytes(to_bytes(parts, metadata))
         for name, content in (beside or {}).items():
             (fresh / name).write_bytes(content)
         _put_in_place(fresh, folder, old)
@@ -283,9 +285,8 @@ def _read_header(
     path: Path, kind: str, version: str, wanted: Sequence[str]
 ) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
     """Metadata and the shapes of the tensors of a file that holds what it should."""
-    with _opened(path) as file:
-        meta = file.metadata() or {}
-        there = set(file.keys())
+    with opened(path) as file:
+        meta, there = file.metadata, file.shapes
         if meta.get("format") != kind:
             raise ValueError(f"{path} is of the format {meta.get('format')!r}, not {kind!r}")
         if meta.get("version") != version:
@@ -293,22 +294,11 @@ def _read_header(
         missing = [name for name in wanted if name not in there]
         if missing:
             raise ValueError(f"{path} lacks the tensors {', '.join(missing[:4])}; compute the set again")
-        return meta, {name: tuple(file.get_slice(name).get_shape()) for name in wanted}
+        return meta, there
 
 
 @lasting
 def _map(path: Path, names: Sequence[str]) -> list[Tensor]:
     """Tensors of a file, mapped into memory; the mapping outlives the handle."""
-    with _opened(path) as file:
-        return [file.get_tensor(name) for name in names]
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Any:
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            yield file
-    except SafetensorError as error:
-        raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
+    with opened(path) as file:
+        return [file.tensor(name) for name in names]

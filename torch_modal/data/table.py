@@ -3,11 +3,10 @@
 import contextlib
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from torch_modal.io.files import write_atomically
+from torch_modal.io.tensors import opened, to_bytes
 
 FORMAT = "torch_modal.between"
 VERSION = "1"
@@ -40,17 +39,17 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
 
 
 def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
-    """A table mapped from disk; None where there is none, or it was made with other settings."""
-    with contextlib.suppress(OSError, SafetensorError), safe_open(path, framework="pt", device="cpu") as file:
-        if file.metadata() == _metadata(key):
-            return file.get_tensor("shapes")
+    """A table mapped from disk; None where there is none, it is damaged, or it was made with other settings."""
+    with contextlib.suppress(OSError, ValueError), opened(path) as file:
+        if file.metadata == _metadata(key):
+            return file.tensor("shapes")
     return None
 
 
 def write_table(path: Path, table: Tensor, key: dict[str, str]) -> None:
     """Keep a table; a folder that cannot be written is passed over, as it can be computed again."""
     with contextlib.suppress(OSError):
-        write_atomically(path, save({"shapes": table.contiguous()}, _metadata(key)))
+        write_atomically(path, to_bytes({"shapes": table}, _metadata(key)))
 
 
 def _metadata(key: dict[str, str]) -> dict[str, str]:

@@ -104,8 +104,7 @@ def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tu
     """
     scale = torch.maximum(t.detach().abs(), times.abs().amax())
     if cyclic:
-        period = times[-1] - times[0]
-        t = t - period * torch.floor((t.detach() - times[0]) / period)
+        t = wrapped(t, times)
     if rounding:
         differences = times - t.detach()[:, None]
         to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
@@ -118,6 +117,12 @@ def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tu
         )
     segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
     return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
+
+
+def wrapped(t: Tensor, times: Tensor) -> Tensor:
+    """Times modulo the period of a cycle. *Shape:* ``(B,)``."""
+    period = times[-1] - times[0]
+    return t - period * torch.floor((t.detach() - times[0]) / period)
 
 
 def around(i: int, times: Tensor, cyclic: bool) -> tuple[int | None, int | None, Spacing]:

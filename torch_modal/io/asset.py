@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshWarning
-from torch_modal.io.write import check_frames, refuse_existing, to_numpy, write_file
+from torch_modal.io.write import check_frames, refuse_existing, to_numpy, write_files
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -157,22 +157,23 @@ class Asset(ABC):
         x = to_numpy(positions)
         self.check(x[None] if x.ndim == 2 else x)
         refuse_existing(path, overwrite)
-        self.write_companions(path.parent, overwrite)
-        write_file(path, self.with_positions(x.astype(np.float64)))
+        write_files([*self.companions_for(path.parent, overwrite), (path, self.with_positions(x.astype(np.float64)))])
         return path
 
-    def write_companions(self, folder: Path, overwrite: bool = False) -> list[Path]:
-        """Write what must lie beside a copy in this folder, unless it is there already."""
-        written = []
+    def companions_for(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
+        """What must lie beside a copy in this folder, and is not there yet.
+
+        Raises:
+            FileExistsError: Another file is there, and ``overwrite`` is off.
+        """
+        missing = []
         for name, data in self.companions.items():
             path = folder / name
             if path.is_file() and path.read_bytes() == data:
                 continue
             refuse_existing(path, overwrite)
-            written.append((path, data))
-        for path, data in written:
-            write_file(path, data)
-        return [path for path, _ in written]
+            missing.append((path, data))
+        return missing
 
     def check(self, frames: Any) -> FloatArray:
         """Refuse frames that are not of this mesh. *Shape:* ``(N, V, 3)``."""

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 
@@ -45,5 +45,18 @@ def write_atomically(path: Path, data: bytes) -> None:
     Raises:
         OSError: As for :func:`temporary_beside`.
     """
-    with temporary_beside(path) as temporary:
-        temporary.write_bytes(data)
+    write_together([(path, data)])
+
+
+def write_together(files: Iterable[tuple[Path, bytes]]) -> None:
+    """Write all files or none: they are moved to their places after the last one was written.
+
+    Args:
+        files: Where each goes, and its whole content. The folders must exist.
+
+    Raises:
+        OSError: As for :func:`temporary_beside`.
+    """
+    with contextlib.ExitStack() as written:
+        for path, data in files:
+            written.enter_context(temporary_beside(path)).write_bytes(data)

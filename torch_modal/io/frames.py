@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from torch_modal.io.write import (
     mesh_bytes,
     refuse_existing,
     to_numpy,
-    write_file,
+    write_files,
 )
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ def save_frames(
         ValueError: ``frames``, ``faces``, ``fmt`` or ``stem`` cannot be used; the message says why.
         FileExistsError: One of the files exists and ``overwrite`` is off; then none is written.
         NotADirectoryError: ``out`` is a file.
+        OSError: A file cannot be written. None is, and those that were there stay.
 
     Warns:
         MeshWarning: The format cannot hold what the asset carries.
@@ -112,16 +114,15 @@ def save_mesh(
 def _write(
     shapes: np.ndarray, faces: np.ndarray, paths: list[Path], fmt: str, asset: Asset | None, overwrite: bool
 ) -> None:
-    """Each shape to its file, all in one folder and of one format; none if one of them may not be written."""
+    """Each shape to its file, all in one folder and of one format; none if one of them cannot be written."""
     for path in paths:
         refuse_existing(path, overwrite)
     same = asset is not None and asset.suffix == f".{fmt}"
+    beside = asset.companions_for(paths[0].parent, overwrite) if asset is not None and same else []
     if asset is not None:
-        if same:
-            asset.write_companions(paths[0].parent, overwrite)
         asset.say_lost(paths[0], _holds(asset, fmt, same))
-    for path, vertices in zip(paths, shapes, strict=True):
-        write_file(path, _bytes(vertices, faces, fmt, asset, same))
+    frames = ((path, _bytes(x, faces, fmt, asset, same)) for path, x in zip(paths, shapes, strict=True))
+    write_files(chain(beside, frames))
 
 
 def _holds(asset: Asset, fmt: str, same: bool) -> tuple[str, ...]:

@@ -6,14 +6,14 @@ Coordinates are written as the caller has them: nothing is centred, scaled or tu
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.io.files import write_atomically
+from torch_modal.io.files import write_together
 
 if TYPE_CHECKING:  # at run time these stay out: a reader of PLY files needs neither
     import torch
@@ -118,9 +118,22 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
 
 def write_file(path: Path, data: bytes) -> None:
     """Write a whole file or nothing; its folder is made if missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, data)
-    logger.debug("wrote %s, %.1f kB", path, len(data) / 1000)
+    write_files([(path, data)])
+
+
+def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
+    """Write all files or none; their folders are made if missing."""
+    sizes = {}
+
+    def noted() -> Iterator[tuple[Path, bytes]]:
+        for path, data in files:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            sizes[path] = len(data) / 1000
+            yield path, data
+
+    write_together(noted())
+    for path, size in sizes.items():
+        logger.debug("wrote %s, %.1f kB", path, size)
 
 
 def _ply_bytes(vertices: FloatArray, faces: IntArray) -> bytes:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry import inspect
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 __all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_solid"]
@@ -277,13 +278,17 @@ def _check_surface(
         )
     elif orientable and not (counts % 2).any():
         volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
-        positive, negative = int(volumes.argmax()), int(volumes.argmin())
-        if volumes[positive] > _FLATNESS and volumes[negative] < -_FLATNESS:
-            raise MeshError(
-                f"key-frame {max(positive, negative)} is mirrored: its faces wind the other way round than "
-                f"those of key-frame {min(positive, negative)}, seen from outside, and no motion without "
-                "passing through itself leads from one to the other; mirror it back (negate one coordinate)"
-            )
+        positive, turned = int(volumes.argmax()), np.flatnonzero(volumes < -_FLATNESS)
+        if volumes[positive] > _FLATNESS and len(turned):
+            first, others = (torch.from_numpy(scaled[rows]) for rows in ([positive] * len(turned), turned))
+            turned = turned[looks_mirrored(first, others, torch.tensor(faces)).numpy()]
+            if len(turned):
+                few, many = sorted((positive, int(turned[volumes[turned].argmin()])))
+                raise MeshError(
+                    f"key-frame {many} is mirrored: its faces wind the other way round than those of key-frame "
+                    f"{few}, seen from outside, and no motion without passing through itself leads from one to the "
+                    "other; mirror it back (negate one coordinate)"
+                )
 
 
 def _seam_hint(vertices: NDArray[np.float64], boundary: NDArray[np.int64]) -> str:

@@ -14,6 +14,7 @@ from torch_modal.energy.terms import Mesh, Term
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.functions import traced, transformed
 from torch_modal.geometry.vectors import cross, pick
+from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.blend import Blends
@@ -353,7 +354,7 @@ class Between(nn.Module):
         self._warn_of_size(sizes)
         usable = sizes > SMALLEST_SIZE * DIAGONAL
         if self.closed:
-            usable = usable & ~(self.fused.volumes(pair.first, pair.second).prod(-1) < 0)
+            usable = usable & ~self._mirrored(pair, self.fused.volumes(pair.first, pair.second).prod(-1) < 0)
         return pair, usable
 
     def _warn_of_size(self, sizes: Tensor) -> None:
@@ -375,10 +376,7 @@ class Between(nn.Module):
         )
 
     def _solvable(self, pair: Pair) -> Tensor:
-        """Whether both ends have a size, and, where closed, the same side out: else the volume would vanish on the way.
-
-        *Shape:* ``(P,)``.
-        """
+        """Whether both ends have a size, and none, where closed, is a mirror image. *Shape:* ``(P,)``."""
         # Rows that lie together in memory are looked through several times as fast.
         ends = [x.detach().movedim(-1, 0).contiguous() for x in (pair.first, pair.second)]
         sizes = [(x.amax(-1) - x.amin(-1)).norm(dim=0) for x in ends]
@@ -387,7 +385,13 @@ class Between(nn.Module):
         if not self.closed:
             return usable
         first, second = (_enclosed(x, self.frame.faces) for x in ends)
-        return usable & ~(first * second < 0)
+        return usable & ~self._mirrored(pair, first * second < 0)
+
+    def _mirrored(self, pair: Pair, turned: Tensor) -> Tensor:
+        """Which samples have a mirror image, of those whose volumes have turned over. *Shape:* ``(P,)``."""
+        if not traced(turned) and not transformed(turned) and not turned.any():
+            return turned
+        return turned & looks_mirrored(pair.first, pair.second, self.frame.faces)
 
 
 def _enclosed(rows: Tensor, faces: Tensor) -> Tensor:

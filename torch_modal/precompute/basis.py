@@ -1,18 +1,15 @@
 """The vibration modes of one key-frame, as tensors."""
 
-import json
 import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 
 from torch_modal.geometry.functions import lasting, outlasting
 from torch_modal.io.files import write_atomically
+from torch_modal.io.tensors import from_bytes, to_bytes
 
 FORMAT = "torch_modal.precompute.basis"
 VERSION = "1"
@@ -117,8 +114,8 @@ class ModalBasis:
         Raises:
             OSError: The file cannot be written.
         """
-        tensors = {name: tensor.cpu().contiguous() for name, tensor in self._tensors().items()}
-        write_atomically(Path(path), save_tensors(tensors, {"format": FORMAT, "version": VERSION}))
+        tensors = {name: tensor.cpu() for name, tensor in self._tensors().items()}
+        write_atomically(Path(path), to_bytes(tensors, {"format": FORMAT, "version": VERSION}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "ModalBasis":
@@ -134,12 +131,7 @@ class ModalBasis:
             FileNotFoundError: There is no such file.
             ValueError: The file is damaged, holds something else, or has another format version.
         """
-        data = Path(path).read_bytes()
-        try:
-            tensors = load_tensors(data)
-        except SafetensorError as error:
-            raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
-        metadata = _metadata(data)
+        tensors, metadata = from_bytes(Path(path).read_bytes(), Path(path))
         if metadata.get("format") != FORMAT:
             raise ValueError(f"{path} holds no modal basis: its format is {metadata.get('format')!r}, not {FORMAT!r}")
         if metadata.get("version") != VERSION:
@@ -154,9 +146,3 @@ class ModalBasis:
             return cls(**{name: tensors[name] for name in names})
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-
-
-def _metadata(data: bytes) -> dict[str, str]:
-    """Metadata of a valid safetensors file: the header is JSON after eight bytes that hold its length."""
-    length = int.from_bytes(data[:8], "little")
-    return json.loads(data[8 : 8 + length]).get("__metadata__", {})

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from torch_modal.errors import MeshError
+from torch_modal.io import tensors as files
 from torch_modal.io.files import write_atomically
 from torch_modal.sequence.codec_modes import N_SEEDS, FixedModes, fixed_modes
 from torch_modal.sequence.codec_packing import PACKED, unpack
@@ -49,8 +48,9 @@ def write_exact(fields: Mapping[str, Any], path: Path) -> None:
 def to_bytes(tensors: dict[str, Tensor], header: dict[str, Any]) -> bytes:
     """A file. The metadata is one entry: safetensors does not keep the order of several."""
     whole = {"format": FORMAT, "version": VERSION, **header}
-    parts = {name: part.contiguous() for name, part in tensors.items()}
-    return save_tensors(parts, {"torch_modal": json.dumps(whole, sort_keys=True, separators=(",", ":"))})
+    metadata = {"torch_modal": json.dumps(whole, sort_keys=True, separators=(",", ":"))}
+    # Packed numbers have a digest of their own.
+    return save_tensors(tensors, metadata) if tensors.keys() == {"packed"} else files.to_bytes(tensors, metadata)
 
 
 def probe(modes: FixedModes) -> Tensor:
@@ -69,11 +69,8 @@ def read(path: Path, cache_dir: str | None = None, cache: bool = True) -> dict[s
 
 def read_bytes(data: bytes, path: Path | str, cache_dir: str | None = None, cache: bool = True) -> dict[str, Any]:
     """The same of what was read."""
-    try:
-        tensors = load_tensors(data)
-    except (SafetensorError, ValueError, OverflowError, KeyError) as error:
-        raise ValueError(f"{path} is no .tms file, or a damaged one: {error}") from error
-    header = _header(data, path)
+    tensors, metadata = files.from_bytes(data, path, ".tms")
+    header = _header(metadata, path)
     try:
         if header.get("coding") == "exact":
             parts = _checked_exact(tensors)
@@ -89,10 +86,9 @@ def read_bytes(data: bytes, path: Path | str, cache_dir: str | None = None, cach
         raise ValueError(f"{path} cannot be read: {error}") from error
 
 
-def _header(data: bytes, path: Path | str) -> dict[str, Any]:
-    size = int.from_bytes(data[:8], "little")
+def _header(metadata: dict[str, str], path: Path | str) -> dict[str, Any]:
     try:
-        header = json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["torch_modal"])
+        header = json.loads(metadata["torch_modal"])
     except (KeyError, TypeError, ValueError, RecursionError):
         raise ValueError(f"{path} holds no motion: it is another safetensors file") from None
     if not isinstance(header, dict) or header.get("format") != FORMAT:

@@ -53,20 +53,20 @@ class PathEditor:
         """Pin the motion at a time: the shape becomes a key-frame.
 
         Args:
-            t: When, between the others.
+            t: When, between the others; modulo the period, if the path is cyclic.
             shape: *Shape:* ``(V, 3)``. Default: where the motion passes then.
 
         Returns:
             Number of the new key-frame.
 
         Raises:
-            ValueError: The time is outside, or that of a key-frame; the shape does not fit.
+            ValueError: The time is outside, or that of a key-frame; the shape does not fit. Nothing is changed then.
         """
         if shape is None:
             shape = lasting(self.path)(self.keyframes, t)
         shape = self._checked(shape)
         path = self.path.insert(t)
-        i = int((path.times < t).sum())
+        i = int((path.times[:-1] == self.path.times).cumprod(0).sum())  # up to there, all times are as before
         self.keyframes = torch.cat([self.keyframes[:i], shape[None], self.keyframes[i:]])
         self._shapes = [*self._shapes[:i], None, *self._shapes[i:]]
         self.path = path

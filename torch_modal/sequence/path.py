@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.functions import broadcast_shapes, lasting
-from torch_modal.geometry.hermite import Spacing, around, located
+from torch_modal.geometry.hermite import Spacing, around, located, wrapped
 from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
 from torch_modal.nn.samples import InBetweenResult, Samples
@@ -25,6 +25,9 @@ from torch_modal.sequence.contact import push_apart
 
 # Even times between two key-frames at which a path looks for contacts.
 N_SEARCHED = 31
+
+# Times that differ by no more than rounding, relative to the larger one, are the same.
+SAME_TIME = 2e-15
 
 
 class _Lazy(InBetween):
@@ -107,24 +110,27 @@ class Path(nn.Module):
         """The same motion with one more key-frame, which borrows the modes of those around it, as in the paper.
 
         Args:
-            t: When it is, between the others.
+            t: When it is, between the others; modulo the period, if cyclic.
 
         Returns:
             A path of one more key-frame, with the same layer.
 
         Raises:
-            ValueError: The time is outside, or that of a key-frame.
+            ValueError: The time is outside, not finite, or that of a key-frame.
         """
-        i = int(located(self.times.new_tensor([t]), self.times, self.cyclic)[0])
-        if bool((self.times == t).any()):
+        at = self.times.new_tensor([t])
+        i = int(located(at, self.times, self.cyclic)[0])
+        if self.cyclic:
+            at = wrapped(at, self.times)
+        # Modulo the period, a key-frame's time comes out with rounding.
+        scale = torch.maximum(self.times.abs().amax(), self.times.new_tensor(abs(t)))
+        if bool(((self.times - at).abs() <= SAME_TIME * scale).any()):
             raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
         other = Path.__new__(Path)
         nn.Module.__init__(other)
         other.layer, other.cyclic, other.smooth, other.contact = self.layer, self.cyclic, self.smooth, self.contact
         other.members = [*self.members[: i + 1], *self.members[i:]]
-        other.register_buffer(
-            "times", torch.cat([self.times[: i + 1], self.times.new_tensor([t]), self.times[i + 1 :]])
-        )
+        other.register_buffer("times", torch.cat([self.times[: i + 1], at, self.times[i + 1 :]]))
         return other
 
     def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:

@@ -34,6 +34,8 @@ class Map(NamedTuple):
     """*Shape:* ``(n_first,)``."""
     score: float
     """Right maps of one subject reach 0.7 and more, wrong ones hardly; see `rate`."""
+    mirrored_score: float = -np.inf
+    """The same if the target were mirrored; known of those that `spectral_maps` finds."""
 
 
 def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
@@ -72,12 +74,17 @@ def rate(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int
 
     Mirrored maps turn all area over, and so lose.
     """
+    return rates(first, second, vertices, k)[0]
+
+
+def rates(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int) -> tuple[float, float]:
+    """The same, and what it would be if the second shape were mirrored."""
     k = min(k, first.functions.shape[1], second.functions.shape[1])
     functional = functional_map(first, second, vertices, k)
     back = nearest_rows(second.functions[:, :k] @ functional.T, first.functions[:, :k])
-    kept = min(_oriented_area(first, second, vertices), _oriented_area(second, first, back))
-    away = np.linalg.norm(first.coarse.vertices[back[vertices]] - first.coarse.vertices, axis=1)
-    return float(kept - _ROUND_TRIP * away.mean())
+    kept = _oriented_area(first, second, vertices), _oriented_area(second, first, back)
+    away = np.linalg.norm(first.coarse.vertices[back[vertices]] - first.coarse.vertices, axis=1).mean()
+    return float(min(kept) - _ROUND_TRIP * away), float(-max(kept) - _ROUND_TRIP * away)
 
 
 def _oriented_area(first: SpectralShape, second: SpectralShape, vertices: IntArray) -> float:
@@ -120,7 +127,7 @@ def spectral_maps(
     keep: int = 4,
     tick: Callable[[], None] = lambda: None,
 ) -> list[Map]:
-    """The best maps that spectra alone give, best first.
+    """The best maps that spectra alone give, best first; the last is the best one of the mirrored target.
 
     Eigenfunctions have no sign: all patterns of signs of the lowest are starts, beside wave kernel signatures and the
     rigid placements by principal axes. Each is refined a little, and the best to the end.
@@ -135,14 +142,14 @@ def spectral_maps(
     coarse = []
     for vertices, k in _starts(first, second, n_signs):
         vertices = zoom_out(first, second, vertices, k, COARSE_FUNCTIONS)
-        coarse.append(Map(vertices, rate(first, second, vertices, COARSE_FUNCTIONS)))
+        coarse.append(Map(vertices, *rates(first, second, vertices, COARSE_FUNCTIONS)))
         tick()
     coarse.sort(key=lambda found: -found.score)
     fine = []
-    for found in coarse[:keep]:
+    for found in [*coarse[:keep], max(coarse, key=lambda found: found.mirrored_score)]:
         vertices = zoom_out(first, second, found.vertices, COARSE_FUNCTIONS, FINE_FUNCTIONS)
-        fine.append(Map(vertices, rate(first, second, vertices, FINE_FUNCTIONS)))
-    return sorted(fine, key=lambda found: -found.score)
+        fine.append(Map(vertices, *rates(first, second, vertices, FINE_FUNCTIONS)))
+    return [*sorted(fine[:-1], key=lambda found: -found.score), fine[-1]]
 
 
 def _starts(first: SpectralShape, second: SpectralShape, n_signs: int) -> Iterator[tuple[IntArray, int]]:

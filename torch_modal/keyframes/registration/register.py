@@ -26,12 +26,21 @@ from torch_modal.keyframes.registration.maps import (
     zoom_out,
 )
 from torch_modal.keyframes.registration.report import Quality, Registration, judge, measure
-from torch_modal.keyframes.registration.spectrum import SpectralShape
-from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Surface, outward, referenced
+from torch_modal.keyframes.registration.spectrum import CUT, SpectralShape
+from torch_modal.keyframes.registration.surface import (
+    FloatArray,
+    IntArray,
+    Surface,
+    largest_piece,
+    outward,
+    referenced,
+    sewn,
+    without_dust,
+)
 from torch_modal.keyframes.seams import weld_seams
 from torch_modal.progress import Progress, ProgressReport
 
-VERSION = 3
+VERSION = 4
 """Part of the key of kept results: raise it when the algorithm changes."""
 FEWEST_ACROSS = 5
 """Landmarks that two different subjects need: their spectra do not tell which map is right."""
@@ -148,10 +157,12 @@ class _Problem:
         self.same_subject, self.progress = same_subject, progress
         rest = template[0]
         goal, self.target_vertices = referenced(target[0], outward(*target))
-        self.unit, self.origin = goal.diagonal / WORKING_DIAGONAL, goal.vertices.mean(0)
+        # Neither size is that of pieces beside the body, such as a stray sphere.
+        body = largest_piece(sewn(without_dust(goal), CUT))
+        self.unit, self.origin = body.diagonal / WORKING_DIAGONAL, body.vertices.mean(0)
         self.target = goal.moved((goal.vertices - self.origin) / self.unit)
         own, self.used = referenced(rest, outward(*template))
-        self.size = np.sqrt(self.target.area / own.area)
+        self.size = np.sqrt(body.area / largest_piece(sewn(without_dust(own), CUT)).area) / self.unit
         self.rest = rest * self.size
         self.template = own.moved(own.vertices * self.size)
         self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
@@ -159,6 +170,8 @@ class _Problem:
         self.consistency = Consistency(self.first, self.second)
         self.marks = points.template * self.size
         self.mark_places = (points.target - self.origin) / self.unit
+        #: Score minus distortion of the best map onto the mirrored target.
+        self.mirrored = -np.inf
 
     def solve(self) -> Registration:
         rivals = self._rivals(self._maps())
@@ -174,13 +187,14 @@ class _Problem:
             return maps + [one for one in self._spectral() if self._agrees(one)] if self.same_subject else maps
         maps = self._spectral()
         if maps[0].score < _SURE_SCORE:
-            self.progress.expect(2**_MORE_SIGNS + N_OTHER_STARTS)
-            maps += spectral_maps(self.first, self.second, _MORE_SIGNS, tick=self.progress.update)
+            maps += self._spectral(_MORE_SIGNS)
         return maps
 
-    def _spectral(self) -> list[Map]:
-        self.progress.expect(2**_SIGNS + N_OTHER_STARTS)
-        return spectral_maps(self.first, self.second, _SIGNS, tick=self.progress.update)
+    def _spectral(self, n_signs: int = _SIGNS) -> list[Map]:
+        self.progress.expect(2**n_signs + N_OTHER_STARTS)
+        *maps, other = spectral_maps(self.first, self.second, n_signs, tick=self.progress.update)
+        self.mirrored = max(self.mirrored, other.mirrored_score - self.consistency.distortion(other.vertices))
+        return maps
 
     @cached_property
     def _pairs(self) -> IntArray:
@@ -298,8 +312,9 @@ class _Problem:
         if len(self.marks):
             rows = self.template.rows(self.template.closest(self.marks))
             errors = np.linalg.norm(rows @ x - self.mark_places, axis=1) * (100 / WORKING_DIAGONAL)
+        lead = float(self.mirrored - (score - distortion))
         confidence, said = judge(
-            quality, score, distortion, errors, same_subject=self.same_subject, landmarks=bool(len(self.marks))
+            quality, score, distortion, errors, lead, same_subject=self.same_subject, landmarks=bool(len(self.marks))
         )
         closest = self.target.closest(everything)
         corners = self.target_vertices[self.target.faces[closest.faces]]
@@ -313,6 +328,8 @@ class _Problem:
             stretch=quality.stretch,
             flipped_area=quality.flipped_area,
             folds=quality.folds,
+            unsupported_area=quality.unsupported_area,
+            mirrored_lead=lead,
             landmark_errors=torch.from_numpy(errors),
             target_faces=torch.from_numpy(closest.faces),
             barycentric=torch.from_numpy(self.target.barycentric(closest)),

@@ -9,10 +9,15 @@ from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
-from torch_modal.keyframes.registration.surface import FloatArray, Surface
+from torch_modal.keyframes.registration.fit import on_open_edge
+from torch_modal.keyframes.registration.surface import BoolArray, FloatArray, Surface, referenced
 
 TRUSTED = 0.5
 """Confidence below which a result is doubtful."""
+
+_FAR = 0.01  # from the target, in diagonals, is without it
+_SHRUNK = 0.2  # of the median change of area: what is missing collapses
+_APART = 0.03  # pieces of the target that are further from the template, in its diagonals, belong to something else
 
 
 class Distances(NamedTuple):
@@ -44,6 +49,8 @@ class Quality(NamedTuple):
     """Part of the template's area that looks against the target."""
     folds: int
     """Edges at which two faces that were at most at right angles now lie nearly back to back."""
+    unsupported_area: float
+    """Part of the template's area without target beside it: its place is extrapolated."""
 
     @property
     def cost(self) -> float:
@@ -54,6 +61,7 @@ class Quality(NamedTuple):
 def measure(template: Surface, x: FloatArray, target: Surface) -> Quality:
     """The quality of a shape of the template against the target."""
     shape = template.moved(x)
+    target = _without_strays(target, shape)
     i, j = shape.edges.T
     now, rest = (np.linalg.norm(p[i] - p[j], axis=1) for p in (x, template.vertices))
     usable = (now > 0) & (rest > 0)
@@ -69,7 +77,29 @@ def measure(template: Surface, x: FloatArray, target: Surface) -> Quality:
         float(np.sqrt(np.mean((logs - np.median(logs)) ** 2))) if len(logs) else 0.0,
         float(template.face_areas[against].sum() / template.area),
         int(((cosines[0] > 0) & (cosines[1] < -0.5)).sum()),
+        float(template.face_areas[_unsupported(template, shape, target)].sum() / template.area),
     )
+
+
+def _without_strays(target: Surface, shape: Surface) -> Surface:
+    """The target without its pieces that lie apart from the laid-on template; all of it, if all do."""
+    pieces = target.connectivity.vertex_pieces
+    if pieces.max() == 0:
+        return target
+    nearest = np.full(pieces.max() + 1, np.inf)
+    np.minimum.at(nearest, pieces, shape.closest(target.vertices).distances)
+    kept = (nearest <= _APART * shape.diagonal)[pieces[target.faces[:, 0]]]
+    return referenced(target.vertices, target.faces[kept])[0] if kept.any() else target
+
+
+def _unsupported(template: Surface, shape: Surface, target: Surface) -> BoolArray:
+    """Faces far from the target, beside a hole of it, or squeezed to nearly nothing. *Shape:* ``(F,)``."""
+    closest = target.closest(shape.vertices[shape.faces].mean(1))
+    open_there = on_open_edge(target, closest) & ~shape.on_boundary[shape.faces].any(1)
+    change = shape.face_areas / np.maximum(template.face_areas, 1e-30)
+    usual = np.median(change[template.face_areas > 0])
+    found: BoolArray = (closest.distances > _FAR * target.diagonal) | open_there | (change < _SHRUNK * usual)
+    return found
 
 
 class Registration(NamedTuple):
@@ -96,6 +126,10 @@ class Registration(NamedTuple):
     """Part of the template's area that looks against the target."""
     folds: int
     """Edges at which the template is folded over itself."""
+    unsupported_area: float
+    """Part of the template's area without target beside it, such as a limb that is missing there."""
+    mirrored_lead: float
+    """By how much a mirrored map beats this one, in score minus distortion; negative where it does not."""
     landmark_errors: torch.Tensor
     """From each landmark to its place. *Shape:* ``(n,)``."""
     target_faces: torch.Tensor
@@ -167,7 +201,7 @@ class Registration(NamedTuple):
             f"confidence {self.confidence:.2f}, distance {self.to_target.mean:.3f} % there and "
             f"{self.from_target.mean:.3f} % back (at most {max(self.to_target.max, self.from_target.max):.1f} %), "
             f"stretch {100 * self.stretch:.0f} %, flipped area {100 * self.flipped_area:.1f} %, "
-            f"{self.folds} folds{marks}"
+            f"{self.folds} folds, without target {100 * self.unsupported_area:.1f} %{marks}"
         )
 
 
@@ -181,6 +215,7 @@ def judge(
     map_score: float,
     distortion: float,
     landmark_errors: FloatArray,
+    mirrored_lead: float,
     *,
     same_subject: bool,
     landmarks: bool,
@@ -193,10 +228,15 @@ def judge(
     signs = [
         (_ramp(distance, 1.0, 0.3), f"the surfaces are {distance:.2f} % of the diagonal apart in the mean"),
         (_ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
+        (
+            _ramp(quality.unsupported_area, 0.10, 0.02),
+            f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
+        ),
     ]
     if same_subject:
         said_of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
         signs.append((_ramp(map_score - distortion, 0.32, 0.70), said_of_map))
+        signs.append((_ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"))
         signs.append((_ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"))
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
