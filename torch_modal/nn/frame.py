@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.functions import applied
@@ -18,17 +17,13 @@ from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, square
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.nn.columns import Columns, Directions
-from torch_modal.nn.resolution import MOST_SPREAD, spread, stretching
-from torch_modal.precompute.coarsening import Coarsening, Collapses, coarsen
+from torch_modal.nn.resolution import resolving
+from torch_modal.precompute.coarsening import Coarsening, Collapses
 
 Collapsing = Callable[[int, int], Coarsening]
 
 # Combinations of columns whose squared norm is below this part of the largest are rounding, not directions.
 DEPENDENT = 1e-9
-
-# Where a coarse mesh does not resolve the modes, more faces are tried, up to so many; more than that are not checked.
-ENOUGH_FACES = 1000
-MORE = 1.5
 
 
 class Around(NamedTuple):
@@ -164,7 +159,7 @@ class Coarse(nn.Module):
         modes: Tensor | None,
     ) -> None:
         super().__init__()
-        coarsening = _resolving(shapes, faces, n_faces, collapses, modes)
+        coarsening = resolving(shapes, faces, n_faces, collapses, modes)
         clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
         member = torch.from_numpy(coarsening.clusters >= 0).double()
         per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
@@ -328,24 +323,6 @@ def vertex_excess(pair: Pair) -> Excess:
     earlier = None if before is None else pair.first - before
     later = None if after is None else after - pair.second
     return excess(step, earlier, later, Spacing(*(h[:, None, None] for h in spacing)), squared_length)
-
-
-def _resolving(
-    shapes: Tensor, faces: Tensor, n_faces: int, collapses: Collapsing | None, modes: Tensor | None
-) -> Coarsening:
-    """A coarse mesh of so many faces, or of more, where those do not resolve the modes. Arguments as for `Coarse`."""
-    found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
-    if modes is None or len(modes) == 0 or n_faces >= min(ENOUGH_FACES, len(faces)):
-        return found
-    fine = stretching(Mesh.of(faces, shapes.shape[1]), shapes[0], modes)
-    while n_faces < min(ENOUGH_FACES, len(faces)):
-        mesh = Mesh.of(torch.from_numpy(found.faces), found.n_vertices)
-        x, moves = (torch.from_numpy(found.restrict(part.numpy())) for part in (shapes[0], modes))
-        if spread(fine, stretching(mesh, x, moves)) <= MOST_SPREAD:
-            break
-        n_faces = min(round(MORE * n_faces), ENOUGH_FACES)
-        found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
-    return found
 
 
 def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:

@@ -1,16 +1,55 @@
-"""Whether a coarse mesh resolves the modes of a shape."""
+"""As many coarse faces as it takes to resolve the modes of a shape."""
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.terms import Mesh, Stretch
+from torch_modal.precompute.coarsening import Coarsening, coarsen
+
+ENOUGH_FACES = 1000
+"""Up to so many are tried; coarse meshes of more are not checked."""
+MORE = 1.5
+"""As many times the faces are tried next."""
 
 MOST_SPREAD = 20.0
 """Largest over smallest ratio of coarse to fine stiffness that is accepted. Of bodies without thin limbs 300 faces have
 5 to 35; where results were wrong, they had 60 to 5,000."""
 RIDGE = 1e-6
 """Relative stiffness below which directions are not compared: those in which loose pieces move rigidly."""
+
+
+def resolving(
+    shapes: Tensor,
+    faces: Tensor,
+    n_faces: int,
+    collapses: Callable[[int, int], Coarsening] | None,
+    modes: Tensor | None,
+) -> Coarsening:
+    """A coarse mesh of so many faces, or of more, where those do not resolve the modes.
+
+    Args:
+        shapes: Float64 on the CPU. *Shape:* ``(2, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_faces: How many are wanted.
+        collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`.
+        modes: Of the first shape; None if it does not matter. *Shape:* ``(k, V, 3)``.
+    """
+    found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
+    enough = min(ENOUGH_FACES, len(faces))
+    if modes is None or len(modes) == 0 or n_faces >= enough:
+        return found
+    fine = stretching(Mesh.of(faces, shapes.shape[1]), shapes[0], modes)
+    while n_faces < enough:
+        mesh = Mesh.of(torch.from_numpy(found.faces), found.n_vertices)
+        x, moves = (torch.from_numpy(found.restrict(part.numpy())) for part in (shapes[0], modes))
+        if spread(fine, stretching(mesh, x, moves)) <= MOST_SPREAD:
+            break
+        n_faces = min(round(MORE * n_faces), ENOUGH_FACES)
+        found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
+    return found
 
 
 def stretching(mesh: Mesh, x: Tensor, modes: Tensor) -> Tensor:
