@@ -14,9 +14,9 @@ ENOUGH_FACES = 1000
 MORE = 1.5
 """As many times the faces are tried next."""
 
-MOST_SPREAD = 20.0
+MOST_SPREAD = 40.0
 """Largest over smallest ratio of coarse to fine stiffness that is accepted. Of bodies without thin limbs 300 faces have
-5 to 35; where results were wrong, they had 60 to 5,000."""
+5 to 37; where results were wrong, they had 60 to 5,000."""
 RIDGE = 1e-6
 """Relative stiffness below which directions are not compared: those in which loose pieces move rigidly."""
 
