@@ -57,8 +57,8 @@ def test_a_bent_bar_is_filled_as_it_bends(carrier: Carrier) -> None:
 
 def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) -> None:
     points = bent(POINTS, np.pi)
-    bar = Surface(POINTS, COMPACT, USED, 1.0)
-    carried = Filling(Body(bar, BAR), Surface(points, COMPACT, USED, 1.0), carrier.carry(points).tetrahedra)
+    bar = Surface(POINTS, COMPACT, USED, 1.0, np.eye(3))
+    carried = Filling(Body(bar, BAR), Surface(points, COMPACT, USED, 1.0, np.eye(3)), carrier.carry(points).tetrahedra)
     truth = Tetrahedra(bent(BAR.vertices, np.pi), BAR.tets)
     found = lowest_modes(arap_hessian(carried.tetrahedra), carried.mass(), carried.tetrahedra.vertices, 8)
     wanted = lowest_modes(arap_hessian(truth), mass_matrix(truth), truth.vertices, 8)
@@ -149,7 +149,8 @@ def test_parting_is_of_what_touched_and_came_apart() -> None:
     faces = np.unique(surface(fine), return_inverse=True)[1].reshape(-1, 3)
     closed, ajar, opened = (Surface.of(horseshoe(angle), faces) for angle in (1.995 * np.pi, 1.9 * np.pi, 0.5))
     # Both ends, of 1 by 1 and of 66 in all, part by most of the length of 16, and half of that is counted for each.
-    expected = np.linalg.norm(opened.points[0] - opened.points[-1]) / 2 * np.sqrt(2 / 66) / 100
+    apart = np.linalg.norm(opened.points[0] - opened.points[-1]) * closed.scale / opened.scale
+    expected = apart / 2 * np.sqrt(2 / 66) / 100
     assert parting(closed, opened) == pytest.approx(expected, rel=0.4)
     assert parting(closed, ajar) < 0.3 * parting(closed, opened)
     assert parting(opened, closed) < 0.001

@@ -1,5 +1,7 @@
 """Clusters of vertices: a total, linear restriction, and a coarse energy that means what the fine one does."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -146,6 +148,15 @@ def test_no_triangle_has_its_corners_on_a_line() -> None:
         sides = corners - np.roll(corners, 1, axis=2)
         area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
         assert (area / (sides**2).sum(-1).max(-1)).min() > 1e-3
+
+
+@pytest.mark.parametrize("n_faces", [1150, 1400, 1600, 1800])
+def test_meshes_of_few_more_faces_than_wanted(data_dir: Path, n_faces: int) -> None:
+    """Of 1,820 faces: where needles remain, more are tried, but never as many as there are."""
+    with np.load(data_dir / "animals" / "trex.npz") as file:
+        keyframes, faces = file["frames"][[0, 10]].astype(np.float64), file["faces"].astype(np.int64)
+    for shapes in (keyframes, keyframes[:1]):
+        assert n_faces / 2 < len(coarsen(shapes, faces, n_faces).faces) < len(faces)
 
 
 def test_pairs_share_the_collapses_of_a_key_frame(

@@ -161,7 +161,7 @@ def test_another_version_of_the_mesher_makes_its_own_tetrahedra(
         return capsule_tetrahedra
 
     monkeypatch.setattr(filling, "tetrahedralize", mesher)
-    surface = Surface(*capsule, np.arange(len(capsule[0])), 1.0)
+    surface = Surface(*capsule, np.arange(len(capsule[0])), 1.0, np.eye(3))
     for installed in ("0.4.2", "0.4.3", "0.4.2"):
         monkeypatch.setattr(filling, "version", lambda _, installed=installed: installed)
         filling.Filler(COARSE, "tetwild", 1.0, Cache.at(tmp_path)).body(surface)

@@ -12,7 +12,7 @@ from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.vectors import cross, inverse, norm
 
 GAP = 0.15
-"""The distance that is kept, at a bounding-box diagonal of 100."""
+"""The distance that is kept, at a size of 100."""
 STIFFNESS = 3000.0
 """``k``, at that size; stretching has 500."""
 

@@ -11,10 +11,11 @@ from torch_modal.geometry.functions import broadcast_shapes, lasting
 from torch_modal.keyframes.arrays import as_faces
 
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
-"""The paper's stiffnesses, for shapes of a bounding-box diagonal of 100."""
+"""The paper's stiffnesses, for shapes of a size of 100."""
 
 DIAGONAL = 100.0
-"""Eq. 5 is not scale-invariant: its stiffnesses are meant for shapes of this bounding-box diagonal."""
+"""Eq. 5 is not scale-invariant: its stiffnesses are meant for shapes of this size, which is that of
+:func:`torch_modal.geometry.canonical.size`, for rods and spheres the bounding-box diagonal."""
 
 
 class Measures(NamedTuple):
@@ -50,7 +51,7 @@ class ShellEnergy(nn.Module):
 
     Angle differences are wrapped. The volume is taken relative to the centroid, so that the energy of an open surface
     does not change with a translation either. The three terms scale differently with size: the defaults are meant
-    for shapes with a bounding-box diagonal of about 100.
+    for shapes whose radius of gyration, times ``2 sqrt(3)``, is about 100. That is about the diagonal of the box.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.

@@ -96,8 +96,8 @@ class Term(nn.Module):
             def measure(self, spokes):
                 return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
 
-    and goes where terms are asked for: ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a bounding-box
-    diagonal of 100, like those of Eq. 5.
+    and goes where terms are asked for: ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a size of 100, like
+    those of Eq. 5.
 
     Args:
         stiffness: ``k``: a number, or a tensor or parameter whose last dimension counts the elements, or is 1, and

@@ -1,4 +1,8 @@
-"""Fewer faces by edge collapses: fast-simplification in the size that its thresholds are for, one call at a time."""
+"""Fewer faces by edge collapses: fast-simplification in the size that its thresholds are for, one call at a time.
+
+It collapses in the order of the faces, so they are sorted first: the same shape gives the same collapses, however its
+faces are listed and its axes turned.
+"""
 
 import threading
 from typing import NamedTuple
@@ -7,13 +11,13 @@ import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_modal.geometry.canonical import ordered_faces, placed, vertex_order
 from torch_modal.geometry.connectivity import IntArray
 
 FloatArray = NDArray[np.float64]
 
 # It keeps its mesh in static memory, and has absolute thresholds.
 _NOT_THREAD_SAFE = threading.Lock()
-_WORKING_DIAGONAL = 100.0
 _AGGRESSIVENESS = 7.0
 
 
@@ -36,14 +40,16 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> Decimation:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: How many are wanted. There may remain more: some edges cannot be collapsed.
     """
-    centre = vertices.mean(0)
-    factor = _WORKING_DIAGONAL / np.linalg.norm(np.ptp(np.stack([x[faces] for x in vertices.T]), axis=(1, 2)))
+    shape = placed(vertices, faces)
+    order = vertex_order(shape.points)
+    rank = np.argsort(order)
     with _NOT_THREAD_SAFE:
         points, triangles, collapses = fast_simplification.simplify(
-            np.ascontiguousarray((vertices - centre) * factor),
-            np.ascontiguousarray(faces, dtype=np.int32),
+            np.ascontiguousarray(shape.points[order]),
+            np.ascontiguousarray(rank[ordered_faces(shape.points, faces)], dtype=np.int32),
             target_count=n_faces,
             agg=_AGGRESSIVENESS,
             return_collapses=True,
         )
-    return Decimation(points.astype(np.float64) / factor + centre, triangles.astype(np.int64), collapses)
+    points = points.astype(np.float64) @ shape.axes / shape.scale + shape.centre
+    return Decimation(points, triangles.astype(np.int64), order[collapses].reshape(-1, 2))

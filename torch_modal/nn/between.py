@@ -127,7 +127,7 @@ class Between(nn.Module):
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
         self.fine, self.fused, self.distortion = shared.energy, shared.fused, shared.distortion
         collapses = partial(shared.collapses, places)
-        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses)
+        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses, modes[0])
         # Steps that are unrolled are differentiated like any other expression: by torch.
         modal = objective.space == "joint" and solver.gradient == "implicit"
         levels = partial(Levels, self.frame, mesh, self.terms, solver.backend if modal else "torch")

@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torch_modal.energy.shell import DIAGONAL
+from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.functions import applied, lasting
 from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, squared_length
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.nn.columns import Columns, Directions
-from torch_modal.precompute.coarsening import Coarsening, Collapses, coarsen
+from torch_modal.nn.resolution import resolving
+from torch_modal.precompute.coarsening import Coarsening, Collapses
 
 Collapsing = Callable[[int, int], Coarsening]
 
@@ -134,9 +136,10 @@ class Coarse(nn.Module):
     Args:
         shapes: Two shapes in the frame, float64 on the CPU. *Shape:* ``(2, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_faces: Of the coarse mesh.
+        n_faces: Of the coarse mesh, or more, where that does not resolve the modes or pieces.
         weights: Of the vertices. *Shape:* ``(V,)``.
         collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`.
+        modes: Of the first shape; None if it does not matter how well they are resolved. *Shape:* ``(k, V, 3)``.
     """
 
     faces: Tensor
@@ -147,10 +150,16 @@ class Coarse(nn.Module):
     shares_of_members: Tensor
 
     def __init__(
-        self, shapes: Tensor, faces: Tensor, n_faces: int, weights: Tensor, collapses: Collapsing | None
+        self,
+        shapes: Tensor,
+        faces: Tensor,
+        n_faces: int,
+        weights: Tensor,
+        collapses: Collapsing | None,
+        modes: Tensor | None,
     ) -> None:
         super().__init__()
-        coarsening = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
+        coarsening = resolving(shapes, faces, n_faces, collapses, modes)
         clusters = torch.from_numpy(coarsening.clusters).clamp_min(0)
         member = torch.from_numpy(coarsening.clusters >= 0).double()
         per_cluster = torch.zeros(coarsening.n_vertices, dtype=torch.float64)
@@ -194,6 +203,7 @@ class Frame(Alignment):
         coarse_faces: Number of faces of the coarse mesh.
         weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
         collapses: What is shared of the edge collapses of both, given them in the frame. Default: nothing.
+        modes: Of the first shape, which the coarse mesh should resolve. *Shape:* ``(k, V, 3)``.
     """
 
     faces: Tensor
@@ -206,9 +216,9 @@ class Frame(Alignment):
         coarse_faces: int,
         weights: Tensor | None = None,
         collapses: Callable[[NDArray[np.float64]], Collapsing] | None = None,
+        modes: Tensor | None = None,
     ) -> None:
-        used = shapes[0][faces.flatten()]
-        scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
+        scale = torch.tensor(DIAGONAL / size(shapes[0].numpy(), faces.numpy()), dtype=shapes.dtype)
         weights = mean_areas(shapes, faces) if weights is None else weights
         turn = best_fit(shapes[1], shapes[0], weights)
         references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale
@@ -217,7 +227,7 @@ class Frame(Alignment):
         self.register_buffer("turn", turn.rotation, persistent=False)
         own = None if collapses is None else collapses(references.numpy())
         self._coarse: Any = None
-        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, own)
+        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, own, modes)
 
     @property
     def coarse(self) -> Coarse:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from torch_modal.geometry.connectivity import IntArray
+from torch_modal.geometry.connectivity import IntArray, connected_pieces, double_areas
 from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
 
@@ -18,6 +18,11 @@ FloatArray = NDArray[np.float64]
 # is one, other numbers of faces are tried.
 NEEDLE = 3e-3
 MORE_FACES = (1.0, 1.1, 1.25, 1.4, 1.6)
+
+# A closed piece with fewer faces bends without stretching, or vanishes, and then nothing keeps its shape.
+FACES_OF_PIECE = 20
+# Of more pieces than this only the largest are looked at.
+MOST_PIECES = 100
 
 
 @dataclass(frozen=True)
@@ -91,20 +96,47 @@ def _renumbered(collapses: Collapses, chosen: Sequence[int], keyframe: int, n_fa
 
 
 def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
-    """Partition by the edge collapses of one pose."""
-    collapses = decimate(points, faces, n_faces).collapses
-    root = np.arange(len(points))
-    root[collapses[:, 1]] = collapses[:, 0]
-    while not np.array_equal(root[root], root):
-        root = root[root]
-    coarse_faces = root[faces]
-    coarse_faces = coarse_faces[~degenerate_faces(coarse_faces)]
-    coarse_faces = coarse_faces[~repeated_faces(coarse_faces)]
+    """Partition by the edge collapses of one pose; pieces that nothing would be left of are collapsed alone."""
+    root = _roots(points, faces, n_faces)
+    coarse_faces = _left(root, faces)
+    piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))[faces[:, 0]]
+    before = np.bincount(piece)
+    if np.count_nonzero(before) > 1:
+        owner = np.zeros(len(points), dtype=np.int64)
+        owner[faces] = piece[:, None]
+        after = np.bincount(owner[coarse_faces[:, 0]], minlength=len(before))
+        poor = after < np.minimum(FACES_OF_PIECE, before)
+        areas = np.bincount(piece, double_areas(points, faces), minlength=len(before))
+        for i in np.argsort(-areas, kind="stable")[:MOST_PIECES]:
+            if poor[i]:
+                own = faces[piece == i]
+                members = np.unique(own)
+                compact = np.searchsorted(members, own)
+                few = before[i] <= FACES_OF_PIECE
+                root[members] = members if few else members[_roots(points[members], compact, FACES_OF_PIECE)]
+        coarse_faces = _left(root, faces)
     # Roots that lost all their faces carry no energy: they are left out, as are vertices that never had one.
     used = np.unique(coarse_faces)
     index = np.full(len(points), -1)
     index[used] = np.arange(len(used))
     return Coarsening(index[root], index[coarse_faces])
+
+
+def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
+    """The vertex that each becomes part of. *Shape:* ``(V,)``."""
+    collapses = decimate(points, faces, n_faces).collapses
+    root = np.arange(len(points))
+    root[collapses[:, 1]] = collapses[:, 0]
+    while not np.array_equal(root[root], root):
+        root = root[root]
+    return root
+
+
+def _left(root: IntArray, faces: IntArray) -> IntArray:
+    """The faces that are left, in terms of the vertices that stay. *Shape:* ``(F_coarse, 3)``."""
+    left = root[faces]
+    left = left[~degenerate_faces(left)]
+    return left[~repeated_faces(left)]
 
 
 def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, float]:
@@ -151,8 +183,10 @@ def coarsen(
         return Coarsening(index, index[faces])
     collapses = Collapses(faces).of(range(len(keyframes)), keyframes) if collapses is None else collapses
     found: list[tuple[float, Coarsening]] = []
-    for factor in MORE_FACES:
-        candidates = [collapses(i, int(factor * n_faces)) for i in range(len(keyframes))]
+    for n in (int(factor * n_faces) for factor in MORE_FACES):
+        if n >= len(faces):
+            break
+        candidates = [collapses(i, n) for i in range(len(keyframes))]
         fatness = [_fatness(keyframes, candidate) for candidate in candidates]
         # Those without needles first, then by the bulk of the triangles.
         best = max(range(len(candidates)), key=lambda i: (min(fatness[i][0], NEEDLE), fatness[i][1]))

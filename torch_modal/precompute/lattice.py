@@ -61,7 +61,7 @@ COARSEST = 3.0
 """Size of a tetrahedron over the thickness of the body, from which on it does not resolve that."""
 MOST_COARSE = 0.02
 """Part of the area where that may be."""
-WIRE = 0.01
+WIRE = 0.012
 """Thickness of wires, in bounding-box diagonals, and less."""
 WIRE_LENGTH = 40.0
 """Over that thickness."""

@@ -191,7 +191,7 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
     )
     modes = np.zeros((n_modes, n_vertices, 3))
     # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
-    modes[:, surface.used] = result["modes"] * surface.scale**1.5
+    modes[:, surface.used] = result["modes"] @ surface.axes * surface.scale**1.5
     return Solved(
         result["eigenvalues"] * surface.scale**2,
         modes,

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
+from torch_modal.geometry.canonical import SIZE, ordered_faces, placed
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.normals import vertex_normals
@@ -14,26 +15,30 @@ from torch_modal.geometry.normals import vertex_normals
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-DIAGONAL = 100.0
-"""Bounding-box diagonal in which the pre-computation works: the decimation has absolute thresholds for it."""
+DIAGONAL = SIZE
+"""Size in which the pre-computation works (:func:`~torch_modal.geometry.canonical.size`)."""
 _DIAGONAL_RANGE = (1e-90, 1e90)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A shape with its used vertices only, centred, with a bounding-box diagonal of 100.
+    """A shape with its used vertices only, in its principal axes, centred, with a size of 100.
+
+    So all that follows from it is the same however the caller's axes are turned and the faces are listed.
 
     Attributes:
         points: *Shape:* ``(U, 3)``.
-        faces: Indices into ``points``, wound counterclockwise seen from outside. *Shape:* ``(F, 3)``.
+        faces: Indices into ``points``, wound counterclockwise seen from outside, sorted. *Shape:* ``(F, 3)``.
         used: Which vertices of the shape the points are. *Shape:* ``(U,)``.
         scale: Units here per unit of the caller.
+        axes: Vectors here times this have the caller's axes. *Shape:* ``(3, 3)``.
     """
 
     points: FloatArray
     faces: IntArray
     used: IntArray
     scale: float
+    axes: FloatArray
 
     @classmethod
     def of(cls, shape: FloatArray, faces: IntArray) -> "Surface":
@@ -48,15 +53,15 @@ class Surface:
         """
         used, compact = np.unique(faces, return_inverse=True)
         points = shape[used]
-        low, high = points.min(axis=0), points.max(axis=0)
-        diagonal = float(np.linalg.norm(high - low))
+        diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
         if not _DIAGONAL_RANGE[0] < diagonal < _DIAGONAL_RANGE[1]:
             raise MeshError(
                 f"the bounding-box diagonal is {diagonal:.3g}, at which eigenvalues leave the range of "
                 "float64; choose another unit"
             )
-        points = (points - (low + high) / 2) * (DIAGONAL / diagonal)
-        return cls(points, outward(points, compact.reshape(-1, 3)), used, DIAGONAL / diagonal)
+        own = placed(points, compact.reshape(-1, 3))
+        ordered = ordered_faces(own.points, compact.reshape(-1, 3))
+        return cls(own.points, outward(own.points, ordered), used, own.scale, own.axes)
 
     @cached_property
     def area(self) -> float:
