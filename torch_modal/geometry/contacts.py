@@ -11,7 +11,8 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, Surface, dot
+from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, Surface
+from torch_modal.geometry.triangle_pairs import dot
 
 # Lengths are parts of the diagonal.
 REACH = 0.06
