@@ -109,7 +109,7 @@ def test_triangles_on_a_grid_cross_as_fractions_say() -> None:
 def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
     # Two boxes with a common plane: their faces touch, partly in one plane, and edges meet edges.
     box = trimesh.creation.box((1, 1, 1)).subdivide()
-    second = np.array(box.vertices) + [1, 0.3125, apart]
+    second = np.array(box.vertices) + np.array([1, 0.3125, apart])
     points, faces = np.concatenate([box.vertices, second]), np.concatenate([box.faces, box.faces + len(second)])
     assert int(tm.self_contacts(points, faces).number) == 0
     mesh = Connectivity(faces, len(points))

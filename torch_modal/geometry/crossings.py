@@ -195,6 +195,15 @@ class Crossings:
         pairs = self.pairs(x)
         return pairs[self.is_far(pairs)]
 
+    def reach(self, x: FloatArray, pairs: IntArray) -> float:
+        """How far triangles of given pairs reach through each other, at most, along a normal. *Shape:* ``(P, 2)``."""
+        least = np.full(len(pairs), np.inf)
+        for own, other in (pairs.T, pairs.T[::-1]):
+            a, b, c = x[self.mesh.faces[other]].transpose(1, 0, 2)
+            height = dot(x[self.mesh.faces[own]] - a[:, None], _unit(cross(b - a, c - a))[:, None])
+            least = np.minimum(least, np.minimum(height.max(1), -height.min(1)))
+        return float(least.max(initial=0.0))
+
     def is_new(self, pairs: IntArray) -> BoolArray:
         """Which pairs cross in none of the known shapes. *Shape:* ``(P, 2) -> (P,)``."""
         n = len(self.mesh.faces)

@@ -45,8 +45,8 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     """Find where shapes pass through themselves.
 
     Two triangles without a common vertex cross where their interiors do (broad phase of ``ipctk``, exact predicates of
-    ``libigl``). Those that only touch, or lie in one plane, do not. Depths come from winding numbers (``libigl``). Nothing is
-    differentiable here.
+    ``libigl``). Those that only touch, or lie in one plane, do not. Depths come from winding numbers (``libigl``).
+    Nothing is differentiable here.
 
     Args:
         x: Shapes. *Shape:* ``(..., V, 3)``.
