@@ -2,6 +2,7 @@
 
 import itertools
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import nearest_on_triangles
-from torch_modal.geometry.crossings import Crossings, pierces
+from torch_modal.geometry.crossings import Crossings
+from torch_modal.geometry.triangle_pairs import pierce_nearly, triangles_cross
 
 pytest.importorskip("ipctk")
 
@@ -58,6 +60,77 @@ def test_pairs_are_those_of_a_slow_search(generator: torch.Generator) -> None:
     assert bool(found.new.all()) and bool(found.far.all())  # of two pieces: nothing leads from one to the other
 
 
+def cross_by_fractions(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two triangles cross, in exact arithmetic: the segments that the planes cut out overlap by a length."""
+    ends = []
+    triangles = [[[Fraction(float(c)) for c in corner] for corner in triangle] for triangle in (one, other)]
+
+    def minus(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
+        return [p - q for p, q in zip(a, b, strict=True)]
+
+    def cross(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
+        return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+    def dot(a: list[Fraction], b: list[Fraction]) -> Fraction:
+        return sum((p * q for p, q in zip(a, b, strict=True)), Fraction(0))
+
+    normals = [cross(minus(b, a), minus(c, a)) for a, b, c in triangles]
+    line = cross(*normals)
+    for own, plane, normal in zip(triangles, triangles[::-1], normals[::-1], strict=True):
+        heights = [dot(minus(corner, plane[0]), normal) for corner in own]
+        if min(heights) >= 0 or max(heights) <= 0:
+            return False
+        places = [dot(corner, line) for corner in own]
+        met = [place for place, height in zip(places, heights, strict=True) if height == 0]
+        for i, j in itertools.combinations(range(3), 2):
+            if heights[i] * heights[j] < 0:
+                met.append(places[i] + (places[j] - places[i]) * heights[i] / (heights[i] - heights[j]))
+        ends.append((min(met), max(met)))
+    return max(ends[0][0], ends[1][0]) < min(ends[0][1], ends[1][1])
+
+
+def test_triangles_on_a_grid_cross_as_fractions_say() -> None:
+    rng = np.random.default_rng(0)
+    # Small whole numbers: vertices lie in planes and on edges, edges meet edges, and triangles share planes.
+    one, other = rng.integers(-2, 3, (2, 1500, 3, 3)).astype(float)
+    wanted = np.array([cross_by_fractions(a, b) for a, b in zip(one, other, strict=True)])
+    touching = (pierce_nearly(one, other) | pierce_nearly(other, one)) & ~wanted
+    assert wanted.sum() > 150 and touching.sum() > 100
+    np.testing.assert_array_equal(triangles_cross(one, other), wanted)
+    np.testing.assert_array_equal(triangles_cross(other[:, [1, 0, 2]], one[:, [2, 0, 1]]), wanted)
+    # Coordinates that no longer are exact: a tenth of them rounds differently at each vertex.
+    one, other = one / 10 + 0.3, other / 10 + 0.3
+    wanted = np.array([cross_by_fractions(a, b) for a, b in zip(one, other, strict=True)])
+    np.testing.assert_array_equal(triangles_cross(one, other), wanted)
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.25], ids=["face on face", "edge on face"])
+@pytest.mark.parametrize("search", ["ipctk", "warp"])
+def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
+    # Two boxes with a common plane: their faces touch, partly in one plane, and edges meet edges.
+    box = trimesh.creation.box((1, 1, 1)).subdivide()
+    second = np.array(box.vertices) + np.array([1, 0.3125, apart])
+    points, faces = np.concatenate([box.vertices, second]), np.concatenate([box.faces, box.faces + len(second)])
+    assert int(tm.self_contacts(points, faces).number) == 0
+    mesh = Connectivity(faces, len(points))
+    kernels = None
+    if search == "warp":
+        pytest.importorskip("warp")
+        from torch_modal.nn.fused_crossings import FusedPairs
+
+        kernels = FusedPairs(mesh, points[None])
+    assert len(Crossings(mesh, points[None], search=kernels).pairs(points)) == 0
+    # As deep as a quarter of an edge, the edges of both meet, and each pair is counted once.
+    points[len(second) :, 0] -= 0.0625
+    pairs = Crossings(mesh, points[None], search=kernels).pairs(points)
+    wanted = {
+        (f, g)
+        for f, g in itertools.product(range(len(box.faces)), range(len(box.faces), len(faces)))
+        if cross_by_fractions(points[faces[f]], points[faces[g]])
+    }
+    assert len(wanted) > 10 and set(map(tuple, pairs.tolist())) == wanted
+
+
 @pytest.mark.parametrize("n_faces", [1, 2, 3, 20, 500])
 def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Generator) -> None:
     pytest.importorskip("warp")
@@ -70,7 +143,8 @@ def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Ge
     apart = ~(mesh.faces[one][:, :, None] == mesh.faces[other][:, None]).any((1, 2))
     one, other = one[apart], other[apart]
     a, b = x[mesh.faces[one]], x[mesh.faces[other]]
-    crossing = pierces(a, b) | pierces(b, a)
+    crossing = pierce_nearly(a, b) | pierce_nearly(b, a)
+    assert np.array_equal(crossing, triangles_cross(a, b))  # nothing is nearly flat here
     wanted = set(zip(one[crossing].tolist(), other[crossing].tolist(), strict=True))
     assert n_faces < 500 or len(wanted) > fused_crossings.ROOM  # which has to be made larger
     found = fused_crossings.FusedPairs(mesh, first[None])(x)

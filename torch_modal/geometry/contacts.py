@@ -11,7 +11,8 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, Surface, dot
+from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, Surface
+from torch_modal.geometry.triangle_pairs import dot
 
 # Lengths are parts of the diagonal.
 REACH = 0.06
@@ -30,6 +31,8 @@ _STRAIGHT = 0.7
 """Least part of the distance that lies along the face's normal; less is beside the face, not before it."""
 _BEHIND = 0.02
 """Of the mean edge length: how far behind a face a vertex that is not inside may lie, which is rounding of a fold."""
+_TIE = 1e-6
+"""Lengths that differ by less than this part of them are equal but for rounding."""
 _NEAREST = 64
 """Faces, by their centres, among which the nearest to a vertex is looked for; four times as many from inside."""
 
@@ -169,8 +172,7 @@ class Search:
             keep = ~behind | stuck[v]
             slack = [part[keep] for part in slack] + [np.where(behind, -side, 0.0)[keep]]
             v, f, distance = _kept(keep, v, f, distance)
-        order = np.lexsort((distance, v))
-        first = order[np.flatnonzero(np.diff(v[order], prepend=-1))]
+        first = _nearest_faces(v, f, distance, _heights(surface, v, f))
         v, f, both = v[first], f[first], np.stack(slack, 1)[first] if slack else np.zeros((len(first), 0))
         # What is in a part also lies behind its far side, deeper than it went in.
         own = np.maximum(self.tolerated[v], self.tolerated[corners[f]].max(1))
@@ -225,6 +227,29 @@ def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
     """From vertices to faces. *Shape:* ``(n,), (n,) -> (n,)``."""
     apart = surface.x[v] - nearest_on_triangles(surface.x[v], surface.x[surface.faces[f]])
     return np.sqrt(dot(apart, apart))  # type: ignore[no-any-return]
+
+
+def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:
+    """Which pairs are those of each vertex with its nearest face.
+
+    Faces around the nearest point share it, and rounding would choose among them: the one whose plane is farthest is
+    taken, and of those in one plane the first.
+
+    Args:
+        v: Vertices. *Shape:* ``(n,)``.
+        f: Faces. *Shape:* ``(n,)``.
+        distance: From the face. *Shape:* ``(n,)``.
+        height: Over its plane. *Shape:* ``(n,)``.
+    """
+    chosen = np.arange(len(v))
+    for lengths, sign in ((distance, 1), (np.abs(height), -1)):
+        least = np.full(v.max(initial=0) + 1, np.inf)
+        values = sign * lengths[chosen]
+        np.minimum.at(least, v[chosen], values)
+        near = least[v[chosen]]
+        chosen = chosen[values <= near + _TIE * np.abs(near)]
+    order = chosen[np.lexsort((f[chosen], v[chosen]))]
+    return order[np.flatnonzero(np.diff(v[order], prepend=-1))]
 
 
 def _kept(keep: BoolArray, *arrays: Any) -> list[Any]:

@@ -1,6 +1,6 @@
 """Which triangles of a surface pass through each other, and which vertices lie inside. NumPy and SciPy only.
 
-Pairs come from a broad phase of ``ipctk`` and a test of an edge against a face; winding numbers from ``libigl``. Both
+Pairs come from a broad phase of ``ipctk`` and exact predicates of ``libigl``, as do winding numbers. Both
 are the extra ``contact`` and are imported when they are first needed.
 """
 
@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from torch_modal import extras
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.triangle_pairs import cross, dot, triangles_cross
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -70,7 +71,8 @@ class Crossings:
         mesh: The connectivity.
         known: Shapes whose own crossings are tolerated. *Shape:* ``(K, V, 3)``.
         like: The shape whose lengths say what is far along the surface. Default: the first of ``known``.
-        search: Finds what :meth:`pairs` does, in any order. *Shape:* ``(V, 3) -> (P, 2)``. Default: with ``ipctk``.
+        search: Finds what :meth:`pairs` does, in any order, and may find more. *Shape:* ``(V, 3) -> (P, 2)``.
+            Default: by boxes, with ``ipctk``.
     """
 
     def __init__(
@@ -162,8 +164,8 @@ class Crossings:
     def pairs(self, x: FloatArray) -> IntArray:
         """Pairs of triangles that cross and share no vertex, the smaller number first, sorted.
 
-        Two triangles cross where an edge of one passes through the other. Those that only touch, or lie in one plane,
-        do not.
+        They cross as :func:`~torch_modal.geometry.triangle_pairs.triangles_cross` says: those that only touch, or lie
+        in one plane, do not.
 
         Args:
             x: *Shape:* ``(V, 3)``.
@@ -172,6 +174,8 @@ class Crossings:
             *Shape:* ``(P, 2)``.
         """
         pairs = np.sort(self._search(x), axis=1)
+        one, other = (x[self.mesh.faces[side]] for side in pairs.T)
+        pairs = pairs[triangles_cross(one, other)]
         return pairs[np.lexsort(pairs.T[::-1])]
 
     def _crossing(self, x: FloatArray) -> IntArray:
@@ -184,13 +188,21 @@ class Crossings:
         candidates = np.fromiter(chain.from_iterable(found), np.int64).reshape(-1, 2)
         corners = self.mesh.faces[candidates]
         candidates = candidates[~(corners[:, 0, :, None] == corners[:, 1, None, :]).any((1, 2))]
-        one, other = (centred[self.mesh.faces[side]] for side in candidates.T)
-        return np.unique(candidates[pierces(one, other) | pierces(other, one)], axis=0)
+        return np.unique(candidates, axis=0)
 
     def far_pairs(self, x: FloatArray) -> IntArray:
         """Those of :meth:`pairs` that are far, by :meth:`is_far`. *Shape:* ``(V, 3) -> (P, 2)``."""
         pairs = self.pairs(x)
         return pairs[self.is_far(pairs)]
+
+    def reach(self, x: FloatArray, pairs: IntArray) -> float:
+        """How far triangles of given pairs reach through each other, at most, along a normal. *Shape:* ``(P, 2)``."""
+        least = np.full(len(pairs), np.inf)
+        for own, other in (pairs.T, pairs.T[::-1]):
+            a, b, c = x[self.mesh.faces[other]].transpose(1, 0, 2)
+            height = dot(x[self.mesh.faces[own]] - a[:, None], _unit(cross(b - a, c - a))[:, None])
+            least = np.minimum(least, np.minimum(height.max(1), -height.min(1)))
+        return float(least.max(initial=0.0))
 
     def is_new(self, pairs: IntArray) -> BoolArray:
         """Which pairs cross in none of the known shapes. *Shape:* ``(P, 2) -> (P,)``."""
@@ -314,36 +326,6 @@ class Surface:
     def vertex_normals(self) -> FloatArray:
         """*Shape:* ``(V, 3)``."""
         return _unit(self._incidence @ self.doubled)
-
-
-def pierces(edges_of: FloatArray, through: FloatArray) -> BoolArray:
-    """Whether an edge of each triangle passes through another one. *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``."""
-    first = through[:, 0]
-    normal = cross(through[:, 1] - first, through[:, 2] - first)
-    side = dot(edges_of - first[:, None], normal[:, None]) > 0
-    crossing = np.zeros(len(edges_of), dtype=bool)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        at = np.flatnonzero((side[:, i] != side[:, j]) & ~crossing)
-        start, end = edges_of[at, i], edges_of[at, j]
-        rays = through[at] - start[:, None]
-        along = end - start
-        turns = [dot(cross(rays[:, k], rays[:, (k + 1) % 3]), along) > 0 for k in range(3)]
-        crossing[at[(turns[0] == turns[1]) & (turns[1] == turns[2])]] = True
-    return crossing
-
-
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """What ``np.cross`` is, which takes ten times as long for a few vectors. *Shape:* ``(n, 3)`` each."""
-    found = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        found[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
-    return found
-
-
-def dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Inner products of vectors: sums along an axis of three take several times as long. *Shape:* ``(..., 3)``."""
-    found: FloatArray = np.einsum("...i,...i->...", a, b)
-    return found
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

@@ -44,9 +44,9 @@ class SelfContacts(NamedTuple):
 def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
     """Find where shapes pass through themselves.
 
-    Two triangles without a common vertex cross where an edge of one passes through the other (broad phase of ``ipctk``,
-    test in float64). Those that only touch do not. Depths come from winding numbers (``libigl``). Nothing is
-    differentiable here.
+    Two triangles without a common vertex cross where their interiors do (broad phase of ``ipctk``, exact predicates of
+    ``libigl``). Those that only touch, or lie in one plane, do not. Depths come from winding numbers (``libigl``).
+    Nothing is differentiable here.
 
     Args:
         x: Shapes. *Shape:* ``(..., V, 3)``.

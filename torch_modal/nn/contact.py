@@ -1,7 +1,6 @@
 """Contacts of a batch of in-betweens: what is held in each, as a term of the modal solve and of the fine steps."""
 
 from collections.abc import Callable, Iterator, Sequence
-from copy import copy
 from typing import Any, NamedTuple
 
 import torch
@@ -69,8 +68,8 @@ class Contacts(NamedTuple):
 
     @property
     def term(self) -> Contact:
-        """The term; its stiffness is in the weights."""
-        return Contact(self.elements, 1.0)
+        """The term; its stiffness is in the weights. On the CPU, where the mesh is that its energy is made of."""
+        return Contact(self.elements.cpu(), 1.0)
 
     def joined(self, reference: Reference) -> Reference:
         """A reference with that of the term, which comes last."""
@@ -205,6 +204,12 @@ class ContactSearch:
     def _search(self, i: int) -> Search:
         return self.searches[self.which[i]]
 
+    def depth(self, x: Tensor) -> float:
+        """How deep the contacts of one sample are, with the gap that is kept. *Shape:* ``(1, V, 3)``."""
+        search, shape = self._search(0), x[0].detach().double().cpu().numpy()
+        pairs = search.crossings.far_pairs(shape)
+        return GAP + max(float(search.depth(shape, pairs).max()), search.crossings.reach(shape, pairs))
+
     def watch(self, held: Contacts, around: int) -> None:
         """Watch what is held in a sample, and beside it, in that one and its neighbours in time."""
         crossings = self.searches[0].crossings
@@ -223,13 +228,6 @@ class ContactSearch:
     def is_watched(self, some: Tensor) -> Tensor:
         """Whether something is watched in samples. *Shape:* ``(S,) -> (S,)``."""
         return torch.tensor([self.watched[i] is not None for i in some.tolist()], device=some.device)
-
-    def of(self, some: Tensor) -> "ContactSearch":
-        """A search in some of the samples, with what is known of them. *Shape:* ``(S,)``."""
-        found, chosen = copy(self), some.tolist()
-        found.which, found.watched = [self.which[i] for i in chosen], [self.watched[i] for i in chosen]
-        found.t, found.n_far, found.n_left = self.t[some], self.n_far[some], self.n_left[some]
-        return found
 
 
 def _areas(x: Tensor, faces: Tensor) -> Tensor:

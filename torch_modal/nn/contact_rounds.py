@@ -1,4 +1,4 @@
-"""In-betweens that do not pass through themselves: what would is made again, with what was found held apart."""
+"""In-betweens that do not pass through themselves: those that would are pushed apart, each sample on its own."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,112 +7,114 @@ import torch
 from torch import Tensor
 
 from torch_modal.nn import trees
-from torch_modal.nn.between import LOCAL_PRODUCTS, POLISH_PRODUCTS, Batch, Between
+from torch_modal.nn.between import Batch, Between
 from torch_modal.nn.contact import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
-from torch_modal.nn.gauss_newton import GaussNewtonStep
-from torch_modal.nn.modal_energy import SumOfEnergies
 from torch_modal.nn.relax import relax
-from torch_modal.nn.samples import InBetweenResult, Samples, warn_of_starts
+from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.solver import Solution
 
+MOST_MOVED = 3.0
+"""How far a vertex may be moved, times the depth of the contacts of its shape."""
 
-class Apart(NamedTuple):
-    """In-betweens that were pushed apart."""
 
+class Pushed(NamedTuple):
+    """A shape that was pushed apart."""
+
+    rounds: list[Contacts]
+    """The active contacts of each round that led to it."""
     x: Tensor
-    """In the frame. *Shape:* ``(S, V, 3)``."""
-    solution: Solution
-    held: Contacts
-    start: Tensor
-    """Where the minimisation started. *Shape:* ``(S, n)``."""
-    n_left: Tensor
-    """Pairs of triangles that are neither kept apart nor tolerated. *Shape:* ``(S,)``."""
-    n_far: Tensor
-    """Pairs of triangles of parts that go through each other all the same. *Shape:* ``(S,)``."""
+    """In the frame. *Shape:* ``(1, V, 3)``."""
+    n_crossing: Tensor
+    """Pairs of triangles of parts that still go through each other. *Shape:* ``(1,)``."""
 
 
 class ContactRounds(Between):
-    """In-betweens of one pair of bases whose parts do not go through each other. Arguments as for :class:`Between`."""
+    """In-betweens of one pair of bases whose parts do not go through each other. Arguments as for :class:`Between`.
+
+    A shape that passes through itself takes steps of all vertices with its contacts as active constraints; the others
+    stay as they are. The result has never more pairs of triangles of parts that go through each other than the shape
+    without contact, and no vertex is moved by more than :data:`MOST_MOVED` times the depth of its contacts; where
+    nothing does that, it is the shape without contact.
+    """
 
     def forward(self, samples: Samples, report: Callable[[Solution], None] | None) -> InBetweenResult:
-        """Solve. Arguments as there; however many rounds it takes, one report."""
-        result = super().forward(samples, None)
-        if report is not None and self.solver.gradient == "implicit":
-            report(result.solution)
-            warn_of_starts(result.solution)
-        return result
+        """Solve. Arguments as there.
+
+        Samples with contacts are solved again alone: rounding depends on the batch, and contacts amplify it.
+        """
+        if len(samples.t) == 1:
+            return super().forward(_alone(samples, 0), report)
+        whole = super().forward(samples, report)
+        n_crossing = whole.solution.n_crossing
+        if n_crossing is None or not bool(n_crossing.any()):
+            return whole
+        some = torch.nonzero(n_crossing).flatten()
+        parts = [super(ContactRounds, self).forward(_alone(samples, i), None) for i in some.tolist()]
+        each = zip(whole.solution, *(part.solution for part in parts), strict=True)
+        merged = (values[0].index_copy(0, some, torch.cat(values[1:])) for values in each)  # type: ignore[union-attr, arg-type]
+        shapes = whole.shapes.index_copy(0, some, torch.cat([part.shapes for part in parts]))
+        return InBetweenResult(shapes, Solution(*merged))
 
     def solved(self, batch: Batch) -> tuple[Tensor, Solution]:
-        """Shapes and solutions, with what crosses all the same.
+        """The shapes, with the pairs of triangles whose parts go through each other; one alone is pushed apart.
 
-        In-betweens that would pass through themselves are made again with what was found held; the others stay as they
-        are without contact. What is held is found without a gradient.
+        Contacts are found without a gradient; the steps with them have one.
         """
         x, solution = super().solved(batch)
-        n_crossing, apart = self.found(batch, x, solution)
-        if apart is None:
-            return x, solution._replace(n_crossing=n_crossing)
-        some = apart.held.samples
-        again, resolved = apart.x, apart.solution
-        if x.requires_grad:
-            again, resolved = self.apart(_rows(batch, some, apart.start), apart.held)
-        pairs = zip(solution[:-1], resolved[:-1], strict=True)
-        merged = (whole.index_copy(0, some, part) for whole, part in pairs)  # type: ignore[union-attr, arg-type]
-        return x.index_copy(0, some, again), Solution(*merged)._replace(n_crossing=n_crossing)
-
-    @torch.no_grad()
-    def found(self, batch: Batch, x: Tensor, solution: Solution) -> tuple[Tensor, Apart | None]:
-        """What crosses in each sample, *shape* ``(B,)``, and those that were pushed apart.
-
-        It is looked again after each push; what left the fewest crossings is taken.
-        """
         pair, samples = batch.pair, batch.samples
         search = ContactSearch(self.mesh, pair.first, pair.second, samples.which, samples.t, pairs=self.crossing_pairs)
-        held = search(x)
-        n_crossing = search.n_far
-        if held is None:
-            return n_crossing, None
-        some = held.samples
-        batch = _rows(batch, some, solution.amplitudes[some])
-        search = search.of(some)
-        best: Apart | None = None
+        pushed = self.found(batch, x.detach(), search) if len(x) == 1 else None
+        if pushed is None:
+            search.count(x)
+            return x, solution._replace(n_crossing=search.n_far)
+        if x.requires_grad:
+            for active in pushed.rounds:
+                x = self._step(batch, x, active)
+        else:
+            x = pushed.x
+        return x, solution._replace(n_crossing=pushed.n_crossing)
+
+    @torch.no_grad()
+    def found(self, batch: Batch, x: Tensor, search: ContactSearch) -> Pushed | None:
+        """A sample pushed apart; None where it has no contacts, or nothing makes it better.
+
+        After each round contacts are searched again. The shape with the fewest pairs is taken.
+        """
+        active = search(x)
+        if active is None or not bool(search.n_far.any()):
+            return None
+        start, n_far, least = x, int(search.n_far), _left(search)
+        most = MOST_MOVED * search.depth(x)
+        rounds: list[Contacts] = []
+        best = None
         for _ in range(ROUNDS):
-            pushed, resolved = self.apart(batch, held)
-            found = search(pushed)
-            apart = Apart(pushed, resolved, held, batch.start, search.n_left, search.n_far)
-            best = apart if best is None else min(best, apart, key=_left)
-            if found is None or not bool(search.n_left.any()):
+            x = self._step(batch, x, active)
+            rounds.append(active)
+            fresh, left = search(x), _left(search)
+            moved = float((x - start).norm(dim=-1).max())
+            if left < least and int(search.n_far) <= n_far and moved <= most:
+                least, best = left, Pushed(list(rounds), x, search.n_far)
+            if fresh is None or not bool(search.n_left.any()):
                 break
-            held, batch = found.of_all(some).beside(held), batch._replace(start=resolved.amplitudes)
-        assert best is not None
-        return n_crossing.index_copy(0, some, best.n_far), best
+            active = fresh.beside(active)
+        return best
 
-    def apart(self, batch: Batch, held: Contacts) -> tuple[Tensor, Solution]:
-        """Shapes and solutions with what is held in each sample."""
-        space, problem, minimisation = self.space, batch.problem, batch.minimisation
-        term = held.modal(self.mesh, space.columns.fine)
-        placement = (*problem.placement, held.place(term, problem.base, space.column(problem.difference)))
-        step = GaussNewtonStep(SumOfEnergies(*space.energy.parts, term))
-        batch = batch._replace(
-            problem=problem._replace(placement=placement), minimisation=minimisation._replace(step=step)
-        )
-        x, solution = self.modal(batch)
-        solver, in_contact = self.solver, held.fine(self.mesh, self.terms)
-        parts = []
-        for own, reference, fixed in self.fine_chunks(batch):
-            moved = relax(self.fine, x[own], reference, solver.local_steps, LOCAL_PRODUCTS, fixed)
-            reference = held.rows(own).joined(reference)
-            moved = relax(in_contact, moved, reference, FINE_STEPS, FINE_PRODUCTS, fixed)
-            parts.append(relax(in_contact, moved, reference, solver.polish, POLISH_PRODUCTS, fixed))
-        return torch.cat(parts), solution
+    def _step(self, batch: Batch, x: Tensor, active: Contacts) -> Tensor:
+        """Steps of all vertices of one sample with its contacts. *Shape:* ``(1, V, 3)``."""
+        ((_, reference, fixed),) = self.fine_chunks(batch)
+        energy = active.fine(self.mesh, self.terms)
+        return relax(energy, x, active.joined(reference), FINE_STEPS, FINE_PRODUCTS, fixed)
 
 
-def _left(apart: Apart) -> tuple[int, int]:
-    return int(apart.n_left.sum()), int(apart.n_far.sum())
+def _left(search: ContactSearch) -> tuple[int, int]:
+    """Pairs of one sample that are not tolerated, and all."""
+    return int(search.n_left), int(search.n_far)
 
 
-def _rows(batch: Batch, some: Tensor, start: Tensor) -> Batch:
-    """Some of the samples, started elsewhere. *Shape:* ``(S,), (S, n)``."""
-    problem, usable, anchors = trees.rows((batch.problem, batch.usable, batch.anchors), some)
-    batch = batch._replace(problem=problem, start=start.detach(), energy=None)
-    return batch._replace(usable=usable, samples=batch.samples.rows(some), anchors=anchors)
+def _alone(samples: Samples, i: int) -> Samples:
+    """One sample as a batch."""
+    pair = slice(i, i + 1) if samples.which is None else samples.which[i : i + 1]
+    around = samples.before, samples.after, samples.spacing
+    x_a, x_b, before, after, spacing = trees.rows((samples.x_a, samples.x_b, *around), pair)
+    t, mu, stiffness = trees.rows((samples.t, samples.mu, samples.stiffness), slice(i, i + 1))
+    return Samples(x_a, x_b, None, t, mu, stiffness, before, after, spacing)

@@ -13,7 +13,7 @@ ROOM = 4096
 
 
 class FusedPairs:
-    """Pairs of triangles that cross and share no vertex.
+    """Pairs of triangles that cross, or miss each other by rounding only, and share no vertex.
 
     The tree is made once, of what lies together in given shapes; of others, only its boxes are made.
 

@@ -34,6 +34,8 @@ LOOKED_AT = 8
 SEARCHED = 16
 """:func:`push_apart` has it."""
 BESIDE = 0.125
+FADE = 0.0625
+"""Over how much of the time a displacement is faded out beside a shape that it makes worse, at first."""
 AROUND = 2
 """Shapes beside those that hold something in which the same is watched."""
 ROUNDS = 4, 8
@@ -58,24 +60,39 @@ class Displacement(NamedTuple):
     n_crossing: Tensor
     """Those that are left. *Shape:* ``(T,)``, int64."""
 
-    def apply(self, member: Between, samples: Samples, shapes: Tensor) -> Tensor:
+    def apply(self, member: Between, samples: Samples, shapes: Tensor) -> tuple[Tensor, Tensor]:
         """Push shapes apart, at any times; between those of the field, along a cubic spline.
 
-        The gradient reaches shapes and times; the field is a constant.
+        A shape that would have more pairs of triangles that go through each other stays as it is. The gradient reaches
+        shapes and times; the field is a constant.
 
         Args:
             member: In-betweens of the pair of key-frames.
             samples: Of that pair, with the times of the shapes.
             shapes: In the caller's coordinates. *Shape:* ``(T, V, 3)``.
+
+        Returns:
+            The shapes, and the pairs that are left in each, *shape* ``(T,)``.
         """
         if self.field is None:
-            return shapes
+            return shapes, torch.zeros_like(samples.t, dtype=torch.int64)
         frame, t = member.frame, samples.t
-        placed = trees.picked(member.placed(samples), samples.which)
-        moved = self.field
-        if t.requires_grad or not torch.equal(t, self.times):
-            moved = through(self.times, t) @ moved
-        return frame.restore(frame.bring(shapes, placed, t) + moved.movedim(0, -1), placed, t)
+        pair = member.placed(samples)
+        placed = trees.picked(pair, samples.which)
+        moved, own = self.field, frame.bring(shapes, placed, t)
+        n_crossing = self.n_crossing
+        if torch.equal(t, self.times) and not t.requires_grad:
+            found = own + moved.movedim(0, -1)
+        else:
+            found = own + (through(self.times, t) @ moved).movedim(0, -1)
+            search = _search(member, samples, pair)
+            search.count(own)
+            before = search.n_far
+            search.count(found)
+            better = search.n_far <= before
+            n_crossing = torch.where(better, search.n_far, before)
+            found = torch.where(better[:, None, None], found, own)
+        return frame.restore(found, placed, t), n_crossing
 
 
 @torch.no_grad()
@@ -94,9 +111,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     frame, t = member.frame, samples.t
     pair = member.placed(samples)
     start = frame.bring(shapes, trees.picked(pair, samples.which), t)
-    search = ContactSearch(
-        member.mesh, pair.first, pair.second, samples.which, t, member.crossing_pairs, is_tolerant=False
-    )
+    search = _search(member, samples, pair)
     every = -(-len(t) // LOOKED_AT)
     few = range(every - 1, len(t), every)
     first = next(search.crossing(start, few), None)
@@ -115,11 +130,50 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     held = held.of_all(torch.arange(len(t), device=start.device))
     search.watch(held, AROUND)
     search.count(start, search.beside(some))
-    n_before = search.n_far
     moved = together(member, samples, pair, start, held, some)
     limit = _limit(member, samples, pair, shapes)
-    x, n_crossing = _at_rest(member, samples, pair, start, start + moved, held, some, search, limit)
-    return Displacement((x - start).movedim(-1, 0), t, n_before, n_crossing)
+    x = _at_rest(member, samples, pair, start, start + moved, held, some, search, limit)
+    search.count(start)
+    n_before = search.n_far
+    field = _never_worse(start, (x - start).movedim(-1, 0), search, limit)
+    return Displacement(field, t, n_before, n_before if field is None else search.n_far)
+
+
+def _search(member: Between, samples: Samples, pair: Pair) -> ContactSearch:
+    """A search in the shapes of a course, in which nothing is tolerated."""
+    return ContactSearch(
+        member.mesh, pair.first, pair.second, samples.which, samples.t, member.crossing_pairs, is_tolerant=False
+    )
+
+
+def _never_worse(start: Tensor, field: Tensor, search: ContactSearch, limit: AccelerationLimit) -> Tensor | None:
+    """The displacement, faded out around shapes in which it makes more pairs go through each other.
+
+    Where that makes others worse, it is faded out around these, too, and twice as far each time: at last, nothing is
+    moved. What is left is kept below the limit of the accelerations.
+
+    Args:
+        start: Without contact. *Shape:* ``(T, V, 3)``.
+        field: The displacement. *Shape:* ``(3, T, V)``.
+        search: Has counted the pairs of ``start``, and counts those of the result.
+        limit: Of the displacement.
+
+    Returns:
+        *Shape:* ``(3, T, V)``; None where nothing is left.
+    """
+    t, n_before, found, reach = search.t, search.n_far, field, FADE
+    bad = torch.zeros_like(n_before, dtype=torch.bool)
+    while True:
+        search.count(start + found.movedim(0, -1))
+        worse = search.n_far > n_before
+        if not bool(worse.any()):
+            return found
+        if reach > 1:
+            return None
+        bad = bad | worse
+        apart = ((t[:, None] - t[bad]).abs().amin(1) / reach).clamp_max(1)
+        found, _ = limit.nearest(field * (apart**2 * (3 - 2 * apart))[:, None])
+        reach = 2 * reach
 
 
 def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor) -> AccelerationLimit:
@@ -152,8 +206,8 @@ def _at_rest(
     every: Tensor,
     search: ContactSearch,
     limit: AccelerationLimit,
-) -> tuple[Tensor, Tensor]:
-    """Shapes at rest with what is held, as far as accelerations allow, and the pairs that are left in each.
+) -> Tensor:
+    """Shapes at rest with what is held, as far as accelerations allow.
 
     Some take steps, and the others follow along a cubic spline; what passes through itself there takes steps, too.
     What leaves the fewest crossings is kept.
@@ -204,6 +258,4 @@ def _at_rest(
             every = torch.nonzero((search.n_far > 0).index_fill(0, every, True)).flatten()
         searched = every[search.n_far[every] > 0]
     assert best is not None
-    if k > n_least:
-        search.count(best[1])
-    return best[1], search.n_far
+    return best[1]

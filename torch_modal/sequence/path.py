@@ -227,6 +227,6 @@ class Path(nn.Module):
                 found = push_apart(member, grid, member(grid, None).shapes)
             mine = torch.nonzero(which == motion).flatten()
             at = self.samples(own, i, torch.zeros_like(mine), samples.t[mine])
-            shapes = shapes.index_copy(0, mine, found.apply(member, at, result.shapes[mine]))
-            left[mine] = found.n_crossing.sum()
+            pushed, left[mine] = found.apply(member, at, result.shapes[mine])
+            shapes = shapes.index_copy(0, mine, pushed)
         return InBetweenResult(shapes, result.solution._replace(n_crossing=left))

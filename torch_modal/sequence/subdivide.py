@@ -264,7 +264,7 @@ class _Apart:
         self.n_searched += len(found.n_crossing)
         self.n_before += int((found.n_before > 0).sum())
         self.n_left += int((found.n_crossing > 0).sum())
-        return found.apply(member, samples, given).to(shapes)
+        return found.apply(member, samples, given)[0].to(shapes)
 
     def report(self, keyframes: Tensor, faces: Tensor) -> None:
         """Say which key-frames pass through themselves, and what is left."""

@@ -4,6 +4,8 @@ import warp as wp
 
 from torch_modal.nn.kernels.elements import place, real, vec3
 
+MARGIN = wp.constant(real(1e-12))
+"""Of the cube of the largest length in a determinant: more than its rounding error."""
 box = wp.types.vector(length=6, dtype=real)
 """Its lowest corner, and the opposite of its highest."""
 
@@ -36,41 +38,48 @@ def meet(a: wp.vec3i, b: wp.vec3i):
 
 
 @wp.func
-def turns(along: vec3, a: vec3, b: vec3) -> bool:
-    return wp.dot(wp.cross(a, b), along) > real(0.0)
+def turn(along: vec3, a: vec3, b: vec3):
+    return wp.dot(wp.cross(a, b), along)
 
 
 @wp.func
-def through(start: vec3, end: vec3, above: bool, end_above: bool, a: vec3, b: vec3, c: vec3) -> bool:
-    """Whether an edge passes through a triangle, of whose plane its ends may lie on two sides."""
-    found = above != end_above
+def through(start: vec3, end: vec3, height: real, end_height: real, margin: real, a: vec3, b: vec3, c: vec3) -> bool:
+    """Whether an edge passes through a triangle, or misses it by rounding only; with the heights of its ends."""
+    found = wp.min(height, end_height) < margin and wp.max(height, end_height) > -margin
     if found:
         along = end - start
-        first = turns(along, a - start, b - start)
-        found = first == turns(along, b - start, c - start) and first == turns(along, c - start, a - start)
+        first = turn(along, a - start, b - start)
+        second = turn(along, b - start, c - start)
+        third = turn(along, c - start, a - start)
+        found = wp.min(first, wp.min(second, third)) > -margin or wp.max(first, wp.max(second, third)) < margin
     return found
 
 
 @wp.func
 def pierces(p: vec3, q: vec3, r: vec3, a: vec3, b: vec3, c: vec3) -> bool:
-    """Whether an edge of the first triangle passes through the second."""
+    """Whether an edge of the first triangle passes through the second, or misses it by rounding only."""
+    reach = wp.max(wp.length(p - a), wp.max(wp.length(q - a), wp.length(r - a)))
+    reach = wp.max(reach, wp.max(wp.length(b - a), wp.length(c - a)))
+    margin = MARGIN * reach * reach * reach
     normal = wp.cross(b - a, c - a)
-    p_above = wp.dot(p - a, normal) > real(0.0)
-    q_above = wp.dot(q - a, normal) > real(0.0)
-    r_above = wp.dot(r - a, normal) > real(0.0)
-    found = p_above != q_above or q_above != r_above
+    p_height = wp.dot(p - a, normal)
+    q_height = wp.dot(q - a, normal)
+    r_height = wp.dot(r - a, normal)
+    lowest = wp.min(p_height, wp.min(q_height, r_height))
+    highest = wp.max(p_height, wp.max(q_height, r_height))
+    found = lowest < margin and highest > -margin
     if found:
         found = (
-            through(p, q, p_above, q_above, a, b, c)
-            or through(q, r, q_above, r_above, a, b, c)
-            or through(r, p, r_above, p_above, a, b, c)
+            through(p, q, p_height, q_height, margin, a, b, c)
+            or through(q, r, q_height, r_height, margin, a, b, c)
+            or through(r, p, r_height, p_height, margin, a, b, c)
         )
     return found
 
 
 @wp.func
 def cross(x: wp.array(dtype=vec3), f: wp.vec3i, g: wp.vec3i) -> bool:
-    """Whether two faces without a common vertex pass through each other."""
+    """Whether two faces without a common vertex pass through each other, or miss each other by rounding only."""
     found = not meet(f, g)
     if found:
         p = x[place(f[0], 0)]
@@ -94,7 +103,7 @@ def crossing(
     pairs: wp.array(dtype=wp.vec2i),
     number: wp.array(dtype=int),
 ):
-    """Pairs of faces that cross and share no vertex, as many as there is room for, and their number.
+    """Pairs of faces that cross or nearly do and share no vertex, as many as there is room for, and their number.
 
     Node ``i`` has the nodes ``2 i`` and ``2 i + 1`` below it, and the last ``n`` are the faces. One thread goes down
     from the root, with the two nodes of each pair on the same level, or one above.
