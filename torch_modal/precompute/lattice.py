@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.precompute.bisection import halved
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.proximity import Clearance, clearances
@@ -57,18 +57,6 @@ NEARBY = 1.5
 """How near that is, in spacings of the grid."""
 RAMP = 0.25
 """Over how much of the spacing the indicator falls there."""
-COARSEST = 3.0
-"""Size of a tetrahedron over the thickness of the body, from which on it does not resolve that."""
-MOST_COARSE = 0.02
-"""Part of the area where that may be."""
-WIRE = 0.012
-"""Thickness of wires, in bounding-box diagonals, and less."""
-WIRE_LENGTH = 40.0
-"""Over that thickness."""
-SPECK = 1 / 500
-"""Area of pieces that need not be apart from others, in that of the largest."""
-MOST_APART = 1000
-"""Pieces of which that is asked, the largest."""
 LEAST_INSIDE = 0.02
 """Tetrahedra with less of them inside are left out, or count as this much where the surface runs through them."""
 REACH = 0.7
@@ -194,62 +182,6 @@ def lattice(surface: Surface, edge_length_fac: float, clearance: Clearance | Non
     used, compact = np.unique(mesh.tets[kept], return_inverse=True)
     filled = Tetrahedra(vertices[used], compact.reshape(-1, 4), np.maximum(inside[kept], LEAST_INSIDE))
     return _fitted(without_debris(filled), indicator)
-
-
-def is_resolved(tetrahedra: Tetrahedra, surface: Surface, clearance: Clearance) -> bool:
-    """Whether tetrahedra are small enough for nearly all of a body, as many pieces as it has, and no part is a wire.
-
-    Of a wire, long and thinner than all else, the lowest modes are all its own.
-    """
-    if len(tetrahedra.tets) == 0:
-        return False
-    piece = connected_pieces(np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]]), len(surface.points))
-    areas = double_areas(surface.points, surface.faces)
-    n_filled = pieces_by_sides(tetrahedra.tets).max() + 1
-    if not _n_apart(surface, piece, areas) <= n_filled <= piece.max() + 1:
-        return False  # pieces were fused, or parts have come off, or hang on an edge
-    sizes = _sizes_at_vertices(tetrahedra)
-    nearest = closest_in(cKDTree(tetrahedra.vertices), surface.points[surface.faces].mean(axis=1))[1]
-    coarse = sizes[nearest] > COARSEST * clearance.thickness
-    return bool(areas[coarse].sum() <= MOST_COARSE * areas.sum()) and not _has_wire(surface, clearance)
-
-
-def _n_apart(surface: Surface, piece: IntArray, areas: FloatArray) -> int:
-    """How many pieces, or groups of them that may lie in each other, have boxes that nothing else reaches into.
-
-    Specks are left out: those are no parts of a body.
-
-    Args:
-        surface: The body.
-        piece: Of each point. *Shape:* ``(V,)``.
-        areas: Of the faces, up to a factor. *Shape:* ``(F,)``.
-    """
-    own = np.bincount(piece[surface.faces[:, 0]], areas, minlength=piece.max() + 1)
-    large = np.argsort(-own)[:MOST_APART]
-    large = large[own[large] > SPECK * own.max()]
-    low, high = (np.full((len(own), 3), fill) for fill in (np.inf, -np.inf))
-    np.minimum.at(low, piece, surface.points)
-    np.maximum.at(high, piece, surface.points)
-    low, high = low[large], high[large]
-    meets = ((low[:, None] <= high) & (low <= high[:, None])).all(axis=-1)
-    return int(connected_pieces(np.argwhere(meets), len(large)).max()) + 1
-
-
-def _has_wire(surface: Surface, clearance: Clearance) -> bool:
-    """Whether a connected part is thin all over, and many times longer than thick."""
-    thin = surface.faces[clearance.thickness < WIRE * DIAGONAL]
-    pieces = connected_pieces(np.concatenate([thin[:, :2], thin[:, 1:]]), len(surface.points))
-    for piece in np.unique(pieces[thin[:, 0]]):
-        if np.linalg.norm(np.ptp(surface.points[pieces == piece], axis=0)) > WIRE_LENGTH * WIRE * DIAGONAL:
-            return True
-    return False
-
-
-def _sizes_at_vertices(tetrahedra: Tetrahedra) -> FloatArray:
-    """Of the smallest tetrahedron around each: the edge of the cube of which six are as large. *Shape:* ``(N,)``."""
-    sizes = np.full(len(tetrahedra.vertices), np.inf)
-    np.minimum.at(sizes, tetrahedra.tets.reshape(-1), np.repeat(np.cbrt(6 * tet_volumes(tetrahedra)), 4))
-    return sizes
 
 
 def is_too_fine(surface: Surface, edge_length_fac: float) -> bool:
