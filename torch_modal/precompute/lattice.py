@@ -184,6 +184,13 @@ def lattice(surface: Surface, edge_length_fac: float, clearance: Clearance | Non
     return _fitted(without_debris(filled), indicator)
 
 
+def _sizes_at_vertices(tetrahedra: Tetrahedra) -> FloatArray:
+    """Of the smallest tetrahedron around each: the edge of the cube of which six are as large. *Shape:* ``(N,)``."""
+    sizes = np.full(len(tetrahedra.vertices), np.inf)
+    np.minimum.at(sizes, tetrahedra.tets.reshape(-1), np.repeat(np.cbrt(6 * tet_volumes(tetrahedra)), 4))
+    return sizes
+
+
 def is_too_fine(surface: Surface, edge_length_fac: float) -> bool:
     """Whether a lattice with such cubes would have too many of them."""
     return bool(_box(surface, ROOT * edge_length_fac * DIAGONAL)[1].prod() > MOST_CUBES)
