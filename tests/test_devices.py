@@ -1,0 +1,153 @@
+"""Devices without having them: tensors without numbers that claim to be on a GPU.
+
+``FakeTensorMode`` runs every operation on shapes, dtypes and devices alone, and refuses those that mix devices. What
+looks at numbers cannot run so: loops that end by a tolerance, line searches, the placement of key-frames, kernels, and
+the searches for contacts, which run on the CPU. The largest pieces between these are called here, one after the other.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor, nn
+from torch._subclasses import FakeTensor, FakeTensorMode
+
+import torch_modal as tm
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.terms import Mesh
+from torch_modal.nn.contact import Contacts
+from torch_modal.nn.relax import ConvexHessian, _solved
+from torch_modal.nn.samples import Samples
+from torch_modal.nn.settings import PRESETS
+
+DOUBLE = torch.float64
+ELEMENTS = torch.tensor([[0, 1, 2, 9], [3, 4, 5, 8]])
+
+
+@contextmanager
+def gpu() -> Iterator[FakeTensorMode]:
+    """A GPU that nobody needs to have. Modules are made before, with numbers."""
+    # Torch without CUDA refuses these two ways to a GPU, even of tensors without numbers.
+    real = torch.Tensor.to
+
+    def to(x: Tensor, *args: Any, **options: Any) -> Tensor:
+        device, dtype = torch._C._nn._parse_to(*args, **{k: v for k, v in options.items() if k != "copy"})[:2]
+        if device is not None and device.type == "cuda":
+            return torch.ops.aten._to_copy(x, dtype=dtype, device=device)
+        return real(x, *args, **options)
+
+    def as_tensor(data: Any, dtype: Any = None, device: Any = None) -> Tensor:
+        if not isinstance(data, Tensor):
+            return torch.tensor(data, dtype=dtype, device=device)
+        return torch.ops.aten._to_copy(data, dtype=dtype, device=device)
+
+    with pytest.MonkeyPatch.context() as patch, FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        patch.setattr(torch.Tensor, "to", to)
+        patch.setattr(torch, "as_tensor", as_tensor)
+        yield mode
+
+
+def there(x: Tensor, mode: FakeTensorMode) -> Tensor:
+    """A tensor of the same shape, there."""
+    return FakeTensor(mode, x.to("meta"), torch.device("cuda:0"))
+
+
+def on_gpu(module: nn.Module, mode: FakeTensorMode) -> None:
+    """Move the buffers of a module there."""
+    for part in module.modules():
+        for name, buffer in part._buffers.items():
+            if buffer is not None:
+                part._buffers[name] = there(buffer, mode)
+
+
+def blank(*shape: int, dtype: torch.dtype = DOUBLE) -> Tensor:
+    """Numbers of no value, there."""
+    return torch.empty(*shape, dtype=dtype, device="cuda")
+
+
+def assert_there(tree: Any) -> None:
+    """All tensors of a result are on the GPU."""
+    if isinstance(tree, Tensor):
+        assert tree.device.type == "cuda"
+    elif isinstance(tree, (tuple, list)):
+        for part in tree:
+            assert_there(part)
+
+
+def contacts(mode: FakeTensorMode) -> Contacts:
+    """Two samples, of which each holds a vertex."""
+    return Contacts(torch.arange(2, device="cuda"), there(ELEMENTS, mode), blank(2, 2), blank(2, 2))
+
+
+def steps(energy: Energy, x: Tensor, reference: Any) -> None:
+    """All that a step of all vertices does but for its length."""
+    rows = energy.extend(x.movedim(-1, 0).contiguous())
+    at = energy.linearise(rows, reference)
+    right = -energy.fold(energy.gradient(at))
+    assert_there([energy.value(rows, reference), energy.value_at(at, reference)])
+    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3))
+
+
+def assert_member_runs(member: Any, x: Tensor, t: Tensor, stiffness: list[Tensor]) -> None:
+    """An in-between of the joint or paired space but for its loops: where it starts, one step, the way back."""
+    samples = Samples(x, x + 1, None, t, torch.ones_like(t), stiffness)
+    pair, finite = member._placed(samples)
+    problem = member.problem(pair, samples)
+    a = t.new_zeros(len(t), member.space.n_unknowns)
+    derivatives = member.space.energy.derivatives(a, problem.placement)
+    shapes = member.space.lift(a, problem)
+    assert_there([pair, finite, problem, derivatives, shapes, member.frame.restore(shapes, pair, t)])
+    assert_there([member.fine_reference(samples, pair), member.anchors(pair, t) or []])
+    steps(member.fine, shapes, member.fine_reference(samples, pair))
+
+
+def test_shell_energy(small_bars: Shapes) -> None:
+    shell = tm.ShellEnergy(small_bars.faces)
+    with gpu() as mode:
+        on_gpu(shell, mode)
+        x, rest = blank(2, 30, 3).requires_grad_(), blank(2, 30, 3)
+        value = shell(x, rest)
+        assert_there([value, *torch.autograd.grad(value.sum(), x)])
+
+
+@pytest.mark.parametrize("backend", ["torch", "warp"])
+@pytest.mark.parametrize("preset", ["accurate", "fast", "paper"])
+@pytest.mark.parametrize("kind", ["InBetween", "InBetween with contact", "MidShape", "Path"])
+def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> None:
+    if backend == "warp":
+        pytest.importorskip("warp")
+    if preset == "paper" and kind in ("InBetween with contact", "Path"):
+        pytest.skip("the paired space has neither")
+    solver = replace(PRESETS[preset].solver, backend=backend)
+    bases, faces = small_bars.bases[:2], small_bars.faces
+    if kind == "MidShape":
+        layer: Any = tm.MidShape(bases, faces, preset=preset, solver=solver).in_between
+    elif kind == "Path":
+        layer = tm.Path(bases, faces, preset=preset, solver=solver).layer
+    else:
+        if "contact" in kind:
+            pytest.importorskip("ipctk")
+        layer = tm.InBetween(bases, faces, preset, solver=solver, contact="contact" in kind or None)
+    with gpu() as mode, torch.no_grad():
+        on_gpu(layer, mode)
+        t = blank(2)
+        assert_member_runs(layer.members[0], blank(2, 30, 3), t, layer.stiffness_of(t, t.shape))
+
+
+def test_energies_with_contacts(small_bars: Shapes) -> None:
+    mesh = Mesh.of(small_bars.faces, 30)
+    shell = tm.ShellEnergy(small_bars.faces).energy
+    terms = [part.term for part in shell.parts]
+    with gpu() as mode, torch.no_grad():
+        on_gpu(shell, mode)
+        held = contacts(mode)
+        x = blank(2, 30, 3)
+        rest = shell.rest(shell.extend(x.movedim(-1, 0).contiguous()))
+        reference = held.joined(Energy.against(rest, [blank(2, 1) for _ in terms]))
+        steps(held.fine(mesh, terms), x, reference)
+        assert_there(held.rows(torch.tensor([1], device="cuda")))
+        assert_there(held.of_all(torch.arange(2, device="cuda")))
