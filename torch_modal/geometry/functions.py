@@ -29,7 +29,7 @@ def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
     """
 
     @wraps(make)
-    def run(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+    def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:  # objects of typing would be guarded by Dynamo
         if not torch.is_inference_mode_enabled():
             with torch.no_grad():
                 return make(*args, **kwargs)
