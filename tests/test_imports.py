@@ -92,8 +92,9 @@ def test_layers_are_torch_only(module: str) -> None:
     assert not packages & FOREIGN_TO_LAYERS
     if module not in ("nn.frame", "nn.congruence"):
         assert "numpy" not in packages
-    # Bases are what comes in; only the frame, made once, looks further into the other room.
-    allowed = {"precompute.basis", "precompute.coarsening"} if module == "nn.frame" else {"precompute.basis"}
+    # Bases are what comes in; only the frame and its coarse mesh, made once, look further into the other room.
+    coarse = {"precompute.coarsening"} if module in ("nn.frame", "nn.resolution") else set()
+    allowed = {"precompute.basis"} | coarse
     assert {name for name in own(module) if name.startswith("precompute")} <= allowed
 
 
