@@ -215,6 +215,19 @@ def test_mirrored_landmarks_are_doubtful(pair: tuple[Mesh, Mesh, np.ndarray]) ->
     assert register(rest, faces, mirrored, turned, landmarks=marks, progress=False).doubtful
 
 
+def test_a_stray_sphere_beside_the_target_changes_nothing(
+    pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration
+) -> None:
+    (rest, faces), (there, there_faces), truth = pair
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1 * np.linalg.norm(np.ptp(there, axis=0)))
+    points = np.concatenate([there, np.array(ball.vertices) + there.mean(0) + 1.2 * np.ptp(there, axis=0)])
+    both = np.concatenate([there_faces, np.array(ball.faces) + len(there)])
+    result = register(rest, faces, points, both, progress=False)
+    assert abs(result.confidence - found.confidence) < 0.1
+    assert errors(result, truth).mean() < 1.2 * errors(found, truth).mean() + 0.1
+    assert result.from_target.max < 2 * found.from_target.max
+
+
 def test_across_shapes_with_landmarks(pair: tuple[Mesh, Mesh, np.ndarray]) -> None:
     (rest, faces), (there, there_faces), truth = pair
     stout = there * [1.0, 1.25, 0.9]
@@ -480,3 +493,34 @@ def test_hand_in_another_pose(data_dir: Path) -> None:
 
     row = registration.one("mh-hand", 0, 3, "none", 3, False)
     assert row["confidence"] >= 0.5 and row["mean"] < 1.3 and row["p95"] < 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flaw", ["none", "sphere", "severed", "mirrored", "mirrored pose"])
+def test_confidence_in_a_hand(data_dir: Path, flaw: str) -> None:
+    """A piece of the target is severed by a plane, it is a left hand, or there is a sphere beside it."""
+    keyframes, triangles = tm.load_keyframes(sorted((data_dir / "mh-hand").glob("*.obj")))
+    shapes, faces = keyframes.numpy(), triangles.numpy()
+    rest, there = shapes[0], shapes[0 if flaw == "mirrored" else 1]
+    order = np.random.default_rng(0).permutation(len(rest))
+    target, target_faces = there[order], np.argsort(order)[faces]
+    if flaw == "severed":
+        along = (rest - rest.mean(0)) @ np.linalg.svd(rest - rest.mean(0), full_matrices=False)[2][0]
+        along *= np.sign(along[np.abs(along).argmax()])  # towards the fingers
+        gone = (along < np.quantile(along, 0.16))[order]
+        target_faces = target_faces[~gone[target_faces].any(1)]
+    elif flaw.startswith("mirrored"):
+        target, target_faces = target * [-1, 1, 1], target_faces[:, ::-1]
+    elif flaw == "sphere":
+        size = np.linalg.norm(np.ptp(there, axis=0))
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1 * size)
+        target_faces = np.concatenate([target_faces, np.array(ball.faces) + len(target)])
+        target = np.concatenate([target, np.array(ball.vertices) + there.mean(0) + [size, 0, 0]])
+    result = register(rest, faces, target, target_faces, progress=False)
+    if flaw in ("none", "sphere"):
+        assert result.confidence > 0.9 and not result.warnings
+        assert errors(result, there).mean() < 0.6
+    else:
+        assert result.doubtful
+        said = "no target beside them" if flaw == "severed" else "mirror image"
+        assert any(said in line for line in result.warnings)

@@ -26,17 +26,8 @@ from torch_modal.keyframes.registration.maps import (
     zoom_out,
 )
 from torch_modal.keyframes.registration.report import Quality, Registration, judge, measure
-from torch_modal.keyframes.registration.spectrum import CUT, SpectralShape
-from torch_modal.keyframes.registration.surface import (
-    FloatArray,
-    IntArray,
-    Surface,
-    largest_piece,
-    outward,
-    referenced,
-    sewn,
-    without_dust,
-)
+from torch_modal.keyframes.registration.spectrum import SpectralShape, main_part
+from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Surface, outward, referenced
 from torch_modal.keyframes.seams import weld_seams
 from torch_modal.progress import Progress, ProgressReport
 
@@ -158,11 +149,11 @@ class _Problem:
         rest = template[0]
         goal, self.target_vertices = referenced(target[0], outward(*target))
         # Neither size is that of pieces beside the body, such as a stray sphere.
-        body = largest_piece(sewn(without_dust(goal), CUT))
+        body = main_part(goal)
         self.unit, self.origin = body.diagonal / WORKING_DIAGONAL, body.vertices.mean(0)
         self.target = goal.moved((goal.vertices - self.origin) / self.unit)
         own, self.used = referenced(rest, outward(*template))
-        self.size = np.sqrt(body.area / largest_piece(sewn(without_dust(own), CUT)).area) / self.unit
+        self.size = np.sqrt(body.area / main_part(own).area) / self.unit
         self.rest = rest * self.size
         self.template = own.moved(own.vertices * self.size)
         self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)

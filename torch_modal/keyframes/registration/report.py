@@ -129,7 +129,7 @@ class Registration(NamedTuple):
     unsupported_area: float
     """Part of the template's area without target beside it, such as a limb that is missing there."""
     mirrored_lead: float
-    """By how much a mirrored map beats this one, in score minus distortion; negative where it does not."""
+    """By how much a mirrored map beats this one, in score minus distortion; minus infinity where none was sought."""
     landmark_errors: torch.Tensor
     """From each landmark to its place. *Shape:* ``(n,)``."""
     target_faces: torch.Tensor
@@ -229,7 +229,7 @@ def judge(
         (_ramp(distance, 1.0, 0.3), f"the surfaces are {distance:.2f} % of the diagonal apart in the mean"),
         (_ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
         (
-            _ramp(quality.unsupported_area, 0.10, 0.02),
+            _ramp(quality.unsupported_area, 0.05, 0.02),
             f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
         ),
     ]

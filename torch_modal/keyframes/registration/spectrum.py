@@ -120,9 +120,14 @@ def decimated(surface: Surface, n_vertices: int) -> Surface:
     """
     surface = without_dust(surface)
     if len(surface.vertices) <= 1.2 * n_vertices:
-        return largest_piece(sewn(surface, CUT))
+        return main_part(surface)
     wanted = int(n_vertices / len(surface.vertices) * len(surface.faces))
     vertices, faces, _ = decimate(surface.vertices, surface.faces, wanted)
     faces = faces[~inspect.degenerate_faces(faces)]
     faces = faces[~inspect.repeated_faces(faces)]
-    return largest_piece(sewn(referenced(vertices, faces)[0], CUT))
+    return main_part(referenced(vertices, faces)[0])
+
+
+def main_part(surface: Surface) -> Surface:
+    """The largest piece, and those that a cut has parted from it."""
+    return largest_piece(sewn(without_dust(surface), CUT))
