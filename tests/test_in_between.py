@@ -452,7 +452,7 @@ class TestSingleSamples:
         shapes, solution = layer.solve(bars.keyframes[0], twisted, 0.5)
         assert bool(shapes.isfinite().all())
         # 1 to 3 are the statuses of a sample that did not converge; whatever it is, it is said.
-        assert solution.converged.item() == (solution.gradient_norm.item() <= 1e-8)
+        assert solution.converged.item() == (solution.gradient_norm.item() <= layer.solver.tolerance)
 
     @pytest.mark.parametrize("t", [-0.1, 1.5, math.nan])
     def test_times_outside_are_refused(self, layer: InBetween, bars: Shapes, t: float) -> None:
