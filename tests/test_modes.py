@@ -14,6 +14,7 @@ from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
 from solids import box, surface, together
 
+from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.precompute import filling, lanczos, parallel, solving
 from torch_modal.precompute.eigen import ENOUGH, EXACT, ModalAnalysisError, VolumeModes, lowest_modes
@@ -223,17 +224,11 @@ def test_untrustworthy_problems_are_refused() -> None:
 
 @pytest.fixture
 def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
-    """A box as a surface, and a mesher that fills it (the surface comes centred, with a diagonal of 100)."""
-    faces = surface(BOX)
-    low, high = BOX.vertices.min(axis=0), BOX.vertices.max(axis=0)
-    used, compact = np.unique(faces, return_inverse=True)
-
-    def fill(points: np.ndarray, *args: object, **kwargs: object) -> Tetrahedra:
-        return Tetrahedra((BOX.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BOX.tets)
-
-    monkeypatch.setattr(filling, "lattice", lambda whole, _: fill(whole.points))
-    monkeypatch.setattr(filling, "tetrahedralize", fill)
-    return BOX.vertices[used], compact.reshape(-1, 3)
+    """A box as a surface, and meshers that fill it."""
+    mesh = as_mesh(BOX)
+    filled_with(monkeypatch, BOX, mesh)
+    monkeypatch.setattr(filling, "tetrahedralize", lambda *_, **__: filling.lattice())
+    return mesh
 
 
 def test_modes_at_the_surface_in_the_callers_units(boxed: Mesh) -> None:
@@ -293,10 +288,10 @@ def as_mesh(solid: Tetrahedra) -> Mesh:
     return solid.vertices[used], faces.reshape(-1, 3)
 
 
-def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: np.ndarray) -> None:
-    """Have the lattice give these tetrahedra, placed as a surface with these points is."""
-    low, high = like.min(axis=0), like.max(axis=0)
-    vertices = (solid.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low))
+def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: Mesh) -> None:
+    """Have the lattice give these tetrahedra, placed as this surface is."""
+    own = placed(*like)
+    vertices = ((solid.vertices - own.centre) * own.scale) @ own.axes.T
     monkeypatch.setattr(filling, "lattice", lambda *_: solid._replace(vertices=vertices))
 
 
@@ -306,7 +301,7 @@ def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     two = together(piece, piece)
     two.vertices[45:, 2] += 3.0
     vertices, faces = as_mesh(two)
-    filled_with(monkeypatch, two, vertices)
+    filled_with(monkeypatch, two, (vertices, faces))
     with pytest.warns(MeshWarning, match=r"has 2 loose pieces.* left to the interpolation") as said:
         basis = extract_bases(np.stack([vertices, vertices]), faces, 8, cache=False)[0]
     assert len(said) == 1
@@ -319,7 +314,7 @@ def test_more_pieces_than_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     many = together(*[box((2, 1, 1), (2.0, 1.0, 1.0))] * 10)
     many.vertices[:, 2] += np.repeat(3.0 * np.arange(10), 12)
     vertices, faces = as_mesh(many)
-    filled_with(monkeypatch, many, vertices)
+    filled_with(monkeypatch, many, (vertices, faces))
     with pytest.warns(MeshWarning, match="has 10 loose pieces"):
         basis = extract_modes(vertices, faces, 20, cache=False)
     assert basis.eigenvalues[0] > 0.01
@@ -333,7 +328,7 @@ def test_a_stray_clump_is_no_body(mesher: Any, monkeypatch: pytest.MonkeyPatch) 
     vertices, faces = as_mesh(BOX)
     found = []
     for solid in (BOX, together(BOX, clump)):
-        filled_with(monkeypatch, solid, vertices)
+        filled_with(monkeypatch, solid, (vertices, faces))
         monkeypatch.setattr(filling, "tetrahedralize", lambda *_, **__: filling.lattice())
         found.append(extract_modes(vertices, faces, 10, mesher=mesher, cache=False))
     plain, stray = found
@@ -349,7 +344,7 @@ def test_a_small_piece_goes_along(monkeypatch: pytest.MonkeyPatch) -> None:
     button.vertices[:] += [1.5, 1.6, 0.5]
     both = together(BOX, button)
     vertices, faces = as_mesh(both)
-    filled_with(monkeypatch, both, vertices)
+    filled_with(monkeypatch, both, (vertices, faces))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         basis = extract_modes(vertices, faces, 10, cache=False)
@@ -367,7 +362,7 @@ def test_tetrahedra_without_surface_are_dropped(monkeypatch: pytest.MonkeyPatch)
     far = box((4, 2, 2), (2.0, 1.0, 1.0))
     far.vertices[:] += 30.0
     vertices, faces = as_mesh(BOX)
-    filled_with(monkeypatch, together(BOX, far), vertices)
+    filled_with(monkeypatch, together(BOX, far), (vertices, faces))
     keyframes = np.stack([vertices, vertices * (1.0, 1.1, 1.0)])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
