@@ -146,7 +146,7 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
     given = [x_a.clone(), x_b.clone(), torch.tensor([0.875], dtype=DOUBLE)]
     for tensor in given:
         tensor.requires_grad_()
-    shapes = member(samples(*given), True, None).shapes[0]
+    shapes = member(samples(*given), None).shapes[0]
     assert len(first[0].rounds[0].elements) > 10
     weights = torch.cos(7 * x_a)
     gradients = torch.autograd.grad((shapes * weights).sum(), given)
@@ -154,7 +154,7 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
 
     def value(*arguments: Tensor) -> float:
         moved = [argument.clone().requires_grad_() for argument in arguments]  # as if for a gradient: to the tolerance
-        return float((member(samples(*moved), True, None).shapes[0].detach() * weights).sum())
+        return float((member(samples(*moved), None).shapes[0].detach() * weights).sum())
 
     at = [tensor.detach() for tensor in given]
     # Small: where a contact becomes active, the steps jump.

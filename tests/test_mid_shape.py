@@ -290,7 +290,7 @@ def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
     ("ends", "truth", "bound"), [((0, 4), 2, 0.05), ((0, 2), 1, 0.011), ((2, 4), 3, 0.016)], ids=["0-8", "0-4", "4-8"]
 )
 def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands: Shapes) -> None:
-    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %, in 6 to 11, 4 and 6 to 8 steps.
+    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %, in about 20 steps with one Hessian.
 
     They vary with the meshing, which is not deterministic.
     """
@@ -300,8 +300,8 @@ def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands
     shell = ShellEnergy(hands.faces)
     if ends == (0, 2):  # on some meshings the wider spans end STALLED, at a collapsed triangle; their shape is as good
         assert found.solution.converged
-        assert found.solution.gradient_norm <= 1e-8
-        assert found.solution.n_steps <= 20
+        assert found.solution.gradient_norm <= 1e-7
+        assert found.solution.n_steps <= 30
     assert edge_error(found.shapes, wanted, hands.faces) <= bound
     assert float(shell.measure(found.shapes).volume) == pytest.approx(float(shell.measure(wanted).volume), rel=0.03)
 

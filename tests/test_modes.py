@@ -239,7 +239,8 @@ def test_modes_at_the_surface_in_the_callers_units(boxed: Mesh) -> None:
     used = np.unique(surface(BOX))
     at_surface = truth.modes.reshape(-1, 3, 5)[used].transpose(2, 0, 1)
     # Moving least squares smooth a little on so coarse a mesh; a wrong unit or order is off by far more.
-    error = np.linalg.norm(basis.modes.numpy() - at_surface) / np.linalg.norm(at_surface)
+    signs = np.sign((basis.modes.numpy() * at_surface).sum(axis=(1, 2)))[:, None, None]  # those are arbitrary
+    error = np.linalg.norm(basis.modes.numpy() - signs * at_surface) / np.linalg.norm(at_surface)
     assert error < 0.2
     np.testing.assert_array_equal(basis.reference, vertices)
     for factor in (1e-6, 4.0, 1e9):
@@ -432,7 +433,8 @@ def test_one_failure_ends_the_other_workers(boxed: Mesh, monkeypatch: pytest.Mon
     begun, stopped = threading.Event(), []
 
     def fill(points: np.ndarray, *args: object, stop: threading.Event, **kwargs: object) -> Tetrahedra:
-        if np.ptp(points[:, 2]) > 50:  # the stretched one
+        _, middle, longest = np.sort(np.ptp(points, axis=0))
+        if middle > 0.55 * longest:  # the stretched one
             assert begun.wait(30)
             raise TetrahedralizationError("no luck")
         begun.set()
