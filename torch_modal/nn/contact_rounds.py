@@ -114,7 +114,8 @@ def _left(search: ContactSearch) -> tuple[int, int]:
 def _alone(samples: Samples, i: int) -> Samples:
     """One sample as a batch."""
     pair = slice(i, i + 1) if samples.which is None else samples.which[i : i + 1]
-    ends = trees.rows((samples.x_a, samples.x_b), pair)
-    around = trees.rows((samples.before, samples.after, samples.spacing), pair)
+    x_a, x_b, before, after, spacing = trees.rows(
+        (samples.x_a, samples.x_b, samples.before, samples.after, samples.spacing), pair
+    )
     t, mu, stiffness = trees.rows((samples.t, samples.mu, samples.stiffness), slice(i, i + 1))
-    return Samples(*ends, None, t, mu, stiffness, *around)
+    return Samples(x_a, x_b, None, t, mu, stiffness, before, after, spacing)
