@@ -290,7 +290,7 @@ def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
     ("ends", "truth", "bound"), [((0, 4), 2, 0.05), ((0, 2), 1, 0.011), ((2, 4), 3, 0.016)], ids=["0-8", "0-4", "4-8"]
 )
 def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands: Shapes) -> None:
-    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %, in about 20 steps with one Hessian.
+    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %, in about 20 steps.
 
     They vary with the meshing, which is not deterministic.
     """

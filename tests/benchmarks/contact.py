@@ -260,8 +260,8 @@ def gradients() -> None:
     try:
         ContactRounds.found = held  # type: ignore[method-assign]
         found = torch.autograd.grad((shape(given) * weights).sum(), given)
-        print(f"\ngradients with {int((first[0][1].held.weights > 0).sum())} vertices held, relative difference")
-        parts = (("first key-frame", way, 1e-3), ("second", way, 1e-3), ("t", torch.ones_like(given[2]), 1e-5))
+        print(f"\ngradients with {int((first[0].rounds[-1].weights > 0).sum())} vertices held, relative difference")
+        parts = (("first key-frame", way, 1e-4), ("second", way, 1e-4), ("t", torch.ones_like(given[2]), 1e-6))
         for i, (name, moved, size) in enumerate(parts):
             values = []
             for sign in (1, -1):

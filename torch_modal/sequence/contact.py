@@ -149,8 +149,8 @@ def _search(member: Between, samples: Samples, pair: Pair) -> ContactSearch:
 def _never_worse(start: Tensor, field: Tensor, search: ContactSearch, limit: AccelerationLimit) -> Tensor | None:
     """The displacement, faded out around shapes in which it makes more pairs go through each other.
 
-    Where that makes others worse, it is faded out around these, too, and twice as far each time: at last, nothing is
-    moved. What is left is kept below the limit of the accelerations.
+    Where that makes others worse, it is faded out around these, too, and where it does not help, twice as far: at last,
+    nothing is moved. What is left is kept below the limit of the accelerations.
 
     Args:
         start: Without contact. *Shape:* ``(T, V, 3)``.
@@ -170,10 +170,11 @@ def _never_worse(start: Tensor, field: Tensor, search: ContactSearch, limit: Acc
             return found
         if reach > 1:
             return None
+        if not bool((worse & ~bad).any()):
+            reach = 2 * reach
         bad = bad | worse
         apart = ((t[:, None] - t[bad]).abs().amin(1) / reach).clamp_max(1)
         found, _ = limit.nearest(field * (apart**2 * (3 - 2 * apart))[:, None])
-        reach = 2 * reach
 
 
 def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor) -> AccelerationLimit:
