@@ -403,14 +403,15 @@ def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
         held = held.of_all(torch.arange(2))
         flat = x.movedim(-1, 0).flatten(1)
         # One shape is free, the other is held, and a corner of both is pulled elsewhere.
-        corner = (x[0] - x[0].amin(0)).norm(dim=-1) < 20
+        distance = (x[0] - x[0].amin(0)).norm(dim=-1)
+        corner = distance <= distance.kthvalue(40).values
         pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas[0])
         y = settled(member, samples, pair, x, held, pull, 10)
         y = settled(member, samples, pair, y, held, pull, 10)
         term = Held(held, x.shape[1])
         pushed = term.value(y.movedim(-1, 0).flatten(1))
         assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(term.value(flat)[1])
-        assert corner.sum() > 20 and bool((pull.value(y) < 0.5 * pull.value(x)).all())
+        assert bool((pull.value(y) < 0.5 * pull.value(x)).all())
         results.append(y)
     torch.testing.assert_close(*results, rtol=0, atol=1e-6)
 

@@ -13,8 +13,8 @@ Given = ParamSpec("Given")
 
 
 def traced(x: Tensor) -> bool:
-    """Whether a tensor only stands for one (torch.compile, export, fake tensors), so that no kernel can have it."""
-    return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter)
+    """Whether a tensor has no numbers (torch.compile, export, fake and meta tensors), so that no kernel can have it."""
+    return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter) or x.is_meta
 
 
 def transformed(x: Tensor) -> bool:
