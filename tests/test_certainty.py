@@ -94,6 +94,17 @@ class TestFallBack:
         assert float((gradient * step).sum()) == pytest.approx(float(there - back) / 2, rel=1e-5)
 
 
+def test_nothing_falls_back_at_a_key_frame(bars: Shapes) -> None:
+    """There, all shapes are the same, and their distortions are rounding."""
+    path = tm.Path(bars.bases, bars.faces)
+    layer = tm.InBetween(bars.bases[1:], bars.faces)
+    t = torch.tensor([0.0, 1e-9, 1.0, 2.0], dtype=torch.float64)
+    for dtype in (torch.float64, torch.float32):
+        keyframes = bars.keyframes.to(dtype)
+        found = path.to(dtype).solve(keyframes, t.to(dtype)), layer.to(dtype).solve(*keyframes[1:], t[:3].to(dtype))
+        assert all((result.solution.status != Status.FELL_BACK).all() for result in found)
+
+
 class TestDistortion:
     """What results are judged by."""
 

@@ -18,7 +18,7 @@ from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.nn import fused_alignment, trees
 from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.blend import Blends
-from torch_modal.nn.comparison import Distortion, no_worse
+from torch_modal.nn.comparison import SLACK, SLACK_OF_PATHS, Distortion, no_worse
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
 from torch_modal.nn.fused_crossings import FusedPairs
 from torch_modal.nn.fused_relax import FusedRelax
@@ -215,7 +215,9 @@ class Between(nn.Module):
             ends = pair.first, pair.second
             given = ends, samples.which, samples.t, samples.stiffness, anchors
             distortion = self.distortion([x, *starts], *given)
-        x, worse = no_worse(x, starts, distortion)
+        rounding = self.distortion.rounding(samples.stiffness, x)
+        slack = SLACK if pair.around is None else SLACK_OF_PATHS
+        x, worse = no_worse(x, starts, distortion, rounding, slack)
         fell = worse & (solution.status != Status.INVALID)
         return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Rest
 from torch_modal.energy.measures import collapsed, dihedral_angle, wrap_angle
+from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.functions import traced, transformed
 from torch_modal.geometry.vectors import cross, inverse, norm
@@ -28,6 +29,12 @@ LARGEST_WEIGHT = 8.0
 # A shape falls back if it has more distortion than its start by this factor. Below it, the volume error, which is not
 # measured and which the starts have more of, and the choice of elements decide more than the shapes do.
 SLACK = 1.2
+
+# The same for shapes of a smooth path, where a change from one to the other would be seen as a jump in time.
+SLACK_OF_PATHS = 3.0
+
+# At a key-frame all shapes are the same, to so many roundings of a coordinate.
+ROUNDINGS = 30.0
 
 
 class Distortion(nn.Module):
@@ -109,6 +116,11 @@ class Distortion(nn.Module):
             total = total + torch.stack([self.further.value(x, reference) for x in each])
         return total
 
+    def rounding(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
+        """The distortion that rounding of positions alone explains. *Shape:* ``(B,)``."""
+        off = ROUNDINGS * torch.finfo(like.dtype).eps * DIAGONAL
+        return self.shares[0] * len(self.edge) * stiffness[0].detach().mean(-1) * off**2
+
     def _by_torch(
         self,
         shapes: Sequence[Tensor],
@@ -155,20 +167,28 @@ class Distortion(nn.Module):
         return (self.shares[0] * out[..., 0] + self.shares[1] * out[..., 1]).to(t)
 
 
-def no_worse(x: Tensor, starts: Sequence[Tensor], distortion: Tensor) -> tuple[Tensor, Tensor]:
+def no_worse(
+    x: Tensor,
+    starts: Sequence[Tensor],
+    distortion: Tensor,
+    rounding: Tensor | float = 0.0,
+    slack: float = SLACK,
+) -> tuple[Tensor, Tensor]:
     """Shapes, and where one is worse than what it started from, the best of its starts.
 
     Args:
         x: *Shape:* ``(B, V, 3)``.
         starts: *Shape of each:* ``(B, V, 3)``.
         distortion: Of ``x`` and of the starts. *Shape:* ``(1 + S, B)``.
+        rounding: Distortions that are no larger are equal. *Shape:* ``(B,)``.
+        slack: How many times as much distortion as its start a shape may have.
 
     Returns:
         The shapes, *shape* ``(B, V, 3)``; where a start was taken, *shape* ``(B,)``, bool.
     """
     found, *others = distortion
     lowest, best = torch.stack(others).nan_to_num(torch.inf).min(0)
-    worse = ~(found <= SLACK * lowest) & lowest.isfinite()
+    worse = ~(found <= slack * lowest + rounding) & lowest.isfinite()
     # What need not be looked at need not be copied, either. A graph has no numbers to look at.
     if not (traced(worse) or transformed(worse)) and not bool(worse.any()):
         return x, worse

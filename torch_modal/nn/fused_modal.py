@@ -131,7 +131,8 @@ class FusedModalEnergy(ModalEnergy):
         """The placement for torch; None where it is for kernels."""
         if not isinstance(placement.reference, ShellReference):
             return placement
-        if torch.is_grad_enabled() or any(traced(x) or transformed(x) for x in trees.leaves(placement)):
+        values = placement.base, placement.extra, *placement.reference
+        if torch.is_grad_enabled() or any(x is not None and (traced(x) or transformed(x)) for x in values):
             base, extra, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
             return super().place(base, self.shell.unpacked(reference), extra)
         return None
@@ -140,9 +141,13 @@ class FusedModalEnergy(ModalEnergy):
     def _shapes(self, a: Tensor, base: Tensor, extra: Tensor | None) -> Tensor:
         """*Shape:* ``(..., B, n) -> (D * B, V, 3)``."""
         n = len(self.columns)
-        x = (a[..., :n].double() @ self.flat.double()).unflatten(-1, (-1, 3)) + base
+        a, flat = a.double(), self.flat.double()
+        if a.dim() == 2:
+            x = torch.addmm(base.flatten(1), a[:, :n], flat).view_as(base)
+        else:
+            x = (a[..., :n] @ flat).unflatten(-1, (-1, 3)) + base
         if extra is not None:
-            x = torch.addcmul(x, a[..., n, None, None].double(), extra)
+            x = torch.addcmul(x, a[..., n, None, None], extra)
         return x.flatten(0, -3)
 
     def rows(self, a: Tensor, placement: Placement) -> Tensor:
