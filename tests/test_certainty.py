@@ -12,7 +12,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.energy.terms import Mesh
 from torch_modal.nn.adjoint import ConvergenceWarning
-from torch_modal.nn.comparison import Distortion, no_worse
+from torch_modal.nn.comparison import Distortion, _weights, no_worse
 from torch_modal.nn.launch import has_kernels
 from torch_modal.nn.settings import PRESETS
 from torch_modal.nn.solver import Status
@@ -77,6 +77,13 @@ class TestFallBack:
         with pytest.warns(ConvergenceWarning, match="1 of 2 in-betweens came out worse.*FELL_BACK"):
             layer(x_a, x_b, torch.tensor([0.5, 0.5]))
 
+    def test_what_has_no_in_between_stays_so(self, bars: Shapes, monkeypatch: Any) -> None:
+        layer = tm.InBetween(bars.bases[1:], bars.faces, **preset("fast"))
+        spoiled = type(layer.members[0].space).lift
+        monkeypatch.setattr(type(layer.members[0].space), "lift", lambda *given: 10 * torch.sin(37 * spoiled(*given)))
+        result = layer.solve(bars.keyframes[1], bars.keyframes[2] * torch.nan, 0.5)
+        assert result.solution.status == Status.INVALID and result.shapes.isnan().all()
+
     @pytest.mark.parametrize("backend", BACKENDS)
     def test_gradients_are_those_of_what_is_returned(self, small_bars: Shapes, backend: str, monkeypatch: Any) -> None:
         layer = tm.InBetween(small_bars.bases[1:], small_bars.faces, **preset("fast", backend=backend))
@@ -110,7 +117,7 @@ class TestDistortion:
 
     def given(self, bars: Shapes) -> tuple[list[Tensor], tuple[Tensor, Tensor], Tensor, list[Tensor]]:
         straight, bent, twisted = bars.keyframes[:, None] * 20
-        shapes = [torch.lerp(bent, twisted, 0.5), straight, bent + 0.2 * torch.sin(straight)]
+        shapes = [torch.lerp(bent, twisted, 0.5), straight, bent + 0.2 * torch.sin(straight), 3.0 * bent]
         stiffness = [torch.tensor([[value]], dtype=torch.float64) for value in (500.0, 10.0, 1000.0)]
         return shapes, (bent, twisted), torch.tensor([0.3], dtype=torch.float64), stiffness
 
@@ -150,6 +157,17 @@ class TestDistortion:
         shell = tm.ShellEnergy(bars.faces)
         assert shell(shapes[0], collapsed[0]) > 100 * shell(shapes[0], ends[0])
 
+    def test_the_best_of_the_starts_is_taken(self) -> None:
+        x, starts = torch.zeros(3, 4, 3), [torch.full((3, 4, 3), value) for value in (1.0, 2.0)]
+        found, worse = no_worse(x, starts, torch.tensor([[9.0, 9.0, 1.0], [1.0, 3.0, 1.0], [2.0, 2.0, 1.0]]))
+        assert worse.tolist() == [True, True, False] and found[:, 0, 0].tolist() == [1.0, 2.0, 0.0]
+
+    def test_needles_have_a_bounded_weight(self) -> None:
+        e, b = torch.tensor([1.0, 0, 0]), torch.tensor([0.5, -1e-3, 0])
+        spokes = torch.stack([torch.stack([e, torch.tensor([0.5, h, 0]), b]) for h in (0.866, 1e-3, 0.0)], -1)
+        weights = _weights(spokes[:, :, None].double())[0]
+        assert weights[0] == pytest.approx(2 / 0.867, rel=1e-3) and weights[1:].tolist() == [8.0, 0.0]
+
     def test_what_is_not_finite_is_worse(self) -> None:
         x, start = torch.zeros(2, 4, 3), torch.ones(2, 4, 3)
         found, worse = no_worse(x, [start], torch.tensor([[torch.nan, 1.0], [1.0, 1.0]]))
@@ -174,9 +192,9 @@ def test_a_key_frame_is_returned_beside_one_that_is_not_finite(small_bars: Shape
 def test_other_units_than_those_of_the_bases_are_told_once(small_bars: Shapes, backend: str) -> None:
     solver = tm.Solver(backend=backend)
     layer = tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=solver)
-    with pytest.warns(tm.MeshWarning, match=r"1e\+03 times as large as the shapes"):
-        layer.solve(*(1000 * small_bars.keyframes[:2]), 0.5)
+    with pytest.warns(tm.MeshWarning, match=r"are 4 times as large as the shapes"):
+        layer.solve(*(4 * small_bars.keyframes[:2]), 0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        layer.solve(*(1000 * small_bars.keyframes[:2]), 0.5)
+        layer.solve(*(4 * small_bars.keyframes[:2]), 0.5)
         tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=solver).solve(*(2 * small_bars.keyframes[:2]), 0.5)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
-from test_gauss_newton import Circle, Rosenbrock, Uphill, problem, start
+from test_gauss_newton import Circle, LeastSquares, Rosenbrock, Uphill, problem, start
 from test_gauss_newton import layer as layer  # a fixture
 from torch import Tensor
 
@@ -47,8 +47,28 @@ def test_a_sample_does_not_depend_on_its_batch(layer: MidShape, bars: Shapes) ->
     assert len(set(together.n_steps.tolist())) > 1, "they end at different times"
 
 
-def test_never_uphill_from_a_bent_valley() -> None:
+class Waves(LeastSquares):
+    """Concave between its minima."""
+
+    def residuals(self, a: Tensor) -> Tensor:
+        return torch.stack([1 - a[..., 0].cos(), 0.3 * (a[..., 1] - 0.1 * a[..., 0])], -1)
+
+
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No Newton steps help."""
+    monkeypatch.setattr(quasi_newton, "minimise", lambda *_: pytest.fail("quasi-Newton steps should do"))
+
+
+def test_across_negative_curvature(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone(monkeypatch)
+    solution = descend(GaussNewtonStep(Waves()), start([2.5, 3.0], [-2.8, -1.0], [2.9, 0.5]), None, tolerance=1e-6)
+    assert solution.converged.all()
+    assert (solution.energy < 1e-6).all()
+
+
+def test_never_uphill_from_a_bent_valley(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hard start: steps are shortened, and the energy never rises."""
+    alone(monkeypatch)
 
     class Recorded(Rosenbrock):
         def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
@@ -68,6 +88,9 @@ def test_newton_steps_take_over(monkeypatch: pytest.MonkeyPatch) -> None:
     solution = descend(GaussNewtonStep(Circle()), start([0.3], [-1.0], [0.0]), None)
     assert solution.status.tolist() == [Status.CONVERGED] * 3
     assert solution.amplitudes.abs().max() < 1e-6
+    energy, first = Circle(), start([0.3], [-1.0])
+    norms = [energy.value_and_gradient(a, None)[1].norm(dim=1) for a in (first, solution.amplitudes[:2])]
+    torch.testing.assert_close(solution.gradient_norm[:2], norms[1] / norms[0], rtol=1e-6, atol=1e-14)
     assert solution.n_steps[2] == 0, "it started at the solution"
 
 
