@@ -459,15 +459,21 @@ class TestSingleSamples:
         with pytest.raises(ValueError, match=r"t lies in \[0, 1\]"):
             layer(*bars.keyframes[:2], times(0.5, t))
 
-    def test_unconverged_samples_are_reported(self, bars: Shapes) -> None:
+    def test_unconverged_samples_are_reported(self, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
         x_a, x_b = bars.keyframes[1:]
         x_b = torch.stack([x_b, x_a]).clone().requires_grad_()
         layer = InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, max_steps=1))
         with pytest.warns(ConvergenceWarning, match="1 of 2 .* in 1 steps .*1 OUT_OF_STEPS"):
             shapes = layer(x_a, x_b, 0.5)
         # Of the sample that did not converge only the part moves that does not go through the amplitudes.
-        (gradient,) = torch.autograd.grad(shapes.sum(), x_b)
+        adjoints, whole = [], SumOfEnergies.pull_back
+        monkeypatch.setattr(SumOfEnergies, "pull_back", lambda *given: adjoints.append(given[2]) or whole(*given))
+        (gradient,) = torch.autograd.grad((shapes * torch.cos(9 * x_b.detach())).sum(), x_b)
         assert bool(gradient.isfinite().all())
+        unconverged = layer.solve(x_a, x_b, 0.5).solution.status != Status.CONVERGED
+        assert (
+            unconverged.sum() == 1 and (adjoints[0][unconverged] == 0).all() and (adjoints[0][~unconverged] != 0).any()
+        )
         layer.solver = replace(layer.solver, unconverged="raise")
         with pytest.raises(ConvergenceError, match="1 of 2"):
             layer(x_a, x_b, 0.5)
