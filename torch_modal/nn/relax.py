@@ -13,8 +13,8 @@ from torch_modal.nn.adjoint import flattened
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
 
-# The whole step, and what is tried where it goes uphill.
-STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)
+# The whole step, and what is tried where it goes uphill. Contacts that a step activates need the shortest ones.
+STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.003, 0.001)
 
 
 class ConvexHessian:
