@@ -28,6 +28,7 @@ from torch_modal.nn.frame import Pair
 from torch_modal.nn.held import Held, Pull, settled
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence import contact, together
+from torch_modal.sequence import path as path_module
 from torch_modal.sequence.acceleration import AccelerationLimit
 from torch_modal.sequence.splines import splines, through
 
@@ -41,6 +42,14 @@ def hand() -> Shapes:
     sample = load_sample("hand")
     bases = tm.extract_bases(sample.keyframes, sample.faces, 20, mesher="lattice", progress=False)
     return Shapes(sample.keyframes, sample.faces, bases)
+
+
+@pytest.fixture(scope="module")
+def fists(data_dir: Path) -> Shapes:
+    """A hand that closes to a fist."""
+    files = sorted((data_dir / "mh-hand").glob("*.obj"))[1:3]
+    keyframes, faces = tm.load_keyframes(files)
+    return Shapes(keyframes, faces, tm.extract_bases(keyframes, faces, 20, progress=False))
 
 
 def far(x: Tensor, shapes: Shapes) -> Tensor:
@@ -307,6 +316,32 @@ def test_a_displacement_fades_out_where_it_makes_shapes_worse() -> None:
     every: Any = Fake(list(range(n)))
     none = contact._never_worse(torch.zeros(n, 2, 3, dtype=DOUBLE), field, every, limit)
     assert none is not None and not bool(none.any())
+
+
+def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    def folding(member: Between, grid: Samples, shapes: Tensor) -> contact.Displacement:
+        """One half of the hand onto the other."""
+        own = member.frame.bring(shapes, trees.picked(member.placed(grid), grid.which), grid.t)
+        side = own[..., 0] - own[..., 0].mean(-1, keepdim=True)
+        field = torch.zeros_like(own).movedim(-1, 0).contiguous()
+        field[0] = -2 * side.clamp_min(0)
+        none = torch.zeros(len(shapes), dtype=torch.int64)
+        return contact.Displacement(field, grid.t, none, none)
+
+    t = torch.tensor([0.3, 0.45], dtype=DOUBLE)
+    with torch.no_grad():
+        plain = tm.Path(hand.bases, hand.faces)(hand.keyframes, t)
+        monkeypatch.setattr(path_module, "push_apart", folding)
+        kept, solution = tm.Path(hand.bases, hand.faces, contact=True).solve(hand.keyframes, t)
+    torch.testing.assert_close(kept, plain, rtol=0, atol=1e-9)
+    assert solution.n_crossing is not None and solution.n_crossing.tolist() == far(plain, hand).tolist()
+
+
+def test_contacts_of_earlier_rounds_stay_active(fists: Shapes) -> None:
+    """Without them, twelve pairs are left: what was pushed out of reach falls back."""
+    with torch.no_grad():
+        _, solution = tm.InBetween(fists.bases, fists.faces, contact=True).solve(*fists.keyframes, 0.675)
+    assert int(solution.n_crossing) == 0
 
 
 @pytest.mark.slow

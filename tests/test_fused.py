@@ -432,7 +432,7 @@ class TestBackend:
         launch._works.cache_clear()
         try:
             assert tm.InBetween(small_bars.bases[:2], small_bars.faces).members[0].fused is None
-            with pytest.raises(MissingPackageError, match=r"pip install 'torch_modal\[warp\]'"):
+            with pytest.raises(MissingPackageError, match="pip install warp-lang"):
                 tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
         finally:
             launch._works.cache_clear()
@@ -456,7 +456,10 @@ class TestBackend:
         )
         folder = Path(tm.__file__).parents[1]
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
-        assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+        assert (result.returncode, result.stdout) == (0, "")
+        # Warp's C code says so where there is no CUDA driver.
+        said = [line for line in result.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
+        assert said == []
 
     def test_import_does_not_load_warp(self) -> None:
         code = "import sys, torch_modal.nn.in_between; sys.exit('warp' in sys.modules)"

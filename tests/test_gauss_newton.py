@@ -158,6 +158,17 @@ def solve(layer: MidShape, bars: Shapes, bends: list[float]) -> Solution:
     return minimise(layer.step, a, placed)
 
 
+def test_a_last_newton_step_that_went_wrong_is_not_the_last() -> None:
+    """All that there is to gain drowns in the rounding of a large constant, and the first Newton step overshoots."""
+
+    class Drowned(LeastSquares):
+        def residuals(self, a: Tensor) -> Tensor:
+            return torch.cat([1.2429636856062651 + a.sin(), 0.1285222588569714 * a**2, torch.full_like(a, 1e9)], -1)
+
+    solution = minimise(GaussNewtonStep(Drowned()), start([1.5465700486790057]), None, tolerance=1e-9)
+    assert float(solution.gradient_norm) < 100, "one Newton step has 202 times the gradient of the start"
+
+
 @pytest.mark.parametrize("ends", [(0, 1), (1, 2)])
 def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes) -> None:
     bars = small_bars.pick(*ends)

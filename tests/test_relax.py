@@ -13,7 +13,7 @@ from torch_modal.energy.energy import Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry.vectors import norm
 from torch_modal.nn.between import fine_chunk
-from torch_modal.nn.relax import RIDGE, ConvexHessian, relax
+from torch_modal.nn.relax import RIDGE, STEP_LENGTHS, ConvexHessian, _downhill, relax
 
 BATCH = 2
 
@@ -110,6 +110,17 @@ def test_steps_go_downhill_and_many_end_at_a_minimum(small_bars: Shapes) -> None
     end = relax(case.core, case.x, case.reference, 60, 100)
     start_norm, end_norm = (case.core.fold(case.core.gradient(case.at(x))).norm() for x in (case.x, end))
     assert float(end_norm / start_norm) < 1e-5
+
+
+def test_a_step_is_shortened_until_the_energy_falls(case: Case) -> None:
+    core, at = case.core, case.at(case.x)
+    before = core.value_at(at, case.reference)
+    moves = -core.extend(core.fold(core.gradient(at))) * torch.tensor([0.1, 0.01])[:, None]
+    length = _downhill(core, before, case.rows, moves, case.reference)
+    for sample, own in enumerate(length.tolist()):
+        reached = [float(core.value(case.rows + k * moves, case.reference)[sample]) for k in STEP_LENGTHS]
+        assert own == next(k for k, energy in zip(STEP_LENGTHS, reached, strict=True) if energy < float(before[sample]))
+    assert bool((length < 1).any()), "no step was too long: the test is too easy"
 
 
 def test_a_minimum_stays(small_bars: Shapes) -> None:

@@ -75,6 +75,13 @@ def test_all_of_a_hinge_by_hand() -> None:
     assert float(ShellEnergy(HINGE, gamma=0.0)(turned, wide)) == pytest.approx(10.0, rel=1e-12)
 
 
+def test_weight_of_needles_is_bounded() -> None:
+    # l = 2 and A = 0.001: l^2 / A = 4000 counts as 1000. beta fold^2 1000 = 10^4 fold^2.
+    needle = torch.tensor([1.0, 0.0005, 0.0005])
+    shell = ShellEnergy(HINGE, gamma=0.0)
+    assert float(shell(hinge(0.3) * needle, hinge(0.0) * needle)) == pytest.approx(900, rel=1e-9)
+
+
 def test_fold_through_half_a_turn_is_short() -> None:
     # From +170 to -170 degrees: 20 degrees, not 340.  20 (20 pi / 180)^2
     degree = math.pi / 180

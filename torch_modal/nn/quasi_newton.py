@@ -50,7 +50,7 @@ def descend(
     a: Tensor,
     placement: Any,
     max_steps: int = 80,
-    tolerance: float = 1e-7,
+    tolerance: float = 3e-7,
     energy: Tensor | None = None,
 ) -> Solution:
     """Minimise by the BFGS method, whose first Hessian is Gauss-Newton's, then by Newton steps what did not converge.
@@ -104,9 +104,9 @@ def _put(whole: tuple[Tensor, ...], state: _State) -> None:
 
 def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
     """One evaluation: a step where the energy falls, a shorter one next where it does not."""
-    gradient, inverse, length = state.gradient, state.inverse, state.length
-    move = torch.bmm(inverse, gradient) * -length[:, None, None]
-    there = state.a + move
+    a, gradient, inverse, length = state.a, state.gradient, state.inverse, state.length
+    move = torch.bmm(inverse, gradient).mul_(-length[:, None, None])
+    there = a + move
     value, slope = energy.value_and_gradient(there.squeeze(-1), state.placement)
     slope = slope[..., None]
     # Energies are sums of squares. They may rise by their rounding.
@@ -116,23 +116,23 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
         length = torch.ones_like(length)
     else:
         taken = better[:, None, None]
-        there, move, change = torch.where(taken, there, state.a), move * taken, torch.where(taken, change, 0)
+        there, move, change = torch.where(taken, there, a), move * taken, torch.where(taken, change, 0)
         value, slope = torch.where(better, value, state.energy), torch.where(taken, slope, gradient)
         shorter = torch.where(length > SHORTEST, 0.5 * length, 0)
         length = torch.where(better, 1, shorter)
     # The update keeps the inverse positive definite where the gradient grows along the step; elsewhere it is left out.
     pushed, across = torch.bmm(inverse, change), change.mT
     curvature = torch.bmm(across, move)
-    share = torch.where(curvature > 0, 1 / curvature, 0)
-    other = share * ((0.5 + 0.5 * share * torch.bmm(across, pushed)) * move - pushed)
-    update = torch.bmm(move, other.mT)
-    norm = slope.flatten(1).norm(dim=-1)
+    share = torch.where(curvature > 0, curvature.reciprocal(), 0)
+    half = torch.bmm(across, pushed).mul_(share).add_(1).mul_(0.5)
+    other, scaled = torch.addcmul(pushed, half, move, value=-1), move * share
+    norm = torch.linalg.vector_norm(slope, dim=(1, 2))
     return state._replace(
         a=there,
         energy=value,
         gradient=slope,
         norm=norm,
-        inverse=inverse.add_(update).add_(update.mT),
+        inverse=inverse.baddbmm_(scaled, other.mT, alpha=-1).baddbmm_(other, scaled.mT, alpha=-1),
         length=length * (norm > state.goal),
         n_steps=state.n_steps + better,
     )

@@ -93,7 +93,7 @@ class Solver:
     """
 
     max_steps: int = 80
-    tolerance: float = 1e-7
+    tolerance: float = 3e-7
     gradient: Literal["implicit", "unroll"] = "implicit"
     unconverged: Literal["warn", "raise"] = "warn"
     local_steps: int = 2
