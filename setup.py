@@ -33,9 +33,13 @@ EXTRAS = {
     # Parts that pass through each other; earlier versions of ipctk have another interface, and were not tried.
     "contact": ["ipctk>=1.6", "libigl>=2.6"],
     "compress": ["constriction>=0.4"],  # small files of motions: the range coder
-    "warp": ["warp-lang>=1.19"],  # kernels; earlier ones are told otherwise what not to print
     "dask": ["distributed>=2024.5"],
 }
+HAS_WARP = (
+    "(sys_platform == 'linux' and (platform_machine == 'x86_64' or platform_machine == 'aarch64'))"
+    " or (sys_platform == 'darwin' and platform_machine == 'arm64')"
+    " or (sys_platform == 'win32' and platform_machine == 'AMD64')"
+)
 # The site: sh docs/build.sh
 DOCS = ["sphinx>=7.4", "furo>=2024.8", "myst-nb>=1.1", "sphinx-copybutton>=0.5"]
 
@@ -89,6 +93,9 @@ setup(
         "pillow>=10",
         "tqdm>=4.65",
         "lazy_loader>=0.4",
+        # Kernels, where there are wheels. nn/launch.py writes arguments into commands that Warp has recorded, whose
+        # layout is not documented.
+        f"warp-lang>=1.19,<1.20 ; {HAS_WARP}",
     ],
     extras_require={
         **EXTRAS,

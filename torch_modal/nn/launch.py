@@ -7,15 +7,15 @@ import math
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from torch_modal.extras import require_installed, uncollected
+from torch_modal.errors import MissingPackageError
+from torch_modal.extras import uncollected
 from torch_modal.progress import ProgressReport
 
 Backend = Literal["auto", "torch", "warp"]
@@ -31,6 +31,7 @@ Module = Literal[
     "crossings",
     "distortion",
 ]
+PACKAGE = "torch_modal.nn.kernels"
 IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps", "distortion")
 """What in-betweens need that record no gradient."""
 MOST_ENTRIES = 2**31 - 1
@@ -43,30 +44,20 @@ def kernels(name: Module) -> Any:
     with uncollected():
         import warp as wp
 
-        module = importlib.import_module(f"torch_modal.nn.kernels.{name}")
+        module = importlib.import_module(f"{PACKAGE}.{name}")
 
-    before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
-    try:
-        with nullcontext() if torch.cuda.is_available() else _silent():
-            wp.init()
-        with ProgressReport(1, "kernels, which are compiled once", unit="module"):
-            wp.load_module(module, device="cpu")
-    finally:
-        wp.config.log_level = before
+    _load(wp, module.__name__)
     return module
 
 
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Nothing on standard error: there Warp's C code says that there is no CUDA driver, whatever it is told."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+def _load(wp: Any, module: str) -> None:
+    """Compile a module and those below it, several at a time, or take them from Warp's cache."""
+    before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
     try:
-        os.dup2(nowhere, 2)
-        yield
+        with ProgressReport(1, "compiling kernels (once for this machine)", unit="module"):
+            wp.load_module(module, device="cpu", recursive=True, max_workers=os.cpu_count())
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
+        wp.config.log_level = before
 
 
 @cache
@@ -85,18 +76,22 @@ def has_kernels(backend: Backend) -> bool:
     """Whether kernels are used.
 
     Raises:
-        MissingPackageError: ``"warp"`` is asked for and not installed.
+        MissingPackageError: ``"warp"`` is requested and not installed.
     """
-    if backend == "warp":
-        require_installed(("warp",), "warp", "backend='warp'")
+    if backend == "warp" and importlib.util.find_spec("warp") is None:
+        raise MissingPackageError("backend='warp' needs warp-lang, which is not installed: pip install warp-lang")
     return backend != "torch" and _works()
 
 
 def load_kernels(backend: Backend) -> None:
     """Load those of in-betweens, if they are used, so that nobody waits for it later."""
     if has_kernels(backend):
-        for name in IN_BETWEENS:
-            kernels(name)
+        import warp as wp
+
+        modules = [importlib.import_module(f"{PACKAGE}.{name}") for name in IN_BETWEENS]
+        _load(wp, PACKAGE)
+        for module in modules:
+            kernels(module.__name__.rsplit(".", 1)[-1])  # type: ignore[arg-type]
 
 
 class _Commands(threading.local):
