@@ -61,7 +61,8 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_across_negative_curvature(monkeypatch: pytest.MonkeyPatch) -> None:
     alone(monkeypatch)
-    solution = descend(GaussNewtonStep(Waves()), start([2.5, 3.0], [-2.8, -1.0], [2.9, 0.5], [2.8559, -0.84165]), None, tolerance=1e-6)
+    first = start([2.5, 3.0], [-2.8, -1.0], [2.9, 0.5], [2.8559, -0.84165])
+    solution = descend(GaussNewtonStep(Waves()), first, None, tolerance=1e-6)
     assert solution.converged.all()
     assert (solution.energy < 1e-6).all()
 
