@@ -128,8 +128,8 @@ class TestDistortion:
     def test_is_eq_5_without_volume_where_strains_are_small(self, bars: Shapes) -> None:
         _, (bent, _), _, stiffness = self.given(bars)
         x = bent + 1e-3 * torch.sin(3 * bent)
-        mesh, terms = Mesh.of(bars.faces, bent.shape[1]), tm.Objective().all_terms()
-        distortion = Distortion(mesh, terms, False)([x], (bent, bent), None, torch.tensor([0.5]).double(), stiffness)
+        mesh = Mesh.of(bars.faces, bent.shape[1])
+        distortion = Distortion(mesh, None, False)([x], (bent, bent), None, torch.tensor([0.5]).double(), stiffness)
         shell = tm.ShellEnergy(bars.faces, alpha=500.0, beta=10.0, gamma=0.0)
         # Beside that, Eq. 5 counts a relative strain squared, and the distortion the same.
         assert float(distortion) == pytest.approx(float(shell(x, bent)), rel=1e-9)
@@ -141,7 +141,7 @@ class TestDistortion:
         n = len(Mesh.of(bars.faces, ends[0].shape[1]).edges)
         stiffness[0] = torch.linspace(1, 2, n, dtype=torch.float64)[None]
         mesh = Mesh.of(bars.faces, ends[0].shape[1])
-        one, other = (Distortion(mesh, tm.Objective().all_terms(), fused) for fused in (True, False))
+        one, other = (Distortion(mesh, None, fused) for fused in (True, False))
         torch.testing.assert_close(
             one(shapes, ends, None, t, stiffness), other(shapes, ends, None, t, stiffness), rtol=1e-12, atol=0
         )
@@ -150,7 +150,7 @@ class TestDistortion:
         """A vertex laid onto its neighbour in both key-frames: Eq. 5 divides by the length of that edge."""
         shapes, ends, t, stiffness = self.given(bars)
         mesh = Mesh.of(bars.faces, ends[0].shape[1])
-        distortion = Distortion(mesh, tm.Objective().all_terms(), False)
+        distortion = Distortion(mesh, None, False)
         before = distortion(shapes, ends, None, t, stiffness)
         i, j = mesh.edges[50].tolist()
         collapsed = [x.clone() for x in ends]

@@ -142,6 +142,7 @@ class Energy(nn.Module):
             numbers[n + 1 :] = len(vertices) + 1 + torch.arange(n_anchors)
         parts = [OnMesh(term, own, numbers) for term, own in zip(terms, meshes, strict=True)]
         self.parts = nn.ModuleList(parts)
+        self.sampled = sampled
         self.n_vertices = len(vertices)
         self.n_extended = len(vertices) + 1 + n_anchors
         self.register_buffer("vertices", vertices, persistent=False)

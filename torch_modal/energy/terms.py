@@ -35,6 +35,9 @@ MIN_RELATIVE_VOLUME = 1e-6  # of (surface area)^(3/2); a sphere has 0.094
 # Strain over which the tension of an edge sets in.
 SLACK = 1e-3
 
+N_SHELL_TERMS = 3
+"""How many terms Eq. 5 has; they come first."""
+
 
 @dataclass(frozen=True)
 class Mesh:

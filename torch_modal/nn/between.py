@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.functions import traced, transformed
 from torch_modal.geometry.vectors import cross, pick
@@ -21,7 +21,8 @@ from torch_modal.nn.blend import Blends
 from torch_modal.nn.comparison import SLACK, SLACK_OF_PATHS, Distortion, no_worse
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
 from torch_modal.nn.fused_crossings import FusedPairs
-from torch_modal.nn.fused_relax import FusedRelax
+from torch_modal.nn.fused_relax import FusedRelax, Other, Terms
+from torch_modal.nn.fused_shell import ShellReference
 from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.joint import JointSpace
 from torch_modal.nn.launch import has_kernels
@@ -73,8 +74,10 @@ class Shared(NamedTuple):
 
     energy: Energy
     """On the caller's mesh."""
+    further: Energy | None
+    """Its terms beyond Eq. 5, where there are some."""
     fused: FusedRelax | None
-    """Its kernels, where there are some."""
+    """The kernels of Eq. 5, where there are some."""
     distortion: Distortion
     """Judges results."""
     weights: Tensor
@@ -89,11 +92,14 @@ class Shared(NamedTuple):
         cls, mesh: Mesh, shapes: Tensor, pairs: Sequence[tuple[int, int]], terms: Sequence[Term], solver: Solver
     ) -> "Shared":
         """Of these terms and pairs of the references of all bases, float64 on the CPU. *Shape:* ``(K, V, 3)``."""
-        energy = Energy(mesh, terms)
-        fused = FusedRelax(energy, mesh) if FusedRelax.serves(energy, solver.backend) else None
-        blends = Blends(mesh.connectivity, shapes, pairs[0], has_kernels(solver.backend))
+        has = has_kernels(solver.backend)
+        shell, others = Energy(mesh, terms[:N_SHELL_TERMS]), terms[N_SHELL_TERMS:]
+        further = Energy(mesh, others) if others else None
+        energy = Energy(mesh, terms) if others else shell
+        fused = FusedRelax(shell, mesh) if has else None
+        blends, distortion = Blends(mesh.connectivity, shapes, pairs[0], has), Distortion(mesh, further, has)
         weights, collapses = mean_areas(shapes, mesh.faces), shared_collapses(mesh.faces)
-        return cls(energy, fused, Distortion(mesh, terms, has_kernels(solver.backend)), weights, collapses, blends)
+        return cls(energy, further, fused, distortion, weights, collapses, blends)
 
 
 class Between(nn.Module):
@@ -125,7 +131,8 @@ class Between(nn.Module):
         #: Whether Eq. 5 has no company: what has no strain then stays as it is.
         self.bare = not objective.terms
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
-        self.fine, self.fused, self.distortion = shared.energy, shared.fused, shared.distortion
+        self.fine, self.further, self.fused = shared.energy, shared.further, shared.fused
+        self.distortion = shared.distortion
         collapses = partial(shared.collapses, places)
         self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses, modes[0])
         # Steps that are unrolled are differentiated like any other expression: by torch.
@@ -285,12 +292,14 @@ class Between(nn.Module):
         """Local interpolation and polish: what the modes cannot do. *Shape:* ``(B, V, 3)``."""
         solver, samples = self.solver, batch.samples
         stages = (solver.local_steps, LOCAL_PRODUCTS), (solver.polish, POLISH_PRODUCTS)
-        if self.fused is not None:
+        if self.fused is not None and self.further is None:
             rest = trees.picked((batch.pair.first, batch.pair.second), samples.which)
             chunk = fine_chunk(x.shape[-2], x.device)
             for n_steps, n_products in stages:
                 x = self.fused(x, *rest, samples.t, samples.stiffness, n_steps, n_products, chunk)
             return x
+        if self.kernels_serve(x):
+            return self.descend(x, batch, stages)
         parts = []
         for own, reference, fixed in self.fine_chunks(batch):
             moved = x[own]
@@ -298,6 +307,51 @@ class Between(nn.Module):
                 moved = relax(self.fine, moved, reference, n_steps, n_products, fixed)
             parts.append(moved)
         return torch.cat(parts)
+
+    def kernels_serve(self, x: Tensor) -> bool:
+        """Whether kernels take the steps of all vertices where there are other energies beside Eq. 5."""
+        recorded = torch.is_grad_enabled() and x.requires_grad
+        return self.fused is not None and not (recorded or traced(x) or transformed(x))
+
+    def descend(
+        self, x: Tensor, batch: Batch, stages: Sequence[tuple[int, int]], contacts: Sequence[Other] = ()
+    ) -> Tensor:
+        """Steps of all vertices by kernels, with further terms and contacts.
+
+        Args:
+            x: *Shape:* ``(B, V, 3)``.
+            batch: The samples.
+            stages: Steps, and products in each.
+            contacts: Of a batch of one.
+        """
+        assert self.fused is not None
+        parts = []
+        for own, to, others in self.fused_chunks(batch.samples, batch.pair, batch.anchors):
+            moved = x[own].double().contiguous()
+            for n_steps, n_products in stages:
+                moved = self.fused.descend(moved, to, [*others, *contacts], n_steps, n_products)
+            parts.append(moved)
+        return torch.cat(parts).to(x)
+
+    def fused_chunks(
+        self, samples: Samples, pair: Pair, anchors: Tensor | None
+    ) -> Iterator[tuple[slice, ShellReference, list[Other]]]:
+        """Samples that kernels relax at a time, what Eq. 5 compares them with, and further terms."""
+        fused = self.fused
+        assert fused is not None
+        first, second = trees.picked((pair.first, pair.second), samples.which)
+        if pair.around is not None:
+            first = second = self.space.on_course(pair, samples.which, samples.t)[0]
+        chunk = fine_chunk(self.mesh.n_vertices, samples.t.device)
+        for i in range(0, len(samples.t), chunk):
+            own = slice(i, i + chunk)
+            given = trees.rows((first, second, samples.t, samples.stiffness, anchors), own)
+            a, b, t, stiffness, fixed = trees.mapped(given, lambda value: value.double().contiguous())
+            others: list[Other] = []
+            if self.further is not None:
+                rests = (self.further.rest(self.further.extend(end.movedim(-1, 0).contiguous())) for end in (a, b))
+                others.append(Terms(self.further, self.further.between(*rests, t, stiffness[N_SHELL_TERMS:]), fixed))
+            yield own, fused.reference(a, b, t, *stiffness[:N_SHELL_TERMS]), others
 
     def fine_chunks(self, batch: Batch) -> Iterator[tuple[slice, Reference, Tensor | None]]:
         """Samples that are relaxed at a time, what they are compared with on the fine mesh, and their anchors."""
@@ -324,14 +378,14 @@ class Between(nn.Module):
 
     def _levelled(self, stiffness: list[Tensor]) -> Stiffness:
         """Stiffnesses of the elements of the fine mesh, on those of each level."""
-        levels = self.space.levels
-        coarse, *sampled = levels.energies
-        parts = zip(levels.members[0], coarse.parts, strict=True)
-        found = [
-            [coarse_values(stiffness[i], self.fine.parts[i], part, self.frame.coarse.clusters) for i, part in parts]
-        ]
-        if sampled:
-            found.append([stiffness[i] for i in levels.members[1]])
+        levels, found = self.space.levels, []
+        for energy, members in zip(levels.energies, levels.members, strict=True):
+            values = [stiffness[i] for i in members]
+            if not energy.sampled:
+                parts = zip(values, members, energy.parts, strict=True)
+                clusters = self.frame.coarse.clusters
+                values = [coarse_values(own, self.fine.parts[i], part, clusters) for own, i, part in parts]
+            found.append(values)
         return Stiffness(stiffness, found)
 
     def anchors(self, placed: Pair, t: Tensor) -> Tensor | None:

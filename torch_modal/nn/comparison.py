@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch_modal.energy.energy import Energy, Rest
 from torch_modal.energy.measures import collapsed, dihedral_angle, wrap_angle
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.terms import N_SHELL_TERMS, Mesh
 from torch_modal.geometry.functions import traced, transformed
 from torch_modal.geometry.vectors import cross, inverse, norm
 from torch_modal.nn import trees
@@ -47,7 +47,7 @@ class Distortion(nn.Module):
 
     Args:
         mesh: The mesh.
-        terms: Stretching, bending and volume, then further terms. The layer owns them.
+        further: Terms beyond Eq. 5.
         fused: Whether kernels compute it.
     """
 
@@ -58,7 +58,7 @@ class Distortion(nn.Module):
     record: Tensor
     record_hinge: Tensor
 
-    def __init__(self, mesh: Mesh, terms: Sequence[Term], fused: bool) -> None:
+    def __init__(self, mesh: Mesh, further: Energy | None, fused: bool) -> None:
         super().__init__()
         self.fused = fused
         interior = torch.tensor(mesh.connectivity.counts == 2)
@@ -81,7 +81,7 @@ class Distortion(nn.Module):
             self.register_buffer(name, values, persistent=False)
         #: How many elements each one stands for.
         self.shares = n_edges / len(edge), n_hinges / max(len(self.hinge), 1)
-        self.further = Energy(mesh, terms[3:]) if len(terms) > 3 else None
+        self.further = further
 
     def forward(
         self,
@@ -110,7 +110,7 @@ class Distortion(nn.Module):
         total = both(shapes, ends, which, t, stiffness)
         if self.further is not None:
             rests = trees.picked([_rest(self.further, end) for end in ends], which)
-            reference = self.further.between(rests[0], rests[1], t, stiffness[3:])
+            reference = self.further.between(rests[0], rests[1], t, stiffness[N_SHELL_TERMS:])
             fixed = None if anchors is None else anchors.movedim(-1, 0)
             each = [self.further.extend(x.movedim(-1, 0).contiguous(), fixed) for x in shapes]
             total = total + torch.stack([self.further.value(x, reference) for x in each])

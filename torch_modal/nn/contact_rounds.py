@@ -9,6 +9,7 @@ from torch import Tensor
 from torch_modal.nn import trees
 from torch_modal.nn.between import Batch, Between
 from torch_modal.nn.contact import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
+from torch_modal.nn.held import Held
 from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.solver import Solution
@@ -101,6 +102,10 @@ class ContactRounds(Between):
 
     def _step(self, batch: Batch, x: Tensor, active: Contacts) -> Tensor:
         """Steps of all vertices of one sample with its contacts. *Shape:* ``(1, V, 3)``."""
+        if self.kernels_serve(x):
+            weights, gaps = active.weights.double(), active.gaps.double()
+            contacts = Held(active._replace(weights=weights, gaps=gaps), x.shape[1])
+            return self.descend(x, batch, [(FINE_STEPS, FINE_PRODUCTS)], [contacts])
         ((_, reference, fixed),) = self.fine_chunks(batch)
         energy = active.fine(self.mesh, self.terms)
         return relax(energy, x, active.joined(reference), FINE_STEPS, FINE_PRODUCTS, fixed)

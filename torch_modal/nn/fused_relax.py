@@ -2,16 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from torch_modal.energy.energy import Energy, Reference
 from torch_modal.geometry.functions import applied, traced
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_shell import FusedShell, ShellPoint, ShellReference
 from torch_modal.nn.launch import kernels, launch
-from torch_modal.nn.relax import STEP_LENGTHS, relax
+from torch_modal.nn.relax import STEP_LENGTHS, ConvexHessian, relax
 
 
 class FusedRelax(FusedShell):
@@ -66,6 +67,49 @@ class FusedRelax(FusedShell):
         return relax(self.energy, x, self.energy.between(one, other, t, stiffness), n_steps, n_products)
 
     # -------------------------------------------------------------------------------------------------------- the steps
+    @torch.no_grad()
+    def descend(
+        self, x: Tensor, to: ShellReference, others: Sequence["Other"], n_steps: int, n_products: int
+    ) -> Tensor:
+        """Steps of all vertices with other energies beside Eq. 5, never uphill; they have no gradient.
+
+        Args:
+            x: Where to start, float64. *Shape:* ``(B, V, 3)``.
+            to: What Eq. 5 compares with.
+            others: The other energies.
+            n_steps: Newton steps.
+            n_products: Iterations of conjugate gradients in each.
+
+        Returns:
+            *Shape:* ``(B, V, 3)``.
+        """
+
+        def value(x: Tensor) -> Tensor:
+            return sum((other.value(x) for other in others), start=self.value(x, to))
+
+        for _ in range(n_steps):
+            at, more = self.at(x, to), [other.at(x) for other in others]
+            before = sum((one.value for one in more), start=at.energy)
+            for one in more:
+                at.gradient.add_(one.gradient)
+                at.diagonal.add_(one.diagonal)
+
+            def beyond(direction: Tensor, product: Tensor, form: Tensor, more: list[AtOther] = more) -> None:
+                for one in more:
+                    pushed = one.product(direction)
+                    product.add_(pushed)
+                    form.add_((pushed * direction).sum((1, 2)))
+
+            solution = self.solved(x, at, to, n_products, beyond=beyond).solution
+            length = torch.zeros_like(before)
+            for shorter in STEP_LENGTHS:
+                downhill = (length == 0) & (value(x + shorter * solution) < before)
+                length = torch.where(downhill, shorter, length)
+                if bool((length > 0).all()):
+                    break
+            x = x + length[:, None, None] * solution
+        return x
+
     def steps(
         self, n_steps: int, n_products: int, x: Tensor, *rest: Tensor, kept: "list[_Taken] | None" = None
     ) -> tuple[Tensor, Tensor]:
@@ -236,6 +280,64 @@ class FusedRelax(FusedShell):
         self.from_point(x, at, to, -to_residual, to_x, to_reference, others, to_normal)
         to_reference.stiffness.add_((done.scalars[1, :-1] * backs[2]).sum(0))
         return to_x
+
+
+class AtOther(NamedTuple):
+    """An energy beside Eq. 5 at given shapes."""
+
+    value: Tensor
+    """*Shape:* ``(B,)``."""
+    gradient: Tensor
+    """*Shape:* ``(B, V, 3)``."""
+    diagonal: Tensor
+    """The blocks of its convex Hessian's diagonal, packed. *Shape:* ``(B, V, 6)``."""
+    product: Callable[[Tensor], Tensor]
+    """With the convex Hessian. *Shape:* ``(B, V, 3) -> (B, V, 3)``."""
+
+
+class Other(Protocol):
+    """An energy that steps of all vertices take beside Eq. 5."""
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+
+    def at(self, x: Tensor) -> AtOther:
+        """*Shape:* ``(B, V, 3)``."""
+
+
+class Terms:
+    """Terms in torch as such an energy.
+
+    Args:
+        energy: Of these terms.
+        reference: What shapes are compared with.
+        anchors: Of the terms, where there are some. *Shape:* ``(B, P, 3)``.
+    """
+
+    def __init__(self, energy: Energy, reference: Reference, anchors: Tensor | None) -> None:
+        self.energy, self.reference = energy, reference
+        self.anchors = None if anchors is None else anchors.movedim(-1, 0)
+
+    def _extended(self, x: Tensor) -> Tensor:
+        return self.energy.extend(x.movedim(-1, 0).contiguous(), self.anchors)
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+        return self.energy.value(self._extended(x), self.reference)
+
+    def at(self, x: Tensor) -> AtOther:
+        """*Shape:* ``(B, V, 3)``."""
+        energy, n = self.energy, x.shape[1]
+        at = energy.linearise(self._extended(x), self.reference)
+        hessian = ConvexHessian(energy, at)
+        packed = hessian.diagonal().flatten(0, 1)[[0, 1, 2, 4, 5, 8], ..., :n].movedim(0, -1)
+
+        def product(field: Tensor) -> Tensor:
+            rows = energy.extend(field.movedim(-1, 0).contiguous())
+            return energy.fold(hessian(rows)).movedim(0, -1)
+
+        gradient = energy.fold(energy.gradient(at)).movedim(0, -1)
+        return AtOther(energy.value_at(at, self.reference), gradient, packed, product)
 
 
 class _Iterations(NamedTuple):

@@ -140,7 +140,7 @@ class JointSpace(nn.Module):
         coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
         difference, column = self._difference(pair, coarse_second - coarse_first)
         # The fine column is not needed before the end, unless terms look at vertices.
-        extras = levels.seen(self.column(difference), column) if levels.sampled else [column]
+        extras = levels.seen(self.column(difference), column) if levels.sampled else [column] * len(levels.energies)
         difference, extras = trees.picked((difference, extras), index)
         start = None
         if pair.around is not None:

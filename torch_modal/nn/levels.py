@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.energy.energy import Energy, OnMesh, Reference, Rest
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
 from torch_modal.nn import trees
 from torch_modal.nn.columns import Columns
 from torch_modal.nn.frame import Frame
@@ -39,35 +39,33 @@ class Levels(nn.Module):
     def __init__(self, frame: Frame, fine: Mesh, terms: Sequence[Term], backend: Backend = "torch") -> None:
         super().__init__()
         self.mesh = Mesh.of(frame.coarse.faces, frame.coarse.n_vertices)
-        numbers = range(len(terms))
-        #: Which terms each level has.
-        self.members = [[i for i in numbers if not terms[i].sampled], [i for i in numbers if terms[i].sampled]]
+        kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
+        members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
+        #: Which terms each level has: those of Eq. 5, others on the coarse mesh, others at vertices of the fine mesh.
+        self.members = [own for own in members if own]
         self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
-        coarse, sampled = ([terms[i] for i in members] for members in self.members)
-        energy = Energy(self.mesh, coarse)
-        self.energies: Any = nn.ModuleList([energy])
-        if sampled:
-            self.energies.append(Energy(fine, sampled, sampled=True))
-        #: The kernels of the coarse level, where they can have it.
-        self.shell = FusedShell(energy, self.mesh) if FusedShell.serves(energy, backend) else None
-
-    @property
-    def sampled(self) -> bool:
-        """Whether some terms are evaluated at vertices of the fine mesh."""
-        return len(self.energies) > 1
+        own_terms = [[terms[i] for i in own] for own in self.members]
+        energies = [Energy(fine, own, True) if own[0].sampled else Energy(self.mesh, own) for own in own_terms]
+        self.energies: Any = nn.ModuleList(energies)
+        #: Whether any are.
+        self.sampled = bool(members[2])
+        #: The kernels of Eq. 5, where there are some.
+        self.shell = FusedShell(energies[0], self.mesh) if FusedShell.serves(energies[0], backend) else None
 
     def modal(self, columns: Columns) -> SumOfEnergies:
         """All of them in the amplitudes of a space."""
-        coarse, *sampled = self.energies
-        if self.shell is None:
-            parts = [ModalEnergy(coarse, columns.coarse)]
-        else:
-            parts = [FusedModalEnergy(self.shell, self.mesh, columns.coarse)]
-        return SumOfEnergies(*parts, *(ModalEnergy(energy, columns.at(energy.vertices)) for energy in sampled))
+        parts = []
+        for i, energy in enumerate(self.energies):
+            if i or self.shell is None:
+                own = columns.at(energy.vertices) if energy.sampled else columns.coarse
+                parts.append(ModalEnergy(energy, own))
+            else:
+                parts.append(FusedModalEnergy(self.shell, self.mesh, columns.coarse))
+        return SumOfEnergies(*parts)
 
     def seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
         """A fine shape and its coarse one as each energy sees them. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
-        return [coarse, *(x[..., energy.vertices, :] for energy in list(self.energies)[1:])]
+        return [x[..., energy.vertices, :] if energy.sampled else coarse for energy in self.energies]
 
     def between(
         self,

@@ -157,9 +157,13 @@ class ModalEnergy(nn.Module):
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        at = self.energy.linearise(self.rows(a, placement), placement.reference)
-        gradient = along_columns(self.energy.gradient(at).transpose(0, 1), self.columns, placement.extra)
-        return self.energy.value_at(at, placement.reference), gradient
+
+        def total(a: Tensor) -> tuple[Tensor, Tensor]:
+            value = self.value(a, placement)
+            return value.sum(), value
+
+        gradient, value = torch.func.grad(total, has_aux=True)(a)
+        return value, gradient
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
