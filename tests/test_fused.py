@@ -374,10 +374,44 @@ class TestLayers:
         slopes = torch.stack([slope(value) for value in given])
         torch.testing.assert_close(vmap(slope)(given), slopes, rtol=1e-7, atol=1e-9 * float(slopes.abs().max()))
 
-    def test_a_term_of_ones_own_is_torchs(self, bars: Shapes) -> None:
-        objective = tm.Objective(terms=(Volume(1.0),))
-        layer = tm.InBetween(bars.bases[:2], bars.faces, objective=objective)
-        assert layer.members[0].fused is None
+    @pytest.mark.parametrize("smooth", [False, True], ids=["pair", "path"])
+    def test_a_term_of_ones_own_is_beside_the_kernels(self, bars: Shapes, smooth: bool) -> None:
+        """The same with kernels and without, with a gradient and without."""
+
+        class Area(tm.Term):
+            def elements(self, mesh: Mesh) -> Tensor:
+                return mesh.faces
+
+            def measure(self, spokes: Tensor) -> Tensor:
+                return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+
+        class Spring(tm.Term):
+            sampled = True
+
+            @property
+            def anchors(self) -> Tensor:
+                return bars.keyframes[0, :1] + 0.3
+
+            def elements(self, mesh: Mesh) -> Tensor:
+                return torch.tensor([[mesh.first_anchor, 5]])
+
+            def measure(self, spokes: Tensor) -> Tensor:
+                return spokes[0].square().sum()
+
+        objective = tm.Objective(terms=(Area(0.3), Volume(1.0), Spring(1e-3)))
+        n, t = (3, 1.3) if smooth else (2, 0.3)
+        found = []
+        for kind in ("warp", "torch"):
+            solver = tm.Solver(backend=kind, polish=1)  # type: ignore[arg-type]
+            path = tm.Path(bars.bases[:n], bars.faces, objective=objective, solver=solver)
+            assert (path.layer.members[0].fused is None) == (kind == "torch")
+            keyframes = bars.keyframes[:n].clone().requires_grad_()
+            shape = path(keyframes, t)
+            with torch.no_grad():
+                torch.testing.assert_close(path(keyframes, t), shape.detach(), rtol=0, atol=1e-9)
+            found.append((shape.detach(), torch.autograd.grad(shape.square().sum(), keyframes)[0]))
+        torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-7)
+        torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-5)
 
     def test_what_has_no_numbers_is_torchs(self, small_bars: Shapes) -> None:
         from torch._subclasses import FakeTensorMode

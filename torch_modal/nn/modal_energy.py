@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from torch_modal.energy.assembly import Curvature
 from torch_modal.energy.energy import Energy, Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.functions import traced, transformed
+from torch_modal.nn import trees
 from torch_modal.nn.congruence import Congruence
 
 
@@ -162,8 +164,14 @@ class ModalEnergy(nn.Module):
             value = self.value(a, placement)
             return value.sum(), value
 
-        gradient, value = torch.func.grad(total, has_aux=True)(a)
-        return value, gradient
+        if traced(a) or any(transformed(x) for x in (a, *trees.leaves(placement))):
+            gradient, value = torch.func.grad(total, has_aux=True)(a)
+            return value, gradient
+        with torch.enable_grad():  # the same, in half of the time
+            leaf = a.detach().requires_grad_()
+            whole, value = total(leaf)
+            (gradient,) = torch.autograd.grad(whole, leaf)
+        return value.detach(), gradient
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
         """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""

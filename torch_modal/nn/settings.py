@@ -84,9 +84,9 @@ class Solver:
         local_steps: Newton steps of all vertices on the fine mesh after the modal solve, for what the modes cannot
             reach: fingertips, hooves, creases. Gradients go through them; they cost memory in proportion to V.
         polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
-        backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations, the modal energy and the local steps;
-            extra ``torch_modal[warp]``), ``"torch"``, or ``"auto"``: kernels where Warp is installed. They compute in
-            float64. Energies with terms beyond Eq. 5 are torch's.
+        backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations, the modal energy and the local steps),
+            ``"torch"``, or ``"auto"``: kernels where Warp is installed. They compute in float64. Terms beyond Eq. 5 are
+            computed by torch.
 
     Raises:
         ValueError: A choice that does not exist, or a number out of range.
