@@ -349,8 +349,9 @@ class Between(nn.Module):
             a, b, t, stiffness, fixed = trees.mapped(given, lambda value: value.double().contiguous())
             others: list[Other] = []
             if self.further is not None:
-                rests = (self.further.rest(self.further.extend(end.movedim(-1, 0).contiguous())) for end in (a, b))
-                others.append(Terms(self.further, self.further.between(*rests, t, stiffness[N_SHELL_TERMS:]), fixed))
+                one, other = (self.further.rest(self.further.extend(x.movedim(-1, 0).contiguous())) for x in (a, b))
+                reference = self.further.between(one, other, t, stiffness[N_SHELL_TERMS:])
+                others.append(Terms(self.further, reference, fixed))
             yield own, fused.reference(a, b, t, *stiffness[:N_SHELL_TERMS]), others
 
     def fine_chunks(self, batch: Batch) -> Iterator[tuple[slice, Reference, Tensor | None]]:
