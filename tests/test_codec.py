@@ -300,3 +300,19 @@ def test_saved_and_loaded(encoded: tm.ModalSequence, tmp_path: Path) -> None:
     assert torch.equal(found.decode(), encoded.decode())
     encoded.save(tmp_path / "b.tms")
     assert (tmp_path / "a.tms").read_bytes() == (tmp_path / "b.tms").read_bytes()
+
+
+def test_files_of_version_2_are_read(small_bars: Shapes) -> None:
+    """One motion, as a compact file and without loss, both written by an earlier program."""
+    folder = Path(__file__).parent / "fixtures"
+    exact = tm.ModalSequence.load(folder / "bar-exact-2.tms")
+    ends = small_bars.keyframes[:2]
+    frames = torch.lerp(ends[0], ends[1], torch.linspace(0, 1, 7).double()[:, None, None])
+    size = (frames[0].amax(0) - frames[0].amin(0)).norm()
+    assert exact.times.tolist() == [0, 1, 2, 3, 5, 6, 8] and torch.equal(exact.faces, small_bars.faces)
+    assert float((exact.decode() - frames).norm(dim=-1).mean(1).max() / size) <= 0.005
+    pytest.importorskip("constriction")
+    compact = tm.ModalSequence.load(folder / "bar-compact-2.tms")
+    for name in ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions"):
+        assert torch.equal(getattr(compact, name), getattr(exact, name)), name
+    assert compact.modes.seed == exact.modes.seed and torch.equal(compact.modes.clusters, exact.modes.clusters)
