@@ -23,6 +23,7 @@ FLOORS = [
     "energy",
     "nn",
     "sequence",
+    "codec",
 ]
 FLOORS += ["data", "view", "", "cli", "__main__"]
 MODULES = sorted(

@@ -9,9 +9,9 @@ from conftest import Shapes, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.codec.modes import _clusters, reproducible_modes
+from torch_modal.codec.selection import FrameSequence, IntervalErrors, select_keyframes
 from torch_modal.nn import modal_decoder
-from torch_modal.sequence.codec_modes import _clusters, fixed_modes
-from torch_modal.sequence.codec_selection import Judge, select_keyframes
 
 
 @pytest.fixture(scope="module")
@@ -257,11 +257,11 @@ def test_chosen_key_frames_are_no_worse_than_even_ones(bars: Shapes) -> None:
     )
     t = 2 * (1 - (1 - torch.linspace(0, 1, 16).double()) ** 4)
     frames = decoder(torch.zeros(16, 8).double(), t)
-    when = torch.arange(16).double()
-    modes = fixed_modes(frames[0], bars.faces, 4)
-    keys = select_keyframes(frames, bars.faces, when, modes.modes, 4, 0.0, False, False)
-    judge = Judge(frames, bars.faces, when, modes.modes, False)
-    assert judge.total(keys) < 0.6 * judge.total([0, 5, 10, 15])
+    motion = FrameSequence.checked(frames, bars.faces, None, False)
+    modes = reproducible_modes(frames[0], bars.faces, 4).modes
+    keys = select_keyframes(motion, modes, 4, 0.0, False)
+    intervals = IntervalErrors(motion, modes)
+    assert intervals.mean(keys) < 0.6 * intervals.mean([0, 5, 10, 15])
 
 
 # ---------------------------------------------------------------------------------------------------------------- modes
@@ -276,7 +276,7 @@ def test_signs_and_mixtures_are_fixed(bars: Shapes, monkeypatch: pytest.MonkeyPa
     """Another machine finds other signs, and modes of one eigenvalue in another mixture."""
     from dataclasses import replace
 
-    from torch_modal.sequence import codec_modes
+    from torch_modal.codec import modes
 
     basis = tm.extract_modes(bars.keyframes[0], bars.faces, 10, mesher="lattice")
     values = basis.eigenvalues.clone()
@@ -285,10 +285,10 @@ def test_signs_and_mixtures_are_fixed(bars: Shapes, monkeypatch: pytest.MonkeyPa
     other = basis.modes.clone()
     other[2], other[3] = c * basis.modes[2] + s * basis.modes[3], s * basis.modes[2] - c * basis.modes[3]
     other[5] = -other[5]
-    monkeypatch.setattr(codec_modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values))
-    here = fixed_modes(bars.keyframes[0], bars.faces, 6)
-    monkeypatch.setattr(codec_modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values, modes=other))
-    there = fixed_modes(bars.keyframes[0], bars.faces, 6, here.clusters, here.seed)
+    monkeypatch.setattr(modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values))
+    here = reproducible_modes(bars.keyframes[0], bars.faces, 6)
+    monkeypatch.setattr(modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values, modes=other))
+    there = reproducible_modes(bars.keyframes[0], bars.faces, 6, here.clusters, here.seed)
     assert here.clusters.tolist() == [1, 1, 2, 1, 1]
     assert torch.allclose(here.modes, there.modes, rtol=0, atol=1e-12 * float(here.modes.abs().max()))
 
