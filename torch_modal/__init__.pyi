@@ -27,6 +27,9 @@ from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals
 from .io.asset import Asset as Asset
+from .io.formats import Animation as Animation
+from .io.formats import animation_format as animation_format
+from .io.formats import mesh_format as mesh_format
 from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
 from .keyframes.check import check_keyframes as check_keyframes

@@ -2,7 +2,7 @@
 
 import argparse
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -62,7 +62,7 @@ def check_page(args: argparse.Namespace, option: str, path: Path | None) -> None
     check_name(args, option, path, PAGES)
 
 
-def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixes: Sequence[str]) -> None:
+def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixes: Collection[str]) -> None:
     """Leave with the usage if an option names a file of another kind."""
     from torch_modal.io.write import check_suffix
 

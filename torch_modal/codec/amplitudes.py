@@ -8,17 +8,14 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.codec.hierarchy import DEAD_ZONE
 from torch_modal.codec.range_coder import IntegerDecoder, IntegerEncoder
 
 MODE_BANDS, SINE_BANDS = (8, 24), (1, 2)
 """Where bands of modes, and of sines, end; each pair of bands has a distribution of its own."""
-
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
 
 
 def runs(keys: Sequence[int], n_frames: int, cyclic: bool) -> list[slice]:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.codec import amplitudes
 from torch_modal.codec.faces import check_unpacked_size, pack_faces, unpack_faces
 from torch_modal.codec.header import CompactHeader, read_header
@@ -22,9 +22,6 @@ from torch_modal.codec.range_coder import IntegerDecoder, IntegerEncoder
 
 PROBE_UNIT = 8192
 """Integers in one, for the probe of the modes."""
-
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
 
 
 def pack(

@@ -3,8 +3,8 @@
 import lzma
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import IntArray
 from torch_modal.codec.header import MAX_COUNT
 
 FREE_BYTES = 2**24
@@ -12,8 +12,6 @@ FREE_BYTES = 2**24
 MAX_RATIO = 1000
 """Beyond that, to this many bytes for each packed byte."""
 FILTERS = [{"id": lzma.FILTER_LZMA1, "preset": 9, "lc": 0, "lp": 0, "pb": 0, "dict_size": 2**20}]
-
-IntArray = NDArray[np.int64]
 
 
 def pack_faces(faces: IntArray) -> bytes:

@@ -17,10 +17,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
 
 COARSEST = 30
@@ -32,9 +32,6 @@ ROTATION_ROUNDS = 3
 """Rounds of fitting the rotations of the guide's neighbourhoods, and solving."""
 DEAD_ZONE = 0.17
 """In steps: how far beyond the half a residual must be to be rounded away from zero."""
-
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
 
 
 class Level(NamedTuple):

@@ -3,17 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.codec.header import N_SHIFTS
 from torch_modal.codec.hierarchy import VertexHierarchy
 from torch_modal.codec.range_coder import IntegerDecoder, IntegerEncoder
 
 FINER = 1024
 """Cells of the grid of decoded key-frames in a step of their integers."""
-
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
 
 
 class QuantizedKeyframes:

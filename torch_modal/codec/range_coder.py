@@ -10,12 +10,9 @@ all machines.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.extras import require
-
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
 
 CAP = 15
 """Larger magnitudes have an escape code."""

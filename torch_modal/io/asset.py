@@ -11,13 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
 from torch_modal.io.write import check_frames, refuse_existing, to_numpy, write_files
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 
@@ -185,14 +182,19 @@ class Asset(ABC):
             )
         return shapes
 
-    def say_lost(self, out: Path, holds: Collection[str]) -> None:
-        """Warn of what a file cannot hold, or is not given.
+    @property
+    def keeps(self) -> Collection[str]:
+        """Features that :meth:`with_positions` keeps."""
+        return self.carries
+
+    def warn_lost(self, name: str, holds: Collection[str]) -> None:
+        """Warn of features that a file will not have.
 
         Args:
-            out: The file.
-            holds: Some of :data:`FEATURES`.
+            name: Of the file.
+            holds: Those of :data:`FEATURES` that it will have.
         """
         lost = [name for feature, name in self.carries.items() if feature not in holds]
         if lost:
             listed = lost[0] if len(lost) == 1 else ", ".join(lost[:-1]) + " and " + lost[-1]
-            warnings.warn(f"{out.name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=3)
+            warnings.warn(f"{name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=4)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, FloatArray, Image, IntArray, Material, Part
+from torch_modal.io.asset import FEATURES, Asset, Image, Material, Part
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
 from torch_modal.io.morph import Drawn, place_frames
 from torch_modal.io.normals import CarriedNormals, on_frames
@@ -54,6 +55,11 @@ class GltfAsset(Asset):
     def suffix(self) -> str:
         """Of the files that it writes."""
         return ".glb"
+
+    @property
+    def keeps(self) -> Collection[str]:
+        """All but what moves the mesh."""
+        return set(FEATURES) - {"posing"}
 
     def _collect(self) -> None:
         positions, faces, n = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray
 from torch_modal.io.gltf import ARRAY_BUFFER, Document, Json
-
-FloatArray = NDArray[np.float64]
 
 TARGET_NAME = "frame-{:03d}"
 

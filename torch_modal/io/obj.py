@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, FloatArray, IntArray, Material, Part, Polygons
+from torch_modal.io.asset import Asset, Material, Part, Polygons
 from torch_modal.io.colors import linear
 from torch_modal.io.mtl import Libraries, read_libraries
 from torch_modal.io.normals import CarriedNormals

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from torch_modal.io.asset import Asset, FloatArray, Material, Part
+from torch_modal.arrays import FloatArray
+from torch_modal.io.asset import Asset, Material, Part
+from torch_modal.io.bare_mesh import off_bytes
 from torch_modal.io.colors import linear
 from torch_modal.io.trimesh_reader import read_triangles
-from torch_modal.io.write import mesh_bytes
 
 
 class OffAsset(Asset):
@@ -37,7 +38,7 @@ class OffAsset(Asset):
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
         if not self._rows:
-            return mesh_bytes("off", positions, self.faces)
+            return off_bytes(positions, self.faces)
         lines = list(self.lines)
         for number, (x, y, z) in zip(self._rows, positions.tolist(), strict=True):
             lines[number] = " ".join([repr(x), repr(y), repr(z), *lines[number].split(None, 3)[3:]])

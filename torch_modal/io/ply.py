@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.io.asset import Asset, FloatArray, Material, Part
+from torch_modal.arrays import FloatArray
+from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.colors import linear
 from torch_modal.io.mtl import as_image
 from torch_modal.io.normals import CarriedNormals

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import FloatArray, IntArray
 
 SECONDS_OF_A_PAIR = 2.0
 SECONDS_OF_A_CYCLE = 1.0

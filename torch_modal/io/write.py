@@ -6,19 +6,15 @@ Coordinates are written as the caller has them: nothing is centred, scaled or tu
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.files import write_together
-
-if TYPE_CHECKING:  # at run time these stay out: a reader of PLY files needs neither
-    import torch
-
-    Array = torch.Tensor | NDArray[Any]
 
 logger = logging.getLogger("torch_modal")
 
@@ -26,9 +22,6 @@ PICTURES = (".png", ".pdf")
 """What pictures are written as."""
 PAGES = (".html", ".htm")
 """What pages are written as."""
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def to_numpy(array: Array) -> NDArray[Any]:
@@ -86,16 +79,13 @@ def check_indices(indices: Sequence[int], n_frames: int, name: str) -> list[int]
     return numbers
 
 
-def check_suffix(path: Path, suffixes: Sequence[str], name: str = "out") -> str:
-    """The format that a file's name asks for.
+def check_suffix(path: Path, suffixes: Collection[str], name: str = "out") -> str:
+    """The suffix of a file in small letters, with its dot.
 
     Args:
         path: The file.
-        suffixes: Those that there are, in small letters, with their dots.
+        suffixes: Those that can be written.
         name: What the message calls the file.
-
-    Returns:
-        The suffix in small letters, without its dot.
 
     Raises:
         ValueError: It is none of those.
@@ -105,7 +95,7 @@ def check_suffix(path: Path, suffixes: Sequence[str], name: str = "out") -> str:
         *others, last = suffixes
         wanted = f"{', '.join(others)} or {last}" if others else last
         raise ValueError(f"{name} must end in {wanted}, got {path.name!r}.")
-    return suffix[1:]
+    return suffix
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
@@ -134,34 +124,3 @@ def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
     write_together(noted())
     for path, size in sizes.items():
         logger.debug("wrote %s, %.1f kB", path, size)
-
-
-def _ply_bytes(vertices: FloatArray, faces: IntArray) -> bytes:
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    rows["count"], rows["corners"] = 3, faces
-    return header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes()
-
-
-# In both text formats repr() gives the fewest digits that read back as the same float64.
-def _obj_bytes(vertices: FloatArray, faces: IntArray) -> bytes:
-    points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
-    return (points + "".join(f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist())).encode("ascii")
-
-
-def _off_bytes(vertices: FloatArray, faces: IntArray) -> bytes:
-    points = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
-    triangles = "".join(f"3 {a} {b} {c}\n" for a, b, c in faces.tolist())
-    return f"OFF\n{len(vertices)} {len(faces)} 0\n{points}{triangles}".encode("ascii")
-
-
-MESH_FORMATS = {"ply": _ply_bytes, "obj": _obj_bytes, "off": _off_bytes}
-
-
-def mesh_bytes(fmt: str, vertices: FloatArray, faces: IntArray) -> bytes:
-    """A file of positions and triangles alone."""
-    return MESH_FORMATS[fmt](vertices, faces)
