@@ -25,10 +25,10 @@ NAMES = {
     "materials": "materials",
     "groups": "groups",
 }
-"""What people call features that every format has the same words for."""
+"""Names of features in messages."""
 
 CLAY = (0.66, 0.52, 0.42, 1.0)
-"""Linear RGBA of what has no colour of its own."""
+"""Linear RGBA of surfaces without a colour."""
 
 
 class Image(NamedTuple):
@@ -46,7 +46,7 @@ class Image(NamedTuple):
 
 
 class Material(NamedTuple):
-    """What a surface looks like, in glTF's terms."""
+    """Appearance of a surface, in the terms of glTF."""
 
     name: str = "clay"
     color: tuple[float, ...] = CLAY
@@ -84,7 +84,7 @@ class Polygons(NamedTuple):
 
 
 class Asset(ABC):
-    """A mesh file: positions and triangles for the solve, and all else for writing it again with other positions.
+    """A mesh file: positions and triangles for the solve, everything else for writing it with other positions.
 
     Args:
         path: The file.
@@ -95,14 +95,14 @@ class Asset(ABC):
     faces: IntArray
     """Polygons are cut into triangles. *Shape:* ``(F, 3)``."""
     carries: dict[str, str]
-    """What else is in the file: one of :data:`FEATURES`, and its name with numbers for people."""
+    """Further content of the file: some of :data:`FEATURES`, each with a description for messages."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.carries = {}
 
     def _carry(self, feature: str, number: int | None = None) -> None:
-        """Note that a feature is there, by its name for people, and how many of them."""
+        """Record a feature, with its name and number for messages."""
         name = NAMES[feature]
         counted = f"{number} {name.removesuffix('s') if number == 1 else name}"
         self.carries[feature] = name if number is None else counted
@@ -114,7 +114,7 @@ class Asset(ABC):
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:
-        """The file with other positions. Its normals turn with the surface; all else stays as it is.
+        """The file with other positions. Its normals rotate with the surface; everything else stays.
 
         Args:
             positions: *Shape:* ``(V, 3)``.
@@ -122,7 +122,7 @@ class Asset(ABC):
 
     @abstractmethod
     def parts(self) -> list[Part]:
-        """The surface as it is drawn, for other formats."""
+        """The surface with its materials, for other formats."""
 
     def polygons(self) -> Polygons:
         """The faces for formats that hold polygons; triangles where the file's are not known."""
@@ -158,7 +158,7 @@ class Asset(ABC):
         return path
 
     def companions_for(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
-        """What must lie beside a copy in this folder, and is not there yet.
+        """The companions that a copy in this folder lacks.
 
         Raises:
             FileExistsError: Another file is there, and ``overwrite`` is off.

@@ -28,7 +28,7 @@ def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
     except OSError as error:
         if error.errno is None or (error.filename is not None and Path(error.filename) != temporary):
             raise
-        # The caller knows the name that they gave, not the temporary one.
+        # The caller knows the final name only.
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with contextlib.suppress(OSError):

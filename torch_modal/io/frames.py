@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.asset import Asset
-from torch_modal.io.formats import MESH_FORMATS, find_mesh_format
+from torch_modal.io.formats import MESH_FORMATS, find_format
 from torch_modal.io.write import check_frames, check_suffix, refuse_existing, to_numpy, write_files
 
 
@@ -97,7 +97,7 @@ def _write(
     """Each shape to its file, all in one folder and of one format; none if one of them cannot be written."""
     for path in paths:
         refuse_existing(path, overwrite)
-    to_bytes, holds = find_mesh_format(suffix)
+    to_bytes, holds, *_ = find_format(MESH_FORMATS, suffix)
     beside, data = [], (to_bytes(x, faces, asset) for x in shapes)
     if asset is not None and asset.suffix == suffix:
         beside, data = asset.companions_for(paths[0].parent, overwrite), (asset.with_positions(x) for x in shapes)

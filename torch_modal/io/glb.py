@@ -26,7 +26,7 @@ HOLDS = ("texcoords", "normals", "colors", "materials")
 """Features taken from a file of another format; of materials, colour, roughness and the texture of the colour."""
 
 
-@mesh_format(".glb", HOLDS)
+@mesh_format(".glb", holds=HOLDS)
 def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> bytes:
     """One shape without an animation."""
     document, drawn, _ = _document(vertices[None], faces, asset, "shape")
@@ -121,7 +121,7 @@ def _document(
 def _normals(
     parts: Sequence[Part], shapes: FloatArray, faces: IntArray, asset: Asset | None
 ) -> list[Callable[[int], dict[str, FloatArray]]]:
-    """For each part, its normals in a frame: the file's, taken along, or smooth ones where it has none."""
+    """For each part, its normals in a frame: the file's, rotated with the surface, or smooth ones."""
     own = [part for part in parts if part.normals is not None]
     starts = np.cumsum([len(part.vertices) for part in own])
     copies = merge_seams(shapes[[0, -1]], faces)

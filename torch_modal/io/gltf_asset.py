@@ -126,7 +126,7 @@ class GltfAsset(Asset):
         return triangles[(np.diff(np.sort(triangles, axis=1)) > 0).all(axis=1)]  # strips turn by empty ones
 
     def morphs(self) -> FloatArray:
-        """The shapes that its morph targets stand for, each shown fully, after the file's own. *Shape:* ``(N, V, 3)``.
+        """The file's shape, and that of each morph target at weight 1. *Shape:* ``(N, V, 3)``.
 
         Raises:
             ValueError: Its meshes do not have the same number of targets.
@@ -149,7 +149,7 @@ class GltfAsset(Asset):
         """A copy without positions and normals, with nothing in it that is not used.
 
         Args:
-            frames: What it will show. *Shape:* ``(N, V, 3)``.
+            frames: *Shape:* ``(N, V, 3)``.
 
         Returns:
             The document; its primitives, for :func:`torch_modal.io.morph.place_frames`; the nodes that show them.

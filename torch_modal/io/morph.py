@@ -101,7 +101,7 @@ def animate(
         numbers: Frame numbers behind the base and the morph targets, for their names.
         times: In seconds, increasing. *Shape:* ``(T,)``.
         shown: Which of the frames is shown at each time: 0 for the base. *Shape:* ``(T,)``.
-        extras: What the animation is given to tell.
+        extras: Metadata of the animation.
     """
     weights = np.eye(len(numbers), dtype=np.float32)[:, 1:][shown]
     sampler = {

@@ -1,4 +1,4 @@
-"""A file's own normals, taken along by the surface."""
+"""Normals of a file, rotated with the surface."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from torch_modal.geometry.turning import surface_frames, turn
 
 
 class CarriedNormals:
-    """Turns a file's normals as the surface turns, so that hard edges stay hard and smooth ones smooth.
+    """Rotates a file's normals with the surface, so that hard edges stay hard and smooth ones smooth.
 
     Points with one place and one normal are one: seams of texture coordinates do not show in the shading.
 
@@ -26,7 +26,7 @@ class CarriedNormals:
         _, self.first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         self.group = group.reshape(-1)
         self.triangles = self.group[triangles]
-        # The other end of an edge of each point: with the normal it tells how the surface turns.
+        # The other end of an edge of each point: with the normal it defines a frame of the surface.
         self.neighbour = np.arange(len(self.first))
         for corner in (2, 1, 0):
             self.neighbour[self.triangles[:, corner]] = self.triangles[:, (corner + 1) % 3]

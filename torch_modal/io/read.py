@@ -1,4 +1,4 @@
-"""Reading mesh files, with their vertices in the order and number in which they stand there."""
+"""Reading mesh files; the order and number of vertices stay."""
 
 import os
 from importlib import import_module

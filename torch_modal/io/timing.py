@@ -34,11 +34,11 @@ class Timing(NamedTuple):
         """When each frame is fully shown, for formats that interpolate linearly between such times.
 
         Args:
-            frames: Numbers of the frames that there are, from the first to the last, ascending. *Shape:* ``(n,)``.
+            frames: Frame numbers that are kept, from the first to the last, ascending. *Shape:* ``(n,)``.
             n_frames: Of the sequence.
 
         Returns:
-            Times in seconds; which of the ``frames`` is shown, as places in that list. *Shape of both:* ``(T,)``.
+            Times in seconds, and indices into ``frames``. *Shape of both:* ``(T,)``.
         """
         if n_frames == 1:
             return np.zeros(1), np.zeros(1, np.int64)
@@ -54,7 +54,7 @@ class Timing(NamedTuple):
         return times, places
 
     def samples(self, n_frames: int) -> FloatArray:
-        """Places in the sequence at the fixed rate, fractions among them; what repeats is not there twice.
+        """Fractional frame numbers at the fixed rate; the first is not repeated at the end.
 
         *Shape:* ``(T,)``, from 0 to ``n_frames - 1`` (to ``n_frames``, if cyclic, which is frame 0 again).
         """

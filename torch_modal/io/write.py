@@ -1,7 +1,4 @@
-"""A sequence of shapes on disk as numbered meshes, and what all writers share.
-
-Coordinates are written as the caller has them: nothing is centred, scaled or turned.
-"""
+"""Checks of arrays and paths, and atomic writes, that all writers share."""
 
 from __future__ import annotations
 
@@ -19,9 +16,9 @@ from torch_modal.io.files import write_together
 logger = logging.getLogger("torch_modal")
 
 PICTURES = (".png", ".pdf")
-"""What pictures are written as."""
+"""Suffixes of pictures."""
 PAGES = (".html", ".htm")
-"""What pages are written as."""
+"""Suffixes of pages."""
 
 
 def to_numpy(array: Array) -> NDArray[Any]:
@@ -39,7 +36,7 @@ def check_frames(frames: Array, faces: Array, name: str = "frames") -> tuple[Flo
     Args:
         frames: Vertex positions. *Shape:* ``(N, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        name: What the messages call ``frames``.
+        name: Of ``frames``, for messages.
 
     Returns:
         ``frames`` as float64, ``faces`` as int64.
@@ -85,7 +82,7 @@ def check_suffix(path: Path, suffixes: Collection[str], name: str = "out") -> st
     Args:
         path: The file.
         suffixes: Those that can be written.
-        name: What the message calls the file.
+        name: Of the argument, for the message.
 
     Raises:
         ValueError: It is none of those.
