@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli.output import check_output, check_picture
-from torch_modal.io.formats import ANIMATION_FORMATS
+from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import ANIMATION_FORMATS, PICTURES
 
 
 def subdivide(args: argparse.Namespace) -> None:
@@ -25,7 +25,7 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
-    check_picture(args, "--picture", args.picture)
+    check_name(args, "--picture", args.picture, PICTURES)
     if args.cyclic and (args.ping_pong or args.ease):
         args.fail(
             f"--{'ping-pong' if args.ping_pong else 'ease'} is for sequences that begin and end; a cycle does not"

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from torch_modal.cli.output import check_name, check_output, check_picture
-from torch_modal.io.formats import MESH_FORMATS
+from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import MESH_FORMATS, PICTURES
 
 SUMMARY = "one mesh's connectivity laid onto others"
 DESCRIPTION = """\
@@ -56,10 +56,7 @@ def run(args: argparse.Namespace) -> None:
     if (args.out is None) == (args.suggest is None):
         args.fail("register needs either --out FILE or --suggest PICTURE")
     file, option = (args.out, "--out") if args.out else (args.suggest, "--suggest")
-    if args.suggest:
-        check_picture(args, option, file)
-    else:
-        check_name(args, option, file, MESH_FORMATS)
+    check_name(args, option, file, MESH_FORMATS if args.out else PICTURES)
     check_output([file], args.meshes, args.overwrite, option=option)
     if args.suggest:
         _suggest(args)

@@ -40,6 +40,10 @@ ANIMATION_FORMATS: dict[str, OutputFormat | str] = {
 """Each format, or the module that registers it."""
 
 
+PICTURES = (".png", ".pdf")
+PAGES = (".html", ".htm")
+
+
 class Animation(NamedTuple):
     """A sequence to write, as :func:`torch_modal.save_animation` passes it to a format.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +16,8 @@ from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.formats import Animation, animation_format, mesh_format
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.morph import Drawn, animate, place_frames
-from torch_modal.io.normals import CarriedNormals, on_frames
+from torch_modal.io.morph import Drawn, animate, place_frames, rows_of
+from torch_modal.io.normals import CarriedNormals
 
 # Normals double the file. Beyond this size (POSITION alone) they are left out.
 LARGEST_FILE_WITH_NORMALS = 48 * 2**20
@@ -126,7 +126,7 @@ def _normals(
     starts = np.cumsum([len(part.vertices) for part in own])
     copies = merge_seams(shapes[[0, -1]], faces)
     _, first = np.unique(copies, return_index=True)
-    smooth = on_frames(lambda x: vertex_normals(x[first], copies[faces])[copies], shapes)
+    smooth = cache(lambda number: vertex_normals(shapes[number][first], copies[faces])[copies])
     carried = None
     if own and asset is not None:
         vertices = np.concatenate([part.vertices for part in own])
@@ -136,20 +136,16 @@ def _normals(
             asset.positions[vertices],
             np.concatenate(triangles),
         )
-        carried = on_frames(lambda x: from_file.at(x[vertices]), shapes)
+        carried = cache(lambda number: from_file.at(shapes[number][vertices]))
     ends = iter(starts.tolist())
     found: list[Callable[[int], dict[str, FloatArray]]] = []
     for part in parts:
         if part.normals is None or carried is None:
-            found.append(partial(_rows, smooth, part.vertices))
+            found.append(partial(rows_of, {"NORMAL": smooth}, part.vertices))
         else:
             end = next(ends)
-            found.append(partial(_rows, carried, slice(end - len(part.vertices), end)))
+            found.append(partial(rows_of, {"NORMAL": carried}, slice(end - len(part.vertices), end)))
     return found
-
-
-def _rows(of: Callable[[int], FloatArray], which: IntArray | slice, number: int) -> dict[str, FloatArray]:
-    return {"NORMAL": of(number)[which]}
 
 
 def _material(document: Document, material: Material) -> Json:

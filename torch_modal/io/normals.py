@@ -1,7 +1,5 @@
 """Normals of a file, rotated with the surface."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
@@ -48,20 +46,3 @@ class CarriedNormals:
         """
         vectors = self.normals if vectors is None else vectors
         return turn(vectors, self.before, self._surface(positions))
-
-
-def on_frames(at: Callable[[FloatArray], FloatArray], frames: FloatArray) -> Callable[[int], FloatArray]:
-    """Of a function of positions, one of the frame's number that computes each frame once, however many ask.
-
-    Args:
-        at: *Shape:* ``(V, 3) -> (P, 3)``.
-        frames: *Shape:* ``(N, V, 3)``.
-    """
-    known: dict[int, FloatArray] = {}
-
-    def of(number: int) -> FloatArray:
-        if number not in known:
-            known[number] = at(frames[number])
-        return known[number]
-
-    return of

@@ -15,11 +15,6 @@ from torch_modal.io.files import write_together
 
 logger = logging.getLogger("torch_modal")
 
-PICTURES = (".png", ".pdf")
-"""Suffixes of pictures."""
-PAGES = (".html", ".htm")
-"""Suffixes of pages."""
-
 
 def to_numpy(array: Array) -> NDArray[Any]:
     """A torch tensor (any device, with or without gradient) or NumPy array as a NumPy array."""

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from torch_modal.arrays import Array, FloatArray
+from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import (
-    PICTURES,
     check_frames,
     check_indices,
     check_suffix,
