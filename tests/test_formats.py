@@ -1,5 +1,6 @@
 """Output formats of one's own: one function each, found by its suffix."""
 
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from textured import bend, textured_obj
 import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.errors import MeshWarning
+from torch_modal.io import bare_mesh
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
 FACES = np.array([[0, 1, 2]])
@@ -49,6 +51,14 @@ def test_own_formats_write(tmp_path: Path) -> None:
     asset = tm.open_asset(textured_obj(tmp_path / "in", "bar.obj"))
     with pytest.warns(MeshWarning, match=r"frame-000.xyz is without the vertex colours, 2 materials and groups"):
         tm.save_frames(bend(asset.positions)[None], asset.faces, tmp_path / "out", "xyz", asset=asset)
+
+
+def test_own_formats_replace_built_in_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MESH_FORMATS, ".off", MESH_FORMATS[".off"])
+    tm.mesh_format(".off")(lambda vertices, faces, asset: b"own")
+    importlib.reload(bare_mesh)
+    (path,) = tm.save_frames(FRAMES[:1], FACES, tmp_path, "off")
+    assert path.read_bytes() == b"own"
 
 
 def test_messages_and_help_list_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

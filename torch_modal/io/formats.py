@@ -99,7 +99,10 @@ def _registration(
     table: dict[str, OutputFormat | str], suffixes: tuple[str, ...], **options: Any
 ) -> Callable[[Writer], Writer]:
     def register(write: Writer) -> Writer:
-        table.update(dict.fromkeys(suffixes, OutputFormat(write, **options)))
+        built_in = write.__module__.startswith("torch_modal.")
+        for suffix in suffixes:
+            if not built_in or not isinstance(table.get(suffix), OutputFormat):  # a user's own is not replaced
+                table[suffix] = OutputFormat(write, **options)
         return write
 
     return register
@@ -110,5 +113,6 @@ def find_format(table: dict[str, OutputFormat | str], suffix: str) -> OutputForm
     found = table[suffix]
     if isinstance(found, str):
         import_module(found)
-        return find_format(table, suffix)
+        found = table[suffix]
+    assert isinstance(found, OutputFormat)
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from torch_modal.io.formats import ANIMATION_FORMATS, Animation, find_format
 from torch_modal.io.timing import make_timing
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.progress import Progress
+
+logger = logging.getLogger("torch_modal")
 
 
 def require_packages(path: Path) -> None:
@@ -116,4 +119,5 @@ def save_animation(
     animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, max_targets, progress)
     with temporary_beside(path, suffix) as temporary:
         find_format(ANIMATION_FORMATS, suffix).write(animation, temporary)
+    logger.debug("wrote %s, %.1f kB", path, path.stat().st_size / 1000)
     return path
