@@ -14,7 +14,8 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
-from torch_modal.io.write import check_frames, refuse_existing, to_numpy, write_files
+from torch_modal.io.files import write_files
+from torch_modal.io.write import check_frames, refuse_existing, to_numpy
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 

@@ -176,17 +176,8 @@ class _Digests:
                 own[name] = None
         return self.all("class", [value.__qualname__, type(value), value.__bases__, own])
 
-    def _of_proxy(self, value: MappingProxyType[Any, Any]) -> bytes:
-        return self.of(dict(value))
-
     def _of_wrapped(self, value: Any) -> bytes:
         return self.all(type(value).__name__, [value.__func__, getattr(value, "__self__", None)])
-
-    def _of_property(self, value: property) -> bytes:
-        return self.all("property", [value.fget, value.fset, value.fdel])
-
-    def _of_cached(self, value: cached_property[Any]) -> bytes:
-        return self.all("cached_property", [value.func, value.attrname])
 
     def _of_name(self, value: Any) -> bytes:
         """Something of a library, or of Python."""
@@ -226,9 +217,9 @@ class _Digests:
         (CodeType, _of_code),
         (ModuleType, _of_module),
         ((MethodType, staticmethod, classmethod), _of_wrapped),
-        (MappingProxyType, _of_proxy),
-        (property, _of_property),
-        (cached_property, _of_cached),
+        (MappingProxyType, lambda self, value: self.of(dict(value))),
+        (property, lambda self, value: self.all("property", [value.fget, value.fset, value.fdel])),
+        (cached_property, lambda self, value: self.all("cached_property", [value.func, value.attrname])),
         (BuiltinFunctionType, _of_builtin),
     )
 

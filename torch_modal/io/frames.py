@@ -7,8 +7,9 @@ from pathlib import Path
 
 from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.asset import Asset
+from torch_modal.io.files import write_files
 from torch_modal.io.formats import MESH_FORMATS, find_format
-from torch_modal.io.write import check_frames, check_suffix, refuse_existing, to_numpy, write_files
+from torch_modal.io.write import check_frames, check_suffix, refuse_existing, to_numpy
 
 
 def save_frames(

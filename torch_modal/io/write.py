@@ -1,9 +1,8 @@
-"""Checks of arrays and paths, and atomic writes, that all writers share."""
+"""Checks of arrays and paths that all writers share."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import Array, FloatArray, IntArray
-from torch_modal.io.files import write_together
-
-logger = logging.getLogger("torch_modal")
 
 
 def to_numpy(array: Array) -> NDArray[Any]:
@@ -96,23 +92,3 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
         raise IsADirectoryError(f"{path} is a folder; name a file.")
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists; pass overwrite=True (--overwrite) to replace it.")
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing; its folder is made if missing."""
-    write_files([(path, data)])
-
-
-def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
-    """Write all files or none; their folders are made if missing."""
-    sizes = {}
-
-    def noted() -> Iterator[tuple[Path, bytes]]:
-        for path, data in files:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            sizes[path] = len(data) / 1000
-            yield path, data
-
-    write_together(noted())
-    for path, size in sizes.items():
-        logger.debug("wrote %s, %.1f kB", path, size)

@@ -10,8 +10,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.io.files import write_file
 from torch_modal.io.formats import PICTURES
-from torch_modal.io.write import check_suffix, refuse_existing, write_file
+from torch_modal.io.write import check_suffix, refuse_existing
 from torch_modal.view.drawing import ByteArray, Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, KEYFRAME_COLOR, view_rotation
 

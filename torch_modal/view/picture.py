@@ -14,15 +14,9 @@ from typing import Any, Literal
 import numpy as np
 
 from torch_modal.arrays import Array, FloatArray
+from torch_modal.io.files import write_file
 from torch_modal.io.formats import PICTURES
-from torch_modal.io.write import (
-    check_frames,
-    check_indices,
-    check_suffix,
-    refuse_existing,
-    to_numpy,
-    write_file,
-)
+from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
 from torch_modal.view.drawing import ByteArray, Scene, draw
 
 __all__ = ["render_sequence"]
