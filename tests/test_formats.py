@@ -29,7 +29,7 @@ def own_formats(monkeypatch: pytest.MonkeyPatch) -> None:
 
     @tm.animation_format(".csv")
     def csv(animation: tm.Animation, path: Path) -> None:
-        times, shown = animation.timing.knots(np.arange(len(animation.shapes)), len(animation.shapes))
+        times, shown = animation.timing.knots()
         np.savetxt(path, np.column_stack([times, animation.shapes[shown].reshape(len(times), -1)]), delimiter=",")
 
     @tm.animation_format(".needs", modules=("no_such_module",), extra="none")

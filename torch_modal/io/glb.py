@@ -62,7 +62,7 @@ def write_glb(animation: Animation, path: Path) -> None:
         document, drawn, nodes = _document(shapes[kept], faces, asset, Path(name).stem)
     place_frames(document, drawn, shapes[kept], move_normals)
     if len(kept) > 1:
-        times, shown = timing.knots(kept, len(shapes))
+        times, shown = timing.knots(kept)
         steps = len(shapes) if timing.cyclic else len(shapes) - 1
         extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": keyframes}
         if timing.ping_pong:

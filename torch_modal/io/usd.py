@@ -26,7 +26,7 @@ def write_usd(animation: Animation, path: Path) -> None:
     if asset is not None:
         asset.warn_lost(name, HOLDS)
     polygons = Polygons(np.full(len(faces), 3), faces.reshape(-1)) if asset is None else asset.polygons()
-    times, shown = timing.knots(np.arange(len(shapes)), len(shapes))
+    times, shown = timing.knots()
     codes = times * timing.fps
     stage: Any = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)

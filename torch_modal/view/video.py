@@ -47,7 +47,7 @@ def write_gif(animation: Animation, path: Path) -> None:
 def _pictures(animation: Animation) -> list[ByteArray]:
     """The sequence drawn from one place, at the rate of its timing."""
     shapes, faces = animation.shapes, animation.faces
-    places = animation.timing.samples(len(shapes))
+    places = animation.timing.samples()
     # A frame that is shown twice, as on the way back, is drawn once.
     unique, which = np.unique(places, return_inverse=True)
     points = resample(shapes, unique) @ view_rotation(shapes[0], None, None).T
