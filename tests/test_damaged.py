@@ -47,11 +47,11 @@ def made(kind: str, bars: Shapes, folder: Path, monkeypatch: pytest.MonkeyPatch)
         else:
             pytest.importorskip("constriction", reason="small files need the extra compress")
             tm.compress(frames, bars.faces, path, 0.01, 4, keyframes=[0, 4], times=[0, 1, 2, 3, 5])
-        from torch_modal.sequence import codec_file
+        from torch_modal.codec import file
 
         modes = tm.ModalSequence.load(path).modes
         # They follow from the numbers of the file; to compute them each time would take long.
-        monkeypatch.setattr(codec_file, "fixed_modes", lambda *_: modes)
+        monkeypatch.setattr(file, "reproducible_modes", lambda *_: modes)
 
         def load() -> list[Any]:
             found = tm.ModalSequence.load(path)

@@ -1,4 +1,4 @@
-"""Files written by torch_modal.io.write, read back with other libraries' readers."""
+"""Written files, read back with other libraries' readers."""
 
 import json
 import os

@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "torch_modal"
 # From the ground up: a module imports from its own floor and lower ones, at the top of the file or inside functions.
 FLOORS = [
     "version",
+    "arrays",
     "errors",
     "extras",
     "progress",
@@ -23,6 +24,7 @@ FLOORS = [
     "energy",
     "nn",
     "sequence",
+    "codec",
 ]
 FLOORS += ["data", "view", "", "cli", "__main__"]
 MODULES = sorted(

@@ -1,6 +1,10 @@
 """The public names, and the modules that they are loaded from when they are first used."""
 
 from . import nn as nn
+from .codec.compress import Compressed as Compressed
+from .codec.compress import compress as compress
+from .codec.sequence import ModalSequence as ModalSequence
+from .codec.sequence import encode as encode
 from .data.augmentation import ShapeAugmentation as ShapeAugmentation
 from .data.augmentation import ShapeBatch as ShapeBatch
 from .data.dataset import SetBatchSampler as SetBatchSampler
@@ -23,6 +27,9 @@ from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals
 from .io.asset import Asset as Asset
+from .io.formats import Animation as Animation
+from .io.formats import animation_format as animation_format
+from .io.formats import mesh_format as mesh_format
 from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
 from .keyframes.check import check_keyframes as check_keyframes
@@ -52,10 +59,6 @@ from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
 from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
-from .sequence.codec import ModalSequence as ModalSequence
-from .sequence.codec import encode as encode
-from .sequence.compress import Compressed as Compressed
-from .sequence.compress import compress as compress
 from .sequence.editor import PathEditor as PathEditor
 from .sequence.path import Path as Path
 from .sequence.subdivide import frame_times as frame_times

@@ -3,7 +3,7 @@
 import gc
 import importlib
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -47,7 +47,7 @@ def require(module: str, extra: str, what: str) -> Any:
         raise _missing([module], extra, what) from error
 
 
-def require_installed(modules: tuple[str, ...], extra: str, what: str) -> None:
+def require_installed(modules: Collection[str], extra: str, what: str) -> None:
     """Refuse work that needs optional packages before any of it is done; nothing is imported.
 
     Raises:

@@ -25,9 +25,9 @@ from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.codec.modes import reproducible_modes
+from torch_modal.codec.selection import FrameSequence, IntervalErrors, select_keyframes
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.sequence.codec_modes import fixed_modes
-from torch_modal.sequence.codec_selection import Judge, select_keyframes
 
 GALLOP, GRIP, LONG = 96, 41, 1000
 
@@ -134,11 +134,11 @@ def vars_of(sequence: tm.ModalSequence) -> dict[str, object]:
 def print_selection(sequence: Sequence) -> None:
     """Rows of chosen against even key-frames, judged alike, by all frames."""
     frames, cyclic = sequence.frames, sequence.cyclic
-    when = torch.arange(len(frames) + cyclic, dtype=torch.float64)
-    modes = fixed_modes(frames[0], sequence.faces, 20)
+    motion = FrameSequence.checked(frames, sequence.faces, None, cyclic)
+    modes = reproducible_modes(frames[0], sequence.faces, 20).modes
     for even in sequence.keyframes:
         start = time.process_time()
-        keys = select_keyframes(frames, sequence.faces, when, modes.modes, len(even), 0.0, cyclic, False)
+        keys = select_keyframes(motion, modes, len(even), 0.0, False)
         seconds = time.process_time() - start
         errors = []
         for choice in (even, keys):
@@ -146,9 +146,9 @@ def print_selection(sequence: Sequence) -> None:
             errors.append(1e3 * float(found.errors.mean()))
         best = ""
         if len(frames) < 12:
-            judge = Judge(frames, sequence.faces, when, modes.modes, cyclic)
+            intervals = IntervalErrors(motion, modes)
             inner = combinations(range(1, len(frames) - 1), len(even) - 2)
-            best = f"{1e3 * min(judge.total([0, *each, len(frames) - 1]) for each in inner):.3g}"
+            best = f"{1e3 * min(intervals.mean([0, *each, len(frames) - 1]) for each in inner):.3g}"
         print(
             f"| {sequence.name} | {len(even)} | {errors[0]:.3g} | {errors[1]:.3g} {keys} "
             f"| {errors[1] / errors[0]:.2f} | {best or '-'} | {seconds:.0f} |",

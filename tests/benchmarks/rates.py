@@ -39,10 +39,10 @@ from parallelogram import generations, residuals
 from threads import limit_threads
 
 import torch_modal as tm
+from torch_modal.codec.faces import pack_integers
+from torch_modal.codec.hierarchy import VertexHierarchy
+from torch_modal.codec.range_coder import IntegerEncoder
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.sequence.codec_entropy import Writer
-from torch_modal.sequence.codec_levels import Levels
-from torch_modal.sequence.codec_packing import squeeze
 
 try:
     import meshopt
@@ -121,33 +121,35 @@ def pca(judge: Judge) -> Iterator[Point]:
         fine = step / max(np.abs(shapes).max(), 1e-12)
         coefficients = np.rint(u / fine).astype(np.int64)
         left = np.stack([residuals(x, plan).T for x in grid])
-        smaller = min((left, grid.transpose(0, 2, 1)), key=lambda part: len(squeeze(part)))
-        series = min((coefficients, np.diff(coefficients, axis=0, prepend=0)), key=lambda part: len(squeeze(part.T)))
+        smaller = min((left, grid.transpose(0, 2, 1)), key=lambda part: len(pack_integers(part)))
+        series = min(
+            (coefficients, np.diff(coefficients, axis=0, prepend=0)), key=lambda part: len(pack_integers(part.T))
+        )
         rounded = step * grid.reshape(len(every), -1)
         x = torch.from_numpy((rounded[0] + (fine * coefficients) @ rounded[1:]).reshape(judge.frames.shape))
-        yield judge.point(x, len(squeeze(smaller)) + len(squeeze(series.T)))
+        yield judge.point(x, len(pack_integers(smaller)) + len(pack_integers(series.T)))
 
 
 def pca_by_levels(judge: Judge) -> Iterator[Point]:
     """The same, of smooth shapes."""
-    levels = Levels(judge.sequence.faces.numpy(), judge.frames.shape[1])
-    sizes = np.concatenate([np.full(3 * len(level.vertices), i) for i, level in enumerate(levels.levels)])
+    hierarchy = VertexHierarchy(judge.sequence.faces.numpy(), judge.frames.shape[1])
+    sizes = np.concatenate([np.full(3 * len(level.vertices), i) for i, level in enumerate(hierarchy.levels)])
     for mean, shapes, u, level in components(judge, factor=2):
         step = level * judge.sequence.diagonal
         every = np.concatenate([mean[None], shapes]).reshape(len(shapes) + 1, -1, 3)
-        rounded = [levels.rounded(x, step, None) for x in every]
+        rounded = [hierarchy.encode(x, step, None) for x in every]
         fine = 0.3 * step / max(np.abs(shapes).max(), 1e-12)
         coefficients = np.rint(u / fine).astype(np.int64)
         series = min(
             (coefficients, np.diff(coefficients, axis=0, prepend=0)), key=lambda part: np.log2(1 + np.abs(part)).sum()
         )
-        writer, n = Writer(), len(levels.levels)
+        encoder, n = IntegerEncoder(), len(hierarchy.levels)
         flat = np.concatenate([part.reshape(-1) for numbers, _ in rounded for part in numbers])
-        writer.numbers(flat, np.concatenate([sizes, np.tile(sizes + n, len(shapes))]), 2 * n)
-        writer.numbers(series.T.reshape(-1), np.repeat(np.arange(len(shapes)), len(u)), len(shapes))
+        encoder.write(flat, np.concatenate([sizes, np.tile(sizes + n, len(shapes))]), 2 * n)
+        encoder.write(series.T.reshape(-1), np.repeat(np.arange(len(shapes)), len(u)), len(shapes))
         first, *rest = (x.reshape(-1) for _, x in rounded)
         x = torch.from_numpy((first + (fine * coefficients) @ np.stack(rest)).reshape(judge.frames.shape))
-        yield judge.point(x, len(writer.data()))
+        yield judge.point(x, len(encoder.data()))
 
 
 def components(judge: Judge, factor: float = 1) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:

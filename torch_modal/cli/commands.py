@@ -11,7 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli.output import check_output, check_picture
+from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import ANIMATION_FORMATS, PICTURES
 
 
 def subdivide(args: argparse.Namespace) -> None:
@@ -24,14 +25,14 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
-    check_picture(args, "--picture", args.picture)
+    check_name(args, "--picture", args.picture, PICTURES)
     if args.cyclic and (args.ping_pong or args.ease):
         args.fail(
             f"--{'ping-pong' if args.ping_pong else 'ease'} is for sequences that begin and end; a cycle does not"
         )
-    from torch_modal.view.animation import SUFFIXES, require_packages
+    from torch_modal.view.animation import require_packages
 
-    single = _is_file(args, *SUFFIXES)
+    single = _is_file(args, *ANIMATION_FORMATS)
     animation = args.out if single else args.out / "animation.glb"
     files = [animation, *([args.picture] if args.picture else [])]
     fmt = args.format or {".gltf": "glb"}.get(args.meshes[0].suffix.lower(), args.meshes[0].suffix.lower()[1:])

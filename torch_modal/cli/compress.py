@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
 SUFFIX = ".tms"
 
@@ -68,11 +69,11 @@ def add_expand(sub: argparse.ArgumentParser, number: Callable[..., Callable[[str
         type=Path,
         required=True,
         metavar="FILE_OR_FOLDER",
-        help="an animation (.glb, .mp4, .gif, .usd, .mdd, .pc2, .npz), or a folder for numbered frames",
+        help=f"an animation ({', '.join(ANIMATION_FORMATS)}), or a folder for numbered frames",
     )
     sub.add_argument(
         "--format",
-        choices=("ply", "obj", "off", "glb"),
+        choices=[suffix[1:] for suffix in MESH_FORMATS],
         default="ply",
         help="of numbered frames (default: %(default)s)",
     )
@@ -125,9 +126,9 @@ def compress(args: argparse.Namespace) -> None:
 
 def expand(args: argparse.Namespace) -> None:
     """Run ``torch-modal expand``."""
-    from torch_modal.view.animation import SUFFIXES, require_packages
+    from torch_modal.view.animation import require_packages
 
-    animated = args.out.suffix.lower() in SUFFIXES
+    animated = args.out.suffix.lower() in ANIMATION_FORMATS
     if animated:
         check_output([args.out], [args.file], args.overwrite)
         require_packages(args.out)

@@ -13,6 +13,7 @@ from typing import Any
 
 from torch_modal.cli import check, commands, compress, precompute, register, view
 from torch_modal.cli.messages import PROGRAM, log_as_lines, say, warnings_as_lines
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 from torch_modal.version import __version__
 
 DESCRIPTION = """\
@@ -194,8 +195,7 @@ def build_parser() -> argparse.ArgumentParser:
         type=Path,
         required=True,
         metavar="FILE_OR_FOLDER",
-        help="the animation alone: .glb, .mp4, .gif, .usd(a|c), .mdd, .pc2, .npz; a folder: numbered frames and "
-        "animation.glb",
+        help=f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb",
     )
     sub.add_argument(
         "--levels",
@@ -248,7 +248,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--format",
-        choices=("ply", "obj", "off", "glb"),
+        choices=[suffix[1:] for suffix in MESH_FORMATS],
         help="of the numbered frames (default: that of the first key-frame, with all that its file carries)",
     )
     group = sub.add_argument_group("animation")

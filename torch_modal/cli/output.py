@@ -2,7 +2,7 @@
 
 import argparse
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -48,21 +48,7 @@ def check_output(
             _refuse(f"the folder {there} cannot be written; choose another {option}")
 
 
-def check_picture(args: argparse.Namespace, option: str, path: Path | None) -> None:
-    """Leave with the usage if an option names what is no picture."""
-    from torch_modal.io.write import PICTURES
-
-    check_name(args, option, path, PICTURES)
-
-
-def check_page(args: argparse.Namespace, option: str, path: Path | None) -> None:
-    """Leave with the usage if an option names what is no page."""
-    from torch_modal.io.write import PAGES
-
-    check_name(args, option, path, PAGES)
-
-
-def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixes: Sequence[str]) -> None:
+def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixes: Collection[str]) -> None:
     """Leave with the usage if an option names a file of another kind."""
     from torch_modal.io.write import check_suffix
 

@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from torch_modal.cli.output import check_name, check_output, check_picture
+from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import MESH_FORMATS, PICTURES
 
 SUMMARY = "one mesh's connectivity laid onto others"
 DESCRIPTION = """\
@@ -25,9 +26,8 @@ examples:
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``register`` besides the common ones."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
-    sub.add_argument(
-        "--out", type=Path, metavar="FILE", help="the template laid onto the target, .obj, .ply, .off or .glb"
-    )
+    suffixes = ", ".join(MESH_FORMATS)
+    sub.add_argument("--out", type=Path, metavar="FILE", help=f"the template laid onto the target, {suffixes}")
     sub.add_argument(
         "--suggest",
         type=Path,
@@ -56,12 +56,7 @@ def run(args: argparse.Namespace) -> None:
     if (args.out is None) == (args.suggest is None):
         args.fail("register needs either --out FILE or --suggest PICTURE")
     file, option = (args.out, "--out") if args.out else (args.suggest, "--suggest")
-    if args.suggest:
-        check_picture(args, option, file)
-    else:
-        from torch_modal.io.frames import SUFFIXES
-
-        check_name(args, option, file, SUFFIXES)
+    check_name(args, option, file, MESH_FORMATS if args.out else PICTURES)
     check_output([file], args.meshes, args.overwrite, option=option)
     if args.suggest:
         _suggest(args)

@@ -10,7 +10,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch_modal.cli.output import check_output, check_page
+from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import PAGES
 
 if TYPE_CHECKING:
     from torch_modal.view.document import Page
@@ -101,7 +102,7 @@ def run(args: argparse.Namespace) -> None:
     if args.live:
         _live(args)
         return
-    check_page(args, "--page", args.page)
+    check_name(args, "--page", args.page, PAGES)
     if args.landmarks:
         _landmarks(args)
         return

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
-from torch_modal.io.write import check_frames, refuse_existing, to_numpy, write_files
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.io.files import write_files
+from torch_modal.io.write import check_frames, refuse_existing, to_numpy
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 
@@ -28,10 +26,10 @@ NAMES = {
     "materials": "materials",
     "groups": "groups",
 }
-"""What people call features that every format has the same words for."""
+"""Names of features in messages."""
 
 CLAY = (0.66, 0.52, 0.42, 1.0)
-"""Linear RGBA of what has no colour of its own."""
+"""Linear RGBA of surfaces without a colour."""
 
 
 class Image(NamedTuple):
@@ -49,7 +47,7 @@ class Image(NamedTuple):
 
 
 class Material(NamedTuple):
-    """What a surface looks like, in glTF's terms."""
+    """Appearance of a surface, in the terms of glTF."""
 
     name: str = "clay"
     color: tuple[float, ...] = CLAY
@@ -87,7 +85,7 @@ class Polygons(NamedTuple):
 
 
 class Asset(ABC):
-    """A mesh file: positions and triangles for the solve, and all else for writing it again with other positions.
+    """A mesh file: positions and triangles for the solve, everything else for writing it with other positions.
 
     Args:
         path: The file.
@@ -98,14 +96,14 @@ class Asset(ABC):
     faces: IntArray
     """Polygons are cut into triangles. *Shape:* ``(F, 3)``."""
     carries: dict[str, str]
-    """What else is in the file: one of :data:`FEATURES`, and its name with numbers for people."""
+    """Further content of the file: some of :data:`FEATURES`, each with a description for messages."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.carries = {}
 
     def _carry(self, feature: str, number: int | None = None) -> None:
-        """Note that a feature is there, by its name for people, and how many of them."""
+        """Record a feature, with its name and number for messages."""
         name = NAMES[feature]
         counted = f"{number} {name.removesuffix('s') if number == 1 else name}"
         self.carries[feature] = name if number is None else counted
@@ -117,7 +115,7 @@ class Asset(ABC):
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:
-        """The file with other positions. Its normals turn with the surface; all else stays as it is.
+        """The file with other positions. Its normals rotate with the surface; everything else stays.
 
         Args:
             positions: *Shape:* ``(V, 3)``.
@@ -125,7 +123,7 @@ class Asset(ABC):
 
     @abstractmethod
     def parts(self) -> list[Part]:
-        """The surface as it is drawn, for other formats."""
+        """The surface with its materials, for other formats."""
 
     def polygons(self) -> Polygons:
         """The faces for formats that hold polygons; triangles where the file's are not known."""
@@ -161,7 +159,7 @@ class Asset(ABC):
         return path
 
     def companions_for(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
-        """What must lie beside a copy in this folder, and is not there yet.
+        """The companions that a copy in this folder lacks.
 
         Raises:
             FileExistsError: Another file is there, and ``overwrite`` is off.
@@ -185,14 +183,19 @@ class Asset(ABC):
             )
         return shapes
 
-    def say_lost(self, out: Path, holds: Collection[str]) -> None:
-        """Warn of what a file cannot hold, or is not given.
+    @property
+    def keeps(self) -> Collection[str]:
+        """Features that :meth:`with_positions` keeps."""
+        return self.carries
+
+    def warn_lost(self, name: str, holds: Collection[str]) -> None:
+        """Warn of features that a file will not have.
 
         Args:
-            out: The file.
-            holds: Some of :data:`FEATURES`.
+            name: Of the file.
+            holds: Those of :data:`FEATURES` that it will have.
         """
         lost = [name for feature, name in self.carries.items() if feature not in holds]
         if lost:
             listed = lost[0] if len(lost) == 1 else ", ".join(lost[:-1]) + " and " + lost[-1]
-            warnings.warn(f"{out.name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=3)
+            warnings.warn(f"{name} is without the {listed} of {self.path.name}", MeshWarning, stacklevel=4)

@@ -1,4 +1,4 @@
-"""Results that take long, kept on disk under the hash of what they were computed from."""
+"""Results of long computations on disk, named by the hash of their inputs."""
 
 import contextlib
 import hashlib
@@ -22,14 +22,14 @@ from safetensors.numpy import save as save_arrays
 from torch_modal.io.files import write_atomically
 
 CACHE_VERSION = 5
-"""Part of every key: raise it when an algorithm changes whose results are kept, and old entries are left."""
+"""Part of every key: raise it when the algorithm of cached results changes."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
 DEFAULT_LIMIT = 4 * 2**30
 KEPT_PART = 0.9
-"""Of the limit is left when it was passed, so that not each new entry has to make room for itself."""
+"""Share of the limit that is left after entries were removed, so that not each new entry removes others."""
 ABANDONED = 3600.0
-"""Seconds after which a file that is still half-written has no process any more."""
+"""Seconds after which a partial file belongs to no running process."""
 SUFFIX = ".safetensors"
 _DIGEST = "digest"
 _OWN_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
@@ -38,7 +38,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class CacheWarning(UserWarning):
-    """The cache cannot be written; results are right, but will be computed again."""
+    """The cache cannot be written: results are right, but will be computed again."""
 
 
 def default_cache_dir() -> Path:
@@ -85,11 +85,11 @@ class Cache:
     """A folder of safetensors files, one per result, each with a digest that every read verifies.
 
     Damaged, truncated or foreign entries are computed again and replaced. Several processes may share the
-    folder: entries are moved into place whole. When they take more than the limit, those that nobody has asked for
-    the longest are removed.
+    folder: entries are moved into place whole. When they take more than the limit, the least recently used are
+    removed.
 
     Attributes:
-        folder: Where entries stand; it is made when the first is written. None keeps nothing.
+        folder: Of the entries; it is made when the first is written. None: nothing is cached.
         limit: Largest size of all entries, in bytes. A single entry may be larger.
     """
 
@@ -98,7 +98,7 @@ class Cache:
 
     @classmethod
     def at(cls, cache_dir: str | os.PathLike[str] | None = None, *, enabled: bool = True) -> "Cache":
-        """The cache in a folder, by default in :func:`default_cache_dir`; or one that keeps nothing.
+        """The cache in a folder, by default in :func:`default_cache_dir`, or a disabled one.
 
         Raises:
             ValueError: ``TORCH_MODAL_CACHE_LIMIT`` is no size.
@@ -114,13 +114,13 @@ class Cache:
         parameters: Mapping[str, Any],
         compute: Callable[[], Mapping[str, NDArray[Any]]],
     ) -> Arrays:
-        """The kept result, or a computed one that is kept from then on.
+        """The cached result; computed and cached if there is none.
 
         Args:
-            kind: What the result is; the first part of the file's name.
+            kind: Of result; the first part of the file's name.
             inputs: Arrays that the result depends on.
             parameters: Numbers and strings that it depends on.
-            compute: Makes the result.
+            compute: Computes the result.
 
         Returns:
             The arrays that ``compute`` returned, now or earlier.
@@ -132,7 +132,7 @@ class Cache:
         return self.keep(kind, inputs, parameters, compute()) if kept is None else kept
 
     def find(self, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Arrays | None:
-        """The kept result, if there is one; arguments as for :meth:`get`."""
+        """The cached result, if there is one; arguments as for :meth:`get`."""
         if self.folder is None:
             return None
         path = self._path(self.folder, kind, inputs, parameters)
@@ -148,7 +148,7 @@ class Cache:
         parameters: Mapping[str, Any],
         result: Mapping[str, NDArray[Any]],
     ) -> Arrays:
-        """Keep a result, instead of what was kept before; arguments as for :meth:`get`.
+        """Write a result, in place of any earlier one; arguments as for :meth:`get`.
 
         Returns:
             The arrays of the result.
@@ -179,7 +179,7 @@ class Cache:
 
 
 class CacheContent(NamedTuple):
-    """What stands in a cache folder."""
+    """Size of a cache folder."""
 
     n_entries: int
     n_bytes: int
@@ -199,7 +199,7 @@ def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheConte
 
 
 def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
-    """Remove the entries of a cache folder and what a killed process left half-written. Other files stay.
+    """Remove the entries of a cache folder, and partial files of killed processes. Other files stay.
 
     Processes that use the folder at the same time compute again what they miss.
 
@@ -207,7 +207,7 @@ def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent
         cache_dir: The folder, by default :func:`default_cache_dir`.
 
     Returns:
-        What was removed.
+        The entries removed.
 
     Raises:
         OSError: An entry cannot be removed.
@@ -223,7 +223,7 @@ def shrink_cache(limit: int, cache_dir: str | os.PathLike[str] | None = None) ->
         cache_dir: The folder, by default :func:`default_cache_dir`.
 
     Returns:
-        What was removed.
+        The entries removed.
 
     Raises:
         OSError: An entry cannot be removed.
@@ -261,7 +261,7 @@ def _oldest(files: list[Path], limit: int) -> list[Path]:
 
 
 def _remove(files: list[Path]) -> CacheContent:
-    """Remove files; what was removed."""
+    """Remove files; returns how many there were."""
     sizes = []
     for path in files:
         with contextlib.suppress(FileNotFoundError):
@@ -272,7 +272,7 @@ def _remove(files: list[Path]) -> CacheContent:
 
 
 def _files(cache_dir: str | os.PathLike[str] | None) -> list[Path]:
-    """Entries and remains of them, known by their names: somebody's own files may stand beside them."""
+    """Entries and partial ones, known by their names; a user's own files may lie beside them."""
     folder = default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser()
     if not folder.is_dir():
         return []

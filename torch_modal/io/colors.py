@@ -1,9 +1,8 @@
 """Colours of files as glTF and USD hold them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from torch_modal.arrays import FloatArray
 
 
 def linear(colors: FloatArray) -> FloatArray:

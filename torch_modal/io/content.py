@@ -1,7 +1,10 @@
-"""Digests of what objects hold: keys under which results are kept, so that none is taken for that of something else.
+"""Digests of the contents of objects, as keys of cached results.
 
 Numbers count with their types and shapes, objects with all their attributes, functions and classes with their code and
-with whatever it refers to. Libraries count with their versions. What cannot be seen through has no digest.
+with whatever it refers to. Libraries count with their versions. Contents that cannot be read have no digest.
+
+joblib.hash and pickles do not serve: they name functions instead of reading their code, and depend on which objects
+are shared.
 """
 
 import builtins
@@ -27,7 +30,7 @@ from torch_modal.version import __version__
 _LIBRARIES = {"torch", "numpy", "scipy"}
 _OWN = "torch_modal"
 
-# What Python writes into classes and what changes nothing that they compute.
+# Attributes that Python adds to classes, and those without effect on results.
 _NOT_CONTENT = {
     *("__dict__", "__weakref__", "__doc__", "__module__", "__qualname__", "__annotations__", "__annotate__"),
     *("__firstlineno__", "__static_attributes__", "__abstractmethods__", "_abc_impl", "__type_params__"),
@@ -36,14 +39,14 @@ _NOT_CONTENT = {
 
 
 class ContentError(ValueError):
-    """Something holds what has no digest, so that nothing can be kept under it."""
+    """An object has contents that cannot be read, so that it has no digest."""
 
 
 def content_digest(value: Any) -> str:
-    """SHA-256 of all that a value holds, the same in every process.
+    """SHA-256 of all contents of a value, the same in every process.
 
     Raises:
-        ContentError: It holds something that cannot be looked into, such as an open file or a lock.
+        ContentError: Some of it cannot be read, such as an open file or a lock.
     """
     try:
         return _Digests().of(value).hex()
@@ -66,7 +69,7 @@ def array_digest(array: np.ndarray[Any, Any]) -> bytes:
 
 @cache
 def code_digest() -> str:
-    """SHA-256 of the package's own code, so that a change of it counts before its version does."""
+    """SHA-256 of the package's own code, which changes before its version does."""
     root = Path(__file__).parents[1]
     files = sorted(root.rglob("*.py"))
     parts = [part for file in files for part in (file.relative_to(root).as_posix().encode(), file.read_bytes())]
@@ -74,14 +77,14 @@ def code_digest() -> str:
 
 
 class _Digests:
-    """Of one value and all that it leads to."""
+    """Digests of one value and everything that it refers to."""
 
     def __init__(self) -> None:
         self.known: dict[int, tuple[Any, bytes]] = {}
         self.open: list[int] = []
 
     def of(self, value: Any) -> bytes:
-        """The digest; of what is being looked into already, how far above it is."""
+        """The digest; for an object that contains itself, its distance above."""
         found = self.known.get(id(value))
         if found is not None:
             return found[1]
@@ -142,7 +145,7 @@ class _Digests:
         return _joined("function", [self.of(part) for part in parts] + used)
 
     def _of_global(self, code: CodeType, name: str, known: dict[str, Any]) -> bytes:
-        """What a function reads by a name; of a module, what of it the code may name."""
+        """A global of a function; of a module, only the attributes that the code may name."""
         if name not in known:
             return _joined("builtin" if hasattr(builtins, name) else "missing", [name.encode()])
         value = known[name]
@@ -162,7 +165,7 @@ class _Digests:
     def _of_module(self, value: ModuleType) -> bytes:
         if _is_library(value.__name__):
             return _joined("library", [value.__name__.encode(), _version(value.__name__).encode()])
-        raise ContentError(f"the module {value.__name__} is held as a whole")
+        raise ContentError(f"the module {value.__name__} is referred to as a whole")
 
     def _of_class(self, value: type) -> bytes:
         if _is_known(value):
@@ -173,17 +176,8 @@ class _Digests:
                 own[name] = None
         return self.all("class", [value.__qualname__, type(value), value.__bases__, own])
 
-    def _of_proxy(self, value: MappingProxyType[Any, Any]) -> bytes:
-        return self.of(dict(value))
-
     def _of_wrapped(self, value: Any) -> bytes:
         return self.all(type(value).__name__, [value.__func__, getattr(value, "__self__", None)])
-
-    def _of_property(self, value: property) -> bytes:
-        return self.all("property", [value.fget, value.fset, value.fdel])
-
-    def _of_cached(self, value: cached_property[Any]) -> bytes:
-        return self.all("cached_property", [value.func, value.attrname])
 
     def _of_name(self, value: Any) -> bytes:
         """Something of a library, or of Python."""
@@ -201,7 +195,7 @@ class _Digests:
         return self.all("bound", [own, value.__name__])
 
     def _of_object(self, value: Any) -> bytes:
-        """What pickle would write: the class, and all that an instance holds."""
+        """What pickle would write: the class, and all attributes of the instance."""
         if hasattr(value, "__wrapped__"):  # such as functools.cache
             return self.all("wrapper", [type(value), value.__wrapped__])
         if isinstance(value, torch.nn.Module):
@@ -223,9 +217,9 @@ class _Digests:
         (CodeType, _of_code),
         (ModuleType, _of_module),
         ((MethodType, staticmethod, classmethod), _of_wrapped),
-        (MappingProxyType, _of_proxy),
-        (property, _of_property),
-        (cached_property, _of_cached),
+        (MappingProxyType, lambda self, value: self.of(dict(value))),
+        (property, lambda self, value: self.all("property", [value.fget, value.fset, value.fdel])),
+        (cached_property, lambda self, value: self.all("cached_property", [value.func, value.attrname])),
         (BuiltinFunctionType, _of_builtin),
     )
 
@@ -265,7 +259,7 @@ def _is_library(module: str | None) -> bool:
 
 
 def _is_known(value: Any) -> bool:
-    """Whether a class or function is what a library has under its name."""
+    """Whether a class or function is the one of that name in a library."""
     if not _is_library(value.__module__):
         return False
     found: Any = sys.modules.get(value.__module__)

@@ -1,10 +1,13 @@
-"""Files that are either whole or absent."""
+"""Atomic writes: a file is whole or absent."""
 
 import contextlib
+import logging
 import os
 import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+logger = logging.getLogger("torch_modal")
 
 
 @contextlib.contextmanager
@@ -14,7 +17,7 @@ def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
     Readers, and other processes that write the same file, see the old content or the new one, never a part.
 
     Args:
-        path: Where the file goes; its folder must exist.
+        path: Of the final file; its folder must exist.
         ending: Of the temporary name, for libraries that choose a format by it.
 
     Raises:
@@ -28,7 +31,7 @@ def temporary_beside(path: Path, ending: str = ".tmp") -> Iterator[Path]:
     except OSError as error:
         if error.errno is None or (error.filename is not None and Path(error.filename) != temporary):
             raise
-        # The caller knows the name that they gave, not the temporary one.
+        # The caller knows the final name only.
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with contextlib.suppress(OSError):
@@ -39,24 +42,35 @@ def write_atomically(path: Path, data: bytes) -> None:
     """Write a whole file or nothing.
 
     Args:
-        path: Where the file goes; its folder must exist.
+        path: Of the file; its folder must exist.
         data: The whole content.
 
     Raises:
         OSError: As for :func:`temporary_beside`.
     """
-    write_together([(path, data)])
+    with temporary_beside(path) as temporary:
+        temporary.write_bytes(data)
 
 
-def write_together(files: Iterable[tuple[Path, bytes]]) -> None:
-    """Write all files or none: they are moved to their places after the last one was written.
+def write_file(path: Path, data: bytes) -> None:
+    """Write a whole file or nothing; its folder is made if missing."""
+    write_files([(path, data)])
+
+
+def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
+    """Write all files or none: they are moved to their places after the last one was written; folders are made.
 
     Args:
-        files: Where each goes, and its whole content. The folders must exist.
+        files: The path and the whole content of each.
 
     Raises:
         OSError: As for :func:`temporary_beside`.
     """
+    sizes = {}
     with contextlib.ExitStack() as written:
         for path, data in files:
+            path.parent.mkdir(parents=True, exist_ok=True)
             written.enter_context(temporary_beside(path)).write_bytes(data)
+            sizes[path] = len(data) / 1000
+    for path, size in sizes.items():
+        logger.debug("wrote %s, %.1f kB", path, size)

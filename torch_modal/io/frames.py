@@ -4,31 +4,12 @@ from __future__ import annotations
 
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.asset import Asset
-from torch_modal.io.glb import HOLDS, HOLDS_OF_ITS_OWN, shape_bytes
-from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.write import (
-    MESH_FORMATS,
-    check_frames,
-    check_suffix,
-    mesh_bytes,
-    refuse_existing,
-    to_numpy,
-    write_files,
-)
-
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import NDArray
-
-    Array = torch.Tensor | NDArray[Any]
-
-FORMATS = (*MESH_FORMATS, "glb")
-SUFFIXES = tuple(f".{name}" for name in FORMATS)
+from torch_modal.io.files import write_files
+from torch_modal.io.formats import MESH_FORMATS, find_format
+from torch_modal.io.write import check_frames, check_suffix, refuse_existing, to_numpy
 
 
 def save_frames(
@@ -74,17 +55,17 @@ def save_frames(
     shapes, triangles = check_frames(frames, faces)
     if asset is not None:
         asset.check(shapes)
-    fmt = (asset.suffix.lstrip(".") if asset is not None else "ply") if fmt is None else fmt
-    if fmt not in FORMATS:
-        raise ValueError(f"fmt must be one of {', '.join(FORMATS)}, got {fmt!r}.")
+    suffix = (".ply" if asset is None else asset.suffix) if fmt is None else f".{fmt}"
+    if suffix not in MESH_FORMATS:
+        raise ValueError(f"fmt must be one of {', '.join(known[1:] for known in MESH_FORMATS)}, got {fmt!r}.")
     if not stem or Path(stem).name != stem:
         raise ValueError(f"stem must be the start of a file name, without folders, got {stem!r}.")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"{folder} is a file; out must be a folder.")
     digits = max(3, len(str(len(shapes) - 1)))
-    paths = [folder / f"{stem}-{number:0{digits}d}.{fmt}" for number in range(len(shapes))]
-    _write(shapes, triangles, paths, fmt, asset, overwrite)
+    paths = [folder / f"{stem}-{number:0{digits}d}{suffix}" for number in range(len(shapes))]
+    _write(shapes, triangles, paths, suffix, asset, overwrite)
     return paths
 
 
@@ -106,32 +87,22 @@ def save_mesh(
     """
     path = Path(out)
     shapes, triangles = check_frames(to_numpy(vertices)[None], faces, "vertices[None]")
-    fmt = check_suffix(path, SUFFIXES)
-    _write(shapes, triangles, [path], fmt, asset, overwrite)
+    suffix = check_suffix(path, MESH_FORMATS)
+    _write(shapes, triangles, [path], suffix, asset, overwrite)
     return path
 
 
 def _write(
-    shapes: np.ndarray, faces: np.ndarray, paths: list[Path], fmt: str, asset: Asset | None, overwrite: bool
+    shapes: FloatArray, faces: IntArray, paths: list[Path], suffix: str, asset: Asset | None, overwrite: bool
 ) -> None:
     """Each shape to its file, all in one folder and of one format; none if one of them cannot be written."""
     for path in paths:
         refuse_existing(path, overwrite)
-    same = asset is not None and asset.suffix == f".{fmt}"
-    beside = asset.companions_for(paths[0].parent, overwrite) if asset is not None and same else []
+    to_bytes, holds, *_ = find_format(MESH_FORMATS, suffix)
+    beside, data = [], (to_bytes(x, faces, asset) for x in shapes)
+    if asset is not None and asset.suffix == suffix:
+        beside, data = asset.companions_for(paths[0].parent, overwrite), (asset.with_positions(x) for x in shapes)
+        holds = asset.keeps
     if asset is not None:
-        asset.say_lost(paths[0], _holds(asset, fmt, same))
-    frames = ((path, _bytes(x, faces, fmt, asset, same)) for path, x in zip(paths, shapes, strict=True))
-    write_files(chain(beside, frames))
-
-
-def _holds(asset: Asset, fmt: str, same: bool) -> tuple[str, ...]:
-    if fmt == "glb":
-        return HOLDS_OF_ITS_OWN if isinstance(asset, GltfAsset) else HOLDS
-    return tuple(asset.carries) if same else ()
-
-
-def _bytes(vertices: np.ndarray, faces: np.ndarray, fmt: str, asset: Asset | None, same: bool) -> bytes:
-    if fmt == "glb":
-        return shape_bytes(vertices, faces, asset, "shape")
-    return asset.with_positions(vertices) if same and asset is not None else mesh_bytes(fmt, vertices, faces)
+        asset.warn_lost(paths[0].name, holds)
+    write_files(chain(beside, zip(paths, data, strict=True)))

@@ -4,86 +4,71 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.normals import vertex_normals
 from torch_modal.geometry.seams import merge_seams
-from torch_modal.io.asset import Asset, FloatArray, IntArray, Material, Part
+from torch_modal.io.asset import Asset, Material, Part
+from torch_modal.io.formats import Animation, animation_format, mesh_format
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.morph import Drawn, animate, place_frames
-from torch_modal.io.normals import CarriedNormals, on_frames
-from torch_modal.io.timing import Timing
-from torch_modal.io.write import write_file
+from torch_modal.io.morph import Drawn, animate, place_frames, rows_of
+from torch_modal.io.normals import CarriedNormals
 
 # Normals double the file. Beyond this size (POSITION alone) they are left out.
 LARGEST_FILE_WITH_NORMALS = 48 * 2**20
 
 HOLDS = ("texcoords", "normals", "colors", "materials")
-"""What is taken over from a file of another format; of materials, colour, roughness and the texture of the colour."""
-HOLDS_OF_ITS_OWN = ("texcoords", "normals", "colors", "materials", "groups", "polygons", "properties")
+"""Features taken from a file of another format; of materials, colour, roughness and the texture of the colour."""
 
 
-def shape_bytes(shape: FloatArray, faces: IntArray, asset: Asset | None, name: str) -> bytes:
-    """One shape that stands still."""
-    if isinstance(asset, GltfAsset):
-        return asset.with_positions(shape)
-    document, drawn, _ = _document(shape[None], faces, asset, name)
-    place_frames(document, drawn, shape[None])
+@mesh_format(".glb", holds=HOLDS)
+def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> bytes:
+    """One shape without an animation."""
+    document, drawn, _ = _document(vertices[None], faces, asset, "shape")
+    place_frames(document, drawn, vertices[None])
     return document.to_glb()
 
 
-def save_glb(
-    shapes: FloatArray,
-    faces: IntArray,
-    path: Path,
-    timing: Timing,
-    keyframes: Sequence[int] = (),
-    max_targets: int = 64,
-    asset: Asset | None = None,
-) -> Path:
-    """Write frame 0 and a morph target for each further frame, with an animation of their weights.
+@animation_format(".glb")
+def write_glb(animation: Animation, path: Path) -> None:
+    """Frame 0, a morph target for each further frame, and an animation of their weights.
 
-    Args:
-        shapes: *Shape:* ``(N, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        path: The file, which is replaced.
-        timing: How it is played.
-        keyframes: Which frames are key-frames: kept when frames are left out, and named in the animation's extras.
-        max_targets: See :func:`torch_modal.save_animation`.
-        asset: Gives materials, textures and texture coordinates; a GLB or GLTF file, its nodes and all else.
+    Key-frames are kept when frames are left out, and named in the animation's extras. Materials, textures and texture
+    coordinates come from the asset; from a GLB or GLTF file also its nodes and everything else.
     """
+    shapes, faces, timing, name, keyframes, asset, max_targets, _ = animation
     if max_targets < 1:
         raise ValueError(f"max_targets must be at least 1, got {max_targets}.")
-    kept = thinned(len(shapes), max_targets + 1, list(keyframes))
+    kept = thinned(len(shapes), max_targets + 1, keyframes)
     if len(kept) < len(shapes):
         warnings.warn(
-            f"{path.name} holds {len(kept)} of the {len(shapes)} frames (max_targets={max_targets}); "
+            f"{name} holds {len(kept)} of the {len(shapes)} frames (max_targets={max_targets}); "
             "players interpolate linearly between them.",
             stacklevel=3,
         )
     move_normals = shapes[kept].size * 4 <= LARGEST_FILE_WITH_NORMALS
     if not move_normals:
-        warnings.warn(f"{path.name} is large: its normals stay those of frame 0.", stacklevel=3)
+        warnings.warn(f"{name} is large: its normals stay those of frame 0.", stacklevel=3)
     if asset is not None:
-        asset.say_lost(path, HOLDS_OF_ITS_OWN if isinstance(asset, GltfAsset) else HOLDS)
+        asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else HOLDS)
     if isinstance(asset, GltfAsset):
         document, drawn, nodes = asset.rebuilt(shapes[kept])
     else:
-        document, drawn, nodes = _document(shapes[kept], faces, asset, path.stem)
+        document, drawn, nodes = _document(shapes[kept], faces, asset, Path(name).stem)
     place_frames(document, drawn, shapes[kept], move_normals)
     if len(kept) > 1:
-        times, shown = timing.knots(kept, len(shapes))
+        times, shown = timing.knots(kept)
         steps = len(shapes) if timing.cyclic else len(shapes) - 1
-        extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": list(keyframes)}
+        extras: Json = {"fps": steps / timing.duration, "frames": kept.tolist(), "keyframes": keyframes}
         if timing.ping_pong:
             extras["ping_pong"] = True
         animate(document, nodes, kept.tolist(), times, shown, extras)
-    write_file(path, document.to_glb())
-    return path
+    path.write_bytes(document.to_glb())
 
 
 def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
@@ -136,12 +121,12 @@ def _document(
 def _normals(
     parts: Sequence[Part], shapes: FloatArray, faces: IntArray, asset: Asset | None
 ) -> list[Callable[[int], dict[str, FloatArray]]]:
-    """For each part, its normals in a frame: the file's, taken along, or smooth ones where it has none."""
+    """For each part, its normals in a frame: the file's, rotated with the surface, or smooth ones."""
     own = [part for part in parts if part.normals is not None]
     starts = np.cumsum([len(part.vertices) for part in own])
     copies = merge_seams(shapes[[0, -1]], faces)
     _, first = np.unique(copies, return_index=True)
-    smooth = on_frames(lambda x: vertex_normals(x[first], copies[faces])[copies], shapes)
+    smooth = cache(lambda number: vertex_normals(shapes[number][first], copies[faces])[copies])
     carried = None
     if own and asset is not None:
         vertices = np.concatenate([part.vertices for part in own])
@@ -151,20 +136,16 @@ def _normals(
             asset.positions[vertices],
             np.concatenate(triangles),
         )
-        carried = on_frames(lambda x: from_file.at(x[vertices]), shapes)
+        carried = cache(lambda number: from_file.at(shapes[number][vertices]))
     ends = iter(starts.tolist())
     found: list[Callable[[int], dict[str, FloatArray]]] = []
     for part in parts:
         if part.normals is None or carried is None:
-            found.append(partial(_rows, smooth, part.vertices))
+            found.append(partial(rows_of, {"NORMAL": smooth}, part.vertices))
         else:
             end = next(ends)
-            found.append(partial(_rows, carried, slice(end - len(part.vertices), end)))
+            found.append(partial(rows_of, {"NORMAL": carried}, slice(end - len(part.vertices), end)))
     return found
-
-
-def _rows(of: Callable[[int], FloatArray], which: IntArray | slice, number: int) -> dict[str, FloatArray]:
-    return {"NORMAL": of(number)[which]}
 
 
 def _material(document: Document, material: Material) -> Json:

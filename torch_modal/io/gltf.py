@@ -26,7 +26,7 @@ class Document:
 
     Args:
         root: The JSON.
-        binary: What its first buffer holds, if that is not a file of its own.
+        binary: Content of its first buffer, unless that is a separate file.
         folder: Where its files are.
     """
 
@@ -78,7 +78,7 @@ class Document:
         return self._buffers[index]
 
     def resource(self, uri: str) -> bytes:
-        """What a URI names: the data in it, or a file."""
+        """The data in a URI, or of the file that it names."""
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(",")[2])
         return (self.folder / unquote(uri)).read_bytes()
@@ -123,7 +123,7 @@ class Document:
         return array
 
     def floats(self, index: int) -> NDArray[np.float64]:
-        """The numbers of an accessor as they are meant: normalised ones divided. *Shape:* ``(count, width)``."""
+        """The numbers of an accessor; normalised integers as fractions. *Shape:* ``(count, width)``."""
         array = self.accessor(index)
         numbers = array.astype(np.float64)
         if self.get("accessors", index).get("normalized") and array.dtype.kind in "iu":
@@ -159,7 +159,7 @@ class Document:
         Args:
             array: In one of the component types. *Shape:* ``(count,)`` or ``(count, width)``.
             kind: ``"SCALAR"``, ``"VEC3"``, ...
-            target: What the view is used for.
+            target: Use of the view.
             bounds: Whether least and greatest numbers are written; positions and times need them.
             normalized: Whether integers stand for fractions.
         """

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Collection, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, FloatArray, Image, IntArray, Material, Part
+from torch_modal.io.asset import FEATURES, Asset, Image, Material, Part
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
-from torch_modal.io.morph import Drawn, place_frames
-from torch_modal.io.normals import CarriedNormals, on_frames
+from torch_modal.io.morph import Drawn, place_frames, rows_of
+from torch_modal.io.normals import CarriedNormals
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -54,6 +55,11 @@ class GltfAsset(Asset):
     def suffix(self) -> str:
         """Of the files that it writes."""
         return ".glb"
+
+    @property
+    def keeps(self) -> Collection[str]:
+        """All but what moves the mesh."""
+        return set(FEATURES) - {"posing"}
 
     def _collect(self) -> None:
         positions, faces, n = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
@@ -120,7 +126,7 @@ class GltfAsset(Asset):
         return triangles[(np.diff(np.sort(triangles, axis=1)) > 0).all(axis=1)]  # strips turn by empty ones
 
     def morphs(self) -> FloatArray:
-        """The shapes that its morph targets stand for, each shown fully, after the file's own. *Shape:* ``(N, V, 3)``.
+        """The file's shape, and that of each morph target at weight 1. *Shape:* ``(N, V, 3)``.
 
         Raises:
             ValueError: Its meshes do not have the same number of targets.
@@ -143,7 +149,7 @@ class GltfAsset(Asset):
         """A copy without positions and normals, with nothing in it that is not used.
 
         Args:
-            frames: What it will show. *Shape:* ``(N, V, 3)``.
+            frames: *Shape:* ``(N, V, 3)``.
 
         Returns:
             The document; its primitives, for :func:`torch_modal.io.morph.place_frames`; the nodes that show them.
@@ -218,18 +224,21 @@ class GltfAsset(Asset):
         def local(x: FloatArray) -> FloatArray:
             return x[everything] @ inverse[:3, :3].T + inverse[:3, 3]
 
-        normal_at = on_frames(lambda x: normals.at(local(x)), frames)
+        normal_at = cache(lambda number: normals.at(local(frames[number])))
         found: dict[int, tuple[Any, FloatArray | None]] = {}
         for primitive, start, size in zip(with_normals, starts.tolist(), sizes, strict=True):
             own = slice(start, start + size)
             if "TANGENT" not in primitive.json["attributes"]:
-                found[primitive.place] = partial(_rows, {"NORMAL": normal_at}, own), None
+                found[primitive.place] = partial(rows_of, {"NORMAL": normal_at}, own), None
                 continue
             tangents = self.document.floats(primitive.json["attributes"]["TANGENT"])
             whole = np.zeros((len(everything), 3))
             whole[own] = tangents[:, :3]
-            tangent_at = on_frames(partial(lambda vectors, x: normals.at(local(x), vectors), whole), frames)
-            found[primitive.place] = partial(_rows, {"NORMAL": normal_at, "TANGENT": tangent_at}, own), tangents[:, 3:]
+            tangent_at = cache(partial(lambda vectors, number: normals.at(local(frames[number]), vectors), whole))
+            found[primitive.place] = (
+                partial(rows_of, {"NORMAL": normal_at, "TANGENT": tangent_at}, own),
+                tangents[:, 3:],
+            )
         return found
 
     def _take(self, document: Document, accessor: int, target: int, taken: dict[int, int]) -> int:
@@ -299,8 +308,3 @@ class GltfAsset(Asset):
 
 
 _REPLACED = ("accessors", "bufferViews", "buffers", "meshes", "animations", "skins")
-
-
-def _rows(of: dict[str, Callable[[int], FloatArray]], own: slice, number: int) -> dict[str, FloatArray]:
-    """Some rows of the vectors of a frame."""
-    return {name: at(number)[own] for name, at in of.items()}

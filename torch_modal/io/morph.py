@@ -6,11 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.io.gltf import ARRAY_BUFFER, Document, Json
-
-FloatArray = NDArray[np.float64]
 
 TARGET_NAME = "frame-{:03d}"
 
@@ -27,6 +25,13 @@ class Drawn(NamedTuple):
     """``NORMAL`` and ``TANGENT`` on the surface of a frame. *Shape of each:* ``(P, 3)``."""
     handedness: FloatArray | None = None
     """Fourth number of the tangents. *Shape:* ``(P, 1)``."""
+
+
+def rows_of(
+    vectors: dict[str, Callable[[int], FloatArray]], rows: IntArray | slice, number: int
+) -> dict[str, FloatArray]:
+    """Some rows of the vectors of a frame, as :attr:`Drawn.directions` returns them."""
+    return {name: of_frame(number)[rows] for name, of_frame in vectors.items()}
 
 
 def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray, move_normals: bool = True) -> None:
@@ -91,7 +96,7 @@ def animate(
     nodes: Sequence[int],
     numbers: Sequence[int],
     times: FloatArray,
-    shown: NDArray[np.int64],
+    shown: IntArray,
     extras: Json,
 ) -> None:
     """Play the frames of meshes by the weights of their morph targets.
@@ -102,7 +107,7 @@ def animate(
         numbers: Frame numbers behind the base and the morph targets, for their names.
         times: In seconds, increasing. *Shape:* ``(T,)``.
         shown: Which of the frames is shown at each time: 0 for the base. *Shape:* ``(T,)``.
-        extras: What the animation is given to tell.
+        extras: Metadata of the animation.
     """
     weights = np.eye(len(numbers), dtype=np.float32)[:, 1:][shown]
     sampler = {

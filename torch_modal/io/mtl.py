@@ -16,7 +16,7 @@ _OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1, "-colorspace": 1}
 
 
 class Libraries(NamedTuple):
-    """What the material libraries of a file hold."""
+    """Contents of the material libraries of a file."""
 
     materials: dict[str, Material]
     files: dict[str, bytes]
@@ -30,7 +30,7 @@ def read_libraries(path: Path, names: list[str]) -> Libraries:
 
     Args:
         path: The OBJ file.
-        names: What its ``mtllib`` lines name.
+        names: From its ``mtllib`` lines.
 
     Warns:
         MeshWarning: A library or a texture is not there.
@@ -127,7 +127,7 @@ def _name_in_copy(name: str) -> str:
 
 
 def as_image(data: bytes) -> Image | None:
-    """PNG and JPEG as they are, others as PNG; None for what is no picture."""
+    """PNG and JPEG as they are, other pictures as PNG, or None."""
     if (known := Image.of(data)) is not None:
         return known
     from PIL import Image as pillow

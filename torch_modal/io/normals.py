@@ -1,19 +1,14 @@
-"""A file's own normals, taken along by the surface."""
-
-from collections.abc import Callable
+"""Normals of a file, rotated with the surface."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.normals import vertex_normals
 from torch_modal.geometry.turning import surface_frames, turn
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 
 class CarriedNormals:
-    """Turns a file's normals as the surface turns, so that hard edges stay hard and smooth ones smooth.
+    """Rotates a file's normals with the surface, so that hard edges stay hard and smooth ones smooth.
 
     Points with one place and one normal are one: seams of texture coordinates do not show in the shading.
 
@@ -29,7 +24,7 @@ class CarriedNormals:
         _, self.first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         self.group = group.reshape(-1)
         self.triangles = self.group[triangles]
-        # The other end of an edge of each point: with the normal it tells how the surface turns.
+        # The other end of an edge of each point: with the normal it defines a frame of the surface.
         self.neighbour = np.arange(len(self.first))
         for corner in (2, 1, 0):
             self.neighbour[self.triangles[:, corner]] = self.triangles[:, (corner + 1) % 3]
@@ -51,20 +46,3 @@ class CarriedNormals:
         """
         vectors = self.normals if vectors is None else vectors
         return turn(vectors, self.before, self._surface(positions))
-
-
-def on_frames(at: Callable[[FloatArray], FloatArray], frames: FloatArray) -> Callable[[int], FloatArray]:
-    """Of a function of positions, one of the frame's number that computes each frame once, however many ask.
-
-    Args:
-        at: *Shape:* ``(V, 3) -> (P, 3)``.
-        frames: *Shape:* ``(N, V, 3)``.
-    """
-    known: dict[int, FloatArray] = {}
-
-    def of(number: int) -> FloatArray:
-        if number not in known:
-            known[number] = at(frames[number])
-        return known[number]
-
-    return of

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: its lines, and the numbers in them that depend on positions."""
+"""Wavefront OBJ: the lines of the file, with other numbers in the place of positions and normals."""
 
 import re
 from functools import cached_property
@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, FloatArray, IntArray, Material, Part, Polygons
+from torch_modal.io.asset import Asset, Material, Part, Polygons
 from torch_modal.io.colors import linear
 from torch_modal.io.mtl import Libraries, read_libraries
 from torch_modal.io.normals import CarriedNormals
@@ -17,13 +18,13 @@ _LINE_END = re.compile(r"\r\n|\n|\r")
 
 
 class ObjAsset(Asset):
-    """An OBJ file, kept as lines. What is written again differs in its ``v`` and ``vn`` lines alone.
+    """An OBJ file, kept as lines. Written again it differs in its ``v`` and ``vn`` lines alone.
 
     trimesh has no options for this: with texture coordinates it drops unused vertices and splits and reorders
     the rest at seams, and with several materials it repeats all vertices per material and reorders the faces.
 
-    Normals that several vertices share are written one for each vertex, as they turn apart; ``f`` lines then name
-    the new ones.
+    Normals that several vertices share are written once for each vertex, as they rotate differently; ``f`` lines then
+    name the new ones.
     """
 
     def __init__(self, path: Path) -> None:

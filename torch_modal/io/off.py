@@ -1,22 +1,27 @@
-"""OFF: the lines of the file, with other numbers where positions stand."""
+"""OFF: the lines of the file, with other numbers in the place of positions."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 
-from torch_modal.io.asset import Asset, FloatArray, Material, Part
+from torch_modal.arrays import FloatArray
+from torch_modal.io.asset import Asset, Material, Part
+from torch_modal.io.bare_mesh import off_bytes
 from torch_modal.io.colors import linear
 from torch_modal.io.trimesh_reader import read_triangles
-from torch_modal.io.write import mesh_bytes
 
 
 class OffAsset(Asset):
-    """An OFF file, kept as lines. Colours and polygons stay; what else a line of a vertex holds stays too."""
+    """An OFF file, kept as lines: colours, polygons and further numbers of vertices stay."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.positions, self.faces = read_triangles(path)
-        self.lines = path.read_bytes().decode("utf-8", errors="surrogateescape").splitlines()
+        text = path.read_bytes().decode("utf-8", errors="surrogateescape")
+        counts = re.sub(r"^\s*\w*OFF", "", re.sub(r"#[^\n]*", "", text[: 1 << 16])).split()[:2]
+        known = len(counts) == 2 and all(word.isdigit() for word in counts)
+        self.positions, self.faces = read_triangles(path, *map(int, counts if known else (0, 0)))
+        self.lines = text.splitlines()
         content = [n for n, line in enumerate(self.lines) if line.partition("#")[0].strip()]
         # The header and the counts stand on one line or on two.
         header = self.lines[content[0]].partition("#")[0].split()
@@ -37,7 +42,7 @@ class OffAsset(Asset):
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
         if not self._rows:
-            return mesh_bytes("off", positions, self.faces)
+            return off_bytes(positions, self.faces)
         lines = list(self.lines)
         for number, (x, y, z) in zip(self._rows, positions.tolist(), strict=True):
             lines[number] = " ".join([repr(x), repr(y), repr(z), *lines[number].split(None, 3)[3:]])

@@ -1,4 +1,8 @@
-"""PLY: the bytes of the file, with other numbers where positions stand."""
+"""PLY: the bytes of the file, with other numbers in the place of positions and normals.
+
+trimesh reads positions and triangles. It writes neither further elements and properties nor comments, so that the file
+is patched here. plyfile could do so, but its license is the GPL.
+"""
 
 import re
 from functools import cached_property
@@ -8,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.io.asset import Asset, FloatArray, Material, Part
+from torch_modal.arrays import FloatArray
+from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.colors import linear
 from torch_modal.io.mtl import as_image
 from torch_modal.io.normals import CarriedNormals
@@ -21,7 +26,6 @@ _UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 
 
 class _Property(NamedTuple):
-    name: str
     type: str
     count_type: str | None = None
     """Of a list."""
@@ -30,21 +34,23 @@ class _Property(NamedTuple):
 class _Element(NamedTuple):
     name: str
     length: int
-    properties: list[_Property]
+    properties: dict[str, _Property]
 
     def row(self, order: str) -> np.dtype:
-        return np.dtype([(prop.name, order + prop.type) for prop in self.properties])
+        return np.dtype([(name, order + prop.type) for name, prop in self.properties.items()])
 
 
 class PlyAsset(Asset):
-    """A PLY file, kept as bytes. What is written again differs in positions and normals alone, in the file's types."""
+    """A PLY file, kept as bytes. Written again it differs in positions and normals alone, in the file's types."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.positions, self.faces = read_triangles(path)
         self.data = path.read_bytes()
         self._read_header()
-        self._describe()
+        faces = [element for element in self._elements if element.name == "face"]
+        n_faces = sum(element.length for element in faces)
+        self.positions, self.faces = read_triangles(path, self._vertex.length, n_faces)
+        self._describe(n_faces, {name for element in faces for name in element.properties})
 
     def _read_header(self) -> None:
         match = re.search(rb"end_header[^\n]*\n|end_header\r", self.data)
@@ -61,54 +67,47 @@ class PlyAsset(Asset):
                 self._format = words[1]
                 self._order = ">" if words[1] == "binary_big_endian" else "<"
             elif words[:1] == ["element"]:
-                self._elements.append(_Element(words[1], int(words[2]), []))
+                self._elements.append(_Element(words[1], int(words[2]), {}))
             elif words[:2] == ["property", "list"]:
-                self._elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
+                self._elements[-1].properties[words[4]] = _Property(_TYPES[words[3]], _TYPES[words[2]])
             elif words[:1] == ["property"]:
-                self._elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
+                self._elements[-1].properties[words[2]] = _Property(_TYPES[words[1]])
+        vertices = [element for element in self._elements if element.name == "vertex"]
+        if not vertices:
+            raise ValueError("no vertices")
+        self._vertex = vertices[0]
+        names = self._vertex.properties.keys()
+        self._uv_names = next((pair for pair in _UV_NAMES if names >= set(pair)), None)
 
-    def _describe(self) -> None:
-        names = {prop.name for prop in self._vertex.properties}
-        if len(self.faces) > self._count("face"):
+    def _describe(self, n_faces: int, face_properties: set[str]) -> None:
+        names = self._vertex.properties.keys()
+        if len(self.faces) > n_faces:
             self.carries["polygons"] = "polygons"
         if {"nx", "ny", "nz"} <= names:
             self._carry("normals")
         if {"red", "green", "blue"} <= names:
             self._carry("colors")
-        face = {prop.name for element in self._elements if element.name == "face" for prop in element.properties}
         if self._uv_names is not None:
             self._carry("texcoords")
         if self._textures:
             self.carries["materials"] = "texture"
         known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", *(self._uv_names or ())}
-        further = sorted((names - known) | (face - {"vertex_indices", "vertex_index"}))
+        further = sorted((names - known) | (face_properties - {"vertex_indices", "vertex_index"}))
         if further or len(self._elements) > 2:
             others = [e.name for e in self._elements if e.name not in ("vertex", "face")]
             self.carries["properties"] = "properties " + ", ".join(further + others)
 
-    def _count(self, name: str) -> int:
-        return sum(element.length for element in self._elements if element.name == name)
-
-    @property
-    def _vertex(self) -> _Element:
-        return next(element for element in self._elements if element.name == "vertex")
-
-    @property
-    def _uv_names(self) -> tuple[str, str] | None:
-        names = {prop.name for prop in self._vertex.properties}
-        return next((pair for pair in _UV_NAMES if set(pair) <= names), None)
-
     # ------------------------------------------------------------------------------------------------ the vertex rows
     @cached_property
     def _place(self) -> tuple[int, int]:
-        """Where the rows of the vertices begin: a byte, or in text a line; and how many bytes they have."""
+        """Start of the rows of the vertices, as a byte or in text as a line, and their size in bytes."""
         before = self._elements[: self._elements.index(self._vertex)]
         if self._format == "ascii":
             return sum(element.length for element in before), 0
         place = self._start
         for element in before:
             for _ in range(element.length):
-                for prop in element.properties:
+                for prop in element.properties.values():
                     repeat = 1
                     if prop.count_type is not None:
                         count = np.dtype(self._order + prop.count_type)
@@ -124,7 +123,7 @@ class PlyAsset(Asset):
     @cached_property
     def _rows(self) -> NDArray[np.void]:
         """The vertices with all their properties. *Shape:* ``(V,)``."""
-        if any(prop.count_type for prop in self._vertex.properties):
+        if any(prop.count_type for prop in self._vertex.properties.values()):
             raise ValueError("vertices with properties that are lists")
         place, size = self._place
         row = self._vertex.row(self._order)
@@ -153,9 +152,9 @@ class PlyAsset(Asset):
                 rows[name] = column
             return self.data[:place] + rows.tobytes() + self.data[place + size :]
         lines = list(self._lines)
-        at = {prop.name: number for number, prop in enumerate(self._vertex.properties)}
-        single = {prop.name for prop in self._vertex.properties if prop.type == "f4"}
-        columns = {at[name]: _text(column, name in single) for name, column in new.items()}
+        properties = self._vertex.properties
+        at = {name: number for number, name in enumerate(properties)}
+        columns = {at[name]: _text(column, properties[name].type == "f4") for name, column in new.items()}
         for number in range(self._vertex.length):
             words = lines[place + number].split()
             for column, text in columns.items():
@@ -178,9 +177,9 @@ class PlyAsset(Asset):
         colors = None
         if "colors" in self.carries:
             channels = ["red", "green", "blue"]
-            types = {prop.name: prop.type for prop in self._vertex.properties}
-            channels += ["alpha"] if "alpha" in types else []
-            scale = {"f4": 1.0, "f8": 1.0}.get(types["red"]) or float(np.iinfo(types["red"]).max)
+            channels += ["alpha"] if "alpha" in self._vertex.properties else []
+            kind = np.dtype(self._vertex.properties["red"].type)
+            scale = float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
             colors = linear(self._columns(*channels) / scale)
         texcoords = None
         if self._uv_names is not None:

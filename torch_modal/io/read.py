@@ -1,6 +1,7 @@
-"""Reading mesh files, with their vertices in the order and number in which they stand there."""
+"""Reading mesh files; the order and number of vertices stay."""
 
 import os
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,15 @@ from numpy.typing import NDArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset
 
-SUFFIXES = (".obj", ".ply", ".off", ".glb", ".gltf")
+READERS = {
+    ".obj": "torch_modal.io.obj.ObjAsset",
+    ".ply": "torch_modal.io.ply.PlyAsset",
+    ".off": "torch_modal.io.off.OffAsset",
+    ".glb": "torch_modal.io.gltf_asset.GltfAsset",
+    ".gltf": "torch_modal.io.gltf_asset.GltfAsset",
+}
+"""The class for each suffix, imported when it is first used."""
+SUFFIXES = tuple(READERS)
 
 
 def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -58,7 +67,8 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
     try:
         if not path.stat().st_size:
             raise MeshError(f"{path}: the file is empty")
-        asset = _reader(suffix)(path)
+        module, _, name = READERS[suffix].rpartition(".")
+        asset: Asset = getattr(import_module(module), name)(path)
     except MeshError:
         raise
     except Exception as error:  # A reader fed with garbage may raise anything; the file's name must not get lost.
@@ -108,22 +118,3 @@ def require_same_mesh(
             f"{where} ({max(len(strange), len(missing))} of {len(faces)} faces differ); {hint}; polygons "
             "that start at another corner are cut along another diagonal, so export triangles"
         )
-
-
-def _reader(suffix: str) -> type[Asset]:
-    """The class for a suffix; readers are imported where they are used."""
-    if suffix == ".obj":
-        from torch_modal.io.obj import ObjAsset
-
-        return ObjAsset
-    if suffix == ".ply":
-        from torch_modal.io.ply import PlyAsset
-
-        return PlyAsset
-    if suffix == ".off":
-        from torch_modal.io.off import OffAsset
-
-        return OffAsset
-    from torch_modal.io.gltf_asset import GltfAsset
-
-    return GltfAsset

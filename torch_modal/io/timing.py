@@ -1,4 +1,4 @@
-"""When the frames of an animation are shown."""
+"""Times of the frames of an animation."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import FloatArray, IntArray
 
 SECONDS_OF_A_PAIR = 2.0
 SECONDS_OF_A_CYCLE = 1.0
@@ -22,30 +20,29 @@ class Timing(NamedTuple):
 
     duration: float
     """Of the whole sequence once, in seconds; for a cycle, with the step back to its start."""
-    fps: float = FPS
+    fps: float
     """Pictures a second, for formats that have a fixed rate."""
-    cyclic: bool = False
-    ping_pong: bool = False
+    cyclic: bool
+    ping_pong: bool
     """There and back again."""
-    ease: bool = False
+    ease: bool
     """Slow at both ends, by half a period of a cosine."""
-    parts: FloatArray | None = None
-    """Which part of the duration has passed at each frame, from 0 on; even where None. *Shape:* ``(N,)``."""
+    parts: FloatArray
+    """Time of each frame over the duration, from 0 on. *Shape:* ``(N,)``."""
 
-    def knots(self, frames: IntArray, n_frames: int) -> tuple[FloatArray, IntArray]:
-        """When each frame is fully shown, for formats that interpolate linearly between such times.
+    def knots(self, frames: IntArray | None = None) -> tuple[FloatArray, IntArray]:
+        """Times at which frames are fully shown, for formats that interpolate linearly between them.
 
         Args:
-            frames: Numbers of the frames that there are, from the first to the last, ascending. *Shape:* ``(n,)``.
-            n_frames: Of the sequence.
+            frames: Frame numbers that are kept, from the first to the last, ascending. Default: all. *Shape:* ``(n,)``.
 
         Returns:
-            Times in seconds; which of the ``frames`` is shown, as places in that list. *Shape of both:* ``(T,)``.
+            Times in seconds, and indices into ``frames``. *Shape of both:* ``(T,)``.
         """
-        if n_frames == 1:
-            return np.zeros(1), np.zeros(1, np.int64)
-        places = np.arange(len(frames))
-        parts = self._parts(n_frames)[frames]
+        parts = self.parts if frames is None else self.parts[frames]
+        places = np.arange(len(parts))
+        if len(parts) == 1:
+            return np.zeros(1), places
         if self.ease:
             parts = np.arccos(np.clip(1 - 2 * parts, -1, 1)) / np.pi
         times = self.duration * parts
@@ -55,12 +52,12 @@ class Timing(NamedTuple):
             return np.concatenate([times, 2 * self.duration - times[-2::-1]]), np.concatenate([places, places[-2::-1]])
         return times, places
 
-    def samples(self, n_frames: int) -> FloatArray:
-        """Places in the sequence at the fixed rate, fractions among them; what repeats is not there twice.
+    def samples(self) -> FloatArray:
+        """Fractional frame numbers at the fixed rate, without the repeated ends of loops.
 
-        *Shape:* ``(T,)``, from 0 to ``n_frames - 1`` (to ``n_frames``, if cyclic, which is frame 0 again).
+        *Shape:* ``(T,)``, from 0 to ``N - 1`` (to ``N``, if cyclic, which is frame 0 again).
         """
-        if n_frames == 1:
+        if len(self.parts) == 1:
             return np.zeros(1)
         steps = max(1, round(self.duration * self.fps))
         part = np.arange(steps if self.cyclic else steps + 1) / steps
@@ -68,14 +65,8 @@ class Timing(NamedTuple):
             part = (1 - np.cos(np.pi * part)) / 2
         if self.ping_pong:
             part = np.concatenate([part, part[-2:0:-1]])
-        known = self._parts(n_frames)
-        known = np.append(known, 1.0) if self.cyclic else known
+        known = np.append(self.parts, 1.0) if self.cyclic else self.parts
         return np.interp(part, known, np.arange(len(known)))
-
-    def _parts(self, n_frames: int) -> FloatArray:
-        if self.parts is not None:
-            return self.parts
-        return np.arange(n_frames) / (n_frames if self.cyclic else n_frames - 1)
 
 
 def make_timing(
@@ -89,7 +80,7 @@ def make_timing(
     ease: bool = False,
     times: Sequence[float] | FloatArray | None = None,
 ) -> Timing:
-    """Settle how a sequence is played.
+    """Check and complete the settings of an animation.
 
     Args:
         n_frames: Of the sequence.
@@ -100,7 +91,7 @@ def make_timing(
         cyclic: The last frame leads on to the first.
         ping_pong: There and back again.
         ease: Slow at both ends.
-        times: When the frames are, in any unit; of a cycle, with the time when it begins again. Default: evenly.
+        times: Of the frames, in any unit; of a cycle, also when it begins again. Default: evenly spaced.
 
     Raises:
         ValueError: A number is not positive, a cycle is to turn back or to slow down, or times do not fit.
@@ -111,30 +102,26 @@ def make_timing(
     if cyclic and (ping_pong or ease):
         name = "ping_pong" if ping_pong else "ease"
         raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither.")
+    steps = max(n_frames if cyclic else n_frames - 1, 1)
     if duration is None:
-        steps = n_frames if cyclic else n_frames - 1
         if fps is not None:
-            duration = max(steps, 1) / fps
+            duration = steps / fps
         elif cyclic:
             duration = SECONDS_OF_A_CYCLE
         else:
             duration = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
-    parts = None if times is None else _parts_of(np.asarray(times, np.float64), n_frames, cyclic)
+    parts = np.arange(n_frames) / steps
+    if times is not None:
+        given, wanted = np.asarray(times, np.float64), n_frames + cyclic
+        if given.shape != (wanted,) or not np.isfinite(given).all() or (np.diff(given) <= 0).any():
+            also = ", and the one when it begins again" if cyclic else ""
+            raise ValueError(f"times must be {wanted} ascending numbers, one for each frame{also}; got {given.shape}.")
+        parts = parts if wanted == 1 else ((given - given[0]) / (given[-1] - given[0]))[:n_frames]
     return Timing(float(duration), float(FPS if fps is None else fps), cyclic, ping_pong, ease, parts)
 
 
-def _parts_of(times: FloatArray, n_frames: int, cyclic: bool) -> FloatArray:
-    wanted = n_frames + cyclic
-    if times.shape != (wanted,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        also = ", and the one when it begins again" if cyclic else ""
-        raise ValueError(f"times must be {wanted} ascending numbers, one for each frame{also}; got {times.shape}.")
-    if wanted == 1:
-        return np.zeros(1)
-    return ((times - times[0]) / (times[-1] - times[0]))[:n_frames]
-
-
 def resample(frames: FloatArray, places: FloatArray) -> FloatArray:
-    """Frames at fractional places, by straight lines between neighbours. *Shape:* ``(N, V, 3), (T,) -> (T, V, 3)``."""
+    """Linear interpolation at fractional frame numbers. *Shape:* ``(N, V, 3), (T,) -> (T, V, 3)``."""
     left = np.floor(places).astype(np.int64)
     part = (places - left)[:, None, None]
     following = frames[(left + 1) % len(frames)]

@@ -1,34 +1,15 @@
-"""A sequence of shapes on disk as numbered meshes, and what all writers share.
-
-Coordinates are written as the caller has them: nothing is centred, scaled or turned.
-"""
+"""Checks of arrays and paths that all writers share."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.io.files import write_together
-
-if TYPE_CHECKING:  # at run time these stay out: a reader of PLY files needs neither
-    import torch
-
-    Array = torch.Tensor | NDArray[Any]
-
-logger = logging.getLogger("torch_modal")
-
-PICTURES = (".png", ".pdf")
-"""What pictures are written as."""
-PAGES = (".html", ".htm")
-"""What pages are written as."""
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import Array, FloatArray, IntArray
 
 
 def to_numpy(array: Array) -> NDArray[Any]:
@@ -46,7 +27,7 @@ def check_frames(frames: Array, faces: Array, name: str = "frames") -> tuple[Flo
     Args:
         frames: Vertex positions. *Shape:* ``(N, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        name: What the messages call ``frames``.
+        name: Of ``frames``, for messages.
 
     Returns:
         ``frames`` as float64, ``faces`` as int64.
@@ -86,16 +67,13 @@ def check_indices(indices: Sequence[int], n_frames: int, name: str) -> list[int]
     return numbers
 
 
-def check_suffix(path: Path, suffixes: Sequence[str], name: str = "out") -> str:
-    """The format that a file's name asks for.
+def check_suffix(path: Path, suffixes: Collection[str], name: str = "out") -> str:
+    """The suffix of a file in small letters, with its dot.
 
     Args:
         path: The file.
-        suffixes: Those that there are, in small letters, with their dots.
-        name: What the message calls the file.
-
-    Returns:
-        The suffix in small letters, without its dot.
+        suffixes: Those that can be written.
+        name: Of the argument, for the message.
 
     Raises:
         ValueError: It is none of those.
@@ -105,7 +83,7 @@ def check_suffix(path: Path, suffixes: Sequence[str], name: str = "out") -> str:
         *others, last = suffixes
         wanted = f"{', '.join(others)} or {last}" if others else last
         raise ValueError(f"{name} must end in {wanted}, got {path.name!r}.")
-    return suffix[1:]
+    return suffix
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
@@ -114,54 +92,3 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
         raise IsADirectoryError(f"{path} is a folder; name a file.")
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists; pass overwrite=True (--overwrite) to replace it.")
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing; its folder is made if missing."""
-    write_files([(path, data)])
-
-
-def write_files(files: Iterable[tuple[Path, bytes]]) -> None:
-    """Write all files or none; their folders are made if missing."""
-    sizes = {}
-
-    def noted() -> Iterator[tuple[Path, bytes]]:
-        for path, data in files:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            sizes[path] = len(data) / 1000
-            yield path, data
-
-    write_together(noted())
-    for path, size in sizes.items():
-        logger.debug("wrote %s, %.1f kB", path, size)
-
-
-def _ply_bytes(vertices: FloatArray, faces: IntArray) -> bytes:
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    rows["count"], rows["corners"] = 3, faces
-    return header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes()
-
-
-# In both text formats repr() gives the fewest digits that read back as the same float64.
-def _obj_bytes(vertices: FloatArray, faces: IntArray) -> bytes:
-    points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
-    return (points + "".join(f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist())).encode("ascii")
-
-
-def _off_bytes(vertices: FloatArray, faces: IntArray) -> bytes:
-    points = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
-    triangles = "".join(f"3 {a} {b} {c}\n" for a, b, c in faces.tolist())
-    return f"OFF\n{len(vertices)} {len(faces)} 0\n{points}{triangles}".encode("ascii")
-
-
-MESH_FORMATS = {"ply": _ply_bytes, "obj": _obj_bytes, "off": _off_bytes}
-
-
-def mesh_bytes(fmt: str, vertices: FloatArray, faces: IntArray) -> bytes:
-    """A file of positions and triangles alone."""
-    return MESH_FORMATS[fmt](vertices, faces)

@@ -1,40 +1,34 @@
-"""A sequence as one file that plays; the suffix says which kind."""
+"""A sequence as one file that plays; its suffix chooses the format."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torch_modal.arrays import Array
 from torch_modal.extras import require_installed
 from torch_modal.io.asset import Asset
+from torch_modal.io.files import temporary_beside
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, find_format
 from torch_modal.io.timing import make_timing
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.progress import Progress
 
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import NDArray
-
-    Array = torch.Tensor | NDArray[Any]
-
-SUFFIXES = (".glb", ".mp4", ".gif", ".usd", ".usda", ".usdc", ".mdd", ".pc2", ".npz")
-
-_USD = (("pxr",), "usd")
-# Modules that a suffix needs, and the extra that brings them.
-_NEEDS = {".mp4": (("imageio", "imageio_ffmpeg"), "video"), ".usd": _USD, ".usda": _USD, ".usdc": _USD}
+logger = logging.getLogger("torch_modal")
 
 
 def require_packages(path: Path) -> None:
     """Refuse a file whose format needs a package that is not installed, before any work.
 
     Raises:
-        MissingPackageError: It says which.
+        MissingPackageError: The message says which.
     """
-    modules, extra = _NEEDS.get(path.suffix.lower(), ((), ""))
-    require_installed(modules, extra, path.name)
+    if path.suffix.lower() in ANIMATION_FORMATS:
+        found = find_format(ANIMATION_FORMATS, path.suffix.lower())
+        require_installed(found.modules, found.extra, path.name)
 
 
 def save_animation(
@@ -102,7 +96,7 @@ def save_animation(
     """
     shapes, triangles = check_frames(frames, faces)
     path = Path(out)
-    suffix = f".{check_suffix(path, SUFFIXES)}"
+    suffix = check_suffix(path, ANIMATION_FORMATS)
     if asset is not None:
         asset.check(shapes)
     require_packages(path)
@@ -121,20 +115,9 @@ def save_animation(
         ease=ease,
         times=times,
     )
-    if suffix == ".glb":
-        from torch_modal.io.glb import save_glb
-
-        return save_glb(shapes, triangles, path, timing, keyframes, max_targets, asset)
-    if suffix in (".mp4", ".gif"):
-        from torch_modal.view.video import save_video
-
-        return save_video(shapes, triangles, path, timing, progress=progress)
-    if suffix.startswith(".usd"):
-        from torch_modal.io.usd import save_usd
-
-        return save_usd(shapes, triangles, path, timing, asset)
-    from torch_modal.io.point_cache import save_mdd, save_npz, save_pc2
-
-    if suffix == ".npz":
-        return save_npz(shapes, triangles, path, timing, keyframes)
-    return (save_mdd if suffix == ".mdd" else save_pc2)(shapes, path, timing)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, max_targets, progress)
+    with temporary_beside(path, suffix) as temporary:
+        find_format(ANIMATION_FORMATS, suffix).write(animation, temporary)
+    logger.debug("wrote %s, %.1f kB", path, path.stat().st_size / 1000)
+    return path

@@ -15,7 +15,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from torch_modal.io.write import PAGES, check_suffix, refuse_existing, write_file
+from torch_modal.io.files import write_file
+from torch_modal.io.formats import PAGES
+from torch_modal.io.write import check_suffix, refuse_existing
 from torch_modal.version import __version__
 
 __all__ = ["Page"]

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.normals import vertex_normals
-from torch_modal.io.write import FloatArray, IntArray
 
 logger = logging.getLogger("torch_modal")
 

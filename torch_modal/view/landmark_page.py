@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from torch_modal.arrays import Array
 from torch_modal.io.write import check_frames, to_numpy
 from torch_modal.view.document import Page, document
 from torch_modal.view.page import packed
-
-if TYPE_CHECKING:
-    from torch_modal.io.write import Array
 
 __all__ = ["show_landmarks"]
 

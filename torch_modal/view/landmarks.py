@@ -9,7 +9,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from torch_modal.io.write import PICTURES, FloatArray, IntArray, check_suffix, refuse_existing, write_file
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.io.files import write_file
+from torch_modal.io.formats import PICTURES
+from torch_modal.io.write import check_suffix, refuse_existing
 from torch_modal.view.drawing import ByteArray, Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, KEYFRAME_COLOR, view_rotation
 
@@ -51,7 +54,7 @@ def render_landmarks(
         FileExistsError: The file exists and ``overwrite`` is off.
     """
     path = Path(out)
-    fmt = check_suffix(path, PICTURES)
+    fmt = check_suffix(path, PICTURES)[1:]
     refuse_existing(path, overwrite)
     write_file(path, _sheet([(mesh, _views(mesh, renderer)) for mesh in meshes], fmt))
     return path

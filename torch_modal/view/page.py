@@ -4,23 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from torch_modal.io.write import (
-    FloatArray,
-    IntArray,
-    check_frames,
-    check_indices,
-    to_numpy,
-)
+from torch_modal.arrays import Array, FloatArray, IntArray
+from torch_modal.io.write import check_frames, check_indices, to_numpy
 from torch_modal.view.document import Page, checked_path, document
 from torch_modal.view.page_data import grid_of, pack_faces, pack_frames, quantise
 from torch_modal.view.picture import check_view, up_axis, view_rotation
-
-if TYPE_CHECKING:
-    from torch_modal.io.write import Array
 
 __all__ = ["show", "write_page"]
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.io.write import FloatArray, IntArray
+from torch_modal.arrays import FloatArray, IntArray
 
 LEVELS = 65_535
 """Steps of the grid along the longest side."""

@@ -9,24 +9,15 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from torch_modal.io.write import (
-    PICTURES,
-    FloatArray,
-    check_frames,
-    check_indices,
-    check_suffix,
-    refuse_existing,
-    to_numpy,
-    write_file,
-)
+from torch_modal.arrays import Array, FloatArray
+from torch_modal.io.files import write_file
+from torch_modal.io.formats import PICTURES
+from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
 from torch_modal.view.drawing import ByteArray, Scene, draw
-
-if TYPE_CHECKING:
-    from torch_modal.io.write import Array
 
 __all__ = ["render_sequence"]
 
@@ -196,7 +187,7 @@ def render_sequence(
     if not frames_by_row:
         raise ValueError("frames_by_row is empty; it needs at least one row of shapes.")
     path = Path(out)
-    fmt = check_suffix(path, PICTURES)
+    fmt = check_suffix(path, PICTURES)[1:]
     if renderer not in ("auto", "pyvista", "matplotlib"):
         raise ValueError(f"renderer must be auto, pyvista or matplotlib, got {renderer!r}.")
     check_view(view, up)

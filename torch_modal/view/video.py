@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from torch_modal.io.files import temporary_beside
-from torch_modal.io.timing import Timing, resample
-from torch_modal.progress import Progress, ProgressReport
+from torch_modal.io.formats import Animation, animation_format
+from torch_modal.io.timing import resample
+from torch_modal.progress import ProgressReport
 from torch_modal.view.drawing import ByteArray, Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, centred, view_rotation
 
@@ -17,64 +17,48 @@ PIXELS = 640
 """The longer side of a picture."""
 
 PICTURES_AT_ONCE = 24
-"""That a process of the renderer draws."""
+"""Drawn by one process of the renderer."""
 
 
-def save_video(
-    shapes: np.ndarray,
-    faces: np.ndarray,
-    path: Path,
-    timing: Timing,
-    view: tuple[float, float] | None = None,
-    renderer: str = "auto",
-    progress: Progress = None,
-) -> Path:
-    """Draw the sequence from one place and write it as H.264 in MP4, or as a GIF that goes on for ever.
+@animation_format(".mp4", modules=("imageio", "imageio_ffmpeg"), extra="video")
+def write_mp4(animation: Animation, path: Path) -> None:
+    """H.264."""
+    import imageio.v2 as imageio
 
-    Args:
-        shapes: *Shape:* ``(N, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        path: The file, ``.mp4`` or ``.gif``, which is replaced.
-        timing: Pictures are taken at its rate.
-        view: Azimuth and elevation of the camera, as for :func:`torch_modal.render_sequence`.
-        renderer: ``"auto"``, ``"pyvista"`` or ``"matplotlib"``.
-        progress: How the drawing shows its progress.
-    """
-    places = timing.samples(len(shapes))
+    options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "error"}
+    pictures = _pictures(animation)
+    writer: Any = imageio.get_writer(path, format="FFMPEG", mode="I", fps=animation.timing.fps, **options)
+    with writer:
+        for picture in pictures:
+            writer.append_data(picture)
+
+
+@animation_format(".gif")
+def write_gif(animation: Animation, path: Path) -> None:
+    """A GIF that repeats for ever."""
+    from PIL import Image
+
+    # GIF counts in hundredths of a second, and players slow down below two of them.
+    milliseconds = max(20, 10 * round(100 / animation.timing.fps))
+    first, *others = map(Image.fromarray, _pictures(animation))
+    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+
+def _pictures(animation: Animation) -> list[ByteArray]:
+    """The sequence drawn from one place, at the rate of its timing."""
+    shapes, faces = animation.shapes, animation.faces
+    places = animation.timing.samples()
     # A frame that is shown twice, as on the way back, is drawn once.
     unique, which = np.unique(places, return_inverse=True)
-    points = resample(shapes, unique) @ view_rotation(shapes[0], view, None).T
+    points = resample(shapes, unique) @ view_rotation(shapes[0], None, None).T
     points, half = centred(points[None])
     # H.264 stores colour for blocks of two by two.
     size = np.maximum((PIXELS * half / half.max() / 2).round() * 2, 2).astype(np.int64)
     paint = np.broadcast_to((np.array(BETWEEN_COLOR) * 255).round().astype(np.uint8), points[0].shape)
     images: list[ByteArray] = []
-    with ProgressReport(len(unique), "pictures", progress, unit="picture") as report:
+    with ProgressReport(len(unique), "pictures", animation.progress, unit="picture") as report:
         for start in range(0, len(unique), PICTURES_AT_ONCE):
             part = slice(start, start + PICTURES_AT_ONCE)
-            images += list(draw(Scene(points[0, part], paint[part].copy(), faces, half, size), renderer))
+            images += list(draw(Scene(points[0, part], paint[part].copy(), faces, half, size), "auto"))
             report.update(len(images) - start)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_beside(path, path.suffix.lower()) as temporary:
-        write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
-        write(temporary, [images[number] for number in which.reshape(-1)], timing.fps)
-    return path
-
-
-def _write_gif(path: Path, pictures: list[ByteArray], fps: float) -> None:
-    from PIL import Image
-
-    # GIF counts in hundredths of a second, and players slow down below two of them.
-    milliseconds = max(20, 10 * round(100 / fps))
-    first, *others = (Image.fromarray(picture) for picture in pictures)
-    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
-
-
-def _write_mp4(path: Path, pictures: list[ByteArray], fps: float) -> None:
-    import imageio.v2 as imageio
-
-    options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "error"}
-    writer: Any = imageio.get_writer(path, format="FFMPEG", mode="I", fps=fps, **options)
-    with writer:
-        for picture in pictures:
-            writer.append_data(picture)
+    return [images[number] for number in which.reshape(-1)]

@@ -4,42 +4,41 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_modal.codec.file import read, write_exact
+from torch_modal.codec.fit import FittedFrames, fit
+from torch_modal.codec.modes import ReproducibleModes, reproducible_modes
+from torch_modal.codec.selection import FrameSequence, choose_keyframes, with_worst
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.modal_decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.sequence.codec_file import read, write_exact
-from torch_modal.sequence.codec_fit import Fit, fit
-from torch_modal.sequence.codec_modes import FixedModes, fixed_modes
-from torch_modal.sequence.codec_selection import select_keyframes
 
 ERROR = 0.002
-"""Mean distance over the diagonal that key-frames are chosen for, if nothing is said."""
+"""Default for the largest mean distance of a frame's vertices, over the diagonal."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModalSequence:
     """A motion: key-frames, and amplitudes, a rigid motion and a time for each frame.
 
-    Modes are a function of a key-frame and cost nothing. Amplitudes are those of :class:`torch_modal.ModalDecoder`: 0
+    Modes follow from a key-frame, so they are not stored. Amplitudes are those of :class:`torch_modal.ModalDecoder`: 0
     is the smooth path, 1 moves vertices by 1 % of the diagonal. They mean the same in all frames.
 
     Attributes:
         keyframes: *Shape:* ``(K, V, 3)``.
         faces: *Shape:* ``(F, 3)``.
-        keyframe_times: If cyclic, with the time when the first comes again. *Shape:* ``(K,)`` or ``(K + 1,)``.
-        times: When the frames are. *Shape:* ``(T,)``.
+        keyframe_times: If cyclic, also when the first comes again. *Shape:* ``(K,)`` or ``(K + 1,)``.
+        times: Of the frames. *Shape:* ``(T,)``.
         amplitudes: Zero at the key-frames. *Shape:* ``(T, k)``.
-        motions: Turns (axis times angle) about the centre, and moves in units of the diagonal. *Shape:* ``(T, 6)``.
+        motions: Rotations (axis times angle) about the centre, and translations in units of the diagonal. *Shape:*
+            ``(T, 6)``.
         modes: Of the key-frame ``reference``.
-        reference: Which key-frame the modes belong to.
+        reference: Index of the key-frame that the modes belong to.
         errors: Mean distance of the vertices to the frame that was encoded, over the diagonal; NaN where that is not
             known. *Shape:* ``(T,)``.
     """
@@ -50,7 +49,7 @@ class ModalSequence:
     times: Tensor
     amplitudes: Tensor
     motions: Tensor
-    modes: FixedModes
+    modes: ReproducibleModes
     reference: int
     errors: Tensor
 
@@ -71,7 +70,7 @@ class ModalSequence:
 
     @property
     def n_floats(self) -> int:
-        """Numbers that the motion needs: key-frames, and amplitudes, rigid motion and time of each other frame."""
+        """Numbers to store: key-frames, and amplitudes, rigid motion and time of each other frame."""
         others = self.n_frames - int(self.is_keyframe.sum())
         return self.keyframes.numel() + len(self.keyframe_times) + others * (self.n_modes + 7)
 
@@ -82,12 +81,12 @@ class ModalSequence:
 
     @cached_property
     def decoder(self) -> ModalDecoder:
-        """Amplitudes and times to shapes, differentiable: made at the first use."""
+        """Maps amplitudes and times to shapes, with gradients; made at the first use."""
         reference = self.keyframes[self.reference]
         return ModalDecoder(self.keyframes, self.faces, self.keyframe_times, reference, self.modes.modes)
 
     def decode(self, t: Any = None, progress: Progress = False) -> Tensor:
-        """The frames, or the shapes at other times, whose amplitudes lie on straight lines between those of frames.
+        """The frames, or the shapes at other times, by linear interpolation of the amplitudes.
 
         Args:
             t: Times, from the first to the last frame; if cyclic, any. Default: those of the frames. *Shape:*
@@ -98,7 +97,7 @@ class ModalSequence:
             float64; key-frames bit for bit. *Shape:* ``(N, V, 3)``.
 
         Raises:
-            ValueError: A time outside.
+            ValueError: A time is outside that range.
         """
         with torch.no_grad():
             if t is None:
@@ -115,19 +114,19 @@ class ModalSequence:
                 out[times == at] = shape.double()
         return out
 
-    def fit(self, frames: Any, times: Any) -> Fit:
-        """Amplitudes of other frames beside the same path, such as those of another motion of the same mesh.
+    def fit(self, frames: Any, times: Any) -> FittedFrames:
+        """Fit amplitudes of other frames beside the same path, such as those of another motion of the same mesh.
 
         Args:
-            frames: In units of their own key-frames. *Shape:* ``(N, V, 3)``.
-            times: Where along the path each is. *Shape:* ``(N,)``.
+            frames: In the units of the key-frames. *Shape:* ``(N, V, 3)``.
+            times: Place of each along the path. *Shape:* ``(N,)``.
 
         Returns:
             ``amplitudes (N, k)``, ``motions (N, 6)`` and ``errors (N,)``, to be passed to :attr:`decoder`.
 
         Raises:
             MeshError: Frames that cannot be used.
-            ValueError: Times that do not fit the frames, or are outside.
+            ValueError: Times that do not fit the frames, or are outside the path.
         """
         x = check_keyframes(frames, self.faces, min_keyframes=1, warn=False)[0].detach().cpu().double()
         t = torch.as_tensor(times, dtype=torch.float64).reshape(-1)
@@ -156,7 +155,7 @@ class ModalSequence:
         return mixed[:, : self.n_modes], mixed[:, self.n_modes :]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a ``.tms`` file without loss, to be read by :meth:`load`; it is whole or absent.
+        """Write a ``.tms`` file without loss, to be read by :meth:`load`; a failed write leaves no file.
 
         Raises:
             OSError: The file cannot be written.
@@ -169,15 +168,15 @@ class ModalSequence:
 
         Args:
             path: The file.
-            cache_dir: Where modes are kept, as for :func:`torch_modal.extract_modes`.
+            cache_dir: Where modes are cached, as for :func:`torch_modal.extract_modes`.
             cache: Whether they are.
 
         Raises:
             FileNotFoundError: There is no such file.
             ValueError: It is damaged, holds something else, or has another version; or this machine finds other modes.
-            MissingPackageError: :func:`torch_modal.compress` wrote it, and the extra ``compress`` is not there.
+            MissingPackageError: :func:`torch_modal.compress` wrote it, and the extra ``compress`` is not installed.
         """
-        return cls(**read(FilePath(path), cache_dir, cache))
+        return cls(**read(FilePath(path).read_bytes(), FilePath(path), cache_dir, cache))
 
 
 def encode(
@@ -193,7 +192,7 @@ def encode(
     cache: bool = True,
     progress: Progress = None,
 ) -> ModalSequence:
-    """A motion as key-frames and amplitudes.
+    """Encode a motion as key-frames and amplitudes.
 
     Each frame is fitted by least squares of its vertices, after the best rigid motion, from the amplitudes of the frame
     before. Modes are those of the first key-frame, by the deterministic mesher.
@@ -202,13 +201,13 @@ def encode(
         frames: A motion of one connectivity, in any units. *Shape:* ``(T, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         keyframes: Which frames are key-frames, with the first, and, if not cyclic, the last; or how many; or, by
-            default, as few as the ``error`` asks for.
+            default, as few as the ``error`` needs.
         n_modes: Amplitudes of a frame, k. A few more where eigenvalues are nearly the same.
-        error: Mean distance of the vertices over the diagonal that no frame is above, where key-frames are not given.
-        times: When the frames are, ascending; if cyclic, and when the first comes again. Default: 0, 1, 2, and so on.
+        error: Largest mean distance of a frame's vertices, over the diagonal, where key-frames are selected.
+        times: Of the frames, ascending; if cyclic, also when the first comes again. Default: 0, 1, 2, and so on.
             *Shape:* ``(T,)``, or ``(T + 1,)`` if cyclic.
         cyclic: Whether the last frame leads on to the first.
-        cache_dir: Where modes are kept, as for :func:`torch_modal.extract_modes`.
+        cache_dir: Where modes are cached, as for :func:`torch_modal.extract_modes`.
         cache: Whether they are.
         progress: See :data:`torch_modal.progress.Progress`.
 
@@ -216,76 +215,35 @@ def encode(
         MeshError: Frames that cannot be used.
         ValueError: Key-frames, times or numbers that cannot be used.
     """
-    shapes, working_faces = check_keyframes(frames, faces, min_keyframes=2, warn=False)
+    motion = FrameSequence.checked(frames, faces, times, cyclic)
     if isinstance(n_modes, bool) or not isinstance(n_modes, int) or n_modes < 1:
         raise ValueError(f"n_modes is {n_modes!r}; give a whole number of at least 1")
-    x, triangles = shapes.detach().cpu().double(), working_faces.cpu()
     if not 0 < error < 1:
         raise ValueError(f"error is a part of the diagonal, such as 0.002; got {error!r}")
-    when = checked_times(times, len(x), cyclic)
-    kept = {"cache_dir": cache_dir, "cache": cache}
-    keys = chosen_keys(x, triangles, when, keyframes, n_modes, error, cyclic, kept, progress)
-    modes = fixed_modes(x[keys[0]], triangles, n_modes, **kept)  # type: ignore[arg-type]
+    caching = {"cache_dir": cache_dir, "cache": cache}
+    keys = choose_keyframes(motion, keyframes, n_modes, error, caching, progress)
+    modes = reproducible_modes(motion.frames[0], motion.faces, n_modes, **caching)  # type: ignore[arg-type]
     while True:
-        found = fitted(x, triangles, when, x[keys], keys, cyclic, modes, progress)
+        found = fitted(motion, keys, motion.frames[keys], modes, progress)
         if keyframes is not None or float(found.errors.max()) <= error:
             return found
         keys = with_worst(keys, found.errors, error)
 
 
-def chosen_keys(
-    frames: Tensor,
-    faces: Tensor,
-    when: Tensor,
-    keyframes: Sequence[int] | int | None,
-    n_modes: int,
-    error: float,
-    cyclic: bool,
-    kept: dict[str, Any],
-    progress: Progress = None,
-) -> list[int]:
-    """The key-frames that a caller names, or those that are found. Arguments as for :func:`encode`."""
-    if not isinstance(keyframes, (int, type(None))):
-        return _checked_keys(keyframes, len(frames), cyclic)
-    modes = fixed_modes(frames[0], faces, n_modes, **kept)
-    return select_keyframes(frames, faces, when, modes.modes, keyframes, error, cyclic, progress)
-
-
-def with_worst(keys: Sequence[int], errors: Tensor, error: float) -> list[int]:
-    """Key-frames, and the worst frame of each interval that has one above an error."""
-    ends = [*keys, len(errors)]
-    worst = [a + int(errors[a:b].argmax()) for a, b in pairwise(ends)]
-    return sorted({*keys, *(f for f in worst if float(errors[f]) > error)})
-
-
 def fitted(
-    frames: Tensor,
-    faces: Tensor,
-    when: Tensor,
-    keyframes: Tensor,
+    motion: FrameSequence,
     keys: Sequence[int],
-    cyclic: bool,
-    modes: FixedModes,
+    keyframes: Tensor,
+    modes: ReproducibleModes,
     progress: Progress = None,
     only: Sequence[int] | None = None,
 ) -> ModalSequence:
-    """The sequence of given key-frames, rounded or not, with modes of the first; of all frames, or ``only`` some."""
-    key_times = when[[*keys, len(frames)]] if cyclic else when[list(keys)]
-    decoder = ModalDecoder(keyframes, faces, key_times, keyframes[0], modes.modes)
-    times = when[: len(frames)]
-    with ProgressReport(len(frames if only is None else only), "encoded frames", progress) as bar:
-        found = fit(decoder, frames, times, keys, bar.update, only)
-    return ModalSequence(keyframes, faces, key_times, times, found.amplitudes, found.motions, modes, 0, found.errors)
-
-
-def _checked_keys(keyframes: Any, n_frames: int, cyclic: bool) -> list[int]:
-    keys = [int(i) for i in keyframes]
-    wanted = "the first frame" if cyclic else "the first and the last frame"
-    ends = {0} if cyclic else {0, n_frames - 1}
-    ascending = all(a < b for a, b in pairwise(keys))
-    if len(keys) < 2 or not ascending or not ends <= set(keys) or keys[-1] >= n_frames or keys[0] < 0:
-        raise ValueError(
-            f"keyframes are two or more ascending frame numbers from 0 to {n_frames - 1}, with {wanted} among them; "
-            f"got {keys}"
-        )
-    return keys
+    """The sequence of given key-frames, rounded or not, fitted to all frames or ``only`` some."""
+    key_times = motion.times[motion.ends(keys)]
+    decoder = ModalDecoder(keyframes, motion.faces, key_times, keyframes[0], modes.modes)
+    times = motion.times[: len(motion.frames)]
+    with ProgressReport(len(times if only is None else only), "encoded frames", progress) as bar:
+        found = fit(decoder, motion.frames, times, keys, bar.update, only)
+    return ModalSequence(
+        keyframes, motion.faces, key_times, times, found.amplitudes, found.motions, modes, 0, found.errors
+    )

@@ -9,9 +9,9 @@ from conftest import Shapes, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.codec.modes import _clusters, reproducible_modes
+from torch_modal.codec.selection import FrameSequence, IntervalErrors, select_keyframes
 from torch_modal.nn import modal_decoder
-from torch_modal.sequence.codec_modes import _clusters, fixed_modes
-from torch_modal.sequence.codec_selection import Judge, select_keyframes
 
 
 @pytest.fixture(scope="module")
@@ -257,11 +257,11 @@ def test_chosen_key_frames_are_no_worse_than_even_ones(bars: Shapes) -> None:
     )
     t = 2 * (1 - (1 - torch.linspace(0, 1, 16).double()) ** 4)
     frames = decoder(torch.zeros(16, 8).double(), t)
-    when = torch.arange(16).double()
-    modes = fixed_modes(frames[0], bars.faces, 4)
-    keys = select_keyframes(frames, bars.faces, when, modes.modes, 4, 0.0, False, False)
-    judge = Judge(frames, bars.faces, when, modes.modes, False)
-    assert judge.total(keys) < 0.6 * judge.total([0, 5, 10, 15])
+    motion = FrameSequence.checked(frames, bars.faces, None, False)
+    modes = reproducible_modes(frames[0], bars.faces, 4).modes
+    keys = select_keyframes(motion, modes, 4, 0.0, False)
+    intervals = IntervalErrors(motion, modes)
+    assert intervals.mean(keys) < 0.6 * intervals.mean([0, 5, 10, 15])
 
 
 # ---------------------------------------------------------------------------------------------------------------- modes
@@ -276,7 +276,7 @@ def test_signs_and_mixtures_are_fixed(bars: Shapes, monkeypatch: pytest.MonkeyPa
     """Another machine finds other signs, and modes of one eigenvalue in another mixture."""
     from dataclasses import replace
 
-    from torch_modal.sequence import codec_modes
+    from torch_modal.codec import modes
 
     basis = tm.extract_modes(bars.keyframes[0], bars.faces, 10, mesher="lattice")
     values = basis.eigenvalues.clone()
@@ -285,10 +285,10 @@ def test_signs_and_mixtures_are_fixed(bars: Shapes, monkeypatch: pytest.MonkeyPa
     other = basis.modes.clone()
     other[2], other[3] = c * basis.modes[2] + s * basis.modes[3], s * basis.modes[2] - c * basis.modes[3]
     other[5] = -other[5]
-    monkeypatch.setattr(codec_modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values))
-    here = fixed_modes(bars.keyframes[0], bars.faces, 6)
-    monkeypatch.setattr(codec_modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values, modes=other))
-    there = fixed_modes(bars.keyframes[0], bars.faces, 6, here.clusters, here.seed)
+    monkeypatch.setattr(modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values))
+    here = reproducible_modes(bars.keyframes[0], bars.faces, 6)
+    monkeypatch.setattr(modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values, modes=other))
+    there = reproducible_modes(bars.keyframes[0], bars.faces, 6, here.clusters, here.seed)
     assert here.clusters.tolist() == [1, 1, 2, 1, 1]
     assert torch.allclose(here.modes, there.modes, rtol=0, atol=1e-12 * float(here.modes.abs().max()))
 
@@ -300,3 +300,19 @@ def test_saved_and_loaded(encoded: tm.ModalSequence, tmp_path: Path) -> None:
     assert torch.equal(found.decode(), encoded.decode())
     encoded.save(tmp_path / "b.tms")
     assert (tmp_path / "a.tms").read_bytes() == (tmp_path / "b.tms").read_bytes()
+
+
+def test_files_of_version_2_are_read(small_bars: Shapes) -> None:
+    """One motion, as a compact file and without loss, both written by an earlier program."""
+    folder = Path(__file__).parent / "fixtures"
+    exact = tm.ModalSequence.load(folder / "bar-exact-2.tms")
+    ends = small_bars.keyframes[:2]
+    frames = torch.lerp(ends[0], ends[1], torch.linspace(0, 1, 7).double()[:, None, None])
+    size = (frames[0].amax(0) - frames[0].amin(0)).norm()
+    assert exact.times.tolist() == [0, 1, 2, 3, 5, 6, 8] and torch.equal(exact.faces, small_bars.faces)
+    assert float((exact.decode() - frames).norm(dim=-1).mean(1).max() / size) <= 0.005
+    pytest.importorskip("constriction")
+    compact = tm.ModalSequence.load(folder / "bar-compact-2.tms")
+    for name in ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions"):
+        assert torch.equal(getattr(compact, name), getattr(exact, name)), name
+    assert compact.modes.seed == exact.modes.seed and torch.equal(compact.modes.clusters, exact.modes.clusters)

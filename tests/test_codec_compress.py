@@ -15,10 +15,11 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.sequence import codec_packing as packing
-from torch_modal.sequence.codec_entropy import Reader, Writer
-from torch_modal.sequence.codec_head import read_head
-from torch_modal.sequence.codec_levels import Levels
+from torch_modal.codec import amplitudes, hierarchy, positions
+from torch_modal.codec.faces import pack_integers, unpack_integers
+from torch_modal.codec.header import read_header
+from torch_modal.codec.hierarchy import VertexHierarchy
+from torch_modal.codec.range_coder import IntegerDecoder, IntegerEncoder
 
 pytest.importorskip("constriction")
 ROOT = Path(__file__).parents[1]
@@ -95,22 +96,24 @@ def test_another_process_with_other_threads_writes_and_reads_the_same(
 @pytest.mark.parametrize("guided", [False, True])
 def test_rounded_levels_are_read_as_they_were_written(bars: Shapes, guided: bool) -> None:
     x, guide = (y.numpy() / float(y.norm(dim=1).max()) for y in (bars.keyframes[1], bars.keyframes[0]))
-    levels = Levels(bars.faces.numpy(), len(x))
+    levels = VertexHierarchy(bars.faces.numpy(), len(x))
     assert len(levels.levels) > 2
     assert sorted(np.concatenate([level.vertices for level in levels.levels])) == list(range(len(x)))
     for step in (0.003, 0.03):
-        numbers, found = levels.rounded(x, step, guide if guided else None)
-        assert np.array_equal(Levels(bars.faces.numpy(), len(x)).shape(numbers, step, guide if guided else None), found)
+        numbers, found = levels.encode(x, step, guide if guided else None)
+        assert np.array_equal(
+            VertexHierarchy(bars.faces.numpy(), len(x)).decode(numbers, step, guide if guided else None), found
+        )
         assert np.abs(found - x).max() < (0.5 + 0.17 + 1e-9) * step
 
 
 def test_a_smooth_shape_takes_few_numbers_and_one_that_bends_little_more(bars: Shapes) -> None:
     """Most numbers of a rounded bar are zero; those of a bent one, whose guide is the straight one, too."""
     x = bars.keyframes.numpy() / float(bars.keyframes.norm(dim=2).max())
-    levels = Levels(bars.faces.numpy(), x.shape[1])
+    levels = VertexHierarchy(bars.faces.numpy(), x.shape[1])
 
     def some(shape: np.ndarray, guide: np.ndarray | None) -> int:
-        return sum(int(np.count_nonzero(each)) for each in levels.rounded(shape, 0.02, guide)[0])
+        return sum(int(np.count_nonzero(each)) for each in levels.encode(shape, 0.02, guide)[0])
 
     free, guided = some(x[1], None), some(x[1], x[0])
     assert guided < 0.7 * free < 0.7 * x[1].size
@@ -125,45 +128,43 @@ def test_a_smooth_shape_takes_few_numbers_and_one_that_bends_little_more(bars: S
     ],
 )
 def test_levels_of_any_connectivity(faces: list[list[int]], monkeypatch: pytest.MonkeyPatch) -> None:
-    from torch_modal.sequence import codec_levels
-
-    monkeypatch.setattr(codec_levels, "LEAST", 2)
+    monkeypatch.setattr(hierarchy, "COARSEST", 2)
     x = np.random.default_rng(0).normal(size=(7, 3))
-    levels = Levels(np.array(faces), 7)
+    levels = VertexHierarchy(np.array(faces), 7)
     assert sorted(np.concatenate([level.vertices for level in levels.levels])) == list(range(7))
     for guide in (None, x[::-1].copy()):
-        numbers, found = levels.rounded(x, 0.1, guide)
-        assert np.abs(found - x).max() < 0.068 and np.array_equal(levels.shape(numbers, 0.1, guide), found)
+        numbers, found = levels.encode(x, 0.1, guide)
+        assert np.abs(found - x).max() < 0.068 and np.array_equal(levels.decode(numbers, 0.1, guide), found)
 
 
 def test_finished_shapes_forgive_other_rounding(bars: Shapes) -> None:
     """Another machine's sums differ in the last digits; the finished key-frames do not."""
     x = bars.keyframes.numpy() / float(bars.keyframes.norm(dim=2).max())
-    rounded = packing.RoundedShapes(Levels(bars.faces.numpy(), x.shape[1]), x, 0.01)
+    rounded = positions.QuantizedKeyframes(VertexHierarchy(bars.faces.numpy(), x.shape[1]), x, 0.01)
     noise = 1e-12 * np.random.default_rng(0).normal(size=x[0].shape)
-    levels, guide = Levels(bars.faces.numpy(), x.shape[1]), None
+    levels, guide = VertexHierarchy(bars.faces.numpy(), x.shape[1]), None
     for i, numbers in enumerate(rounded.numbers):
-        guide = rounded.shapes[rounded.guides[i]] if i else None
-        found = levels.shape(numbers, 0.01, guide)
-        shape = packing.finished(found + noise, 0.01, rounded.shifts[i])
-        assert np.array_equal(shape, rounded.shapes[i])
-        assert np.abs(shape - found).max() <= 0.01 / packing.FINER
+        guide = rounded.decoded[rounded.guides[i]] if i else None
+        found = levels.decode(numbers, 0.01, guide)
+        shape = positions.on_grid(found + noise, 0.01, rounded.shifts[i])
+        assert np.array_equal(shape, rounded.decoded[i])
+        assert np.abs(shape - found).max() <= 0.01 / positions.FINER
 
 
 @pytest.mark.parametrize("cyclic", [False, True])
 def test_series_are_sums_of_sines(cyclic: bool) -> None:
     keys = [0, 1, 7, 19]
-    between = packing.runs(keys, 24 if cyclic else 20, cyclic)
+    between = amplitudes.runs(keys, 24 if cyclic else 20, cyclic)
     assert [(run.start, run.stop) for run in between] == [(2, 7), (8, 19)] + cyclic * [(20, 24)]
     series = np.random.default_rng(0).normal(size=(24 if cyclic else 20, 9))
     series[keys] = 0
-    steps = packing.series_steps(3, 0.1, 0.01, 0.02)
-    found = packing.from_sines(packing.to_sines(series, steps, between), steps, between)
+    steps = amplitudes.column_steps(3, 0.1, 0.01, 0.02)
+    found = amplitudes.from_sines(amplitudes.to_sines(series, steps, between), steps, between)
     apart = np.sqrt(np.square(found - series).sum(0) / len(series))
     assert bool((apart < 0.4 * steps).all()) and bool((apart > 0.1 * steps).all())
     slow = np.zeros_like(series)
     slow[8:19] = np.sin(np.pi * np.arange(1, 12) / 12)[:, None]
-    assert np.count_nonzero(packing.to_sines(slow, steps, between)) == 9
+    assert np.count_nonzero(amplitudes.to_sines(slow, steps, between)) == 9
 
 
 def test_the_range_coder_is_near_the_entropy() -> None:
@@ -173,27 +174,27 @@ def test_the_range_coder_is_near_the_entropy() -> None:
     few = np.array([0, -5, 2**39, 2**21, -(2**39)])
     numbers = np.concatenate([rare, wide, few])
     kinds = np.repeat([0, 1, 3], [len(rare), len(wide), len(few)])
-    writer = Writer()
-    writer.numbers(numbers, kinds, 5)
+    writer = IntegerEncoder()
+    writer.write(numbers, kinds, 5)
     data = writer.data()
-    assert np.array_equal(Reader(data).numbers(kinds, 5), numbers)
+    assert np.array_equal(IntegerDecoder(data).read(kinds, 5), numbers)
     part = np.bincount(rare - rare.min()) / len(rare)
     bits = -float((part[part > 0] * np.log2(part[part > 0])).sum()) * len(rare) + len(wide) * np.log2(
         3000 * np.sqrt(2 * np.pi * np.e)
     )
     assert 8 * len(data) < 1.03 * bits + 400
     with pytest.raises(ValueError, match="damaged"):
-        Reader(data).numbers(kinds[:-5], 5)
+        IntegerDecoder(data).read(kinds[:-5], 5)
     with pytest.raises(ValueError, match="too large"):
-        Writer().numbers(np.array([2**41]), np.array([0]), 1)
+        IntegerEncoder().write(np.array([2**41]), np.array([0]), 1)
 
 
 @pytest.mark.parametrize("numbers", [[], [0], [-1, 1, 0], [2**40, -(2**40), 3], list(range(-200, 200))])
 def test_numbers_are_packed_and_unpacked(numbers: list[int]) -> None:
     array = np.array(numbers, dtype=np.int64)
-    assert packing.unsqueeze(packing.squeeze(array), len(array)).tolist() == numbers
+    assert unpack_integers(pack_integers(array), len(array)).tolist() == numbers
     with pytest.raises(ValueError, match="damaged"):
-        packing.unsqueeze(packing.squeeze(array), len(array) + 1)
+        unpack_integers(pack_integers(array), len(array) + 1)
 
 
 # -------------------------------------------------------------------------------------------------- damaged and hostile
@@ -204,7 +205,7 @@ def rewritten(path: Path, out: Path, **changes: object) -> Path:
     header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["torch_modal"])
     outer = {name: changes.pop(name) for name in list(changes) if name in header}
     packed = tensors["packed"].numpy().tobytes()
-    head, end = read_head(packed)
+    head, end = read_header(packed)
     changed = head._replace(**changes).data() + packed[end:]
     tensors["packed"] = torch.frombuffer(bytearray(changed), dtype=torch.uint8)
     save_file(tensors, out, {"torch_modal": json.dumps({**header, **outer})})
@@ -222,12 +223,12 @@ def test_a_cut_file_is_an_error(written: tuple[Path, tm.Compressed], tmp_path: P
 def test_any_changed_byte_is_an_error_or_changes_nothing(
     written: tuple[Path, tm.Compressed], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from torch_modal.sequence import codec_file
+    from torch_modal.codec import file
 
     data = written[0].read_bytes()
     before = tm.ModalSequence.load(written[0])
     # Modes follow from what the digest covers.
-    monkeypatch.setattr(codec_file, "fixed_modes", lambda *_: before.modes)
+    monkeypatch.setattr(file, "reproducible_modes", lambda *_: before.modes)
     start = 8 + int.from_bytes(data[:8], "little")
     for place in np.random.default_rng(0).integers(start, len(data), 60).tolist():
         changed = bytearray(data)
@@ -289,15 +290,15 @@ def test_other_files_are_refused(tmp_path: Path, bars: Shapes) -> None:
 
 
 def test_other_modes_are_noticed(written: tuple[Path, tm.Compressed], monkeypatch: pytest.MonkeyPatch) -> None:
-    from torch_modal.sequence import codec_file
+    from torch_modal.codec import file
 
-    real = codec_file.fixed_modes
+    real = file.reproducible_modes
 
     def other(*arguments: object) -> object:
         found = real(*arguments)  # type: ignore[arg-type]
         return found._replace(modes=found.modes.flip(0))
 
-    monkeypatch.setattr(codec_file, "fixed_modes", other)
+    monkeypatch.setattr(file, "reproducible_modes", other)
     with pytest.raises(ValueError, match="modes computed here differ"):
         tm.ModalSequence.load(written[0])
 

@@ -1,0 +1,72 @@
+"""Output formats of one's own: one function each, found by its suffix."""
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from textured import bend, textured_obj
+
+import torch_modal as tm
+from torch_modal.cli import main as cli
+from torch_modal.errors import MeshWarning
+from torch_modal.io import bare_mesh
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
+
+FACES = np.array([[0, 1, 2]])
+FRAMES = np.arange(18.0).reshape(2, 3, 3)
+
+
+@pytest.fixture(autouse=True)
+def own_formats(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three formats, which are registered during one test."""
+    for suffix, table in {".xyz": MESH_FORMATS, ".csv": ANIMATION_FORMATS, ".needs": ANIMATION_FORMATS}.items():
+        monkeypatch.setitem(table, suffix, "")  # which is undone at the end
+
+    @tm.mesh_format(".xyz", holds=("polygons", "texcoords", "normals"))
+    def xyz(vertices: np.ndarray, faces: np.ndarray, asset: tm.Asset | None) -> bytes:
+        return "".join(f"{x} {y} {z}\n" for x, y, z in vertices).encode()
+
+    @tm.animation_format(".csv")
+    def csv(animation: tm.Animation, path: Path) -> None:
+        times, shown = animation.timing.knots()
+        np.savetxt(path, np.column_stack([times, animation.shapes[shown].reshape(len(times), -1)]), delimiter=",")
+
+    @tm.animation_format(".needs", modules=("no_such_module",), extra="none")
+    def needs(animation: tm.Animation, path: Path) -> None:
+        raise AssertionError
+
+
+def test_own_formats_write(tmp_path: Path) -> None:
+    paths = tm.save_frames(FRAMES, FACES, tmp_path, "xyz")
+    np.testing.assert_array_equal([np.loadtxt(path) for path in paths], FRAMES)
+    rows = np.loadtxt(tm.save_animation(FRAMES, FACES, tmp_path / "a.csv", duration=3), delimiter=",")
+    np.testing.assert_array_equal(rows[:, 0], [0, 3])
+    np.testing.assert_array_equal(rows[:, 1:], FRAMES.reshape(2, 9))
+    with pytest.raises(FileExistsError):
+        tm.save_animation(FRAMES, FACES, tmp_path / "a.csv")
+    with pytest.raises(ImportError, match="no_such_module"):
+        tm.save_animation(FRAMES, FACES, tmp_path / "a.needs")
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".csv", ".xyz", ".xyz"]
+    asset = tm.open_asset(textured_obj(tmp_path / "in", "bar.obj"))
+    with pytest.warns(MeshWarning, match=r"frame-000.xyz is without the vertex colours, 2 materials and groups"):
+        tm.save_frames(bend(asset.positions)[None], asset.faces, tmp_path / "out", "xyz", asset=asset)
+
+
+def test_own_formats_replace_built_in_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MESH_FORMATS, ".off", MESH_FORMATS[".off"])
+    tm.mesh_format(".off")(lambda vertices, faces, asset: b"own")
+    importlib.reload(bare_mesh)
+    (path,) = tm.save_frames(FRAMES[:1], FACES, tmp_path, "off")
+    assert path.read_bytes() == b"own"
+
+
+def test_messages_and_help_list_all_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match=r"\.npz, \.csv or \.needs, got 'a\.avi'"):
+        tm.save_animation(FRAMES, FACES, tmp_path / "a.avi")
+    with pytest.raises(ValueError, match="fmt must be one of ply, obj, off, glb, xyz, got 'stl'"):
+        tm.save_frames(FRAMES, FACES, tmp_path, "stl")
+    with pytest.raises(SystemExit):
+        cli.main(["subdivide", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "{ply,obj,off,glb,xyz}" in said and all(suffix in said for suffix in (".glb", ".mp4", ".usdc", ".npz"))

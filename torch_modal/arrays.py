@@ -1,0 +1,15 @@
+"""Types of arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # at run time torch stays out: a reader of PLY files does not need it
+    import torch
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Array: TypeAlias = "torch.Tensor | NDArray[Any]"

@@ -1,0 +1,1 @@
+"""A motion as key-frames and amplitudes of vibration modes, and its file."""
