@@ -13,7 +13,7 @@ import pytest
 from torch_modal.io.cache import Cache, cache_content, clear_cache
 from torch_modal.precompute import filling, tetrahedra
 from torch_modal.precompute.modes import extract_modes
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -161,7 +161,7 @@ def test_another_version_of_the_mesher_makes_its_own_tetrahedra(
         return capsule_tetrahedra
 
     monkeypatch.setattr(filling, "tetrahedralize", mesher)
-    surface = Surface(*capsule, np.arange(len(capsule[0])), 1.0, np.eye(3))
+    surface = CanonicalSurface(*capsule, np.arange(len(capsule[0])), 1.0, np.eye(3))
     for installed in ("0.4.2", "0.4.3", "0.4.2"):
         monkeypatch.setattr(filling, "version", lambda _, installed=installed: installed)
         filling.Filler(COARSE, "tetwild", 1.0, Cache.at(tmp_path)).body(surface)

@@ -26,10 +26,6 @@ from .io.asset import Asset as Asset
 from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
 from .keyframes.check import check_keyframes as check_keyframes
-from .keyframes.load import load_keyframes as load_keyframes
-from .keyframes.registration.landmarks import suggest_landmarks as suggest_landmarks
-from .keyframes.registration.register import register as register
-from .keyframes.registration.report import Registration as Registration
 from .keyframes.seams import weld_seams as weld_seams
 from .keyframes.self_contacts import SelfContacts as SelfContacts
 from .keyframes.self_contacts import self_contacts as self_contacts
@@ -52,6 +48,10 @@ from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
 from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
+from .registration.landmarks import suggest_landmarks as suggest_landmarks
+from .registration.load import load_keyframes as load_keyframes
+from .registration.register import register as register
+from .registration.report import Registration as Registration
 from .sequence.codec import ModalSequence as ModalSequence
 from .sequence.codec import encode as encode
 from .sequence.compress import Compressed as Compressed

@@ -19,7 +19,7 @@ from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_we
 from torch_modal.precompute.lattice import is_too_fine, lattice
 from torch_modal.precompute.proximity import parting, self_proximity
 from torch_modal.precompute.stiffness import mass_matrix
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     EDGE_RANGE,
     Tetrahedra,
@@ -60,7 +60,7 @@ class Body:
         tetrahedra: In the units of the surface.
     """
 
-    surface: Surface
+    surface: CanonicalSurface
     tetrahedra: Tetrahedra
     _lock: threading.RLock = field(default_factory=threading.RLock, init=False, repr=False, compare=False)
 
@@ -100,7 +100,7 @@ class Filling:
     """
 
     body: Body
-    surface: Surface
+    surface: CanonicalSurface
     tetrahedra: Tetrahedra
 
     def mass(self) -> sp.csr_matrix:
@@ -137,7 +137,7 @@ class Filler:
     cache: Cache
     stop: threading.Event = field(default_factory=threading.Event)
 
-    def body(self, surface: Surface) -> Body:
+    def body(self, surface: CanonicalSurface) -> Body:
         """The surface with tetrahedra of its own.
 
         Raises:
@@ -147,7 +147,7 @@ class Filler:
         kept = self._kept(surface, lambda: _as_arrays(make(surface)))
         return _without_idle(Body(surface, Tetrahedra(**kept)))
 
-    def _by_lattice(self, surface: Surface) -> Tetrahedra:
+    def _by_lattice(self, surface: CanonicalSurface) -> Tetrahedra:
         """By the lattice; in another direction, too, where that falls into pieces.
 
         A thin wall that lies along the cubes' sides is in tetrahedra that hardly share any.
@@ -165,7 +165,7 @@ class Filler:
             return found
         return turned._replace(vertices=turned.vertices @ TURN)
 
-    def _by_tetwild(self, surface: Surface) -> Tetrahedra:
+    def _by_tetwild(self, surface: CanonicalSurface) -> Tetrahedra:
         """By fTetWild, unless it is known to fail: nobody should wait for the same failure twice."""
         inputs, parameters = _content(surface), {**asdict(self.settings), **_mesher_versions()}
         if (failure := self.cache.find("failure", inputs, parameters)) is not None:
@@ -192,12 +192,12 @@ class Filler:
             "--clear), or do without it"
         )
 
-    def _kept(self, surface: Surface, make: Callable[[], Arrays]) -> Arrays:
+    def _kept(self, surface: CanonicalSurface, make: Callable[[], Arrays]) -> Arrays:
         versions = _mesher_versions() if self.mesher == "tetwild" else {"lattice": LATTICE_VERSION}
         parameters = {**asdict(self.settings), **versions, "mesher": self.mesher}
         return dict(self.cache.get("tetrahedra", _content(surface), parameters, make))
 
-    def carried(self, body: Body, surface: Surface) -> Filling | None:
+    def carried(self, body: Body, surface: CanonicalSurface) -> Filling | None:
         """The body in the pose of another key-frame, or None if its tetrahedra do not survive that."""
 
         def compute() -> dict[str, NDArray[Any]]:
@@ -237,7 +237,7 @@ def _mesher_versions() -> dict[str, str | None]:
     return {name: installed(name) for name in ("pytetwild", "fast-simplification")}
 
 
-def _content(surface: Surface) -> Arrays:
+def _content(surface: CanonicalSurface) -> Arrays:
     """What tetrahedra depend on, for the cache."""
     return {"points": surface.points, "faces": surface.faces}
 
@@ -246,11 +246,11 @@ def _as_arrays(tetrahedra: Tetrahedra) -> dict[str, NDArray[Any]]:
     return {name: array for name, array in tetrahedra._asdict().items() if array is not None}
 
 
-def meshing_order(surfaces: list[Surface]) -> list[int]:
+def meshing_order(surfaces: list[CanonicalSurface]) -> list[int]:
     """Key-frames in the order in which they should be filled: the one that touches itself least comes first."""
     return [int(i) for i in np.argsort([self_proximity(surface) for surface in surfaces], kind="stable")]
 
 
-def is_torn(rest: Surface, posed: Surface) -> bool:
+def is_torn(rest: CanonicalSurface, posed: CanonicalSurface) -> bool:
     """Whether it is known beforehand that tetrahedra of one pose do not survive being carried to another."""
     return parting(rest, posed) > MOST_PARTING

@@ -15,8 +15,8 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.precompute.bisection import halved
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.proximity import Clearance, clearances
-from torch_modal.precompute.sampling import Samples, sampled
-from torch_modal.precompute.surface import DIAGONAL, Surface
+from torch_modal.precompute.sampling import SurfaceSamples, sampled
+from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
@@ -87,7 +87,7 @@ class Indicator(NamedTuple):
     values: FloatArray
     low: FloatArray
     spacing: float
-    samples: Samples
+    samples: SurfaceSamples
     has_sides: BoolArray
 
     def inside(self, corners: FloatArray) -> FloatArray:
@@ -126,7 +126,7 @@ class Indicator(NamedTuple):
         return found
 
 
-def lattice(surface: Surface, edge_length_fac: float, clearance: Clearance | None = None) -> Tetrahedra:
+def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Clearance | None = None) -> Tetrahedra:
     """Cubes around a surface, cut into tetrahedra, with the outer vertices moved onto it where that is near.
 
     Where the body is thin, or another part of it is near, tetrahedra are halved until they are small enough.
@@ -191,12 +191,12 @@ def _sizes_at_vertices(tetrahedra: Tetrahedra) -> FloatArray:
     return sizes
 
 
-def is_too_fine(surface: Surface, edge_length_fac: float) -> bool:
+def is_too_fine(surface: CanonicalSurface, edge_length_fac: float) -> bool:
     """Whether a lattice with such cubes would have too many of them."""
     return bool(_box(surface, ROOT * edge_length_fac * DIAGONAL)[1].prod() > MOST_CUBES)
 
 
-def _box(surface: Surface, cell: float) -> tuple[FloatArray, IntArray]:
+def _box(surface: CanonicalSurface, cell: float) -> tuple[FloatArray, IntArray]:
     """Lowest corner of the cubes, and their numbers along the axes."""
     low = surface.points.min(axis=0) - 1.5 * cell
     return low, np.ceil((surface.points.max(axis=0) + 1.5 * cell - low) / cell).astype(np.int64)
@@ -262,7 +262,7 @@ def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
     return kept
 
 
-def _indicator(samples: Samples, low: FloatArray, spacing: float, counts: IntArray) -> FloatArray:
+def _indicator(samples: SurfaceSamples, low: FloatArray, spacing: float, counts: IntArray) -> FloatArray:
     """One inside, zero outside, on the points of a grid.
 
     Its gradient is minus the normal on the surface, so it solves a Poisson equation with the divergence of the

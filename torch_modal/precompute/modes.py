@@ -15,7 +15,7 @@ from torch_modal.precompute.filling import MESHERS, Filler, Mesher
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedraSettings
 from torch_modal.progress import Progress, ProgressReport
 
@@ -176,11 +176,11 @@ def bases_of_checked(
     shapes = keyframes.detach().cpu().double().numpy()
     triangles = faces.cpu().numpy()
     _check_n_modes(n_modes, len(np.unique(triangles)))
-    surfaces: list[Surface] = []
+    surfaces: list[CanonicalSurface] = []
     for index, shape in enumerate(shapes):
         with naming_keyframe(index, len(shapes)):
             require_solid(shape, triangles)
-            surfaces.append(Surface.of(shape, triangles))
+            surfaces.append(CanonicalSurface.of(shape, triangles))
 
     with ProgressReport(2 * len(shapes), "vibration modes", progress) as bar:
 
