@@ -23,7 +23,8 @@ from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases
 from torch_modal.precompute.stiffness import arap_hessian, lumped_mass
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.tetrahedra import Tetrahedra
+from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
 from torch_modal.registration.load import load_keyframes
 
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)

@@ -7,7 +7,7 @@ from bodies import bend
 from solids import box, surface
 
 from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling, modes, solving
+from torch_modal.precompute import filling, modes, solving, tetwild
 from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, nearest_rotations
 from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
 from torch_modal.precompute.embedding import embed_surface
@@ -16,7 +16,8 @@ from torch_modal.precompute.proximity import clearances, parting, self_proximity
 from torch_modal.precompute.solving import Solved
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tet_volumes
+from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+from torch_modal.precompute.tetwild import TetWild
 
 BAR = box((16, 4, 4), (8.0, 1.0, 1.0))
 FACES = surface(BAR)
@@ -173,7 +174,7 @@ def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         low, high = BAR.vertices.min(axis=0), BAR.vertices.max(axis=0)
         return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
 
-    monkeypatch.setattr(filling, "tetrahedralize", fill)
+    monkeypatch.setattr(tetwild, "tetrahedralize", fill)
     return asked
 
 
@@ -219,7 +220,7 @@ def test_what_is_known_to_tear_is_not_carried(monkeypatch: pytest.MonkeyPatch) -
 def test_carried_tetrahedra_come_from_the_cache(
     meshed: list[np.ndarray], tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    filler = Filler(TetrahedraSettings(), "tetwild", 1.0, Cache.at(tmp_path))
+    filler = Filler(TetWild(), 1.0, Cache.at(tmp_path))
     surfaces = [CanonicalSurface.of(pose, COMPACT) for pose in (POINTS, bent(POINTS, 1.0))]
     first = filler.carried(filler.body(surfaces[0]), surfaces[1])
     monkeypatch.setattr(filling, "Carrier", None)

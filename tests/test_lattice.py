@@ -3,32 +3,37 @@
 import os
 import subprocess
 import sys
+import threading
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
 from solids import box, surface
 
 from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling
+from torch_modal.precompute import filling, tetwild
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.filling import Filler
-from torch_modal.precompute.lattice import is_too_fine, lattice
+from torch_modal.precompute.lattice import Lattice, is_too_fine, lattice
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.proximity import clearances
 from torch_modal.precompute.stiffness import arap_hessian, lumped_mass, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
+    Tetrahedra,
     TetrahedralizationError,
-    TetrahedraSettings,
     pieces_by_sides,
     solid_volumes,
     tet_volumes,
 )
+from torch_modal.precompute.tetwild import TetrahedraSettings
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -102,12 +107,12 @@ def test_it_is_the_only_default(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) 
     def fail(*args: object, **kwargs: object) -> None:
         raise AssertionError("fTetWild was asked")
 
-    monkeypatch.setattr(filling, "tetrahedralize", fail)
+    monkeypatch.setattr(tetwild, "tetrahedralize", fail)
     vertices, faces = capsule
     for shape in (vertices, vertices * (1.0, 0.02, 1.0)):
         default, named = (extract_modes(shape, faces, 6, cache=False, **way) for way in ({}, {"mesher": "lattice"}))
         np.testing.assert_array_equal(default.modes, named.modes)
-    assert filling.MESHERS == ("lattice", "tetwild")
+    assert tuple(filling.MESHERS) == ("lattice", "tetwild")
 
 
 def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
@@ -122,7 +127,7 @@ def test_thin_plates_are_filled(thickness: float) -> None:
     """By tetrahedra in one piece, all over."""
     vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
     whole = CanonicalSurface.of(vertices, faces)
-    filled = Filler(TetrahedraSettings(), "lattice", 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    filled = Filler(Lattice(), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
     assert pieces_by_sides(filled.tets).max() == 0
     assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
     basis = extract_modes(vertices, faces, 6, cache=False)
@@ -135,8 +140,8 @@ def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     ball = trimesh.creation.icosphere(subdivisions=2)
     settings = TetrahedraSettings(edge_length_fac=0.012)
     whole = CanonicalSurface.of(ball.vertices, ball.faces)
-    assert is_too_fine(whole, filling.CUBE * 0.012)
-    filled = Filler(settings, "lattice", 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    assert is_too_fine(whole, lattice_module.CUBE * 0.012)
+    filled = Filler(Lattice(settings), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
     assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
 
 
@@ -226,8 +231,35 @@ def test_settings_reach_the_mesher(capsule: Mesh, monkeypatch: pytest.MonkeyPatc
         seen.append(edge)
         return lattice(surface, 0.05)
 
-    monkeypatch.setattr(filling, "lattice", note)
+    monkeypatch.setattr(lattice_module, "lattice", note)
     for settings in ("fast", "fine", TetrahedraSettings(edge_length_fac=0.07)):
         extract_modes(*capsule, 5, settings=settings, cache=False)
     assert seen[0] > seen[1]
-    assert seen[2] == filling.CUBE * 0.07
+    assert seen[2] == lattice_module.CUBE * 0.07
+
+
+@dataclass(frozen=True)
+class Cubes:
+    """A mesher of a user's own."""
+
+    edge: float
+    filled: list[int] = field(default_factory=list)
+
+    def key(self) -> dict[str, Any]:
+        return {"mesher": "cubes", "edge": self.edge}
+
+    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
+        self.filled.append(len(surface.points))
+        return lattice(surface, self.edge)
+
+
+def test_a_mesher_of_ones_own(capsule: Mesh, tmp_path: Path) -> None:
+    coarse, fine = Cubes(0.06), Cubes(0.04)
+    first, second, again = (
+        extract_modes(*capsule, 5, mesher=mesher, cache_dir=str(tmp_path)) for mesher in (coarse, fine, coarse)
+    )
+    assert coarse.filled == fine.filled == [len(capsule[0])]
+    assert torch.equal(first.eigenvalues, again.eigenvalues)
+    assert not torch.equal(first.eigenvalues, second.eigenvalues)
+    with pytest.raises(ValueError, match="the mesher is 'cube'"):
+        extract_modes(*capsule, 5, mesher="cube")

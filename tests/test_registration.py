@@ -126,7 +126,7 @@ def test_the_second_time_is_from_the_cache(
         calls.append(len(calls))
         return found._replace(confidence=0.25, warnings=("one, with a comma", "two"), folds=3)
 
-    monkeypatch.setattr(register_module._Problem, "solve", solved)
+    monkeypatch.setattr(register_module._RegistrationProblem, "solve", solved)
 
     def again(target: np.ndarray, marks: object = None, dtype: type = np.float64) -> tm.Registration:
         own = rest.astype(np.float32).astype(dtype)

@@ -47,7 +47,7 @@ from .precompute.eigen import ModalAnalysisError as ModalAnalysisError
 from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
-from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
+from .precompute.tetwild import TetrahedraSettings as TetrahedraSettings
 from .registration.landmarks import suggest_landmarks as suggest_landmarks
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register

@@ -20,7 +20,8 @@ from torch_modal.precompute.lattice import USUAL_EDGE, lattice
 from torch_modal.precompute.modes import QUALITIES
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian, hat_gradients, lumped_mass, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.tetrahedra import Tetrahedra
+from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

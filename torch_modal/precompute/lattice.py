@@ -4,14 +4,16 @@ Deterministic, and never at a loss.
 """
 
 import itertools
-from typing import NamedTuple
+import threading
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import halved
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.proximity import Clearance, clearances
@@ -25,11 +27,20 @@ from torch_modal.precompute.tetrahedra import (
     tet_volumes,
     without_debris,
 )
+from torch_modal.precompute.tetwild import EDGE_RANGE, TetrahedraSettings
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+VERSION = "whole"
+"""Tetrahedra that other versions of the package have stored are not those of this one."""
+CUBE = 0.75
+"""Edge of the lattice's cubes at the surface, over the largest edge of fTetWild."""
+COARSER = 1.1
+"""Factor of that edge until there are not too many cubes."""
+TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+"""A rotation after which no axis is along or across another."""
 ROOT = 2.0
 """Edge of the cubes that all tetrahedra come from by halving, over that of cubes at the surface."""
 ACROSS = 2.0
@@ -71,6 +82,36 @@ LEAST_KEPT = 0.8
 """Of the volume: where more is lost on the way, the body is too thin for it."""
 SPREAD = np.concatenate([np.eye(4) * 2 / 3 + 1 / 12, np.full((1, 4), 0.25)])
 """Points of a tetrahedron: from its corners a third of the way to the centroid, and the centroid."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The mesher ``"lattice"``: :func:`lattice`, in another direction where that falls into pieces.
+
+    A thin wall that lies along the cubes' sides is in tetrahedra that hardly share any. Of the settings it takes
+    ``edge_length_fac``.
+    """
+
+    settings: TetrahedraSettings = field(default_factory=TetrahedraSettings)
+
+    def key(self) -> dict[str, Any]:
+        """Settings, and a version."""
+        return {**asdict(self.settings), "lattice": VERSION, "mesher": "lattice"}
+
+    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
+        """Tetrahedra that fill the surface."""
+        cube = CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
+        while is_too_fine(surface, cube):
+            cube *= COARSER
+        found = lattice(surface, cube)
+        pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
+        most = connected_pieces(pairs, len(surface.points)).max()
+        if pieces_by_sides(found.tets).max() <= most:
+            return found
+        turned = lattice(replace(surface, points=surface.points @ TURN.T), cube)
+        if pieces_by_sides(turned.tets).max() >= pieces_by_sides(found.tets).max():
+            return found
+        return turned._replace(vertices=turned.vertices @ TURN)
 
 
 class Indicator(NamedTuple):
