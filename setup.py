@@ -86,6 +86,8 @@ setup(
         "networkx>=3.0",
         "pytetwild>=0.4.2",
         "fast-simplification>=0.1.11",
+        # Without wheels for Linux and Windows on ARM, where SciPy solves.
+        "cholespy>=2.1; platform_machine in 'x86_64 AMD64' or sys_platform == 'darwin'",
         "kornia>=0.8.2",
         "safetensors>=0.4.3",
         "matplotlib>=3.7",

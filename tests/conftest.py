@@ -15,7 +15,6 @@ from solids import box, surface
 from threads import limit_threads
 
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.keyframes.load import load_keyframes
 from torch_modal.nn.frame import Pair
 from torch_modal.nn.mid_shape import MidShape
 from torch_modal.nn.samples import Samples
@@ -24,7 +23,9 @@ from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases
 from torch_modal.precompute.stiffness import arap_hessian, lumped_mass
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.tetrahedra import Tetrahedra
+from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
+from torch_modal.registration.load import load_keyframes
 
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
 

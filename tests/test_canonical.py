@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import torch_modal as tm
 from torch_modal.geometry.canonical import ROUNDING, ordered_faces, placed, size
 from torch_modal.geometry.decimation import decimate
-from torch_modal.keyframes.load import load_keyframes
+from torch_modal.registration.load import load_keyframes
 
 Mesh = tuple[np.ndarray, np.ndarray]
 TURN = Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix()

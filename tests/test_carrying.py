@@ -7,7 +7,7 @@ from bodies import bend
 from solids import box, surface
 
 from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling, modes, solving
+from torch_modal.precompute import filling, modes, solving, tetwild
 from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, nearest_rotations
 from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
 from torch_modal.precompute.embedding import embed_surface
@@ -15,8 +15,9 @@ from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
 from torch_modal.precompute.proximity import clearances, parting, self_proximity
 from torch_modal.precompute.solving import Solved
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tet_volumes
+from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+from torch_modal.precompute.tetwild import TetWild
 
 BAR = box((16, 4, 4), (8.0, 1.0, 1.0))
 FACES = surface(BAR)
@@ -57,8 +58,10 @@ def test_a_bent_bar_is_filled_as_it_bends(carrier: Carrier) -> None:
 
 def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) -> None:
     points = bent(POINTS, np.pi)
-    bar = Surface(POINTS, COMPACT, USED, 1.0, np.eye(3))
-    carried = Filling(Body(bar, BAR), Surface(points, COMPACT, USED, 1.0, np.eye(3)), carrier.carry(points).tetrahedra)
+    bar = CanonicalSurface(POINTS, COMPACT, USED, 1.0, np.eye(3))
+    carried = Filling(
+        Body(bar, BAR), CanonicalSurface(points, COMPACT, USED, 1.0, np.eye(3)), carrier.carry(points).tetrahedra
+    )
     truth = Tetrahedra(bent(BAR.vertices, np.pi), BAR.tets)
     found = lowest_modes(arap_hessian(carried.tetrahedra), carried.mass(), carried.tetrahedra.vertices, 8)
     wanted = lowest_modes(arap_hessian(truth), mass_matrix(truth), truth.vertices, 8)
@@ -112,7 +115,7 @@ def test_clearances_of_a_plate_and_of_a_gap() -> None:
     plate = box((40, 20, 2), (8.0, 4.0, 0.4))
     used, compact = np.unique(surface(plate), return_inverse=True)
     one = plate.vertices[used]
-    whole = Surface.of(
+    whole = CanonicalSurface.of(
         np.concatenate([one, one + np.array([0, 0, 0.7])]),
         np.concatenate([compact.reshape(-1, 3), compact.reshape(-1, 3) + len(one)]),
     )
@@ -126,7 +129,7 @@ def test_clearances_of_a_plate_and_of_a_gap() -> None:
     # Corners of a box are no thin parts.
     cube = box((20, 20, 20), (1.0, 1.0, 1.0))
     used, compact = np.unique(surface(cube), return_inverse=True)
-    assert np.isinf(clearances(Surface.of(cube.vertices[used], compact.reshape(-1, 3))).thickness).all()
+    assert np.isinf(clearances(CanonicalSurface.of(cube.vertices[used], compact.reshape(-1, 3))).thickness).all()
 
 
 def horseshoe(angle: float) -> np.ndarray:
@@ -137,7 +140,7 @@ def horseshoe(angle: float) -> np.ndarray:
 def test_self_proximity_grows_as_the_ends_meet() -> None:
     fine = box((48, 6, 6), (16.0, 1.0, 1.0))
     faces = np.unique(surface(fine), return_inverse=True)[1].reshape(-1, 3)
-    surfaces = [Surface.of(horseshoe(angle), faces) for angle in (1.98 * np.pi, 1.0, 0.0)]
+    surfaces = [CanonicalSurface.of(horseshoe(angle), faces) for angle in (1.98 * np.pi, 1.0, 0.0)]
     closeness = [self_proximity(s) for s in surfaces]
     assert closeness[2] == 0
     assert closeness[0] > closeness[1]
@@ -147,14 +150,14 @@ def test_self_proximity_grows_as_the_ends_meet() -> None:
 def test_parting_is_of_what_touched_and_came_apart() -> None:
     fine = box((48, 6, 6), (16.0, 1.0, 1.0))
     faces = np.unique(surface(fine), return_inverse=True)[1].reshape(-1, 3)
-    closed, ajar, opened = (Surface.of(horseshoe(angle), faces) for angle in (1.995 * np.pi, 1.9 * np.pi, 0.5))
+    closed, ajar, opened = (CanonicalSurface.of(horseshoe(angle), faces) for angle in (1.995 * np.pi, 1.9 * np.pi, 0.5))
     # Both ends, of 1 by 1 and of 66 in all, part by most of the length of 16, and half of that is counted for each.
     apart = np.linalg.norm(opened.points[0] - opened.points[-1]) * closed.scale / opened.scale
     expected = apart / 2 * np.sqrt(2 / 66) / 100
     assert parting(closed, opened) == pytest.approx(expected, rel=0.4)
     assert parting(closed, ajar) < 0.3 * parting(closed, opened)
     assert parting(opened, closed) < 0.001
-    turned = Surface.of(horseshoe(1.995 * np.pi) @ TURN.T * 7.0 + 3.0, faces)
+    turned = CanonicalSurface.of(horseshoe(1.995 * np.pi) @ TURN.T * 7.0 + 3.0, faces)
     assert parting(closed, turned) < 1e-9
 
 
@@ -171,7 +174,7 @@ def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         low, high = BAR.vertices.min(axis=0), BAR.vertices.max(axis=0)
         return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
 
-    monkeypatch.setattr(filling, "tetrahedralize", fill)
+    monkeypatch.setattr(tetwild, "tetrahedralize", fill)
     return asked
 
 
@@ -217,8 +220,8 @@ def test_what_is_known_to_tear_is_not_carried(monkeypatch: pytest.MonkeyPatch) -
 def test_carried_tetrahedra_come_from_the_cache(
     meshed: list[np.ndarray], tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    filler = Filler(TetrahedraSettings(), "tetwild", 1.0, Cache.at(tmp_path))
-    surfaces = [Surface.of(pose, COMPACT) for pose in (POINTS, bent(POINTS, 1.0))]
+    filler = Filler(TetWild(), 1.0, Cache.at(tmp_path))
+    surfaces = [CanonicalSurface.of(pose, COMPACT) for pose in (POINTS, bent(POINTS, 1.0))]
     first = filler.carried(filler.body(surfaces[0]), surfaces[1])
     monkeypatch.setattr(filling, "Carrier", None)
     again = filler.carried(filler.body(surfaces[0]), surfaces[1])

@@ -21,9 +21,11 @@ from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
 from torch_modal.io.cache import Cache
 from torch_modal.io.frames import save_frames
-from torch_modal.precompute import filling
+from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute import modes as modes_module
-from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
+from torch_modal.precompute import tetwild
+from torch_modal.precompute.tetrahedra import TetrahedralizationError
+from torch_modal.precompute.tetwild import TetrahedraSettings
 
 FAST = ["--modes", "6", "--levels", "1", "--preset", "fast"]
 
@@ -59,8 +61,8 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*_: object, **__: object) -> None:
         raise AssertionError("the mesher was started")
 
-    monkeypatch.setattr(filling, "tetrahedralize", started)
-    monkeypatch.setattr(filling, "lattice", started)
+    monkeypatch.setattr(tetwild, "tetrahedralize", started)
+    monkeypatch.setattr(lattice_module, "lattice", started)
 
 
 def fails(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
@@ -226,7 +228,7 @@ def test_failed_mesher_is_one_line_and_a_bug_is_not(
     def crash(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(filling, "tetrahedralize", crash)
+    monkeypatch.setattr(tetwild, "tetrahedralize", crash)
     error: Exception = TetrahedralizationError("cannot fill\nthis")
     assert fails(capsys, *argv) == "cannot fill this"
     error = TypeError("a bug")

@@ -8,8 +8,8 @@ from types import ModuleType
 import pytest
 import torch
 
-from torch_modal.keyframes.load import load_keyframes
-from torch_modal.keyframes.registration.landmarks import read_landmarks
+from torch_modal.registration.landmarks import read_landmarks
+from torch_modal.registration.load import load_keyframes
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from torch_modal.io.cache import Cache, cache_content, clear_cache
-from torch_modal.precompute import filling, tetrahedra
+from torch_modal.precompute import filling, tetrahedra, tetwild
 from torch_modal.precompute.modes import extract_modes
-from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import TetrahedralizationError, TetrahedraSettings
+from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import TetrahedralizationError
+from torch_modal.precompute.tetwild import TetrahedraSettings
 
 Mesh = tuple[np.ndarray, np.ndarray]
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
@@ -39,7 +40,7 @@ class Worker:
 @pytest.fixture
 def worker(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Worker:
     made = Worker(tmp_path_factory.mktemp("worker"))
-    monkeypatch.setattr(tetrahedra, "WORKER", made.script)
+    monkeypatch.setattr(tetwild, "WORKER", made.script)
     return made
 
 
@@ -128,7 +129,7 @@ def test_what_is_not_the_meshers_fault_is_tried_again(worker: Worker, capsule: M
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of the address space")
 def test_too_little_memory_is_not_remembered(worker: Worker, capsule: Mesh, tmp_path: Path) -> None:
     """The real mesher where threads and memory cannot be had, and then where they can."""
-    real = str(Path(tetrahedra.__file__).with_name("_tetwild_worker.py"))
+    real = str(Path(tetwild.__file__).with_name("_tetwild_worker.py"))
     limited = "import resource\nresource.setrlimit(resource.RLIMIT_AS, ({0}, {0}))\n"
     run = f"import runpy\nsys.path.insert(0, '')\nsys.argv[0] = {real!r}\nrunpy.run_path({real!r}, run_name='__main__')"
     worker.does(limited.format(180 * 2**20) + run)
@@ -145,7 +146,7 @@ def test_another_version_of_the_mesher_is_tried(
 ) -> None:
     worker.does(CRASH)
     for runs, installed in enumerate(("0.4.2", "0.4.3", "0.4.2")):
-        monkeypatch.setattr(filling, "version", lambda _, installed=installed: installed)
+        monkeypatch.setattr(tetwild, "version", lambda _, installed=installed: installed)
         with pytest.raises(TetrahedralizationError, match="SIGSEGV"):
             modes_of(capsule, tmp_path)
         assert worker.runs == min(runs + 1, 2)
@@ -160,11 +161,11 @@ def test_another_version_of_the_mesher_makes_its_own_tetrahedra(
         calls.append(args)
         return capsule_tetrahedra
 
-    monkeypatch.setattr(filling, "tetrahedralize", mesher)
-    surface = Surface(*capsule, np.arange(len(capsule[0])), 1.0, np.eye(3))
+    monkeypatch.setattr(tetwild, "tetrahedralize", mesher)
+    surface = CanonicalSurface(*capsule, np.arange(len(capsule[0])), 1.0, np.eye(3))
     for installed in ("0.4.2", "0.4.3", "0.4.2"):
-        monkeypatch.setattr(filling, "version", lambda _, installed=installed: installed)
-        filling.Filler(COARSE, "tetwild", 1.0, Cache.at(tmp_path)).body(surface)
+        monkeypatch.setattr(tetwild, "version", lambda _, installed=installed: installed)
+        filling.Filler(tetwild.TetWild(COARSE), 1.0, Cache.at(tmp_path)).body(surface)
     assert len(calls) == 2
 
 
@@ -176,7 +177,7 @@ def test_success_after_a_failure_lasts(
         modes_of(capsule, tmp_path, timeout=0.5, settings=COARSE)
     monkeypatch.undo()
     modes_of(capsule, tmp_path, timeout=100.0, settings=COARSE)
-    monkeypatch.setattr(tetrahedra, "WORKER", tmp_path / "gone")
+    monkeypatch.setattr(tetwild, "WORKER", tmp_path / "gone")
     modes_of(capsule, tmp_path, timeout=0.5, settings=COARSE)  # the tetrahedra are kept: no failure stands before them
 
 
@@ -195,8 +196,8 @@ def test_the_exit_code_of_the_real_worker(capsule: Mesh, tmp_path: Path) -> None
     """It tells the mesher's refusal, here of a wrong edge length, from a job that cannot be read."""
     numbers = {"edge_length_fac": 2.0, "epsilon": 1e-3, "stop_energy": 10.0, "max_surface_faces": 10**6, "timeout": 60}
     np.savez(tmp_path / "job.npz", vertices=capsule[0], faces=capsule[1], **numbers)
-    for job, code, says in (("job.npz", tetrahedra.MESHER_RAISED, "ValueError: Edge"), ("none.npz", 1, "No such file")):
-        command = [sys.executable, str(tetrahedra.WORKER), str(tmp_path / job), str(tmp_path / "result.npz")]
+    for job, code, says in (("job.npz", tetwild.MESHER_RAISED, "ValueError: Edge"), ("none.npz", 1, "No such file")):
+        command = [sys.executable, str(tetwild.WORKER), str(tmp_path / job), str(tmp_path / "result.npz")]
         run = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
         assert run.returncode == code
         assert says in run.stderr.splitlines()[-1]

@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-import pickle
 import subprocess
 import sys
 import warnings
@@ -24,11 +23,8 @@ from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.sparse import SparseSolver
 from torch_modal.nn import fused_alignment, fused_modal, launch, trees
-from torch_modal.nn.blend import FusedSolver
 from torch_modal.nn.frame import Frame
 from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
 from torch_modal.nn.fused_relax import FusedRelax
@@ -311,18 +307,6 @@ def test_alignment(small_bars: Shapes, turn: float) -> None:
         back = fused_alignment.restore(frame, truth.first, truth, t)
         torch.testing.assert_close(back, frame.restore(truth.first, truth, t), rtol=0, atol=1e-11)
         assert fused_alignment.place(frame, x, y.index_fill(1, torch.tensor(3), torch.inf)) is None
-
-
-def test_substitution(small_bars: Shapes) -> None:
-    mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
-    weights = torch.rand(len(mesh.edges), dtype=DOUBLE, generator=torch.Generator().manual_seed(5)) + 0.1
-    fused, plain = (Poisson(mesh.connectivity, weights, solver=kind).solver for kind in (FusedSolver, SparseSolver))
-    right = torch.randn(2, mesh.n_vertices, 3, dtype=DOUBLE, generator=torch.Generator().manual_seed(6))
-    truth = plain(right)
-    assert float(truth.abs().max()) > 0.1
-    torch.testing.assert_close(fused(right), truth, rtol=0, atol=1e-11)
-    assert fused(right.float()).dtype == torch.float32
-    torch.testing.assert_close(pickle.loads(pickle.dumps(fused))(right), truth, rtol=0, atol=1e-11)
 
 
 class TestLayers:

@@ -4,9 +4,8 @@ import ast
 import graphlib
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 PACKAGE = Path(__file__).parents[1] / "torch_modal"
 
@@ -23,17 +22,23 @@ FLOORS = [
     "precompute",
     "energy",
     "nn",
+    "registration",
     "sequence",
     "codec",
+    "data",
+    "view",
+    "",
+    "cli",
+    "__main__",
 ]
-FLOORS += ["data", "view", "", "cli", "__main__"]
 MODULES = sorted(
     str(path.relative_to(PACKAGE).with_suffix("")).replace("/", ".").removesuffix("__init__").removesuffix(".")
     for path in PACKAGE.rglob("*.py")
 )
-FOREIGN_TO_LAYERS = set("scipy fast_simplification trimesh pytetwild tqdm pyvista matplotlib pygltflib".split())
+FOREIGN_TO_LAYERS = set("numpy scipy fast_simplification trimesh pytetwild tqdm pyvista matplotlib pygltflib".split())
 
 
+@cache
 def imported(module: str) -> set[str]:
     """Every module that a file imports, anywhere in it; of this package without its name."""
     folder = PACKAGE / module.replace(".", "/")
@@ -69,35 +74,43 @@ def test_every_module_has_its_floor() -> None:
     assert "geometry.connectivity" in own("nn.frame"), "from torch_modal.geometry import connectivity is not seen"
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda name: name or "torch_modal")
-def test_imports_go_down(module: str) -> None:
-    upwards = sorted(name for name in own(module) if floor(name) > floor(module))
-    assert not upwards, f"{module or '__init__'} imports {upwards}, which stand on higher floors"
+def test_imports_go_down() -> None:
+    upwards = [
+        f"{module or '__init__'} imports {name}, on a higher floor"
+        for module in MODULES
+        for name in sorted(own(module))
+        if floor(name) > floor(module)
+    ]
+    assert not upwards
 
 
 def test_no_imports_go_round() -> None:
     graphlib.TopologicalSorter({module: own(module) - {module} for module in MODULES}).prepare()
 
 
-@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("precompute")])
-def test_precompute_does_not_know_the_layers(module: str) -> None:
-    assert not {name for name in own(module) if name.startswith("nn")}
-    if module not in ("precompute", "precompute.basis", "precompute.modes"):
-        assert "torch" not in {name.split(".")[0] for name in imported(module)}, (
-            "modes.py alone makes tensors, for basis.py"
-        )
+def test_precompute_is_without_torch() -> None:
+    """Besides the basis: ``modes.py`` alone makes tensors, for ``basis.py``."""
+    with_torch = {
+        name
+        for name in MODULES
+        if name.startswith("precompute.") and "torch" in {found.split(".")[0] for found in imported(name)}
+    }
+    assert with_torch == {"precompute.basis", "precompute.modes"}
 
 
-@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("nn")])
-def test_layers_are_torch_only(module: str) -> None:
-    packages = {name.split(".")[0] for name in imported(module)}
-    assert not packages & FOREIGN_TO_LAYERS
-    if module not in ("nn.frame", "nn.congruence"):
-        assert "numpy" not in packages
-    # Bases are what comes in; only the frame and its coarse mesh, made once, look further into the other room.
-    coarse = {"precompute.coarsening"} if module in ("nn.frame", "nn.resolution") else set()
-    allowed = {"precompute.basis"} | coarse
-    assert {name for name in own(module) if name.startswith("precompute")} <= allowed
+def test_layers_are_torch_only() -> None:
+    """Bases are what comes in; only the frame and its coarse mesh, made once, use more of the pre-computation."""
+    allowed = {"nn.frame": {"numpy", "precompute.coarsening"}, "nn.congruence": {"numpy"}}
+    allowed["nn.resolution"] = {"precompute.coarsening"}
+    foreign = {
+        (module, name)
+        for module in MODULES
+        if module.startswith("nn.")
+        for name in {found if found in MODULES else found.split(".")[0] for found in imported(module)}
+        if name in FOREIGN_TO_LAYERS or (name.startswith("precompute.") and name != "precompute.basis")
+        if name not in allowed.get(module, ())
+    }
+    assert not foreign
 
 
 def test_one_lock_guards_the_decimation() -> None:

@@ -15,7 +15,7 @@ from torch_modal.geometry import inspect
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes, require_solid
-from torch_modal.keyframes.load import load_keyframes
+from torch_modal.registration.load import load_keyframes
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 

@@ -3,39 +3,44 @@
 import os
 import subprocess
 import sys
+import threading
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
 from solids import box, surface
 
 from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling
+from torch_modal.precompute import filling, tetwild
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.filling import Filler
-from torch_modal.precompute.lattice import is_too_fine, lattice
+from torch_modal.precompute.lattice import Lattice, is_too_fine, lattice
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.proximity import clearances
 from torch_modal.precompute.stiffness import arap_hessian, lumped_mass, mass_matrix
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
+    Tetrahedra,
     TetrahedralizationError,
-    TetrahedraSettings,
     pieces_by_sides,
     solid_volumes,
     tet_volumes,
 )
+from torch_modal.precompute.tetwild import TetrahedraSettings
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.mark.parametrize("cell", [0.08, 0.04])
 def test_volume_and_place(capsule: Mesh, cell: float) -> None:
-    whole = Surface.of(*capsule)
+    whole = CanonicalSurface.of(*capsule)
     filled = lattice(whole, cell)
     assert (tet_volumes(filled) > 0).all()
     exact = trimesh.Trimesh(whole.points, whole.faces)
@@ -49,7 +54,7 @@ def test_volume_and_place(capsule: Mesh, cell: float) -> None:
 
 
 def test_outer_vertices_lie_on_the_surface(capsule: Mesh) -> None:
-    whole = Surface.of(*capsule)
+    whole = CanonicalSurface.of(*capsule)
     filled = lattice(whole, 0.05)
     outer = filled.vertices[np.unique(surface(filled))]
     corners = whole.points[whole.faces]
@@ -65,7 +70,7 @@ def test_what_is_thinner_than_a_cube_stays_in_one_piece() -> None:
     solid = box((30, 20, 1), (10.0, 6.0, 0.12))
     used, compact = np.unique(surface(solid), return_inverse=True)
     turn = np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0]
-    sheet = Surface.of(solid.vertices[used] @ turn, compact.reshape(-1, 3))
+    sheet = CanonicalSurface.of(solid.vertices[used] @ turn, compact.reshape(-1, 3))
     filled = lattice(sheet, 0.03)
     assert lowest_modes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).n_zero == 6
     assert solid_volumes(filled).sum() == pytest.approx(10 * 6 * 0.12 * sheet.scale**3, rel=0.2)
@@ -102,12 +107,12 @@ def test_it_is_the_only_default(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) 
     def fail(*args: object, **kwargs: object) -> None:
         raise AssertionError("fTetWild was asked")
 
-    monkeypatch.setattr(filling, "tetrahedralize", fail)
+    monkeypatch.setattr(tetwild, "tetrahedralize", fail)
     vertices, faces = capsule
     for shape in (vertices, vertices * (1.0, 0.02, 1.0)):
         default, named = (extract_modes(shape, faces, 6, cache=False, **way) for way in ({}, {"mesher": "lattice"}))
         np.testing.assert_array_equal(default.modes, named.modes)
-    assert filling.MESHERS == ("lattice", "tetwild")
+    assert tuple(filling.MESHERS) == ("lattice", "tetwild")
 
 
 def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
@@ -121,8 +126,8 @@ def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
 def test_thin_plates_are_filled(thickness: float) -> None:
     """By tetrahedra in one piece, all over."""
     vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
-    whole = Surface.of(vertices, faces)
-    filled = Filler(TetrahedraSettings(), "lattice", 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    whole = CanonicalSurface.of(vertices, faces)
+    filled = Filler(Lattice(), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
     assert pieces_by_sides(filled.tets).max() == 0
     assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
     basis = extract_modes(vertices, faces, 6, cache=False)
@@ -134,15 +139,15 @@ def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     """What fTetWild could still fill, the lattice fills with as many cubes as it may have."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     settings = TetrahedraSettings(edge_length_fac=0.012)
-    whole = Surface.of(ball.vertices, ball.faces)
-    assert is_too_fine(whole, filling.CUBE * 0.012)
-    filled = Filler(settings, "lattice", 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    whole = CanonicalSurface.of(ball.vertices, ball.faces)
+    assert is_too_fine(whole, lattice_module.CUBE * 0.012)
+    filled = Filler(Lattice(settings), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
     assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
 
 
-def of_body(name: str) -> Surface:
+def of_body(name: str) -> CanonicalSurface:
     shape = body(name)
-    return Surface.of(shape.pose(0.0), shape.faces)
+    return CanonicalSurface.of(shape.pose(0.0), shape.faces)
 
 
 @pytest.mark.parametrize("name", ["limb bent 120", "wire bent 120", "rod bent 180"])
@@ -169,7 +174,7 @@ def test_lowest_mode_of_a_rod() -> None:
 def test_each_side_is_shared_alike(capsule: Mesh) -> None:
     """Neighbouring cubes cut their common side along the same diagonal: no side belongs to three tetrahedra, and the
     outer sides are closed."""
-    filled = lattice(Surface.of(*capsule), 0.06)
+    filled = lattice(CanonicalSurface.of(*capsule), 0.06)
     sides = np.sort(np.concatenate([filled.tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
     assert np.unique(sides, axis=0, return_counts=True)[1].max() == 2
     edges = np.sort(np.concatenate([surface(filled)[:, c] for c in ([0, 1], [1, 2], [2, 0])]), axis=1)
@@ -177,7 +182,7 @@ def test_each_side_is_shared_alike(capsule: Mesh) -> None:
 
 
 def test_deterministic(capsule: Mesh) -> None:
-    one, two = (lattice(Surface.of(*capsule), 0.05) for _ in range(2))
+    one, two = (lattice(CanonicalSurface.of(*capsule), 0.05) for _ in range(2))
     for first, second in zip(one, two, strict=True):
         np.testing.assert_array_equal(first, second)
     bases = [extract_modes(*capsule, 10, mesher="lattice", cache=False) for _ in range(2)]
@@ -189,7 +194,7 @@ def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:
     solid = box((30, 6, 6), (10.0, 1.0, 1.3))
     faces = surface(solid)
     used, compact = np.unique(faces, return_inverse=True)
-    bar = Surface.of(
+    bar = CanonicalSurface.of(
         solid.vertices[used] @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces=compact.reshape(-1, 3)
     )
     filled = lattice(bar, 0.025)
@@ -203,14 +208,14 @@ def test_open_and_half_flipped_surfaces(capsule: Mesh) -> None:
     vertices, faces = capsule
     centers = vertices[faces].mean(axis=1)
     far = centers[:, 2] > np.quantile(centers[:, 2], 0.875)
-    whole, opened = Surface.of(vertices, faces), Surface.of(vertices, faces[~far])
+    whole, opened = CanonicalSurface.of(vertices, faces), CanonicalSurface.of(vertices, faces[~far])
     share = solid_volumes(lattice(opened, 0.05)).sum() / opened.scale**3
     assert share == pytest.approx(solid_volumes(lattice(whole, 0.05)).sum() / whole.scale**3, rel=0.25)
 
 
 def test_too_fine_a_lattice_is_refused(capsule: Mesh) -> None:
     with pytest.raises(TetrahedralizationError, match="give a larger edge_length_fac"):
-        lattice(Surface.of(*capsule), 0.002)
+        lattice(CanonicalSurface.of(*capsule), 0.002)
 
 
 @pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("mesher", "auto"), ("settings", "best")])
@@ -222,12 +227,39 @@ def test_unknown_names(capsule: Mesh, name: str, value: str) -> None:
 def test_settings_reach_the_mesher(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[float] = []
 
-    def note(surface: Surface, edge: float, *_: object):
+    def note(surface: CanonicalSurface, edge: float, *_: object):
         seen.append(edge)
         return lattice(surface, 0.05)
 
-    monkeypatch.setattr(filling, "lattice", note)
+    monkeypatch.setattr(lattice_module, "lattice", note)
     for settings in ("fast", "fine", TetrahedraSettings(edge_length_fac=0.07)):
         extract_modes(*capsule, 5, settings=settings, cache=False)
     assert seen[0] > seen[1]
-    assert seen[2] == filling.CUBE * 0.07
+    assert seen[2] == lattice_module.CUBE * 0.07
+
+
+@dataclass(frozen=True)
+class Cubes:
+    """A mesher of a user's own."""
+
+    edge: float
+    filled: list[int] = field(default_factory=list)
+
+    def key(self) -> dict[str, Any]:
+        return {"mesher": "cubes", "edge": self.edge}
+
+    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
+        self.filled.append(len(surface.points))
+        return lattice(surface, self.edge)
+
+
+def test_a_mesher_of_ones_own(capsule: Mesh, tmp_path: Path) -> None:
+    coarse, fine = Cubes(0.06), Cubes(0.04)
+    first, second, again = (
+        extract_modes(*capsule, 5, mesher=mesher, cache_dir=str(tmp_path)) for mesher in (coarse, fine, coarse)
+    )
+    assert coarse.filled == fine.filled == [len(capsule[0])]
+    assert torch.equal(first.eigenvalues, again.eigenvalues)
+    assert not torch.equal(first.eigenvalues, second.eigenvalues)
+    with pytest.raises(ValueError, match="the mesher is 'cube'"):
+        extract_modes(*capsule, 5, mesher="cube")

@@ -16,7 +16,8 @@ from solids import box, surface, together
 
 from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
-from torch_modal.precompute import filling, lanczos, parallel, solving
+from torch_modal.precompute import lanczos, parallel, solving, tetwild
+from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import ENOUGH, EXACT, ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.parallel import StoppedError
@@ -227,7 +228,7 @@ def boxed(monkeypatch: pytest.MonkeyPatch) -> Mesh:
     """A box as a surface, and meshers that fill it."""
     mesh = as_mesh(BOX)
     filled_with(monkeypatch, BOX, mesh)
-    monkeypatch.setattr(filling, "tetrahedralize", lambda *_, **__: filling.lattice())
+    monkeypatch.setattr(tetwild, "tetrahedralize", lambda *_, **__: lattice_module.lattice())
     return mesh
 
 
@@ -275,7 +276,7 @@ def test_cached_modes_are_the_same_and_not_recomputed(
     first = extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path))
     assert len(list(tmp_path.iterdir())) == 4  # tetrahedra, carried ones, modes
     monkeypatch.setattr(solving, "lowest_modes", None)
-    monkeypatch.setattr(filling, "lattice", None)
+    monkeypatch.setattr(lattice_module, "lattice", None)
     for basis, again in zip(first, extract_bases(keyframes, boxed[1], 4, cache_dir=str(tmp_path)), strict=True):
         np.testing.assert_array_equal(basis.modes, again.modes)
         np.testing.assert_array_equal(basis.eigenvalues, again.eigenvalues)
@@ -293,7 +294,7 @@ def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: Mesh) 
     """Have the lattice give these tetrahedra, placed as this surface is."""
     own = placed(*like)
     vertices = ((solid.vertices - own.centre) * own.scale) @ own.axes.T
-    monkeypatch.setattr(filling, "lattice", lambda *_: solid._replace(vertices=vertices))
+    monkeypatch.setattr(lattice_module, "lattice", lambda *_: solid._replace(vertices=vertices))
 
 
 def test_loose_pieces_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,7 +331,7 @@ def test_a_stray_clump_is_no_body(mesher: Any, monkeypatch: pytest.MonkeyPatch) 
     found = []
     for solid in (BOX, together(BOX, clump)):
         filled_with(monkeypatch, solid, (vertices, faces))
-        monkeypatch.setattr(filling, "tetrahedralize", lambda *_, **__: filling.lattice())
+        monkeypatch.setattr(tetwild, "tetrahedralize", lambda *_, **__: lattice_module.lattice())
         found.append(extract_modes(vertices, faces, 10, mesher=mesher, cache=False))
     plain, stray = found
     np.testing.assert_allclose(stray.eigenvalues, plain.eigenvalues, rtol=1e-6)
@@ -393,7 +394,7 @@ def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) 
 
     with pytest.raises(MeshError, match=r"key-frame 1: the surface is flat"):
         extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, cache=False)
-    monkeypatch.setattr(filling, "tetrahedralize", fail)
+    monkeypatch.setattr(tetwild, "tetrahedralize", fail)
     with pytest.raises(TetrahedralizationError, match=r"key-frame [01]: no luck"):
         extract_bases(np.stack([vertices, vertices]), faces, 4, mesher="tetwild", cache=False)
     with pytest.raises(TetrahedralizationError, match=r"^no luck"):
@@ -416,14 +417,14 @@ def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_keyframes_are_meshed_at_the_same_time(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = boxed
-    fill, together = filling.tetrahedralize, threading.Barrier(3)
+    fill, together = tetwild.tetrahedralize, threading.Barrier(3)
 
     def wait_for_the_others(*args: object, **kwargs: object) -> Tetrahedra:
         together.wait(timeout=30)  # passes only if three are in here
         return fill(*args, **kwargs)
 
     monkeypatch.setattr(parallel, "n_cpus", lambda: 3)
-    monkeypatch.setattr(filling, "tetrahedralize", wait_for_the_others)
+    monkeypatch.setattr(tetwild, "tetrahedralize", wait_for_the_others)
     three = np.stack([vertices] * 3)
     assert len(extract_bases(three, faces, 4, mesher="tetwild", carry=False, cache=False)) == 3
 
@@ -442,7 +443,7 @@ def test_one_failure_ends_the_other_workers(boxed: Mesh, monkeypatch: pytest.Mon
         raise StoppedError
 
     monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
-    monkeypatch.setattr(filling, "tetrahedralize", fill)
+    monkeypatch.setattr(tetwild, "tetrahedralize", fill)
     keyframes = np.stack([vertices, vertices * (1, 1, 5)])
     with pytest.raises(TetrahedralizationError, match="key-frame 1: no luck"):
         extract_bases(keyframes, faces, 4, mesher="tetwild", carry=False, cache=False)

@@ -19,8 +19,8 @@ from browsers import NoBrowser, console, open_browser, open_page, requests
 import torch_modal as tm
 from torch_modal.cli.main import main
 from torch_modal.errors import MeshError
-from torch_modal.keyframes.load import load_keyframes
-from torch_modal.keyframes.registration.landmarks import read_landmarks
+from torch_modal.registration.landmarks import read_landmarks
+from torch_modal.registration.load import load_keyframes
 from torch_modal.view.page_data import LEVELS, grid_of, pack_faces, pack_frames, quantise
 from torch_modal.view.page_input import read_shapes
 

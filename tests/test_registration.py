@@ -11,17 +11,16 @@ import torch_modal as tm
 from torch_modal import extras
 from torch_modal.cli import main as cli
 from torch_modal.io.frames import save_mesh
-from torch_modal.keyframes.registration import register as register_module
-from torch_modal.keyframes.registration.elastic import ElasticSurface, Pull
-from torch_modal.keyframes.registration.landmarks import read_landmarks
-from torch_modal.keyframes.registration.libraries import require
-from torch_modal.keyframes.registration.maps import FINE_FUNCTIONS, nearest_rows, rate, zoom_out
-from torch_modal.keyframes.registration.register import register
-from torch_modal.keyframes.registration.report import measure
-from torch_modal.keyframes.registration.sequence import landmark_table
-from torch_modal.keyframes.registration.spectrum import SpectralShape
-from torch_modal.keyframes.registration.surface import Surface, largest_piece, outward, referenced, sewn, without_dust
-from torch_modal.view import drawing, landmarks
+from torch_modal.registration import register as register_module
+from torch_modal.registration.elastic import ElasticSurface, PointTargets
+from torch_modal.registration.landmarks import read_landmarks
+from torch_modal.registration.libraries import require
+from torch_modal.registration.maps import FINE_FUNCTIONS, nearest_rows, rate, zoom_out
+from torch_modal.registration.register import register
+from torch_modal.registration.report import measure
+from torch_modal.registration.sequence import landmark_table
+from torch_modal.registration.spectrum import SpectralShape
+from torch_modal.registration.surface import MeshSurface, largest_piece, outward, referenced, sewn, without_dust
 
 for library in ("robust_laplacian", "potpourri3d", "igl"):
     pytest.importorskip(library, reason=f"{library} is not installed; it is part of the extra 'register'")
@@ -127,7 +126,7 @@ def test_the_second_time_is_from_the_cache(
         calls.append(len(calls))
         return found._replace(confidence=0.25, warnings=("one, with a comma", "two"), folds=3)
 
-    monkeypatch.setattr(register_module._Problem, "solve", solved)
+    monkeypatch.setattr(register_module._RegistrationProblem, "solve", solved)
 
     def again(target: np.ndarray, marks: object = None, dtype: type = np.float64) -> tm.Registration:
         own = rest.astype(np.float32).astype(dtype)
@@ -272,7 +271,7 @@ def test_bad_input_is_refused(pair: tuple[Mesh, Mesh, np.ndarray], monkeypatch: 
 
 # ------------------------------------------------------------------------------------------------------------- parts
 def test_closest_points_and_rows() -> None:
-    surface = Surface(np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0.0]]), np.array([[0, 1, 2]]))
+    surface = MeshSurface(np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0.0]]), np.array([[0, 1, 2]]))
     closest = surface.closest(np.array([[0.5, 0.5, 3.0], [-1, -1, 0]]))
     np.testing.assert_allclose(closest.distances, [3, 2**0.5])
     np.testing.assert_allclose(surface.barycentric(closest), [[0.5, 0.25, 0.25], [1, 0, 0]], atol=1e-12)
@@ -282,14 +281,14 @@ def test_closest_points_and_rows() -> None:
 
 def test_pieces_and_winding() -> None:
     rest, faces = limbs(2)
-    both = Surface(np.vstack([rest, 0.1 * rest]), np.vstack([faces, faces + len(rest)]))
+    both = MeshSurface(np.vstack([rest, 0.1 * rest]), np.vstack([faces, faces + len(rest)]))
     assert len(largest_piece(both).vertices) == len(rest)
     np.testing.assert_array_equal(outward(rest, faces), outward(rest, faces[:, ::-1])[:, ::-1][:, ::-1][:, [0, 1, 2]])
     small, used = referenced(rest, faces[:4])
     np.testing.assert_array_equal(small.vertices, rest[used])
 
 
-def cut_through(vertices: np.ndarray, faces: np.ndarray, gap: float) -> tuple[Surface, np.ndarray]:
+def cut_through(vertices: np.ndarray, faces: np.ndarray, gap: float) -> tuple[MeshSurface, np.ndarray]:
     """Without the faces of a band across the first bump, and which of the vertices that are left lie beyond it."""
     along = vertices @ (direction := np.array([1, 0.2, 0.1]) / np.linalg.norm([1, 0.2, 0.1]))
     at = 0.6 * along.max()
@@ -305,7 +304,7 @@ def test_what_a_cut_has_parted_is_sewn_on() -> None:
     assert cut.connectivity.vertex_pieces.max() == 1 and 200 < beyond.sum() < 0.2 * len(beyond)
     whole = largest_piece(sewn(cut, 0.04))
     assert len(whole.vertices) == len(cut.vertices)
-    shape, before = SpectralShape(cut), SpectralShape(Surface(rest, faces))
+    shape, before = SpectralShape(cut), SpectralShape(MeshSurface(rest, faces))
     tip, far = rest[(rest @ [1, 0.2, 0.1]).argmax()], rest[(rest @ [1, 0.2, 0.1]).argmin()]
     lengths = []
     for one in (shape, before):
@@ -313,21 +312,23 @@ def test_what_a_cut_has_parted_is_sewn_on() -> None:
         lengths.append(one.geodesics_from(np.array(ends[:1]))[ends[1], 0] * one.scale)
     assert lengths[0] == pytest.approx(lengths[1], rel=0.08)
     assert sewn(cut, 0.001).connectivity.vertex_pieces.max() == 1, "the gap is wider"
-    speck = Surface(np.vstack([rest, rest[0] + 0.1 * np.eye(3)]), np.vstack([faces, len(rest) + np.arange(3)[None]]))
+    speck = MeshSurface(
+        np.vstack([rest, rest[0] + 0.1 * np.eye(3)]), np.vstack([faces, len(rest) + np.arange(3)[None]])
+    )
     assert len(without_dust(speck).vertices) == len(rest)
 
 
 def test_a_limb_that_is_cut_off_stays_where_it_belongs(pair: tuple[Mesh, Mesh, np.ndarray]) -> None:
     (rest, faces), _, _ = pair
     cut, _ = cut_through(*limbs(5), 0.15)
-    moved = Surface(bent(cut.vertices), cut.faces)
+    moved = MeshSurface(bent(cut.vertices), cut.faces)
     result = register(rest, faces, moved.vertices, moved.faces, progress=False)
     assert not result.doubtful and errors(result, bent(rest)).mean() < 1.0
 
 
 def test_spectrum_of_the_sphere() -> None:
     ball = trimesh.creation.icosphere(subdivisions=3)
-    shape = SpectralShape(Surface(np.array(ball.vertices), np.array(ball.faces)))
+    shape = SpectralShape(MeshSurface(np.array(ball.vertices), np.array(ball.faces)))
     # l (l + 1), each 2 l + 1 times, on a sphere of area one: radius^2 = 1 / 4 pi.
     expected = 4 * np.pi * np.array([0] + [2] * 3 + [6] * 5)
     np.testing.assert_allclose(shape.eigenvalues[:9], expected, rtol=0.02, atol=1e-6)
@@ -339,8 +340,8 @@ def test_spectrum_of_the_sphere() -> None:
 
 def test_zoom_out_repairs_a_rough_map_and_mirrors_lose() -> None:
     rest, faces = limbs(3)
-    first = SpectralShape(Surface(rest, faces))
-    second = SpectralShape(Surface(bent(rest), faces))
+    first = SpectralShape(MeshSurface(rest, faces))
+    second = SpectralShape(MeshSurface(bent(rest), faces))
     random = np.random.default_rng(0)
     true = np.arange(len(rest))
     near = nearest_rows(rest + 0.3 * random.normal(size=rest.shape), rest)
@@ -351,23 +352,23 @@ def test_zoom_out_repairs_a_rough_map_and_mirrors_lose() -> None:
 
     assert off(refined) < 0.5 * off(near)
     assert rate(first, second, true, FINE_FUNCTIONS) > 0.5
-    mirrored = SpectralShape(Surface(rest * [1, 1, -1], faces[:, ::-1]))
+    mirrored = SpectralShape(MeshSurface(rest * [1, 1, -1], faces[:, ::-1]))
     assert rate(first, mirrored, true, FINE_FUNCTIONS) < 0
 
 
 def test_elastic_surface_follows_a_rigid_motion_exactly() -> None:
     rest, faces = limbs(2)
     turn = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])[:3, :3]
-    elastic = ElasticSurface(Surface(rest, faces))
+    elastic = ElasticSurface(MeshSurface(rest, faces))
     np.testing.assert_allclose(elastic.local_frames(rest @ turn.T), np.tile(turn, (len(rest), 1, 1)), atol=1e-9)
     from scipy import sparse
 
     chosen = np.array([0, 5, 9, 30, 70])
     points = sparse.identity(len(rest), format="csr")[chosen]
-    pulls = [Pull(points, (rest @ turn.T)[chosen], np.full(5, 10.0))]
+    pulls = [PointTargets(points, (rest @ turn.T)[chosen], np.full(5, 10.0))]
     moved = elastic.follow(rest, pulls, rounds=400)
     np.testing.assert_allclose(moved, rest @ turn.T, atol=1e-3 * np.ptp(rest))
-    stretchable = ElasticSurface(Surface(rest, faces), stretchable=True)
+    stretchable = ElasticSurface(MeshSurface(rest, faces), stretchable=True)
     np.testing.assert_allclose(
         stretchable.local_frames(1.5 * rest), np.tile(1.5 * np.eye(3), (len(rest), 1, 1)), atol=1e-9
     )
@@ -375,11 +376,13 @@ def test_elastic_surface_follows_a_rigid_motion_exactly() -> None:
 
 def test_measures_of_a_turned_flap() -> None:
     rest, faces = limbs(3)
-    surface = Surface(rest, faces)
+    surface = MeshSurface(rest, faces)
     same = measure(surface, rest, surface)
     assert same.to_target.max < 1e-9 and same.flipped_area == 0 and same.folds == 0 and same.stretch == 0
-    assert measure(surface, 2 * rest, Surface(2 * rest, faces)).stretch < 1e-12, "the scale of the whole is no stretch"
-    inside_out = Surface(rest, faces[:, ::-1])
+    assert measure(surface, 2 * rest, MeshSurface(2 * rest, faces)).stretch < 1e-12, (
+        "the scale of the whole is no stretch"
+    )
+    inside_out = MeshSurface(rest, faces[:, ::-1])
     assert measure(surface, rest, inside_out).flipped_area > 0.9
 
 
@@ -458,17 +461,6 @@ def test_command(files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixtur
         cli.main(["register", *map(str, files[:2])])
     with pytest.raises(SystemExit):
         cli.main(["subdivide", *map(str, files[:2]), "--across", "--out", str(tmp_path / "x.glb")])
-
-
-def test_suggestion_picture(
-    files: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(landmarks, "draw", lambda scene, renderer: drawing.draw(scene, "matplotlib"))  # the faster one
-    picture = tmp_path / "numbers.png"
-    assert cli.main(["register", *map(str, files[:2]), "--suggest", str(picture)]) == 0
-    assert picture.stat().st_size > 10_000
-    listed = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("a.obj:"))
-    np.testing.assert_array_equal([int(word) for word in listed.split()[1:]], tm.suggest_landmarks(*limbs(3)))
 
 
 @pytest.mark.slow

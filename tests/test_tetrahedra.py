@@ -15,16 +15,9 @@ import trimesh
 from conftest import COARSE
 from solids import box, together
 
-from torch_modal.precompute import tetrahedra
-from torch_modal.precompute.tetrahedra import (
-    Tetrahedra,
-    TetrahedralizationError,
-    TetrahedraSettings,
-    oriented,
-    tet_volumes,
-    tetrahedralize,
-    without_debris,
-)
+from torch_modal.precompute import tetwild
+from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, tet_volumes, without_debris
+from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -56,13 +49,13 @@ def test_mesher_stays_out_of_this_process(tmp_path: Path) -> None:
         import signal, sys
         import trimesh
         handler = signal.getsignal(signal.SIGINT)
-        from torch_modal.precompute.tetrahedra import TetrahedraSettings, tetrahedralize
+        from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
         ball = trimesh.creation.icosphere(subdivisions=1)
         assert len(tetrahedralize(ball.vertices, ball.faces, TetrahedraSettings(edge_length_fac=0.3)).tets)
         assert "pytetwild" not in sys.modules
         assert signal.getsignal(signal.SIGINT) is handler
     """
-    root = str(Path(tetrahedra.__file__).parents[2])
+    root = str(Path(tetwild.__file__).parents[2])
     subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
         check=True,
@@ -79,7 +72,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def replace(code: str) -> None:
         script = tmp_path / "worker.py"
         script.write_text("import os, signal, sys, time\njob, result = sys.argv[1:]\n" + textwrap.dedent(code))
-        monkeypatch.setattr(tetrahedra, "WORKER", script)
+        monkeypatch.setattr(tetwild, "WORKER", script)
 
     return replace
 
@@ -148,15 +141,15 @@ def test_ctrl_c_ends_the_worker(tmp_path: Path) -> None:
     code = f"""
         import pathlib, signal, trimesh
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        from torch_modal.precompute import tetrahedra
-        tetrahedra.WORKER = pathlib.Path({str(tmp_path / "worker.py")!r})
+        from torch_modal.precompute import tetwild
+        tetwild.WORKER = pathlib.Path({str(tmp_path / "worker.py")!r})
         ball = trimesh.creation.icosphere(subdivisions=1)
         try:
-            tetrahedra.tetrahedralize(ball.vertices, ball.faces)
+            tetwild.tetrahedralize(ball.vertices, ball.faces)
         except KeyboardInterrupt:
             print("interrupted")
     """
-    root = str(Path(tetrahedra.__file__).parents[2])
+    root = str(Path(tetwild.__file__).parents[2])
     process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(code)],
         stdout=subprocess.PIPE,

@@ -11,11 +11,12 @@ from conftest import Shapes, random_rotation
 from scipy import sparse
 
 from torch_modal.data.random_in_between import mirror
+from torch_modal.geometry import sparse as sparse_systems
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Poisson, Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.sparse import SparseSolver, factorize, solve_by
+from torch_modal.geometry.sparse import SparseSolver, factorize, graph_laplacian
 from torch_modal.geometry.triangle_frames import (
     Bend,
     Sides,
@@ -365,22 +366,41 @@ def test_frames_have_gradients(small_bars: Shapes) -> None:
     assert torch.autograd.gradcheck(wanted, [x])
 
 
-def test_by_the_inverse_as_by_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("has_cholespy", [True, False])
+def test_sparse_solver(has_cholespy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a dense inverse: more columns than are solved at once, some unknowns only, with gradients, pickled."""
+    if not has_cholespy:  # there is no wheel for every machine
+        monkeypatch.setattr(sparse_systems, "cholespy", None)
     generator = torch.Generator().manual_seed(0)
-    root = torch.randn(12, 12, generator=generator, dtype=torch.float64)
-    matrix = sparse.csr_matrix((root @ root.T + torch.eye(12, dtype=torch.float64)).numpy())
+    root = torch.randn(12, 12, generator=generator, dtype=F64)
+    dense = root @ root.T + torch.eye(12, dtype=F64)
+    right = torch.randn(2, 20, 12, 3, generator=generator, dtype=F64)
     for free in (None, np.array([0, 2, 3, 7, 11])):
-        solver = SparseSolver(matrix, free)
-        right = torch.randn(2, 12, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-        assert not solver.has_inverse(right.device)
-        truth = solver(right)
-        (slope,) = torch.autograd.grad(truth.square().sum(), right)
-        with monkeypatch.context() as there:
-            there.setattr(SparseSolver, "has_inverse", lambda self, device: True)
-            found = solve_by(lambda solver=solver: solver, right)  # type: ignore[misc]
-            torch.testing.assert_close(found, truth, rtol=1e-10, atol=1e-12)
-            torch.testing.assert_close(
-                torch.autograd.grad(found.square().sum(), right)[0], slope, rtol=1e-9, atol=1e-11
-            )
-    assert solver.has_inverse(torch.device("cuda"))
-    assert solver._inverses and not solver.__getstate__()["_inverses"]
+        solver = SparseSolver(sparse.csr_matrix(dense.numpy()), free)
+        inverse = torch.zeros_like(dense)
+        rows = torch.arange(12) if free is None else torch.from_numpy(free)
+        inverse[rows[:, None], rows] = torch.linalg.inv(dense[rows][:, rows])
+        torch.testing.assert_close(solver(right), inverse @ right, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(pickle.loads(pickle.dumps(solver))(right[0, 0]), solver(right)[0, 0])
+        assert solver(right.float()).dtype == torch.float32
+        assert solver(right[:0]).shape == (0, 20, 12, 3)
+        assert torch.autograd.gradcheck(solver, right[0, :2].clone().requires_grad_())
+    assert torch.equal(SparseSolver(sparse.eye(12), np.empty(0, dtype=np.int64))(right), torch.zeros_like(right))
+
+
+def test_sparse_solver_refuses_an_indefinite_matrix() -> None:
+    pytest.importorskip("cholespy")
+    with pytest.raises(ValueError, match="not positive definite"):
+        SparseSolver(sparse.diags([1.0, -1.0, 1.0]))(torch.ones(3, 1, dtype=F64))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
+def test_sparse_solver_on_a_gpu() -> None:
+    mesh = Connectivity(trimesh.creation.icosphere(4).faces)
+    laplacian = graph_laplacian(mesh.edges, np.ones(len(mesh.edges)), mesh.n_vertices)
+    solver = SparseSolver(laplacian, np.arange(1, mesh.n_vertices))
+    right = torch.randn(70, mesh.n_vertices, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    truth = solver(right)
+    with torch.cuda.stream(torch.cuda.Stream()):
+        found = solver(right.cuda())
+    torch.testing.assert_close(found.cpu(), truth, rtol=1e-9, atol=1e-9)

@@ -33,10 +33,6 @@ from .io.formats import mesh_format as mesh_format
 from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
 from .keyframes.check import check_keyframes as check_keyframes
-from .keyframes.load import load_keyframes as load_keyframes
-from .keyframes.registration.landmarks import suggest_landmarks as suggest_landmarks
-from .keyframes.registration.register import register as register
-from .keyframes.registration.report import Registration as Registration
 from .keyframes.seams import weld_seams as weld_seams
 from .keyframes.self_contacts import SelfContacts as SelfContacts
 from .keyframes.self_contacts import self_contacts as self_contacts
@@ -58,7 +54,11 @@ from .precompute.eigen import ModalAnalysisError as ModalAnalysisError
 from .precompute.modes import extract_bases as extract_bases
 from .precompute.modes import extract_modes as extract_modes
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
-from .precompute.tetrahedra import TetrahedraSettings as TetrahedraSettings
+from .precompute.tetwild import TetrahedraSettings as TetrahedraSettings
+from .registration.landmarks import suggest_landmarks as suggest_landmarks
+from .registration.load import load_keyframes as load_keyframes
+from .registration.register import register as register
+from .registration.report import Registration as Registration
 from .sequence.editor import PathEditor as PathEditor
 from .sequence.path import Path as Path
 from .sequence.subdivide import frame_times as frame_times

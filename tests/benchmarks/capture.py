@@ -19,8 +19,9 @@ from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
 from torch_modal.precompute.lattice import USUAL_EDGE, lattice
 from torch_modal.precompute.modes import QUALITIES
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian, hat_gradients, lumped_mass, mass_matrix
-from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import Tetrahedra
+from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -53,7 +54,7 @@ class Judge:
         kept: Where references are kept from one run to the next, as they take minutes.
     """
 
-    def __init__(self, surface: Surface, kept: Cache) -> None:
+    def __init__(self, surface: CanonicalSurface, kept: Cache) -> None:
         self.surface = surface
         self._kept = kept
         self._areas = np.repeat(np.sqrt(vertex_areas(surface.points, surface.faces)), 3)[:, None]
@@ -161,7 +162,7 @@ def table(meshes: Sequence[tuple[str, FloatArray, IntArray]], runs: int, keep: P
     print(HEAD)
     least = 1.0
     for name, vertices, faces in meshes:
-        judge = Judge(Surface.of(vertices, faces), Cache(keep))
+        judge = Judge(CanonicalSurface.of(vertices, faces), Cache(keep))
         for number, (setting, found) in enumerate(rows(judge, runs)):
             by_quadratic = [judge.captured(one.modes, judge.quadratic) for one in found]
             by_linear = [judge.captured(one.modes, judge.linear) for one in found]

@@ -13,7 +13,7 @@ from torch_modal.precompute.lanczos import factored, lowest_spans
 from torch_modal.precompute.lattice import lattice
 from torch_modal.precompute.mass import Mass
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -25,7 +25,7 @@ SAME_TOLERANCE = 1e-8
 
 def eigensolvers(name: str, vertices: FloatArray, faces: IntArray) -> None:
     """Print how much longer ARPACK takes, and what both leave of a residual."""
-    surface = Surface.of(vertices, faces)
+    surface = CanonicalSurface.of(vertices, faces)
     for cell in CELLS:
         solid = lattice(surface, cell)
         k, mass = arap_hessian(solid), Mass.of(mass_matrix(solid))

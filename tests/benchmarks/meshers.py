@@ -21,7 +21,7 @@ from precompute import measured
 from threads import limit_threads
 
 import torch_modal as tm
-from torch_modal.precompute.tetrahedra import TetrahedraSettings
+from torch_modal.precompute.tetwild import TetrahedraSettings
 
 REFERENCE = "tetwild"
 FAST = {"edge_length_fac": None, "epsilon": 2e-3, "stop_energy": 50.0, "max_surface_faces": 3000}

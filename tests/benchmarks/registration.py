@@ -28,9 +28,9 @@ import torch_modal as tm
 from torch_modal.data.samples import sample_files
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import read_mesh
-from torch_modal.keyframes.registration.consistency import farthest_points
-from torch_modal.keyframes.registration.spectrum import SpectralShape
-from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Surface, referenced
+from torch_modal.registration.consistency import farthest_points
+from torch_modal.registration.spectrum import SpectralShape
+from torch_modal.registration.surface import FloatArray, IntArray, MeshSurface, referenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from _animals import animal, held_out, tips
@@ -70,7 +70,7 @@ def remeshed(
 
 def transported(points: FloatArray, source: FloatArray, target: FloatArray, faces: IntArray) -> FloatArray:
     """The points of another pose at the same places."""
-    surface = Surface(source, faces)
+    surface = MeshSurface(source, faces)
     return surface.rows(surface.closest(points)) @ target
 
 
@@ -103,7 +103,7 @@ def damaged(
 
 def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Five points spread over the template, and where they belong: what a person would pick."""
-    surface = Surface(rest, faces)
+    surface = MeshSurface(rest, faces)
     shape = SpectralShape(surface)
     chosen = surface.nearest_alike(shape.positions, shape.coarse.vertex_normals)[farthest_points(shape, 5)[0]]
     return rest[chosen], truth[chosen]
@@ -185,7 +185,7 @@ def across() -> dict[str, Any]:
     """Two animals of other proportions and tessellation, eight landmarks."""
     (first, first_faces, first_cones), (second, second_faces, second_cones) = animal("slender"), animal("stout")
     marks = [surface.closest(tips(cones)).points for surface, cones in (
-        (Surface(first, first_faces), first_cones), (Surface(second, second_faces), second_cones))]  # fmt: skip
+        (MeshSurface(first, first_faces), first_cones), (MeshSurface(second, second_faces), second_cones))]  # fmt: skip
     started = time.process_time()
     found = tm.register(
         first,
@@ -198,10 +198,10 @@ def across() -> dict[str, Any]:
         progress=False,
     )
     seconds = time.process_time() - started
-    here = Surface(first, first_faces)
+    here = MeshSurface(first, first_faces)
     others = [
         surface.closest(held_out(cones))
-        for surface, cones in ((here, first_cones), (Surface(second, second_faces), second_cones))
+        for surface, cones in ((here, first_cones), (MeshSurface(second, second_faces), second_cones))
     ]
     size = np.linalg.norm(np.ptp(second, axis=0))
     off = 100 / size * np.linalg.norm(here.rows(others[0]) @ found.positions.numpy() - others[1].points, axis=1)
@@ -232,7 +232,7 @@ def own_hand() -> tuple[FloatArray, IntArray, FloatArray]:
     return vertices, faces, places
 
 
-def web(surface: Surface, tips: tuple[int, int]) -> int:
+def web(surface: MeshSurface, tips: tuple[int, int]) -> int:
     """Where the shortest way along edges from one finger tip to another is farthest from both: between the fingers."""
     i, j = surface.edges.T
     lengths = np.linalg.norm(surface.vertices[i] - surface.vertices[j], axis=1)
@@ -249,7 +249,7 @@ def across_hands() -> dict[str, Any]:
     """A hand on a hand of another maker, eight landmarks; the webs between the four fingers are held out."""
     first, first_faces, places = own_hand()
     second, second_faces = (part[0] if part.ndim == 3 else part for part in poses("mh-hand"))
-    here, there = Surface(first, first_faces), Surface(second, second_faces)
+    here, there = MeshSurface(first, first_faces), MeshSurface(second, second_faces)
     marks = np.stack([cKDTree(first).query(places)[1], HAND_LANDMARKS], axis=1)
     started = time.process_time()
     found = tm.register(
@@ -282,7 +282,7 @@ def middle(name: str, i: int, j: int) -> dict[str, Any]:
         tm.subdivide(np.stack(pair), f, 1, progress=False)[1].numpy()
         for pair, f in (((rest, found.positions.numpy()), triangles), ((shapes[i], shapes[j]), faces))
     ]
-    mine, true = Surface(halves[0], triangles), Surface(halves[1], faces)
+    mine, true = MeshSurface(halves[0], triangles), MeshSurface(halves[1], faces)
     size = 100 / true.diagonal
     apart = [size * a.closest(b.vertices).distances for a, b in ((true, mine), (mine, true))]
     return {"case": f"{name} {i}-{j}", "mean": [a.mean() for a in apart], "max": [a.max() for a in apart],

@@ -21,7 +21,7 @@ from torch_modal.precompute import lanczos
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.lattice import lattice
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
 FloatArray = NDArray[np.float64]
@@ -63,7 +63,7 @@ OTHERS: dict[str, Callable[[sp.csc_matrix], Solve]] = {"cholespy": cholespy, "qd
 
 def solvers(vertices: FloatArray, faces: IntArray) -> None:
     """Print time and memory of each solver that is installed."""
-    surface = Surface.of(vertices, faces)
+    surface = CanonicalSurface.of(vertices, faces)
     missing = [name for name in OTHERS if importlib.util.find_spec(name) is None]
     if missing:
         print(f"not installed, so not compared: {', '.join(missing)}")
@@ -90,7 +90,7 @@ def solvers(vertices: FloatArray, faces: IntArray) -> None:
                 )
 
 
-def of_size(surface: Surface, n_vertices: int) -> Tetrahedra:
+def of_size(surface: CanonicalSurface, n_vertices: int) -> Tetrahedra:
     """A lattice in the surface, each tetrahedron cut into eight, with about so many vertices."""
     low, high = 0.01, 0.06
     for _ in range(12):

@@ -1,10 +1,10 @@
-"""``torch-modal register``: one mesh laid onto another, or numbered suggestions for landmarks."""
+"""``torch-modal register``: one mesh laid onto another."""
 
 import argparse
 from pathlib import Path
 
 from torch_modal.cli.output import check_name, check_output
-from torch_modal.io.formats import MESH_FORMATS, PICTURES
+from torch_modal.io.formats import MESH_FORMATS
 
 SUMMARY = "one mesh's connectivity laid onto others"
 DESCRIPTION = """\
@@ -17,9 +17,8 @@ with a line for each, which names one vertex of each mesh, counted from 0."""
 EXAMPLES = """\
 examples:
   torch-modal register open.obj scan.ply --out wrapped.obj
-  numbered suggestions for landmarks, in a picture:
-    torch-modal register cat.obj dog.obj --suggest numbers.png
-  and with the pairs that were typed from it, one a line:
+  landmarks are picked on a page, and saved there as pairs.txt:
+    torch-modal view cat.obj dog.obj --landmarks
     torch-modal register cat.obj dog.obj --across --landmarks pairs.txt --out wrapped.obj"""
 
 
@@ -27,12 +26,12 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``register`` besides the common ones."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
     suffixes = ", ".join(MESH_FORMATS)
-    sub.add_argument("--out", type=Path, metavar="FILE", help=f"the template laid onto the target, {suffixes}")
     sub.add_argument(
-        "--suggest",
+        "--out",
         type=Path,
-        metavar="PICTURE",
-        help="only draw both meshes with the numbers of vertices that make good landmarks, as .png or .pdf",
+        metavar="FILE",
+        required=True,
+        help=f"the template laid onto the target, {suffixes}",
     )
     sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     add_options(sub)
@@ -53,41 +52,15 @@ def add_options(sub: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run ``torch-modal register``."""
-    if (args.out is None) == (args.suggest is None):
-        args.fail("register needs either --out FILE or --suggest PICTURE")
-    file, option = (args.out, "--out") if args.out else (args.suggest, "--suggest")
-    check_name(args, option, file, MESH_FORMATS if args.out else PICTURES)
-    check_output([file], args.meshes, args.overwrite, option=option)
-    if args.suggest:
-        _suggest(args)
-    else:
-        _register(args)
-
-
-def _suggest(args: argparse.Namespace) -> None:
-    from torch_modal.io.read import read_mesh
-    from torch_modal.keyframes.registration.landmarks import suggest_landmarks
-    from torch_modal.view.landmarks import MarkedMesh, render_landmarks
-
-    marked = []
-    for mesh in args.meshes:
-        vertices, faces = read_mesh(mesh)
-        marked.append(MarkedMesh(mesh.name, vertices, faces, suggest_landmarks(vertices, faces)))
-    render_landmarks(marked, args.suggest, overwrite=args.overwrite)
-    if not args.quiet:
-        for mesh in marked:
-            print(f"{mesh.label}: " + " ".join(map(str, mesh.marked)))
-        print(f"picture: {args.suggest}; type pairs of its numbers that belong together, one a line, for --landmarks")
-
-
-def _register(args: argparse.Namespace) -> None:
     import warnings
 
     from torch_modal.io.frames import save_mesh
     from torch_modal.io.read import open_asset, read_mesh
-    from torch_modal.keyframes.registration.register import register
-    from torch_modal.keyframes.registration.sequence import ADVICE, landmark_table
+    from torch_modal.registration.register import register
+    from torch_modal.registration.sequence import ADVICE, landmark_table
 
+    check_name(args, "--out", args.out, MESH_FORMATS)
+    check_output([args.out], args.meshes, args.overwrite)
     asset = open_asset(args.meshes[0])
     vertices, faces = asset.positions, asset.faces
     there, there_faces = read_mesh(args.meshes[1])

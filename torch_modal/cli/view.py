@@ -156,7 +156,7 @@ def _landmarks(args: argparse.Namespace) -> None:
 
     import torch_modal as tm
     from torch_modal.io.read import read_mesh
-    from torch_modal.keyframes.registration.landmarks import landmark_vertices
+    from torch_modal.registration.landmarks import landmark_vertices
 
     meshes = [read_mesh(path) for path in args.meshes]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])

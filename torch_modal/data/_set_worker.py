@@ -25,8 +25,8 @@ from torch_modal.data.set_task import Options
 from torch_modal.data.stored import RECORD_FILE, write_set
 from torch_modal.errors import MeshError
 from torch_modal.io.files import write_atomically
-from torch_modal.keyframes.load import load_keyframes
 from torch_modal.precompute.modes import extract_bases
+from torch_modal.registration.load import load_keyframes
 
 ENOUGH = 30.0
 """Seconds after which a process that was told to end does so at once."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 
-from torch_modal.keyframes.load import load_keyframes
+from torch_modal.registration.load import load_keyframes
 
 FOLDER = Path(__file__).parents[1] / "samples"
 

@@ -33,7 +33,6 @@ class Poisson(nn.Module):
         mesh: The connectivity, of all vertices.
         weights: One for each edge, above 0. *Shape:* ``(E,)``.
         vertex_weights: Whose mean is a piece's centre, none below 0; by default all the same. *Shape:* ``(V,)``.
-        solver: What factorises.
     """
 
     edges: Tensor
@@ -42,15 +41,8 @@ class Poisson(nn.Module):
     shares: Tensor
     free: Tensor
 
-    def __init__(
-        self,
-        mesh: Connectivity,
-        weights: Tensor,
-        vertex_weights: Tensor | None = None,
-        solver: type[SparseSolver] = SparseSolver,
-    ) -> None:
+    def __init__(self, mesh: Connectivity, weights: Tensor, vertex_weights: Tensor | None = None) -> None:
         super().__init__()
-        self._kind = solver
         piece = torch.tensor(mesh.vertex_pieces)
         mass = torch.ones(len(piece)) if vertex_weights is None else vertex_weights.cpu()
         mass = mass.double() + torch.finfo(torch.float64).tiny  # for pieces without area
@@ -73,7 +65,7 @@ class Poisson(nn.Module):
     def _solver_of(self, weights: Tensor) -> SparseSolver:
         if self._made is None or not _equal(weights, self._made[0]):
             laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
-            self._made = weights, self._kind(laplacian, self.free.cpu().numpy())
+            self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy())
         return self._made[1]
 
     def forward(self, wanted: Tensor, near: Tensor) -> Tensor:

@@ -1,6 +1,15 @@
-"""Sparse symmetric systems: factorised by SciPy, and for tensors differentiable, the same for every sample."""
+"""Sparse symmetric positive definite systems. For tensors they are differentiable, and the same for every sample.
 
+:class:`SparseSolver` is CHOLMOD by ``cholespy``, on the CPU and on CUDA: nested dissection keeps its factors sparse on
+surfaces of any size. It has no wheels for Linux on ARM, where SciPy's SuperLU takes its place. :func:`factorize` is
+SuperLU: on tetrahedra its supernodes take half the time of ``cholespy``, which has none (docs/precompute.md), and it
+does not hold Python's interpreter lock.
+"""
+
+import ctypes
+import sys
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,10 +19,17 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
-from torch_modal.geometry.functions import applied, lasting
+from torch_modal.geometry.functions import applied
 
-# An inverse of so many unknowns takes 3.2 GB.
-MOST_DENSE = 20_000
+try:
+    import cholespy
+except ImportError:
+    cholespy = None
+
+Solve = Callable[[Tensor], Tensor]
+
+# At once: more take no less time for each, on CUDA no more than 128 are possible, and CHOLMOD keeps memory for them.
+MOST_COLUMNS = 48
 
 
 def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> SuperLU:
@@ -28,11 +44,10 @@ def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> Super
 
 
 class SparseSolver:
-    """The inverse of a sparse symmetric positive definite matrix.
+    """The inverse of a sparse symmetric positive definite matrix, in float64.
 
-    SciPy's sparse LU in float64 on the CPU. On a GPU, where triangular solves of one sample wait for each other and
-    products of matrices do not, the inverse itself, dense, up to :data:`MOST_DENSE` unknowns; beyond, tensors go to the
-    CPU and back. Backward solves once more. Factors and inverses are made at the first use, and again after pickling.
+    Solves run on the device of the right side; on other GPUs than the first, which ``cholespy`` does not know, on the
+    CPU. Backward solves once more. The matrix is factorised at the first use, and again after pickling.
 
     Args:
         matrix: *Shape:* ``(V, V)``.
@@ -42,57 +57,76 @@ class SparseSolver:
     def __init__(self, matrix: sparse.spmatrix, free: NDArray[np.int64] | None = None) -> None:
         self.n = matrix.shape[0]
         self.free = np.arange(self.n) if free is None else free
-        self._inner = matrix if free is None else matrix.tocsr()[free][:, free]
-        self._factor: SuperLU | None = None
-        self._inverses: dict[torch.device, Tensor] = {}
+        self._inner = matrix.tocsr() if free is None else matrix.tocsr()[free][:, free]
+        self._solves: dict[torch.device, Solve] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the factorisation, which cannot be pickled, and inverses, which are large."""
-        return {**self.__dict__, "_factor": None, "_inverses": {}}
+        """Without the factors, which cannot be pickled."""
+        return {**self.__dict__, "_solves": {}}
 
     def __call__(self, right: Tensor) -> Tensor:
-        """Solve for one or more columns. *Shape:* ``(..., V, m) -> (..., V, m)``."""
+        """Solve for one or more columns. *Shape:* ``(..., V, m) -> (..., V, m)``.
+
+        Raises:
+            ValueError: The matrix is not positive definite.
+        """
         return solve_by(lambda: self, right)
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same for arrays. *Shape:* ``(V, m) -> (V, m)``."""
-        if self._factor is None:
-            self._factor = factorize(self._inner)
-        out = np.zeros_like(right)
-        out[self.free] = self._factor.solve(right[self.free])
+        return self.solved(torch.from_numpy(right)).numpy()
+
+    def solved(self, right: Tensor) -> Tensor:
+        """The same without a gradient."""
+        device = right.device if _is_served(right.device) else torch.device("cpu")
+        columns = right.detach().to(device, torch.float64).movedim(-2, 0)
+        out = columns.new_zeros(columns.shape)
+        if len(self.free) and out.numel():
+            if device not in self._solves:
+                self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
+            free = torch.from_numpy(self.free).to(device)
+            parts = columns.index_select(0, free).flatten(1).split(MOST_COLUMNS, 1)
+            solved = [self._solves[device](part.contiguous()) for part in parts]
+            out.flatten(1).index_copy_(0, free, solved[0] if len(solved) == 1 else torch.cat(solved, 1))
+        return out.movedim(0, -2).to(right).contiguous()
+
+
+@cache
+def _is_served(device: torch.device) -> bool:
+    """Whether systems are solved there: cholespy knows the first GPU, if it finds the driver by its plain name."""
+    if device.type != "cuda" or device.index or cholespy is None or torch.version.cuda is None:
+        return device.type == "cpu"
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so")
+    except OSError:
+        return False
+    return True
+
+
+def _superlu(matrix: sparse.csr_matrix) -> Solve:
+    factor = factorize(matrix)
+    return lambda right: torch.from_numpy(factor.solve(right.numpy()))
+
+
+def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
+    whole = [torch.from_numpy(part.astype(np.int32)) for part in (matrix.indptr, matrix.indices)]
+    entries = [part.to(device) for part in (*whole, torch.from_numpy(matrix.data.astype(np.float64)))]
+    # By rows, which it copies: columns it would sort and free in place.
+    solver = cholespy.CholeskySolverD(matrix.shape[0], *entries, cholespy.MatrixType.CSR)
+
+    def solve(right: Tensor) -> Tensor:
+        out = torch.empty_like(right)
+        if device.type == "cpu":
+            solver.solve(right, out)
+            return out
+        # Its kernels run on the default stream, whatever the current one is.
+        current, default = torch.cuda.current_stream(device), torch.cuda.default_stream(device)
+        default.wait_stream(current)
+        solver.solve(right, out)
+        current.wait_stream(default)
         return out
 
-    def factors(self) -> list[Tensor]:
-        """``L D L^T`` of the matrix of the free unknowns.
-
-        Returns:
-            Which unknown is eliminated when; starts, rows and entries of the columns of ``L`` below its diagonal;
-            ``D``. Whole numbers are int32.
-        """
-        factor = factorize(self._inner)
-        below = sparse.tril(factor.L, -1, format="csc")
-        order = np.empty_like(self.free)
-        order[factor.perm_c] = self.free
-        whole = [torch.from_numpy(part.astype(np.int32)) for part in (order, below.indptr, below.indices)]
-        return [*whole, torch.from_numpy(below.data), torch.from_numpy(factor.U.diagonal())]
-
-    def has_inverse(self, device: torch.device) -> bool:
-        """Whether tensors there are multiplied by the inverse."""
-        return device.type != "cpu" and len(self.free) <= MOST_DENSE
-
-    def _inverse(self, device: torch.device) -> Tensor:
-        dense = torch.from_numpy(self._inner.toarray()).to(device)
-        return torch.cholesky_inverse(torch.linalg.cholesky(dense))
-
-    def times_inverse(self, right: Tensor) -> Tensor:
-        """The same by the dense inverse, in float64, on the device. *Shape:* ``(..., V, m) -> (..., V, m)``."""
-        if right.device not in self._inverses:
-            self._inverses[right.device] = lasting(self._inverse)(right.device)
-        free = torch.from_numpy(self.free).to(right.device)
-        columns = right.double().movedim(-2, 0)
-        solved = self._inverses[right.device] @ columns.index_select(0, free).flatten(1)
-        out = torch.zeros_like(columns).flatten(1).index_copy(0, free, solved)
-        return out.reshape(columns.shape).movedim(0, -2).to(right).contiguous()
+    return solve
 
 
 def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
@@ -108,12 +142,7 @@ def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
 class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
-        inverse = solver()
-        if inverse.has_inverse(right.device):
-            return inverse.times_inverse(right.detach())
-        columns = right.detach().double().cpu().movedim(-2, 0)
-        solved = inverse.solve(np.ascontiguousarray(columns.flatten(1).numpy()))
-        return torch.from_numpy(solved).reshape(columns.shape).movedim(0, -2).to(right).contiguous()
+        return solver().solved(right)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

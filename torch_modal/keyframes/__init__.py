@@ -1,1 +1,1 @@
-"""The border: key-frames from files and arrays, checked."""
+"""The border: key-frames from arrays, checked."""

@@ -10,7 +10,6 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.functions import applied, lasting, traced
 from torch_modal.geometry.local_rotations import Course, LocalRotations, weights_per_length
 from torch_modal.geometry.poisson import Poisson
-from torch_modal.geometry.sparse import SparseSolver
 from torch_modal.geometry.vectors import pick
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.fused_rotations import FusedRotations
@@ -38,8 +37,7 @@ class RotationBlend(nn.Module):
         super().__init__()
         self.rotations = (FusedRotations if fused else LocalRotations)(mesh, references)
         if poisson is None:
-            weights = weights_per_length(mesh, references)
-            poisson = Poisson(mesh, weights, solver=FusedSolver if fused else SparseSolver)
+            poisson = Poisson(mesh, weights_per_length(mesh, references))
         self.poisson = poisson
         self.fused = fused
         self.register_buffer("ends", self.poisson.edges.int(), persistent=False)
@@ -117,33 +115,6 @@ class Blends:
         turns = rotations.turns(pair[:1], pair[1:])[:, 0]
         one, other = torch.tensor(self.mesh.face_neighbours, device=turns.device).unbind(1)
         return bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
-
-
-class FusedSolver(SparseSolver):
-    """Whose solves of few columns on the CPU are a kernel's: SciPy's take two to three times as long."""
-
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
-        self._columns: list[Tensor] | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """As the other's."""
-        return {**super().__getstate__(), "_columns": None}
-
-    def has_inverse(self, device: torch.device) -> bool:
-        """As the other's."""
-        return device.type == "cpu" or super().has_inverse(device)
-
-    def times_inverse(self, right: Tensor) -> Tensor:
-        """As the other's. *Shape:* ``(..., V, 3) -> (..., V, 3)``."""
-        if right.device.type != "cpu":
-            return super().times_inverse(right)
-        if self._columns is None:
-            self._columns = lasting(self.factors)()
-        own = right.detach().double().reshape(-1, self.n, 3).contiguous()
-        work, out = own.new_empty(len(own), len(self.free), 3), torch.zeros_like(own)
-        launch(kernels("rotations").substituted, (len(own),), [own, *self._columns, self.n, work, out])
-        return out.reshape(right.shape).to(right)
 
 
 class _Pulls(torch.autograd.Function):

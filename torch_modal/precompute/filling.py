@@ -1,50 +1,36 @@
 """Key-frames filled with tetrahedra: meshed once for the whole set where that works."""
 
-import contextlib
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
-from torch_modal.precompute.lattice import is_too_fine, lattice
+from torch_modal.precompute.lattice import Lattice
 from torch_modal.precompute.proximity import parting, self_proximity
 from torch_modal.precompute.stiffness import mass_matrix
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
-    EDGE_RANGE,
+    Mesher,
     Tetrahedra,
     TetrahedralizationError,
-    TetrahedraSettings,
     kept_tetrahedra,
     loose_pieces,
-    pieces_by_sides,
     solid_volumes,
-    tetrahedralize,
 )
+from torch_modal.precompute.tetwild import TetrahedraSettings, TetWild
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Mesher = Literal["lattice", "tetwild"]
-MESHERS: tuple[Mesher, ...] = ("lattice", "tetwild")
-
-LATTICE_VERSION = "whole"
-"""Tetrahedra that other versions of the package have kept are not those of this one."""
-CUBE = 0.75
-"""Edge of the lattice's cubes at the surface, over the largest that fTetWild is asked for."""
-COARSER = 1.1
-"""Factor of that edge until there are not too many cubes."""
-TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
-"""A turn after which no axis is along or across another."""
+MESHERS: dict[str, Callable[[TetrahedraSettings], Mesher]] = {"lattice": Lattice, "tetwild": TetWild}
+"""By their names, made of how fine the tetrahedra are wanted."""
 
 MOST_PARTING = 0.014
 """Where parts that touch come further apart, carrying is not tried (:func:`~torch_modal.precompute.proximity.parting`).
@@ -60,7 +46,7 @@ class Body:
         tetrahedra: In the units of the surface.
     """
 
-    surface: Surface
+    surface: CanonicalSurface
     tetrahedra: Tetrahedra
     _lock: threading.RLock = field(default_factory=threading.RLock, init=False, repr=False, compare=False)
 
@@ -100,7 +86,7 @@ class Filling:
     """
 
     body: Body
-    surface: Surface
+    surface: CanonicalSurface
     tetrahedra: Tetrahedra
 
     def mass(self) -> sp.csr_matrix:
@@ -124,60 +110,39 @@ class Filler:
     """How surfaces are filled with tetrahedra; by several threads at once if need be.
 
     Attributes:
-        settings: How fine the tetrahedra are.
-        mesher: ``"lattice"`` or ``"tetwild"``.
-        timeout: Seconds that the child process of fTetWild may take.
-        cache: Where tetrahedra are kept.
-        stop: Set when they are no longer wanted: children are killed then.
+        mesher: Fills them.
+        timeout: Seconds that it may take for one.
+        cache: Where tetrahedra are stored.
+        stop: Set when they are no longer wanted: child processes are killed then.
     """
 
-    settings: TetrahedraSettings
     mesher: Mesher
     timeout: float
     cache: Cache
     stop: threading.Event = field(default_factory=threading.Event)
 
-    def body(self, surface: Surface) -> Body:
+    def body(self, surface: CanonicalSurface) -> Body:
         """The surface with tetrahedra of its own.
 
         Raises:
             TetrahedralizationError: No mesher could fill it.
         """
-        make = self._by_lattice if self.mesher == "lattice" else self._by_tetwild
-        kept = self._kept(surface, lambda: _as_arrays(make(surface)))
-        return _without_idle(Body(surface, Tetrahedra(**kept)))
+        key, inputs = self.mesher.key(), {"points": surface.points, "faces": surface.faces}
+        stored = self.cache.get("tetrahedra", inputs, key, lambda: _as_arrays(self._made(surface, inputs, key)))
+        return _without_idle(Body(surface, Tetrahedra(**stored)))
 
-    def _by_lattice(self, surface: Surface) -> Tetrahedra:
-        """By the lattice; in another direction, too, where that falls into pieces.
-
-        A thin wall that lies along the cubes' sides is in tetrahedra that hardly share any.
-        """
-        cube = CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
-        while is_too_fine(surface, cube):
-            cube *= COARSER
-        found = lattice(surface, cube)
-        pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
-        most = connected_pieces(pairs, len(surface.points)).max()
-        if pieces_by_sides(found.tets).max() <= most:
-            return found
-        turned = lattice(replace(surface, points=surface.points @ TURN.T), cube)
-        if pieces_by_sides(turned.tets).max() >= pieces_by_sides(found.tets).max():
-            return found
-        return turned._replace(vertices=turned.vertices @ TURN)
-
-    def _by_tetwild(self, surface: Surface) -> Tetrahedra:
-        """By fTetWild, unless it is known to fail: nobody should wait for the same failure twice."""
-        inputs, parameters = _content(surface), {**asdict(self.settings), **_mesher_versions()}
-        if (failure := self.cache.find("failure", inputs, parameters)) is not None:
+    def _made(self, surface: CanonicalSurface, inputs: Arrays, key: dict[str, Any]) -> Tetrahedra:
+        """Tetrahedra of the mesher, unless it is known to fail: nobody should wait for the same failure twice."""
+        key = {name: value for name, value in key.items() if name != "mesher"}
+        if (failure := self.cache.find("failure", inputs, key)) is not None:
             self._raise_known(failure)
         try:
-            return tetrahedralize(surface.points, surface.faces, self.settings, timeout=self.timeout, stop=self.stop)
+            return self.mesher.fill(surface, self.timeout, self.stop)
         except TetrahedralizationError as error:
             if error.fails_until > 0:
                 reason = np.frombuffer(str(error).encode(), dtype=np.uint8)
-                self.cache.keep(
-                    "failure", inputs, parameters, {"reason": reason, "fails_until": np.array([error.fails_until])}
-                )
+                failure = {"reason": reason, "fails_until": np.array([error.fails_until])}
+                self.cache.keep("failure", inputs, key, failure)
             raise
 
     def _raise_known(self, failure: Arrays) -> None:
@@ -192,12 +157,7 @@ class Filler:
             "--clear), or do without it"
         )
 
-    def _kept(self, surface: Surface, make: Callable[[], Arrays]) -> Arrays:
-        versions = _mesher_versions() if self.mesher == "tetwild" else {"lattice": LATTICE_VERSION}
-        parameters = {**asdict(self.settings), **versions, "mesher": self.mesher}
-        return dict(self.cache.get("tetrahedra", _content(surface), parameters, make))
-
-    def carried(self, body: Body, surface: Surface) -> Filling | None:
+    def carried(self, body: Body, surface: CanonicalSurface) -> Filling | None:
         """The body in the pose of another key-frame, or None if its tetrahedra do not survive that."""
 
         def compute() -> dict[str, NDArray[Any]]:
@@ -226,31 +186,15 @@ def _without_idle(body: Body) -> Body:
     return Body(body.surface, kept_tetrahedra(body.tetrahedra, bears[piece[body.tetrahedra.tets[:, 0]]]))
 
 
-def _mesher_versions() -> dict[str, str | None]:
-    """What the result of fTetWild depends on beside the surface and the settings, for the cache."""
-
-    def installed(name: str) -> str | None:
-        with contextlib.suppress(PackageNotFoundError):
-            return version(name)
-        return None  # the worker will say so
-
-    return {name: installed(name) for name in ("pytetwild", "fast-simplification")}
-
-
-def _content(surface: Surface) -> Arrays:
-    """What tetrahedra depend on, for the cache."""
-    return {"points": surface.points, "faces": surface.faces}
-
-
 def _as_arrays(tetrahedra: Tetrahedra) -> dict[str, NDArray[Any]]:
     return {name: array for name, array in tetrahedra._asdict().items() if array is not None}
 
 
-def meshing_order(surfaces: list[Surface]) -> list[int]:
+def meshing_order(surfaces: list[CanonicalSurface]) -> list[int]:
     """Key-frames in the order in which they should be filled: the one that touches itself least comes first."""
     return [int(i) for i in np.argsort([self_proximity(surface) for surface in surfaces], kind="stable")]
 
 
-def is_torn(rest: Surface, posed: Surface) -> bool:
+def is_torn(rest: CanonicalSurface, posed: CanonicalSurface) -> bool:
     """Whether it is known beforehand that tetrahedra of one pose do not survive being carried to another."""
     return parting(rest, posed) > MOST_PARTING

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.precompute.embedding import N_NEIGHBOURS, Neighbours, fit_weights
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra, is_small, kept_tetrahedra, loose_pieces
 
 FloatArray = NDArray[np.float64]
@@ -77,7 +77,7 @@ def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArr
     return near[found]
 
 
-def deforming(motions: FloatArray, surface: Surface) -> FloatArray:
+def deforming(motions: FloatArray, surface: CanonicalSurface) -> FloatArray:
     """Combinations of motions that deform a surface, without those that only move its pieces against each other.
 
     Those have no energy at any size, so nothing would say how far in-betweens follow them. Interpolation of the

@@ -4,19 +4,21 @@ Deterministic, and never at a loss.
 """
 
 import itertools
-from typing import NamedTuple
+import threading
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
-from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import halved
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.proximity import Clearance, clearances
-from torch_modal.precompute.sampling import Samples, sampled
-from torch_modal.precompute.surface import DIAGONAL, Surface
+from torch_modal.precompute.sampling import SurfaceSamples, sampled
+from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
@@ -25,11 +27,20 @@ from torch_modal.precompute.tetrahedra import (
     tet_volumes,
     without_debris,
 )
+from torch_modal.precompute.tetwild import EDGE_RANGE, TetrahedraSettings
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+VERSION = "whole"
+"""Tetrahedra that other versions of the package have stored are not those of this one."""
+CUBE = 0.75
+"""Edge of the lattice's cubes at the surface, over the largest edge of fTetWild."""
+COARSER = 1.1
+"""Factor of that edge until there are not too many cubes."""
+TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+"""A rotation after which no axis is along or across another."""
 ROOT = 2.0
 """Edge of the cubes that all tetrahedra come from by halving, over that of cubes at the surface."""
 ACROSS = 2.0
@@ -73,6 +84,36 @@ SPREAD = np.concatenate([np.eye(4) * 2 / 3 + 1 / 12, np.full((1, 4), 0.25)])
 """Points of a tetrahedron: from its corners a third of the way to the centroid, and the centroid."""
 
 
+@dataclass(frozen=True)
+class Lattice:
+    """The mesher ``"lattice"``: :func:`lattice`, in another direction where that falls into pieces.
+
+    A thin wall that lies along the cubes' sides is in tetrahedra that hardly share any. Of the settings it takes
+    ``edge_length_fac``.
+    """
+
+    settings: TetrahedraSettings = field(default_factory=TetrahedraSettings)
+
+    def key(self) -> dict[str, Any]:
+        """Settings, and a version."""
+        return {**asdict(self.settings), "lattice": VERSION, "mesher": "lattice"}
+
+    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
+        """Tetrahedra that fill the surface."""
+        cube = CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
+        while is_too_fine(surface, cube):
+            cube *= COARSER
+        found = lattice(surface, cube)
+        pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
+        most = connected_pieces(pairs, len(surface.points)).max()
+        if pieces_by_sides(found.tets).max() <= most:
+            return found
+        turned = lattice(replace(surface, points=surface.points @ TURN.T), cube)
+        if pieces_by_sides(turned.tets).max() >= pieces_by_sides(found.tets).max():
+            return found
+        return turned._replace(vertices=turned.vertices @ TURN)
+
+
 class Indicator(NamedTuple):
     """One inside a surface, zero outside.
 
@@ -87,7 +128,7 @@ class Indicator(NamedTuple):
     values: FloatArray
     low: FloatArray
     spacing: float
-    samples: Samples
+    samples: SurfaceSamples
     has_sides: BoolArray
 
     def inside(self, corners: FloatArray) -> FloatArray:
@@ -126,7 +167,7 @@ class Indicator(NamedTuple):
         return found
 
 
-def lattice(surface: Surface, edge_length_fac: float, clearance: Clearance | None = None) -> Tetrahedra:
+def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Clearance | None = None) -> Tetrahedra:
     """Cubes around a surface, cut into tetrahedra, with the outer vertices moved onto it where that is near.
 
     Where the body is thin, or another part of it is near, tetrahedra are halved until they are small enough.
@@ -191,12 +232,12 @@ def _sizes_at_vertices(tetrahedra: Tetrahedra) -> FloatArray:
     return sizes
 
 
-def is_too_fine(surface: Surface, edge_length_fac: float) -> bool:
+def is_too_fine(surface: CanonicalSurface, edge_length_fac: float) -> bool:
     """Whether a lattice with such cubes would have too many of them."""
     return bool(_box(surface, ROOT * edge_length_fac * DIAGONAL)[1].prod() > MOST_CUBES)
 
 
-def _box(surface: Surface, cell: float) -> tuple[FloatArray, IntArray]:
+def _box(surface: CanonicalSurface, cell: float) -> tuple[FloatArray, IntArray]:
     """Lowest corner of the cubes, and their numbers along the axes."""
     low = surface.points.min(axis=0) - 1.5 * cell
     return low, np.ceil((surface.points.max(axis=0) + 1.5 * cell - low) / cell).astype(np.int64)
@@ -262,7 +303,7 @@ def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
     return kept
 
 
-def _indicator(samples: Samples, low: FloatArray, spacing: float, counts: IntArray) -> FloatArray:
+def _indicator(samples: SurfaceSamples, low: FloatArray, spacing: float, counts: IntArray) -> FloatArray:
     """One inside, zero outside, on the points of a grid.
 
     Its gradient is minus the normal on the surface, so it solves a Poisson equation with the divergence of the

@@ -11,12 +11,13 @@ from torch_modal.io.cache import Cache
 from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import ENOUGH, N_RIGID
-from torch_modal.precompute.filling import MESHERS, Filler, Mesher
+from torch_modal.precompute.filling import MESHERS, Filler
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
-from torch_modal.precompute.surface import Surface
-from torch_modal.precompute.tetrahedra import TetrahedraSettings
+from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import Mesher
+from torch_modal.precompute.tetwild import TetrahedraSettings
 from torch_modal.progress import Progress, ProgressReport
 
 QUALITIES = {
@@ -36,7 +37,7 @@ def extract_modes(
     *,
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
-    mesher: Mesher = "lattice",
+    mesher: Mesher | str = "lattice",
     tolerance: float = ENOUGH,
     timeout: float = TIMEOUT,
     cache_dir: str | None = None,
@@ -51,7 +52,8 @@ def extract_modes(
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
         mesher: What fills the surface: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts
-            every surface; or ``"tetwild"``, fTetWild in a child process.
+            every surface; ``"tetwild"``, fTetWild in a child process; or a
+            :class:`~torch_modal.precompute.tetrahedra.Mesher`, which has settings of its own.
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
             more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
         timeout: Seconds that the child process of fTetWild may take.
@@ -89,7 +91,7 @@ def extract_bases(
     *,
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
-    mesher: Mesher = "lattice",
+    mesher: Mesher | str = "lattice",
     tolerance: float = ENOUGH,
     carry: bool = True,
     timeout: float = TIMEOUT,
@@ -112,7 +114,8 @@ def extract_bases(
         form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
         mesher: What fills the surface: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts
-            every surface; or ``"tetwild"``, fTetWild in a child process.
+            every surface; ``"tetwild"``, fTetWild in a child process; or a
+            :class:`~torch_modal.precompute.tetrahedra.Mesher`, which has settings of its own.
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
             more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
         carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each has its own.
@@ -136,11 +139,9 @@ def extract_bases(
     """
     if form not in HESSIAN_FORMS:
         raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
-    if mesher not in MESHERS:
-        raise ValueError(f"the mesher is {mesher!r}; give one of {MESHERS}")
     if not 0 < tolerance < np.inf:
         raise ValueError(f"the tolerance is {tolerance!r}; give a positive number, {ENOUGH:g} by default")
-    filler = Filler(_settings(settings), mesher, timeout, Cache.at(cache_dir, enabled=cache))
+    filler = Filler(_mesher(mesher, settings), timeout, Cache.at(cache_dir, enabled=cache))
     positions, working_faces = check_keyframes(keyframes, faces)
     return bases_of_checked(
         positions, working_faces, n_modes, filler, form=form, tolerance=tolerance, carry=carry, progress=progress
@@ -172,15 +173,15 @@ def bases_of_checked(
         progress: As there.
         meanwhile: Called while this goes on, by a processor that has nothing else to do, if there is one.
     """
-    filler = filler or Filler(QUALITIES["fast"], "lattice", TIMEOUT, Cache.at(None))
+    filler = filler or Filler(_mesher("lattice", "fast"), TIMEOUT, Cache.at(None))
     shapes = keyframes.detach().cpu().double().numpy()
     triangles = faces.cpu().numpy()
     _check_n_modes(n_modes, len(np.unique(triangles)))
-    surfaces: list[Surface] = []
+    surfaces: list[CanonicalSurface] = []
     for index, shape in enumerate(shapes):
         with naming_keyframe(index, len(shapes)):
             require_solid(shape, triangles)
-            surfaces.append(Surface.of(shape, triangles))
+            surfaces.append(CanonicalSurface.of(shape, triangles))
 
     with ProgressReport(2 * len(shapes), "vibration modes", progress) as bar:
 
@@ -203,12 +204,16 @@ def bases_of_checked(
     ]
 
 
-def _settings(settings: TetrahedraSettings | str) -> TetrahedraSettings:
-    if isinstance(settings, TetrahedraSettings):
-        return settings
-    if settings not in QUALITIES:
-        raise ValueError(f"settings are {settings!r}; give TetrahedraSettings or one of {tuple(QUALITIES)}")
-    return QUALITIES[settings]
+def _mesher(mesher: Mesher | str, settings: TetrahedraSettings | str) -> Mesher:
+    if not isinstance(settings, TetrahedraSettings):
+        if settings not in QUALITIES:
+            raise ValueError(f"settings are {settings!r}; give TetrahedraSettings or one of {tuple(QUALITIES)}")
+        settings = QUALITIES[settings]
+    if not isinstance(mesher, str):
+        return mesher
+    if mesher not in MESHERS:
+        raise ValueError(f"the mesher is {mesher!r}; give a Mesher or one of {tuple(MESHERS)}")
+    return MESHERS[mesher](settings)
 
 
 def _check_n_modes(n_modes: int, n_used: int) -> None:

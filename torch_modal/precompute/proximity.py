@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.precompute.parallel import closest_in
-from torch_modal.precompute.sampling import Samples, sampled
-from torch_modal.precompute.surface import DIAGONAL, Surface
+from torch_modal.precompute.sampling import SurfaceSamples, sampled
+from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -32,7 +32,7 @@ CELL = 0.005
 """Of so large cells one point is looked at for that."""
 
 
-def self_proximity(surface: Surface) -> float:
+def self_proximity(surface: CanonicalSurface) -> float:
     """Fraction of the area that has an opposing part of the surface near in front of it.
 
     From such a pose tetrahedra cannot be carried well: they fuse what touches.
@@ -41,7 +41,7 @@ def self_proximity(surface: Surface) -> float:
     return _opposed_part(surface, np.array([1 / 16, 1 / 8, 1 / 4, 1 / 2]) * NEAR * DIAGONAL)
 
 
-def parting(rest: Surface, posed: Surface) -> float:
+def parting(rest: CanonicalSurface, posed: CanonicalSurface) -> float:
     """How far parts of a surface that touch in one pose are from each other in another, in bounding-box diagonals.
 
     Root mean square over the surface of half of what the distance of a point to those near it grows by, at most.
@@ -77,7 +77,7 @@ class Clearance(NamedTuple):
     gap: FloatArray
 
 
-def clearances(surface: Surface) -> Clearance:
+def clearances(surface: CanonicalSurface) -> Clearance:
     """Diameters of the balls that touch a surface at samples and at an opposing part of it."""
     spacing = np.sqrt(surface.area / N_SAMPLES)
     samples = sampled(surface, np.full(len(surface.faces), spacing))
@@ -91,7 +91,7 @@ def clearances(surface: Surface) -> Clearance:
     return Clearance(*found)
 
 
-def _opposed_part(surface: Surface, distances: FloatArray) -> float:
+def _opposed_part(surface: CanonicalSurface, distances: FloatArray) -> float:
     """Fraction of the area from which a way along the normal leads to where another side is nearer."""
     step = max(len(surface.points) // SEEN_POINTS, 1)
     points, normals = surface.points[::step], surface.normals[::step]
@@ -104,7 +104,7 @@ def _opposed_part(surface: Surface, distances: FloatArray) -> float:
     return float(areas[opposed].sum() / areas.sum())
 
 
-def _opposed_radius(samples: Samples, side: float, seen: IntArray, most: float) -> FloatArray:
+def _opposed_radius(samples: SurfaceSamples, side: float, seen: IntArray, most: float) -> FloatArray:
     """Radii of the balls that touch at samples and at another side.
 
     They shrink until they are empty (Ma, Bae and Choi 2012), or touch something that is no other side, as in a corner.

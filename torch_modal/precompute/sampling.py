@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -16,7 +16,7 @@ LEAF = 32
 """Points that a search compares one by one; twice SciPy's, which takes a third off searches a little off a surface."""
 
 
-class Samples(NamedTuple):
+class SurfaceSamples(NamedTuple):
     """Points all over a surface.
 
     Attributes:
@@ -34,7 +34,7 @@ class Samples(NamedTuple):
     tree: cKDTree
 
 
-def sampled(surface: Surface, spacing: FloatArray) -> Samples:
+def sampled(surface: CanonicalSurface, spacing: FloatArray) -> SurfaceSamples:
     """Points over all faces, about so far apart in each, and one in each at least.
 
     Args:
@@ -60,7 +60,7 @@ def sampled(surface: Surface, spacing: FloatArray) -> Samples:
         faces.append(np.repeat(np.flatnonzero(chosen), n**2))
     places, normal = np.concatenate(points), np.concatenate(shares)
     areas = np.linalg.norm(normal, axis=1)
-    return Samples(
+    return SurfaceSamples(
         places,
         normal / np.maximum(areas, 1e-300)[:, None],
         areas,

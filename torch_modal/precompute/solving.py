@@ -16,7 +16,7 @@ from torch_modal.precompute.filling import Filler, Filling, is_torn, meshing_ord
 from torch_modal.precompute.following import deforming, larger_pieces
 from torch_modal.precompute.parallel import Budget, run_all
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, loose_pieces
 
 FloatArray = NDArray[np.float64]
@@ -61,7 +61,7 @@ class KeyframeSet:
         meanwhile: Called by a thread that has nothing else to do, see :func:`~torch_modal.precompute.parallel.run_all`.
     """
 
-    surfaces: list[Surface]
+    surfaces: list[CanonicalSurface]
     n_vertices: int
     filler: Filler
     n_modes: int

@@ -21,7 +21,7 @@ _DIAGONAL_RANGE = (1e-90, 1e90)
 
 
 @dataclass(frozen=True)
-class Surface:
+class CanonicalSurface:
     """A shape with its used vertices only, in its principal axes, centred, with a size of 100.
 
     So all that follows from it is the same however the caller's axes are turned and the faces are listed.
@@ -41,7 +41,7 @@ class Surface:
     axes: FloatArray
 
     @classmethod
-    def of(cls, shape: FloatArray, faces: IntArray) -> "Surface":
+    def of(cls, shape: FloatArray, faces: IntArray) -> "CanonicalSurface":
         """The surface of a checked shape.
 
         Args:

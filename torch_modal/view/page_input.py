@@ -14,7 +14,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.read import open_asset
-from torch_modal.keyframes.load import load_keyframes
+from torch_modal.registration.load import load_keyframes
 
 FRAME_SUFFIXES = (".ply", ".obj", ".off")
 GENERATOR = "torch_modal"

@@ -362,35 +362,3 @@ def pulls(
         both = ends[place(k, 0)]
         wp.atomic_add(out, place(s * n, both[0]), -pull)
         wp.atomic_add(out, place(s * n, both[1]), pull)
-
-
-@wp.kernel(enable_backward=False)
-def substituted(
-    right: wp.array(dtype=vec3),
-    order: wp.array(dtype=wp.int32),
-    start: wp.array(dtype=wp.int32),
-    row: wp.array(dtype=wp.int32),
-    entry: wp.array(dtype=real),
-    pivot: wp.array(dtype=real),
-    n: int,
-    work: wp.array(dtype=vec3),
-    out: wp.array(dtype=vec3),
-):
-    """Substitution with ``L D L^T``, ``L`` by its columns below the diagonal. One thread for a sample."""
-    s = wp.tid()
-    n_free = order.shape[0]
-    at = s * n_free
-    for k in range(n_free):
-        work[place(at, k)] = right[place(s * n, order[place(k, 0)])]
-    for k in range(n_free):
-        found = work[place(at, k)]
-        for p in range(start[place(k, 0)], start[place(k, 1)]):
-            to = place(at, row[place(p, 0)])
-            work[to] = work[to] - entry[place(p, 0)] * found
-    for j in range(n_free):
-        k = place(n_free - 1, -j)
-        found = work[place(at, k)] / pivot[k]
-        for p in range(start[k], start[place(k, 1)]):
-            found = found - entry[place(p, 0)] * work[place(at, row[place(p, 0)])]
-        work[place(at, k)] = found
-        out[place(s * n, order[k])] = found

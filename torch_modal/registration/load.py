@@ -59,7 +59,7 @@ def load_keyframes(
     if not paths:
         raise MeshError("paths is empty; pass one file per key-frame")
     if register:
-        from torch_modal.keyframes.registration.sequence import register_files
+        from torch_modal.registration.sequence import register_files
 
         return register_files(
             paths,

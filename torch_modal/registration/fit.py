@@ -7,9 +7,9 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from torch_modal.keyframes.registration.elastic import ElasticSurface, Pull
-from torch_modal.keyframes.registration.spectrum import SpectralShape
-from torch_modal.keyframes.registration.surface import BoolArray, Closest, FloatArray, IntArray, Surface
+from torch_modal.registration.elastic import ElasticSurface, PointTargets
+from torch_modal.registration.spectrum import SpectralShape
+from torch_modal.registration.surface import BoolArray, Closest, FloatArray, IntArray, MeshSurface
 
 WORKING_DIAGONAL = 100.0
 """Of the target's bounding box: reaches below are in percent of it."""
@@ -59,7 +59,7 @@ class Gate:
         return self._near[images, coarse]
 
 
-class Fit:
+class TemplateFit:
     """A template on its way to a target.
 
     Args:
@@ -75,9 +75,9 @@ class Fit:
 
     def __init__(
         self,
-        template: Surface,
-        target: Surface,
-        back: Surface,
+        template: MeshSurface,
+        target: MeshSurface,
+        back: MeshSurface,
         gate: Gate,
         images: IntArray,
         landmarks: tuple[sparse.csr_matrix, FloatArray] | None = None,
@@ -91,13 +91,13 @@ class Fit:
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
         self._back_coarse = gate.coarse(back.vertices)
-        self._fixed: list[Pull] = []
-        self._map: list[Pull] = []
+        self._fixed: list[PointTargets] = []
+        self._map: list[PointTargets] = []
         if landmarks is not None:
             self._fixed = [self._pull(*landmarks, np.full(len(landmarks[1]), _LANDMARK_WEIGHT))]
 
-    def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray) -> Pull:
-        return Pull(points, places, self.elastic.stiffness * weights)
+    def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray) -> PointTargets:
+        return PointTargets(points, places, self.elastic.stiffness * weights)
 
     def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
         """Towards the places that a map gives, softly; and from then on a little. *Shape:* ``(V, 3), (V, 3)``."""
@@ -130,7 +130,7 @@ class Fit:
             self.tick()
         return x
 
-    def _forth(self, shape: Surface, stage: Stage, released: BoolArray | None) -> Pull:
+    def _forth(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
         """Template vertices to their closest points on the target."""
         closest = self.target.closest(shape.vertices)
         places, normals = closest.points.copy(), self.target.face_normals[closest.faces]
@@ -150,7 +150,7 @@ class Fit:
         points = sparse.identity(len(used), format="csr")[kept]
         return self._pull(points, places[kept], stage.weight * self._share[kept])
 
-    def _and_back(self, shape: Surface, stage: Stage, released: BoolArray | None) -> Pull:
+    def _and_back(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
         """The template's points next to the target's vertices, pulled to these."""
         closest = shape.closest(self.back.vertices)
         corners = shape.faces[closest.faces]
@@ -175,7 +175,7 @@ class Fit:
         return spread
 
 
-def on_open_edge(surface: Surface, closest: Closest) -> BoolArray:
+def on_open_edge(surface: MeshSurface, closest: Closest) -> BoolArray:
     """Closest points on the boundary: what is really next to them may be missing. *Shape:* ``(n,)``."""
     if not surface.open_sides.any():
         return np.zeros(len(closest.faces), dtype=bool)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_modal.keyframes.registration.spectrum import SpectralShape
-from torch_modal.keyframes.registration.surface import FloatArray, IntArray
+from torch_modal.registration.spectrum import SpectralShape
+from torch_modal.registration.surface import FloatArray, IntArray
 
 COARSE_FUNCTIONS = 20
 FINE_FUNCTIONS = 50

@@ -10,13 +10,13 @@ import torch
 from torch_modal.errors import MeshError
 from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.keyframes.registration.landmarks import read_landmarks, vertices_named
-from torch_modal.keyframes.registration.register import register
-from torch_modal.keyframes.registration.surface import FloatArray, IntArray
+from torch_modal.registration.landmarks import read_landmarks, vertices_named
+from torch_modal.registration.register import register
+from torch_modal.registration.surface import FloatArray, IntArray
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
-    "0 (--landmarks FILE, landmarks=...); `torch-modal register --suggest PICTURE.png` draws numbered suggestions"
+    "0 (--landmarks FILE, landmarks=...); `torch-modal view MESH MESH --landmarks` opens a page to pick them on"
 )
 
 

@@ -10,12 +10,12 @@ from scipy.sparse.linalg import eigsh
 
 from torch_modal.geometry import inspect
 from torch_modal.geometry.decimation import decimate
-from torch_modal.keyframes.registration.libraries import require
-from torch_modal.keyframes.registration.surface import (
+from torch_modal.registration.libraries import require
+from torch_modal.registration.surface import (
     BoolArray,
     FloatArray,
     IntArray,
-    Surface,
+    MeshSurface,
     largest_piece,
     referenced,
     sewn,
@@ -38,12 +38,12 @@ class SpectralShape:
         n_vertices: About as many are kept.
     """
 
-    def __init__(self, surface: Surface, n_vertices: int = N_COARSE) -> None:
+    def __init__(self, surface: MeshSurface, n_vertices: int = N_COARSE) -> None:
         self.fine = surface
         coarse = decimated(surface, n_vertices)
         self.scale = np.sqrt(coarse.area)
         """Length of the fine surface's units that is one here."""
-        self.coarse = Surface(coarse.vertices / self.scale, coarse.faces)
+        self.coarse = MeshSurface(coarse.vertices / self.scale, coarse.faces)
 
     def __len__(self) -> int:
         """Number of coarse vertices."""
@@ -108,12 +108,12 @@ class SpectralShape:
         return self.placed.nearest_alike(points, normals)
 
     @cached_property
-    def placed(self) -> Surface:
+    def placed(self) -> MeshSurface:
         """The coarse copy in the units of the fine surface."""
-        return Surface(self.positions, self.coarse.faces)
+        return MeshSurface(self.positions, self.coarse.faces)
 
 
-def decimated(surface: Surface, n_vertices: int) -> Surface:
+def decimated(surface: MeshSurface, n_vertices: int) -> MeshSurface:
     """The largest piece, and those that a cut has parted from it, with fewer vertices.
 
     With no more than a fifth above, all are kept.
@@ -128,6 +128,6 @@ def decimated(surface: Surface, n_vertices: int) -> Surface:
     return main_part(referenced(vertices, faces)[0])
 
 
-def main_part(surface: Surface) -> Surface:
+def main_part(surface: MeshSurface) -> MeshSurface:
     """The largest piece, and those that a cut has parted from it."""
     return largest_piece(sewn(without_dust(surface), CUT))

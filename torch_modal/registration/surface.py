@@ -1,4 +1,4 @@
-"""A surface that is asked for its closest points."""
+"""Closest-point queries on a surface."""
 
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.normals import vertex_normals
-from torch_modal.keyframes.registration.libraries import require
+from torch_modal.registration.libraries import require
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -32,7 +32,7 @@ class Closest(NamedTuple):
     """*Shape:* ``(n, 3)``."""
 
 
-class Surface:
+class MeshSurface:
     """A triangle mesh with what is derived from it once.
 
     Args:
@@ -159,9 +159,9 @@ class Surface:
         where = (np.repeat(np.arange(n), 3), self.faces[closest.faces].reshape(-1))
         return sparse.csr_matrix((self.barycentric(closest).reshape(-1), where), shape=(n, len(self.vertices)))
 
-    def moved(self, vertices: FloatArray) -> "Surface":
+    def moved(self, vertices: FloatArray) -> "MeshSurface":
         """The same connectivity in another shape."""
-        return Surface(vertices, self.connectivity)
+        return MeshSurface(vertices, self.connectivity)
 
 
 def unit(vectors: FloatArray) -> FloatArray:
@@ -177,13 +177,13 @@ def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     return faces[:, ::-1].copy() if closed and signed_volume(centred, faces) < 0 else faces
 
 
-def referenced(vertices: FloatArray, faces: IntArray) -> tuple[Surface, IntArray]:
+def referenced(vertices: FloatArray, faces: IntArray) -> tuple[MeshSurface, IntArray]:
     """Without the vertices of no face; and which vertices are left. *Shape of the second:* ``(V',)``."""
     used, renumbered = np.unique(faces, return_inverse=True)
-    return Surface(vertices[used], renumbered.reshape(-1, 3)), used
+    return MeshSurface(vertices[used], renumbered.reshape(-1, 3)), used
 
 
-def without_dust(surface: Surface, share: float = 0.01) -> Surface:
+def without_dust(surface: MeshSurface, share: float = 0.01) -> MeshSurface:
     """The connected pieces with so much of the area, or the largest if none has."""
     pieces = surface.connectivity.vertex_pieces
     if pieces.max() == 0:
@@ -193,7 +193,7 @@ def without_dust(surface: Surface, share: float = 0.01) -> Surface:
     return referenced(surface.vertices, surface.faces[areas[of_faces] >= min(share * surface.area, areas.max())])[0]
 
 
-def sewn(surface: Surface, reach: float) -> Surface:
+def sewn(surface: MeshSurface, reach: float) -> MeshSurface:
     """Pieces whose edges lie side by side, as a cut leaves them, joined by strips of triangles.
 
     Args:
@@ -216,10 +216,10 @@ def sewn(surface: Surface, reach: float) -> Surface:
         distances, found = cKDTree(surface.vertices[others]).query(middle)
         near = distances < reach * surface.diagonal
         strips.append(np.column_stack([end[own], start[own], others[found]])[near])
-    return Surface(surface.vertices, np.concatenate([surface.faces, *strips]))
+    return MeshSurface(surface.vertices, np.concatenate([surface.faces, *strips]))
 
 
-def largest_piece(surface: Surface) -> Surface:
+def largest_piece(surface: MeshSurface) -> MeshSurface:
     """The connected piece with the largest area."""
     pieces = surface.connectivity.vertex_pieces
     if pieces.max() == 0:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
-from torch_modal.keyframes.registration.fit import on_open_edge
-from torch_modal.keyframes.registration.surface import BoolArray, FloatArray, Surface, referenced
+from torch_modal.registration.fit import on_open_edge
+from torch_modal.registration.surface import BoolArray, FloatArray, MeshSurface, referenced
 
 TRUSTED = 0.5
 """Confidence below which a result is doubtful."""
@@ -31,7 +31,7 @@ class Distances(NamedTuple):
     """Of the vertices."""
 
     @classmethod
-    def between(cls, surface: Surface, other: Surface, diagonal: float) -> "Distances":
+    def between(cls, surface: MeshSurface, other: MeshSurface, diagonal: float) -> "Distances":
         """From ``surface`` to ``other``."""
         distances = 100 / diagonal * other.closest(surface.vertices).distances
         weights = surface.vertex_areas / surface.vertex_areas.sum()
@@ -58,7 +58,7 @@ class Quality(NamedTuple):
         return self.stretch + 0.1 * (self.to_target.mean + self.from_target.mean) + self.flipped_area
 
 
-def measure(template: Surface, x: FloatArray, target: Surface) -> Quality:
+def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> Quality:
     """The quality of a shape of the template against the target."""
     shape = template.moved(x)
     target = _without_strays(target, shape)
@@ -81,7 +81,7 @@ def measure(template: Surface, x: FloatArray, target: Surface) -> Quality:
     )
 
 
-def _without_strays(target: Surface, shape: Surface) -> Surface:
+def _without_strays(target: MeshSurface, shape: MeshSurface) -> MeshSurface:
     """The target without its pieces that lie apart from the laid-on template; all of it, if all do."""
     pieces = target.connectivity.vertex_pieces
     if pieces.max() == 0:
@@ -92,7 +92,7 @@ def _without_strays(target: Surface, shape: Surface) -> Surface:
     return referenced(target.vertices, target.faces[kept])[0] if kept.any() else target
 
 
-def _unsupported(template: Surface, shape: Surface, target: Surface) -> BoolArray:
+def _unsupported(template: MeshSurface, shape: MeshSurface, target: MeshSurface) -> BoolArray:
     """Faces far from the target, beside a hole of it, or squeezed to nearly nothing. *Shape:* ``(F,)``."""
     closest = target.closest(shape.vertices[shape.faces].mean(1))
     open_there = on_open_edge(target, closest) & ~shape.on_boundary[shape.faces].any(1)

@@ -7,7 +7,7 @@ from scipy import sparse
 
 from torch_modal.geometry.connectivity import half_cotangents
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
-from torch_modal.keyframes.registration.surface import FloatArray, Surface
+from torch_modal.registration.surface import FloatArray, MeshSurface
 
 # Cotangent weights of obtuse triangles are negative, those of slivers huge.
 _WEIGHTS = (0.05, 10.0)
@@ -17,8 +17,8 @@ _SMOOTHING, _SMOOTHING_ROUNDS = 0.5, 2
 _SCALE_ROUNDS, _SCALES = 30, (0.3, 3.0)
 
 
-class Pull(NamedTuple):
-    """Places of points of the surface, with weights: ``sum_m weight_m |points_m x - targets_m|^2``."""
+class PointTargets(NamedTuple):
+    """Target positions of points of the surface, with weights: ``sum_m weight_m |points_m x - targets_m|^2``."""
 
     points: sparse.csr_matrix
     """*Shape:* ``(m, V)``."""
@@ -38,7 +38,7 @@ class ElasticSurface:
         stretchable: Whether parts may also grow and shrink, smoothly.
     """
 
-    def __init__(self, rest: Surface, *, stretchable: bool = False) -> None:
+    def __init__(self, rest: MeshSurface, *, stretchable: bool = False) -> None:
         self.rest, self.stretchable = rest, stretchable
         n, edges = len(rest.vertices), rest.edges
         weights = _cotangent_weights(rest)
@@ -77,7 +77,7 @@ class ElasticSurface:
             both = 0.5 * both + 0.5 * (self._mean @ both)
         return np.clip(np.sqrt(both[:, 0] / np.maximum(both[:, 1], 1e-30)), *_SCALES)
 
-    def follow(self, x: FloatArray, pulls: list[Pull], rounds: int = 2) -> FloatArray:
+    def follow(self, x: FloatArray, pulls: list[PointTargets], rounds: int = 2) -> FloatArray:
         """Some rounds of: rotations for fixed positions, positions for fixed rotations. *Shape:* ``(V, 3)``."""
         matrix, pulled = self.laplacian, np.zeros_like(x)
         for pull in pulls:
@@ -92,7 +92,7 @@ class ElasticSurface:
         return x
 
 
-def _cotangent_weights(surface: Surface) -> FloatArray:
+def _cotangent_weights(surface: MeshSurface) -> FloatArray:
     """Half the cotangents opposite to each edge, summed, within bounds. *Shape:* ``(E,)``."""
     mesh = surface.connectivity
     return np.clip(

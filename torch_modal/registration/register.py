@@ -13,10 +13,12 @@ from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.keyframes.registration.consistency import Consistency
-from torch_modal.keyframes.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Fit, Gate
-from torch_modal.keyframes.registration.landmarks import LandmarkPoints, landmark_points
-from torch_modal.keyframes.registration.maps import (
+from torch_modal.keyframes.seams import weld_seams
+from torch_modal.progress import Progress, ProgressReport
+from torch_modal.registration.consistency import Consistency
+from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Gate, TemplateFit
+from torch_modal.registration.landmarks import LandmarkPoints, landmark_points
+from torch_modal.registration.maps import (
     FINE_FUNCTIONS,
     N_OTHER_STARTS,
     Map,
@@ -25,11 +27,9 @@ from torch_modal.keyframes.registration.maps import (
     spectral_maps,
     zoom_out,
 )
-from torch_modal.keyframes.registration.report import Quality, Registration, judge, measure
-from torch_modal.keyframes.registration.spectrum import SpectralShape, main_part
-from torch_modal.keyframes.registration.surface import FloatArray, IntArray, Surface, outward, referenced
-from torch_modal.keyframes.seams import weld_seams
-from torch_modal.progress import Progress, ProgressReport
+from torch_modal.registration.report import Quality, Registration, judge, measure
+from torch_modal.registration.spectrum import SpectralShape, main_part
+from torch_modal.registration.surface import FloatArray, IntArray, MeshSurface, outward, referenced
 
 VERSION = 4
 """Part of the key of kept results: raise it when the algorithm changes."""
@@ -53,7 +53,7 @@ class _Candidate(NamedTuple):
     distortion: float
     scale: float
     x: FloatArray
-    fit: Fit
+    fit: TemplateFit
     quality: Quality
 
     @property
@@ -118,7 +118,7 @@ def register(
     def compute() -> dict[str, Any]:
         # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
         with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
-            return _Problem(own, other, points, same_subject, report).solve().arrays()
+            return _RegistrationProblem(own, other, points, same_subject, report).solve().arrays()
 
     inputs = {"template": own[0], "faces": own[1], "target": other[0], "target_faces": other[1]}
     marks = {"here": points.template, "there": points.target}
@@ -134,7 +134,7 @@ def register(
     )
 
 
-class _Problem:
+class _RegistrationProblem:
     """Two meshes in working units: the target around the origin with a diagonal of 100, the template of its area."""
 
     def __init__(
@@ -228,12 +228,12 @@ class _Problem:
         x = fit.run(x, COARSE_STAGES, releases=2)
         return _Candidate(found, distortion, scale, x, fit, measure(template, x, back))
 
-    def _fit(self, template: Surface, back: Surface, images: IntArray, scale: float) -> Fit:
+    def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray, scale: float) -> TemplateFit:
         landmarks = None
         if len(self.marks):
             rows = template.rows(template.closest(self.marks * scale))
             landmarks = (rows, self.mark_places)
-        return Fit(
+        return TemplateFit(
             template,
             self.target,
             back,
@@ -333,7 +333,7 @@ def _apart(places: FloatArray, others: FloatArray) -> float:
     return float(np.percentile(np.linalg.norm(places - others, axis=1), 98))
 
 
-def _normals(surface: Surface, points: FloatArray) -> FloatArray:
+def _normals(surface: MeshSurface, points: FloatArray) -> FloatArray:
     return surface.face_normals[surface.closest(points).faces]
 
 
@@ -344,7 +344,7 @@ def _placed(x: FloatArray, places: FloatArray, weights: FloatArray) -> FloatArra
         return best_fit(here, there, shares).apply(here).numpy()
 
 
-def _carried(points: FloatArray, coarse: Surface, x: FloatArray, frames: FloatArray) -> FloatArray:
+def _carried(points: FloatArray, coarse: MeshSurface, x: FloatArray, frames: FloatArray) -> FloatArray:
     """Points beside a coarse surface at rest, moved along with it. *Shape:* ``(n, 3)``."""
     rows: sparse.csr_matrix = coarse.rows(coarse.closest(points))
     # Each corner carries the point as its own frame says; the mean by barycentric weights.
