@@ -168,8 +168,8 @@ class TestDistortion:
 
     def test_needles_have_a_bounded_weight(self) -> None:
         e, b = torch.tensor([1.0, 0, 0]), torch.tensor([0.5, -1e-3, 0])
-        spokes = torch.stack([torch.stack([e, torch.tensor([0.5, h, 0]), b]) for h in (0.866, 1e-3, 0.0)], -1)
-        weights = _weights(spokes[:, :, None].double())[0]
+        edge_vectors = torch.stack([torch.stack([e, torch.tensor([0.5, h, 0]), b]) for h in (0.866, 1e-3, 0.0)], -1)
+        weights = _weights(edge_vectors[:, :, None].double())[0]
         assert weights[0] == pytest.approx(2 / 0.867, rel=1e-3) and weights[1:].tolist() == [8.0, 0.0]
 
     def test_what_is_not_finite_is_worse(self) -> None:

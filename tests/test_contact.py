@@ -9,6 +9,7 @@ import torch
 from conftest import Shapes
 from scipy.optimize import minimize
 from torch import Tensor
+from torch_modal.nn.active import ActiveContacts, Pull, settled
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
@@ -25,7 +26,6 @@ from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.contact_rounds import ContactRounds
 from torch_modal.nn.frame import Pair
-from torch_modal.nn.held import Held, Pull, settled
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence import contact, together
 from torch_modal.sequence import path as path_module
@@ -75,16 +75,16 @@ def test_term_measures_the_height_over_a_plane(generator: torch.Generator) -> No
     x = torch.randn(9, 3, dtype=DOUBLE, generator=generator)
     elements = torch.tensor([[0, 1, 2, 5], [3, 4, 5, 8], [6, 7, 8, 0]])
     energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [3, 4, 5], [6, 7, 8]]), 9), [Contact(elements)], sampled=True)
-    heights = energy.parts[0].measures(energy.parts[0].spokes(energy.extend(x[energy.vertices].T)))
+    heights = energy.parts[0].measures(energy.parts[0].edge_vectors(energy.extend(x[energy.vertices].T)))
     for (a, b, c, v), height in zip(x[elements].unbind(0), heights, strict=True):
         normal = torch.linalg.cross(b - a, c - a)
         assert float(height) == pytest.approx(float((v - b) @ normal / normal.norm()), abs=1e-12)
 
 
 def test_term_has_the_derivatives_of_torch_func(generator: torch.Generator) -> None:
-    spokes = torch.randn(3, 3, 2, 5, dtype=DOUBLE, generator=generator)
+    edge_vectors = torch.randn(3, 3, 2, 5, dtype=DOUBLE, generator=generator)
     term = Contact(torch.zeros(5, 4, dtype=torch.int64))
-    torch.testing.assert_close(term.gradients(spokes), Term.gradients(term, spokes), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(term.gradients(edge_vectors), Term.gradients(term, edge_vectors), rtol=1e-12, atol=1e-12)
 
 
 def test_positions_pull_to_places(generator: torch.Generator) -> None:
@@ -433,16 +433,16 @@ def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
         member, samples, pair = first_interval(hand, t, smooth, backend)
         x = member.frame.bring(member(samples, None).shapes, trees.picked(pair, samples.which), t)
         search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t)
-        held = search(x)
-        assert held is not None and held.samples.tolist() == [1]
-        held = held.of_all(torch.arange(2))
+        active = search(x)
+        assert active is not None and active.samples.tolist() == [1]
+        active = active.of_all(torch.arange(2))
         # One shape is free, the other is held, and a corner of both is pulled elsewhere.
         distance = (x[0] - x[0].amin(0)).norm(dim=-1)
         corner = distance <= distance.kthvalue(40).values
         pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas[0])
-        y = settled(member, samples, pair, x, held, pull, 10)
-        y = settled(member, samples, pair, y, held, pull, 10)
-        term = Held(held, x.shape[1])
+        y = settled(member, samples, pair, x, active, pull, 10)
+        y = settled(member, samples, pair, y, active, pull, 10)
+        term = ActiveContacts(active, x.shape[1])
         before, pushed = (term.value(z.contiguous()) for z in (x, y))
         assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(before[1])
         assert bool((pull.value(y) < 0.5 * pull.value(x)).all())
@@ -520,8 +520,8 @@ def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> N
     assert depth[:, 1].max() == 0 < depth[:, 0].max() < 0.1 and depth[tip, 0] > 0
     assert np.linalg.norm(known[0][depth[:, 0] > 0] - known[0][tip], axis=1).max() < 0.5 * search.crossings.diagonal
     slack = np.array([[2.0, 0.0]])
-    course = [float(search.tolerance(slack, t)[0, 0]) for t in (0.0, 0.02, 0.05, 0.07, 0.5)]
-    assert course[0] == 1 and course[3:] == [0, 0] and sorted(course, reverse=True) == course
+    trajectory = [float(search.tolerance(slack, t)[0, 0]) for t in (0.0, 0.02, 0.05, 0.07, 0.5)]
+    assert trajectory[0] == 1 and trajectory[3:] == [0, 0] and sorted(trajectory, reverse=True) == trajectory
     pairs = np.array([[int(face) for face in torch.nonzero((hand.faces == tip).any(1)).flatten()[:2]]])
     assert search.n_left(pairs, 0.02) == 0 and search.n_left(pairs, 0.5) == 1
 
@@ -532,9 +532,9 @@ def test_in_a_course_nothing_is_tolerated(hand: Shapes) -> None:
     mesh, t = Mesh.of(hand.faces, hand.keyframes.shape[1]), torch.tensor([0.02], dtype=DOUBLE)
     at_tip = torch.nonzero((hand.faces == hand.keyframes[0, :, 0].argmin()).any(1)).flatten()
     pairs = at_tip[:2].numpy()[None]
-    alone, course = (ContactSearch(mesh, first, second, None, t, is_tolerant=each) for each in (True, False))
-    assert alone.has_crossed and course.has_crossed
-    assert alone._told(0, pairs) == (1, 0) and course._told(0, pairs) == (1, 1)
+    alone, trajectory = (ContactSearch(mesh, first, second, None, t, is_tolerant=each) for each in (True, False))
+    assert alone.has_crossed and trajectory.has_crossed
+    assert alone._told(0, pairs) == (1, 0) and trajectory._told(0, pairs) == (1, 1)
 
 
 def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
@@ -544,16 +544,16 @@ def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
     deep = search.tolerated
     assert deep[:, 0].max() > 0 == deep[:, 1].max()
     x = 0.9 * stuck.keyframes[0] + 0.1 * hand.keyframes[0]
-    held = search(x.numpy(), search.crossings.within(deep[:, 0] > 0, 0.02))
-    beside = np.maximum(deep[held.vertices], deep[hand.faces.numpy()[held.faces]].max(1))
+    active = search(x.numpy(), search.crossings.within(deep[:, 0] > 0, 0.02))
+    beside = np.maximum(deep[active.vertices], deep[hand.faces.numpy()[active.faces]].max(1))
     assert (beside[:, 0] > 0).sum() > 10
-    np.testing.assert_array_equal(held.slack[beside > 0], beside[beside > 0])
+    np.testing.assert_array_equal(active.slack[beside > 0], beside[beside > 0])
 
 
 def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> None:
     differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
     differences = 64 * torch.cat([differences, 2 * torch.eye(7, dtype=DOUBLE)[:1]])  # and it goes on at the start
-    course = 8 * torch.randn(3, 8, 5, dtype=DOUBLE, generator=generator)
+    trajectory = 8 * torch.randn(3, 8, 5, dtype=DOUBLE, generator=generator)
     seen = torch.randn(3, 7, 5, dtype=DOUBLE, generator=generator)
     seen[..., 4] *= 1e-3
     # The coordinates of displacements turn as time goes on; accelerations are seen from outside.
@@ -562,15 +562,15 @@ def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> No
     turns[:, 0, 0], turns[:, 1, 1] = angle.cos(), angle.cos()
     turns[:, 1, 0], turns[:, 0, 1] = angle.sin(), -angle.sin()
     wanted = torch.einsum("tij,itv->jtv", turns, seen)
-    found, kept = AccelerationLimit(course, differences, turns, 25.0).nearest(wanted)
+    found, kept = AccelerationLimit(trajectory, differences, turns, 25.0).nearest(wanted)
     assert kept.tolist() == [0, 1, 2, 3]
     assert torch.equal(found[..., 4], wanted[..., 4]) and not torch.equal(found[..., 0], wanted[..., 0])
     turned = torch.einsum("tij,jtv->itv", turns, found)
-    assert float((course + differences @ turned).norm(dim=0).max()) < 25.0 * 1.02
+    assert float((trajectory + differences @ turned).norm(dim=0).max()) < 25.0 * 1.02
     for v in range(4):
 
         def room(x: np.ndarray, v: int = v) -> np.ndarray:
-            rows = course[..., v].numpy() + x.reshape(3, 7) @ differences.numpy().T
+            rows = trajectory[..., v].numpy() + x.reshape(3, 7) @ differences.numpy().T
             return 25.0**2 - (rows**2).sum(0)
 
         goal = seen[..., v].numpy().ravel()
@@ -678,7 +678,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
         def rows(self, some: Tensor) -> Tensor:
             return some
 
-    def rest(member: Any, own: Tensor, pair: Any, x: Tensor, held: Any, pull: Pull, n_products: int) -> Tensor:
+    def rest(member: Any, own: Tensor, pair: Any, x: Tensor, active: Any, pull: Pull, n_products: int) -> Tensor:
         own_springs = springs[own, None, None]
         pulls = pull.weights[:, None]
         found: Tensor = (own_springs * places[own] + pulls * pull.to) / (own_springs + pulls)

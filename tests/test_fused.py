@@ -270,8 +270,8 @@ class TestRotations:
         which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
 
         def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-            course = rotations.course(x[2:3], first, second, None, hours)
-            return kind.along(rotations, course, which, t)
+            trajectory = rotations.trajectory(x[2:3], first, second, None, hours)
+            return kind.along(rotations, trajectory, which, t)
 
         def by_warp(*given: Tensor) -> Tensor:
             return by(FusedRotations, *given)
@@ -366,8 +366,8 @@ class TestLayers:
             def elements(self, mesh: Mesh) -> Tensor:
                 return mesh.faces
 
-            def measure(self, spokes: Tensor) -> Tensor:
-                return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+            def measure(self, edge_vectors: Tensor) -> Tensor:
+                return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
 
         class Spring(tm.Term):
             sampled = True
@@ -379,8 +379,8 @@ class TestLayers:
             def elements(self, mesh: Mesh) -> Tensor:
                 return torch.tensor([[mesh.first_anchor, 5]])
 
-            def measure(self, spokes: Tensor) -> Tensor:
-                return spokes[0].square().sum()
+            def measure(self, edge_vectors: Tensor) -> Tensor:
+                return edge_vectors[0].square().sum()
 
         objective = tm.Objective(terms=(Area(0.3), Volume(1.0), Spring(1e-3)))
         n, t = (3, 1.3) if smooth else (2, 0.3)
@@ -411,11 +411,11 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
     """Also by ``python -O``. Indices have 32 bits: beyond, they would wrap."""
     x = torch.zeros(4, 3, dtype=DOUBLE)
     normal, total = torch.zeros_like(x), torch.zeros(1, dtype=DOUBLE)
-    walls = torch.zeros(2, 3, dtype=torch.int32)
+    capped_faces = torch.zeros(2, 3, dtype=torch.int32)
     volume = launch.kernels("shell").volume
     for wrong in (x.float(), torch.zeros(3, 4, dtype=DOUBLE).T):
         with pytest.raises(ValueError, match=r"contiguous tensor of torch\.float64"):
-            launch.launch(volume, (1, 2), [wrong, None, walls, 4, total, normal])
+            launch.launch(volume, (1, 2), [wrong, None, capped_faces, 4, total, normal])
     huge = torch.empty(2**31, 3, dtype=DOUBLE, device="meta")
     with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):
         launch._length(huge, 3, DOUBLE)

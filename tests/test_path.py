@@ -49,7 +49,7 @@ def path(motion: Shapes) -> Path:
 def test_half_way_it_is_the_four_point_scheme(generator: torch.Generator) -> None:
     a, b, c, d = 0.1 * torch.randn(4, 50, dtype=DOUBLE, generator=generator) + times(0, 1, 2, 3)[:, None]
     even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
-    bend = hermite.excess(c - b, b - a, d - c, even)
+    bend = hermite.tangent_offset(c - b, b - a, d - c, even)
     half = b + 0.5 * (c - b) + hermite.beyond(bend, times(0.5))
     torch.testing.assert_close(half, 9 / 16 * (b + c) - 1 / 16 * (a + d))
 
@@ -60,7 +60,7 @@ def test_a_parabola_is_followed_whatever_the_spacing() -> None:
 
     knots, u = times(0.0, 0.7, 1.9, 2.4), torch.linspace(0, 1, 9, dtype=DOUBLE)
     steps, h = at(knots).diff(), hermite.Spacing(*knots.diff())
-    bend = hermite.excess(steps[1], steps[0], steps[2], h)
+    bend = hermite.tangent_offset(steps[1], steps[0], steps[2], h)
     found = at(knots[1]) + u * steps[1] + hermite.beyond(bend, u)
     torch.testing.assert_close(found, at(knots[1] + u * h.own))
 
@@ -72,10 +72,10 @@ def test_what_stops_does_not_overshoot() -> None:
     u = torch.linspace(0, 1, 33, dtype=DOUBLE)
     for i in range(1, 4):
         steps = places.diff()
-        bend = hermite.excess(steps[i], steps[i - 1], steps[i + 1], even)
-        course = places[i] + u * steps[i] + hermite.beyond(bend, u)
-        assert bool((course.diff() >= -1e-12).all())
-    rest = hermite.excess(places.diff()[2], places.diff()[1], places.diff()[3], even)
+        bend = hermite.tangent_offset(steps[i], steps[i - 1], steps[i + 1], even)
+        trajectory = places[i] + u * steps[i] + hermite.beyond(bend, u)
+        assert bool((trajectory.diff() >= -1e-12).all())
+    rest = hermite.tangent_offset(places.diff()[2], places.diff()[1], places.diff()[3], even)
     assert largest(hermite.beyond(rest, u)) == 0
 
 
@@ -84,10 +84,10 @@ def test_ends_are_natural() -> None:
     step, after = times(1.0), times(1.6)
     even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
     u = torch.tensor(0.0, dtype=DOUBLE, requires_grad=True)
-    value = hermite.beyond(hermite.excess(step, None, after, even), u).sum()
+    value = hermite.beyond(hermite.tangent_offset(step, None, after, even), u).sum()
     (first,) = torch.autograd.grad(value, u, create_graph=True)
     assert float(torch.autograd.grad(first, u)[0]) == pytest.approx(0, abs=1e-12)
-    alone = hermite.excess(step, None, None, even)
+    alone = hermite.tangent_offset(step, None, None, even)
     assert largest(alone.first) == largest(alone.last) == 0
 
 
@@ -175,9 +175,9 @@ def test_velocities_are_continuous(path: Path, motion: Shapes) -> None:
     h, keys = 1e-3, times(1.0, 2.0, 3.0)
     pair = Path(motion.bases, motion.faces, smooth=False)
 
-    def jump(course: Path) -> float:
-        left = (course(motion.keyframes, keys) - course(motion.keyframes, keys - h)) / h
-        right = (course(motion.keyframes, keys + h) - course(motion.keyframes, keys)) / h
+    def jump(trajectory: Path) -> float:
+        left = (trajectory(motion.keyframes, keys) - trajectory(motion.keyframes, keys - h)) / h
+        right = (trajectory(motion.keyframes, keys + h) - trajectory(motion.keyframes, keys)) / h
         return largest(right - left)
 
     assert jump(path) < 0.02 * jump(pair)
@@ -189,8 +189,8 @@ def test_velocities_are_continuous_where_edges_change(bars: Shapes) -> None:
     x[1] *= 1 + 0.5 * torch.sin(3 * x[1][:, :1])
     bases = [dataclasses.replace(basis, reference=shape) for basis, shape in zip(bars.bases, x, strict=True)]
     jumps = [
-        largest((course(x, key + h) + course(x, key - h) - 2 * x[1]) / h)
-        for course in (Path(bases, bars.faces, smooth=smooth) for smooth in (True, False))
+        largest((trajectory(x, key + h) + trajectory(x, key - h) - 2 * x[1]) / h)
+        for trajectory in (Path(bases, bars.faces, smooth=smooth) for smooth in (True, False))
     ]
     assert jumps[0] < 1e-4 * jumps[1]
 
@@ -280,8 +280,8 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
         def elements(self, mesh: "tm.energy.terms.Mesh") -> Tensor:  # type: ignore[name-defined]
             return mesh.faces
 
-        def measure(self, spokes: Tensor) -> Tensor:
-            return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+        def measure(self, edge_vectors: Tensor) -> Tensor:
+            return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
 
         def at_rest(self, measures: Tensor) -> Tensor:
             return 0.9 * measures

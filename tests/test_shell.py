@@ -238,9 +238,9 @@ def test_gradcheck_of_an_open_surface(pair: tuple[Tensor, Tensor, Tensor]) -> No
 
 
 def test_closed_forms_are_the_gradients(generator: torch.Generator) -> None:
-    spokes = torch.randn(3, 3, 50, dtype=torch.float64, generator=generator, requires_grad=True)
-    (truth,) = torch.autograd.grad(dihedral_angle(spokes).sum(), spokes)
-    torch.testing.assert_close(dihedral_gradient(spokes), truth, atol=1e-10, rtol=1e-10)
+    edge_vectors = torch.randn(3, 3, 50, dtype=torch.float64, generator=generator, requires_grad=True)
+    (truth,) = torch.autograd.grad(dihedral_angle(edge_vectors).sum(), edge_vectors)
+    torch.testing.assert_close(dihedral_gradient(edge_vectors), truth, atol=1e-10, rtol=1e-10)
     edges = torch.randn(3, 50, dtype=torch.float64, generator=generator, requires_grad=True)
     (truth,) = torch.autograd.grad(norm(edges).sum(), edges)
     torch.testing.assert_close(length_gradient(edges), truth, atol=1e-14, rtol=1e-14)

@@ -46,8 +46,8 @@ class Edges(tm.Term):
     def elements(self, mesh: Any) -> Tensor:
         return mesh.edges
 
-    def measure(self, spokes: Tensor) -> Tensor:
-        return spokes[0].norm()
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return edge_vectors[0].norm()
 
 
 CASES: dict[str, Case] = {

@@ -24,8 +24,8 @@ class Area(Term):
     def elements(self, mesh: Mesh) -> Tensor:
         return mesh.faces
 
-    def measure(self, spokes: Tensor) -> Tensor:
-        return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
 
 
 class Spring(Term):
@@ -46,8 +46,8 @@ class Spring(Term):
         places = torch.arange(len(self.vertices))
         return torch.stack([mesh.first_anchor + places, torch.tensor(self.vertices)], 1)
 
-    def measure(self, spokes: Tensor) -> Tensor:
-        return spokes[0].norm()
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return edge_vectors[0].norm()
 
     def at_rest(self, measures: Tensor) -> Tensor:
         return torch.zeros_like(measures)
@@ -68,8 +68,8 @@ class Pull(Term):
         vertices = torch.arange(mesh.n_vertices)
         return torch.stack([torch.full_like(vertices, mesh.first_anchor), vertices], 1)
 
-    def measure(self, spokes: Tensor) -> Tensor:
-        return spokes[0].norm()
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return edge_vectors[0].norm()
 
     at_rest = Spring.at_rest
 

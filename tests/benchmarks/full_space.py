@@ -226,7 +226,9 @@ class _Assembly:
                 ends = part.to_corners(one.gradients).unflatten(-1, (len(part.corners), -1)).movedim(-2, 0)
                 n = len(ends)
                 parts += [one.curvature * ends[s][:, None] * ends[t] for s in range(n) for t in range(s + 1, n)]
-            own = torch.cat(list(part.term.blocks(one.spokes, one.slope.clamp_min(0) if convex else one.slope)), -1)
+            own = torch.cat(
+                list(part.term.blocks(one.edge_vectors, one.slope.clamp_min(0) if convex else one.slope)), -1
+            )
             curved.append(own if not convex or isinstance(part.term, Stretch) else torch.zeros_like(own))
         return self.blocks(torch.cat([*parts, *curved], -1))
 

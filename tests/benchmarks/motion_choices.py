@@ -38,17 +38,17 @@ def without_limit() -> Iterator[None]:
 def ends(part: float) -> Iterator[None]:
     """The excess at an end is this part of the other: -1/2 is natural, -1 is a parabola, 0 the speed of the step."""
 
-    def excess(step: Tensor, before: Tensor | None, after: Tensor | None, *rest: Any) -> hermite.Excess:
-        found = hermite.excess(step, before, after, *rest)
+    def tangent_offset(step: Tensor, before: Tensor | None, after: Tensor | None, *rest: Any) -> hermite.TangentOffset:
+        found = hermite.tangent_offset(step, before, after, *rest)
         if before is None and after is not None:
-            return hermite.Excess(part * found.last, found.last)
+            return hermite.TangentOffset(part * found.last, found.last)
         if after is None and before is not None:
-            return hermite.Excess(found.first, part * found.first)
+            return hermite.TangentOffset(found.first, part * found.first)
         return found
 
     with ExitStack() as stack:
         for user in USERS:
-            stack.enter_context(mock.patch(f"{user}.excess", excess))
+            stack.enter_context(mock.patch(f"{user}.tangent_offset", tangent_offset))
         yield
 
 

@@ -80,7 +80,7 @@ def _fit_interval(
     on_frame: Callable[[], None],
 ) -> None:
     interval = decoder.interval(i)
-    rotation = torch.quantile(interval.course.step[:3].norm(dim=0).flatten()[::7], QUANTILE)
+    rotation = torch.quantile(interval.trajectory.step[:3].norm(dim=0).flatten()[::7], QUANTILE)
     n_parts = int(float(rotation) / MAX_ROTATION) + 1
     part_of = (u[rows] * n_parts).long().clamp(0, n_parts - 1)
     a = torch.zeros(decoder.n_modes).double()

@@ -64,4 +64,6 @@ class Curvature(PairBlocks):
     def of(self, energy: Energy, at: Sequence[Linearised]) -> Tensor:
         """The blocks at given shapes. *Shape:* ``(3, 3, B, P)``."""
         parts = zip(energy.parts, at, strict=True)
-        return self(torch.cat([block for part, one in parts for block in part.term.blocks(one.spokes, one.slope)], -1))
+        return self(
+            torch.cat([block for part, one in parts for block in part.term.blocks(one.edge_vectors, one.slope)], -1)
+        )

@@ -39,9 +39,9 @@ class Contact(Term):
         """As given."""
         return self.elements_
 
-    def measure(self, spokes: Tensor) -> Tensor:
+    def measure(self, edge_vectors: Tensor) -> Tensor:
         """Height of the vertex over the plane of the face."""
-        side, other, to_vertex = spokes
+        side, other, to_vertex = edge_vectors
         doubled = cross(side, other)
         length = norm(doubled)
         return (doubled * to_vertex).sum(0) * inverse(length, length <= 0)
@@ -56,9 +56,9 @@ class Contact(Term):
         """What is missing; nothing where the gap is kept."""
         return (measures - rest).clamp_max(0)
 
-    def gradients(self, spokes: Tensor) -> Tensor:
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
         """The unit normal for the vertex; the sides of the face turn it."""
-        side, other, to_vertex = spokes
+        side, other, to_vertex = edge_vectors
         doubled = cross(side, other)
         length = norm(doubled)
         per_length = inverse(length, length <= 0)

@@ -39,10 +39,10 @@ class Reference(NamedTuple):
 class Linearised(NamedTuple):
     """One term at given shapes."""
 
-    spokes: Tensor
+    edge_vectors: Tensor
     """*Shape:* ``(n-1, 3, B, M)``."""
     gradients: Tensor
-    """Of the measures in the spokes, *shape* ``(n-1, 3, B, M)``; of a total in the vertices, *shape* ``(3, B, V)``."""
+    """Of the measures in the edge vectors, *shape* ``(n-1, 3, B, M)``; of a total in the vertices, ``(3, B, V)``."""
     difference: Tensor
     """From the reference. *Shape:* ``(B, R, M)``; M is 1 of a total, here and below."""
     slope: Tensor
@@ -91,23 +91,23 @@ class OnMesh(nn.Module):
         """The term."""
         return self._term[0]
 
-    def spokes(self, rows: Tensor) -> Tensor:
+    def edge_vectors(self, rows: Tensor) -> Tensor:
         """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
         first, *others = (pick(rows, corner) for corner in self.corners)
         return torch.stack([other - first for other in others])
 
-    def measures(self, spokes: Tensor) -> Tensor:
+    def measures(self, edge_vectors: Tensor) -> Tensor:
         """What the energy sees of them: the measures, or their sum. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
-        measures = self.term.measures(spokes)
+        measures = self.term.measures(edge_vectors)
         return measures.sum(-1, keepdim=True) if self.term.total else measures
 
     def acting(self, weight: Tensor, difference: Tensor) -> Tensor:
         """The weights where the measures are stiff. *Shape:* ``(B, R, M)``."""
         return torch.where(difference == 0, 0, weight) if self.term.one_sided else weight
 
-    def to_corners(self, on_spokes: Tensor) -> Tensor:
-        """From the spokes to the vertices of the elements. *Shape:* ``(n-1, 3, ..., M) -> (3, ..., n M)``."""
-        return torch.cat([-on_spokes.sum(0), *on_spokes], -1)
+    def to_corners(self, on_edge_vectors: Tensor) -> Tensor:
+        """From the edge vectors to the vertices of the elements. *Shape:* ``(n-1, 3, ..., M) -> (3, ..., n M)``."""
+        return torch.cat([-on_edge_vectors.sum(0), *on_edge_vectors], -1)
 
 
 class Energy(nn.Module):
@@ -185,10 +185,10 @@ class Energy(nn.Module):
         """Measures and weights of rest shapes. *Shape:* ``(3, ..., V)``, extended."""
         measures, weights = [], []
         for part in self.parts:
-            spokes = part.spokes(extended)
-            found = part.measures(spokes)
+            edge_vectors = part.edge_vectors(extended)
+            found = part.measures(edge_vectors)
             measures.append(part.term.at_rest(found))
-            weights.append(part.term.weights(spokes, found))
+            weights.append(part.term.weights(edge_vectors, found))
         return Rest(tuple(measures), tuple(weights))
 
     def between(self, first: Rest, second: Rest, t: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
@@ -212,10 +212,10 @@ class Energy(nn.Module):
                 continue
             whole = pull_a + pull_b
             share = pull_b * inverse(whole, whole <= 0)
-            apart = part.term.difference(second.measures[i], first.measures[i])
-            measures.append((first.measures[i] + share * apart)[..., None, :])
+            difference = part.term.difference(second.measures[i], first.measures[i])
+            measures.append((first.measures[i] + share * difference)[..., None, :])
             weights.append((factor * whole)[..., None, :])
-            constant = constant + (factor * pull_a * share * apart**2).sum(-1)
+            constant = constant + (factor * pull_a * share * difference**2).sum(-1)
         return Reference(tuple(measures), tuple(weights), constant)
 
     @staticmethod
@@ -229,7 +229,7 @@ class Energy(nn.Module):
         """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
         total: Any = reference.constant
         for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
-            difference = part.term.difference(part.measures(part.spokes(extended))[..., None, :], rest)
+            difference = part.term.difference(part.measures(part.edge_vectors(extended))[..., None, :], rest)
             total = total + (weight * difference**2).sum((-1, -2))
         return total
 
@@ -238,15 +238,15 @@ class Energy(nn.Module):
         """All terms at given shapes. *Shape:* ``(3, B, V)``, extended."""
         found = []
         for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
-            spokes = part.spokes(extended)
-            measures = part.measures(spokes)
-            gradients = part.term.gradients(spokes)
+            edge_vectors = part.edge_vectors(extended)
+            measures = part.measures(edge_vectors)
+            gradients = part.term.gradients(edge_vectors)
             if part.term.total:
                 corners = part.to_corners(gradients)
                 gradients = torch.zeros_like(extended).index_add(-1, part.corners.flatten(), corners)
             difference = part.term.difference(measures[..., None, :], rest)
             slope, curvature = 2 * (weight * difference).sum(-2), 2 * part.acting(weight, difference).sum(-2)
-            found.append(Linearised(spokes, gradients, difference, slope, curvature.expand_as(slope)))
+            found.append(Linearised(edge_vectors, gradients, difference, slope, curvature.expand_as(slope)))
         return found
 
     @staticmethod
@@ -261,7 +261,7 @@ class Energy(nn.Module):
         return [
             (one.gradients * field).sum((0, -1))[:, None]
             if part.term.total
-            else (one.gradients * part.spokes(field)).sum((0, 1))
+            else (one.gradients * part.edge_vectors(field)).sum((0, 1))
             for part, one in zip(self.parts, at, strict=True)
         ]
 
@@ -270,8 +270,8 @@ class Energy(nn.Module):
 
         Args:
             at: Gives the gradients of totals.
-            on_elements: Of each term what its spokes receive, *shape* ``(n-1, 3, B, M)``; of a total, the factor of its
-                gradient, *shape* ``(B, 1)``.
+            on_elements: Of each term what its edge vectors receive, *shape* ``(n-1, 3, B, M)``; of a total, the factor
+                of its gradient, *shape* ``(B, 1)``.
 
         Returns:
             *Shape:* ``(3, B, V)``, extended.

@@ -21,17 +21,17 @@ def length_gradient(edge: Tensor) -> Tensor:
     return edge * inverse(squared.sqrt(), squared <= tiny(edge))
 
 
-def dihedral_angle(spokes: Tensor) -> Tensor:
+def dihedral_angle(edge_vectors: Tensor) -> Tensor:
     """Signed angle between the normals of the two triangles of a hinge, 0 where flat, in ``(-pi, pi]``.
 
     With the edge ``e``, ``n1 = e x a`` and ``n2 = b x e``, the sine is ``(n1 x n2).e/|e| = -|e| n1.b`` and the cosine
     ``n1.n2``, both up to the factor ``|n1||n2|``.
 
     Args:
-        spokes: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` of a row of
+        edge_vectors: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` of a row of
             :attr:`~torch_modal.geometry.connectivity.Connectivity.hinges`, components second. *Shape:* ``(3, 3, ...)``.
     """
-    e, a, b = spokes
+    e, a, b = edge_vectors
     n1 = cross(e, a)
     n2 = cross(b, e)
     sine = -norm(e) * (n1 * b).sum(0)
@@ -41,16 +41,16 @@ def dihedral_angle(spokes: Tensor) -> Tensor:
     return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
 
 
-def dihedral_gradient(spokes: Tensor) -> Tensor:
+def dihedral_gradient(edge_vectors: Tensor) -> Tensor:
     """Gradient of :func:`dihedral_angle` in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
 
     Args:
-        spokes: As above. *Shape:* ``(3, 3, ...)``.
+        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
 
     Returns:
         Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
     """
-    e, a, b = spokes
+    e, a, b = edge_vectors
     n1 = cross(e, a)
     n2 = cross(b, e)
     flat = collapsed(e, n1) | collapsed(e, n2)
@@ -70,7 +70,7 @@ def length_hessian(edge: Tensor) -> Tensor:
     return (eye - unit[:, None] * unit) * per_length
 
 
-def dihedral_hessian(spokes: Tensor) -> Tensor:
+def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
     r"""Hessian of :func:`dihedral_angle` in closed form, as its blocks between different vertices.
 
     Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude ``h``
@@ -80,13 +80,13 @@ def dihedral_hessian(spokes: Tensor) -> Tensor:
     follows because translations change nothing.
 
     Args:
-        spokes: As above. *Shape:* ``(3, 3, ...)``.
+        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
 
     Returns:
         The blocks of the vertices ``ij, ki, kj, li, lj`` of a hinge, indexed by row, then column; zero where a triangle
         is collapsed. *Shape:* ``(5, 3, 3, ...)``.
     """
-    e, a, b = spokes
+    e, a, b = edge_vectors
     n1, n2 = cross(e, a), cross(b, e)
     flat = collapsed(e, n1) | collapsed(e, n2)
     length = norm(e)

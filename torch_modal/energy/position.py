@@ -30,13 +30,13 @@ class Position(Term):
         vertices = torch.arange(mesh.n_vertices).repeat(3)
         return torch.stack([torch.full_like(vertices, mesh.first_anchor), vertices], 1)
 
-    def measure(self, spokes: Tensor) -> Tensor:
+    def measure(self, edge_vectors: Tensor) -> Tensor:
         """The coordinate along the element's axis."""
-        return torch.einsum("i...m,im->...m", spokes[0], self.axes.to(spokes))
+        return torch.einsum("i...m,im->...m", edge_vectors[0], self.axes.to(edge_vectors))
 
     measures = measure
 
-    def gradients(self, spokes: Tensor) -> Tensor:
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
         """The axis."""
-        axes = self.axes.to(spokes)
-        return axes.reshape(1, 3, *[1] * (spokes.dim() - 3), -1).expand_as(spokes)
+        axes = self.axes.to(edge_vectors)
+        return axes.reshape(1, 3, *[1] * (edge_vectors.dim() - 3), -1).expand_as(edge_vectors)

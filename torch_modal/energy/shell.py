@@ -98,7 +98,7 @@ class ShellEnergy(nn.Module):
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of shapes. *Shape:* ``(..., V, 3)``."""
         rows = self._rows(x)
-        length, angle, volume = (part.measures(part.spokes(rows)) for part in list(self.energy.parts)[:3])
+        length, angle, volume = (part.measures(part.edge_vectors(rows)) for part in list(self.energy.parts)[:3])
         return Measures(length, angle, volume[..., 0])
 
     def residuals(self, x: Tensor, x_rest: Tensor) -> Tensor:
@@ -114,11 +114,11 @@ class ShellEnergy(nn.Module):
         rows = self._rows(x)
         reference = self.against(x_rest)
         parts = [
-            (weight.sqrt() * part.term.difference(part.measures(part.spokes(rows))[..., None, :], rest)).squeeze(-2)
+            weight.sqrt() * part.term.difference(part.measures(part.edge_vectors(rows))[..., None, :], rest)
             for part, rest, weight in zip(self.energy.parts, reference.measures, reference.weights, strict=True)
         ]
-        lead = broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return torch.cat([part.expand(*lead, -1) for part in parts], -1)
+        lead = broadcast_shapes(*(part.shape[:-2] for part in parts))
+        return torch.cat([part.squeeze(-2).expand(*lead, -1) for part in parts], -1)
 
     def forward(self, x: Tensor, x_rest: Tensor) -> Tensor:
         """Energy of Eq. 5.

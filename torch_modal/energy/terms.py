@@ -129,7 +129,7 @@ class Term(nn.Module):
         """The vertices of each element. *Shape:* ``(M, n)``, with n of 2 or more."""
         raise NotImplementedError
 
-    def measure(self, spokes: Tensor) -> Tensor:
+    def measure(self, edge_vectors: Tensor) -> Tensor:
         """The measure of one element, of the vectors from its first vertex to the others. *Shape:* ``(n-1, 3) -> ()``.
 
         Only operations that ``torch.func`` can differentiate twice.
@@ -145,7 +145,7 @@ class Term(nn.Module):
         """
         return None
 
-    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
         """Weights ``w`` of elements at rest. *Shape:* ``(n-1, 3, ..., M), (..., M) -> (..., M)``; one if total."""
         return torch.ones_like(measures)
 
@@ -158,13 +158,13 @@ class Term(nn.Module):
         return measures - rest
 
     # ---------------------------------------------- all elements at once; written out by the terms that have to be fast
-    def measures(self, spokes: Tensor) -> Tensor:
+    def measures(self, edge_vectors: Tensor) -> Tensor:
         """The measure of each element. *Shape:* ``(n-1, 3, ..., M) -> (..., M)``."""
-        return self._each(self.measure, spokes)
+        return self._each(self.measure, edge_vectors)
 
-    def gradients(self, spokes: Tensor) -> Tensor:
-        """Gradients of the measures in the spokes. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
-        return self._each(jacrev(self.measure), spokes)
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
+        """Gradients of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
+        return self._each(jacrev(self.measure), edge_vectors)
 
     def pairs(self, mesh: Mesh) -> Tensor:
         """Pairs of vertices that the second derivatives couple. *Shape:* ``(N, 2)``."""
@@ -172,38 +172,38 @@ class Term(nn.Module):
         n = len(corners)
         return torch.cat([torch.stack([corners[s], corners[t]], 1) for s in range(n) for t in range(s + 1, n)])
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
+    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
         r"""The blocks of :math:`\sum_m s_m \nabla^2 q_m` between the two vertices of each of :meth:`pairs`.
 
         Args:
-            spokes: *Shape:* ``(n-1, 3, B, M)``.
+            edge_vectors: *Shape:* ``(n-1, 3, B, M)``.
             slope: ``s``. *Shape:* ``(B, M)``, or ``(B, 1)``.
 
         Returns:
             By row and column, in parts that together have all pairs in their order. *Shape of each:* ``(3, 3, B, ·)``.
         """
-        hessian = slope * self._each(jacrev(jacrev(self.measure)), spokes)
+        hessian = slope * self._each(jacrev(jacrev(self.measure)), edge_vectors)
         # Translations change nothing: the first vertex has what is left.
         first = -hessian.sum(0).movedim(1, 0)
-        n = len(spokes)
+        n = len(edge_vectors)
         others = [hessian[s, :, t] for s in range(n) for t in range(s + 1, n)]
         return [*first, *others]
 
-    def tension(self, spokes: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
+    def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
         """Stiffness that stretched elements of two vertices have across; None for elements of more.
 
         Args:
-            spokes: *Shape:* ``(1, 3, B, M)``.
+            edge_vectors: *Shape:* ``(1, 3, B, M)``.
             slope: First derivative of the energy in each measure. *Shape:* ``(B, M)``.
             curvature: Second derivative. *Shape:* ``(B, M)``.
         """
         return None
 
     @staticmethod
-    def _each(function: Any, spokes: Tensor) -> Tensor:
+    def _each(function: Any, edge_vectors: Tensor) -> Tensor:
         """A function of one element on all, which stay the last dimensions."""
-        out = vmap(function, in_dims=2, out_dims=-1)(spokes.flatten(2))
-        return out.unflatten(-1, spokes.shape[2:])
+        out = vmap(function, in_dims=2, out_dims=-1)(edge_vectors.flatten(2))
+        return out.unflatten(-1, edge_vectors.shape[2:])
 
 
 class Stretch(Term):
@@ -213,27 +213,27 @@ class Stretch(Term):
         """All edges."""
         return mesh.edges
 
-    def measure(self, spokes: Tensor) -> Tensor:
+    def measure(self, edge_vectors: Tensor) -> Tensor:
         """The length."""
-        return norm(spokes[0])
+        return norm(edge_vectors[0])
 
     measures = measure
 
-    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
         """One over the length."""
         return inverse(measures, measures <= MIN_RELATIVE_LENGTH * measures.mean(-1, keepdim=True))
 
-    def gradients(self, spokes: Tensor) -> Tensor:
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
         """Unit vectors."""
-        return length_gradient(spokes[0])[None]
+        return length_gradient(edge_vectors[0])[None]
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
+    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
         """The length's Hessian with the other sign, between both ends."""
-        return [-slope * length_hessian(spokes[0])]
+        return [-slope * length_hessian(edge_vectors[0])]
 
-    def tension(self, spokes: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
+    def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """What a stretched string has; nearly none where compressed, without a kink in between."""
-        length = norm(spokes[0])
+        length = norm(edge_vectors[0])
         width = SLACK * curvature * length
         return 0.5 * (slope + (slope * slope + width * width + torch.finfo(slope.dtype).tiny).sqrt()) / length
 
@@ -247,15 +247,15 @@ class Bend(Term):
         """All hinges."""
         return mesh.hinges
 
-    def measure(self, spokes: Tensor) -> Tensor:
+    def measure(self, edge_vectors: Tensor) -> Tensor:
         """The angle."""
-        return dihedral_angle(spokes)
+        return dihedral_angle(edge_vectors)
 
     measures = measure
 
-    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
         """Square of the edge over the area of both triangles."""
-        e, a, b = spokes
+        e, a, b = edge_vectors
         n1, n2 = cross(e, a), cross(b, e)
         squared, area = (e * e).sum(0), 0.5 * (norm(n1) + norm(n2))
         floored = torch.maximum(area, squared / MAX_BENDING_RATIO)
@@ -265,18 +265,18 @@ class Bend(Term):
         """The short way round."""
         return wrap_angle(measures - rest)
 
-    def gradients(self, spokes: Tensor) -> Tensor:
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
         """In closed form."""
-        return dihedral_gradient(spokes)
+        return dihedral_gradient(edge_vectors)
 
     def pairs(self, mesh: Mesh) -> Tensor:
         """Without that of the two tips, which have no mixed derivative."""
         i, j, k, m = mesh.hinges.unbind(1)
         return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
+    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
         """In closed form."""
-        return (slope * dihedral_hessian(spokes)).unbind()
+        return (slope * dihedral_hessian(edge_vectors)).unbind()
 
 
 class Volume(Term):
@@ -294,22 +294,22 @@ class Volume(Term):
         closed = torch.cat([mesh.faces, torch.cat([chain.flip(1), centre], 1)])
         return torch.cat([torch.full_like(closed[:, :1], mesh.centre), closed], 1)
 
-    def measure(self, spokes: Tensor) -> Tensor:
+    def measure(self, edge_vectors: Tensor) -> Tensor:
         """Signed volume of a tetrahedron."""
-        p, q, r = spokes
+        p, q, r = edge_vectors
         return (p * cross(q, r)).sum(0) / 6
 
     measures = measure
 
-    def weights(self, spokes: Tensor, measures: Tensor) -> Tensor:
+    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
         """One over the square of the volume."""
-        p, q, r = spokes
+        p, q, r = edge_vectors
         surface = 0.5 * norm(cross(q - p, r - p)).sum(-1, keepdim=True)
         return torch.maximum(measures.abs(), MIN_RELATIVE_VOLUME * surface**1.5) ** -2
 
-    def gradients(self, spokes: Tensor) -> Tensor:
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
         """Sixths of cross products."""
-        p, q, r = spokes
+        p, q, r = edge_vectors
         return torch.stack([cross(q, r), cross(r, p), cross(p, q)]) / 6
 
     def pairs(self, mesh: Mesh) -> Tensor:
@@ -317,9 +317,9 @@ class Volume(Term):
         i, j, k = self.elements(mesh)[:, 1:].unbind(1)
         return torch.cat([torch.stack(side, 1) for side in ((i, j), (j, k), (k, i))])
 
-    def blocks(self, spokes: Tensor, slope: Tensor) -> Sequence[Tensor]:
+    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
         """``p.(q x r)`` has the block ``-[r]`` between ``p`` and ``q``."""
-        p, q, r = spokes
+        p, q, r = edge_vectors
         x, y, z = torch.cat([r, p, q], -1) * (slope / 6)
         zero = torch.zeros_like(x)
         return [torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3))]

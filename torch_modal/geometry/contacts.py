@@ -37,7 +37,7 @@ _NEAREST = 64
 """Faces, by their centres, among which the nearest to a vertex is looked for; four times as many from inside."""
 
 
-class Held(NamedTuple):
+class FoundContacts(NamedTuple):
     """Vertices and faces that face each other in one shape."""
 
     vertices: IntArray
@@ -65,7 +65,7 @@ class Search:
         self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
         self._known = [Surface(crossings, x) for x in crossings.known]
 
-    def __call__(self, x: FloatArray, watched: BoolArray | None = None) -> Held:
+    def __call__(self, x: FloatArray, watched: BoolArray | None = None) -> FoundContacts:
         """What is to be held in a shape.
 
         Args:
@@ -77,7 +77,7 @@ class Search:
         seeds = np.zeros(len(x), dtype=bool) if watched is None else watched.copy()
         none = np.zeros(0, np.int64)
         if not len(pairs) and not seeds.any():
-            return Held(none, none, np.zeros((0, len(self._known))), pairs, seeds)
+            return FoundContacts(none, none, np.zeros((0, len(self._known))), pairs, seeds)
         corners = np.zeros(len(x), dtype=bool)
         corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
         before = crossings.known_inside
@@ -87,7 +87,7 @@ class Search:
         seeds |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
         # What was inside in a key-frame is not to go in elsewhere.
         stuck = winds & before & seeds
-        return Held(*self.opposite(surface, seeds, inside, stuck), pairs, seeds)
+        return FoundContacts(*self.opposite(surface, seeds, inside, stuck), pairs, seeds)
 
     def tolerance(self, slack: FloatArray, t: float) -> FloatArray:
         """How much of what crosses in both key-frames is tolerated between them: all at their times, nothing later.
@@ -138,7 +138,7 @@ class Search:
             stuck: Vertices that are inside the surface, and were in a known shape. *Shape:* ``(V,)``.
 
         Returns:
-            Vertices, faces and slack of :class:`Held`.
+            Vertices, faces and slack of :class:`FoundContacts`.
         """
         crossings, corners = self.crossings, self.crossings.mesh.faces
         reach, near = REACH * crossings.diagonal, NEAR * crossings.diagonal
@@ -179,7 +179,7 @@ class Search:
         both = np.where(own > 0, own, both)
         # Folds are inside, too, where they are in a key-frame.
         keep = np.ones(len(v), dtype=bool)
-        keep[stuck[v]] = crossings.apart(v[stuck[v]], corners[f[stuck[v]]])
+        keep[stuck[v]] = crossings.separated(v[stuck[v]], corners[f[stuck[v]]])
         return v[keep], f[keep], both[keep]
 
     def depth(self, x: FloatArray, pairs: IntArray) -> FloatArray:
@@ -225,8 +225,8 @@ def _heights(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
 
 def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
     """From vertices to faces. *Shape:* ``(n,), (n,) -> (n,)``."""
-    apart = surface.x[v] - nearest_on_triangles(surface.x[v], surface.x[surface.faces[f]])
-    return np.sqrt(dot(apart, apart))  # type: ignore[no-any-return]
+    offset = surface.x[v] - nearest_on_triangles(surface.x[v], surface.x[surface.faces[f]])
+    return np.sqrt(dot(offset, offset))  # type: ignore[no-any-return]
 
 
 def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:

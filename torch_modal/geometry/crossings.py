@@ -226,10 +226,10 @@ class Crossings:
     def far_apart(self, pairs: IntArray) -> BoolArray:
         """Which pairs are more than :data:`FAR` apart along the surface. *Shape:* ``(P, 2) -> (P,)``."""
         faces = self.mesh.faces
-        found = [self.apart(faces[pairs[:, 0], corner], faces[pairs[:, 1]]) for corner in range(3)]
+        found = [self.separated(faces[pairs[:, 0], corner], faces[pairs[:, 1]]) for corner in range(3)]
         return np.all(found, axis=0)
 
-    def apart(self, vertices: IntArray, faces: IntArray) -> BoolArray:
+    def separated(self, vertices: IntArray, faces: IntArray) -> BoolArray:
         """Whether a vertex and a face are more than :data:`FAR` apart along the surface.
 
         Args:

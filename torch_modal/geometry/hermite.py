@@ -21,7 +21,7 @@ from torch import Tensor
 LIMIT = 2.75
 
 
-class Excess(NamedTuple):
+class TangentOffset(NamedTuple):
     """How far the velocities at both ends are from the straight step's."""
 
     first: Tensor
@@ -36,13 +36,13 @@ class Spacing(NamedTuple):
     after: Tensor
 
 
-def excess(
+def tangent_offset(
     step: Tensor,
     before: Tensor | None,
     after: Tensor | None,
     spacing: Spacing,
     squared: Callable[[Tensor], Tensor] = torch.square,
-) -> Excess:
+) -> TangentOffset:
     r"""The excess that follows from the steps before and after.
 
     Velocities are those of the parabola through three key-frames, :math:`(h_+ v_- + h_- v_+) / (h_- + h_+)` of the
@@ -65,12 +65,12 @@ def excess(
         speed = _velocity(step / spacing.own, after / spacing.after, spacing.own, spacing.after, squared)
         last = spacing.own * speed - step
     if first is None and last is None:
-        return Excess(torch.zeros_like(step), torch.zeros_like(step))
+        return TangentOffset(torch.zeros_like(step), torch.zeros_like(step))
     # No second derivative at an end: -4 e_0 - 2 e_1 = 0 at the first.
     if first is None:
         assert last is not None
-        return Excess(-0.5 * last, last)
-    return Excess(first, -0.5 * first if last is None else last)
+        return TangentOffset(-0.5 * last, last)
+    return TangentOffset(first, -0.5 * first if last is None else last)
 
 
 def _velocity(
@@ -140,7 +140,7 @@ def around(i: int, times: Tensor, cyclic: bool) -> tuple[int | None, int | None,
     return before, after, Spacing(*(h[j % len(h)] for j in (i - 1, i, i + 1)))
 
 
-def beyond(bend: Excess, u: Tensor) -> Tensor:
+def beyond(bend: TangentOffset, u: Tensor) -> Tensor:
     """What the cubic adds to the straight step at ``u``, which broadcasts against the excess."""
     return u * (1 - u) * ((1 - u) * bend.first - u * bend.last)
 

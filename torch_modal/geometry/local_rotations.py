@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
-from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess
+from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, tangent_offset
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import Frames, Sides, edge_means, frames, sides, stretched
 from torch_modal.geometry.vectors import pick
@@ -20,7 +20,7 @@ SLIVER = 0.02
 SHORTEST = 1e-9
 
 
-class Course(NamedTuple):
+class Trajectory(NamedTuple):
     """How triangles move between two shapes of a motion. Components first."""
 
     e1: Tensor
@@ -38,9 +38,9 @@ class Course(NamedTuple):
     unit: Tensor
     """The mean length. *Shape:* ``(P, F)``."""
 
-    def rows(self, index: Tensor) -> "Course":
+    def rows(self, index: Tensor) -> "Trajectory":
         """Of some of the shapes."""
-        return Course._make(part.index_select(-2, index) for part in self)
+        return Trajectory._make(part.index_select(-2, index) for part in self)
 
 
 class LocalRotations(nn.Module):
@@ -96,12 +96,12 @@ class LocalRotations(nn.Module):
         a, b = (_frames(x, self.faces) for x in (first, second))
         areas, t = a.doubled_areas + b.doubled_areas, t[:, None]
         length, along, height = (torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))
-        turn = power(self._sensed(a, b), t)
+        turn = power(self._signed(a, b), t)
         return self._edges(Sides(rotate(turn, length * a.e1), rotate(turn, a.world(along, height))), areas)
 
-    def course(
+    def trajectory(
         self, before: Tensor | None, first: Tensor, second: Tensor, after: Tensor | None, spacing: Spacing
-    ) -> Course:
+    ) -> Trajectory:
         """A smooth course through four shapes, between the two in the middle. *Shape of each:* ``(P, V, 3)``.
 
         Args:
@@ -119,7 +119,7 @@ class LocalRotations(nn.Module):
         def step(p: Frames | None, q: Frames | None, at: Frames) -> Tensor | None:
             if p is None or q is None:
                 return None
-            turn = turn_of(self._sensed(p, q))
+            turn = turn_of(self._signed(p, q))
             # The axis has the same coordinates in either frame.
             turns = [(turn * axis).sum(0) for axis in (at.e1, at.e2, at.normal)]
             return torch.stack([*turns, *((y - x) / unit for x, y in zip(p[3:], q[3:], strict=True))])
@@ -127,27 +127,27 @@ class LocalRotations(nn.Module):
         own = step(a, b, a)
         assert own is not None
         wide = Spacing(*(h[:, None] for h in spacing))
-        bend = excess(own, step(earlier, a, a), step(b, later, b), wide, lambda x: x.square().sum(0))
-        return Course(a.e1, a.e2, a.normal, torch.stack(a[3:]), own, *bend, unit)
+        bend = tangent_offset(own, step(earlier, a, a), step(b, later, b), wide, lambda x: x.square().sum(0))
+        return Trajectory(a.e1, a.e2, a.normal, torch.stack(a[3:]), own, *bend, unit)
 
-    def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
+    def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """Edge vectors on courses, components first.
 
         Args:
-            course: Of P pairs of shapes.
+            trajectory: Of P pairs of shapes.
             which: Of which of them. *Shape:* ``(B,)``.
             t: Times. *Shape:* ``(B,)``.
 
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        return self._along(course.rows(which), t, None)
+        return self._along(trajectory.rows(which), t, None)
 
-    def bent_along(self, course: Course, t: Tensor, bending: Tensor) -> Tensor:
+    def bent_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor) -> Tensor:
         """The same of one pair of shapes, whose triangles also bend: they are strained, then turned, and carried along.
 
         Args:
-            course: Of one pair.
+            trajectory: Of one pair.
             t: *Shape:* ``(B,)``.
             bending: In coordinates of the triangles (:func:`~torch_modal.geometry.triangle_frames.convected`). *Shape:*
                 ``(6, B, F)``.
@@ -155,22 +155,22 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        return self._along(course, t, bending)
+        return self._along(trajectory, t, bending)
 
-    def _along(self, course: Course, t: Tensor, bending: Tensor | None) -> Tensor:
+    def _along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None) -> Tensor:
         u = t[:, None]
-        straight, bent = u * course.step, beyond(Excess(course.first, course.last), u)
-        length, along, height = course.size + course.unit * (straight + bent)[3:]
+        straight, bent = u * trajectory.step, beyond(TangentOffset(trajectory.first, trajectory.last), u)
+        length, along, height = trajectory.size + trajectory.unit * (straight + bent)[3:]
         flat = torch.zeros_like(length)
 
         def placed(x: Tensor, y: Tensor) -> Tensor:
             side = torch.stack([x, y, flat])
             side = side if bending is None else turned(bending[:3], side)
             x, y, z = turned(straight[:3], turned(bent[:3], side))
-            return x * course.e1 + y * course.e2 + z * course.normal
+            return x * trajectory.e1 + y * trajectory.e2 + z * trajectory.normal
 
-        end = course.size + course.unit * course.step[3:]
-        areas = course.size[0] * course.size[2] + end[0] * end[2]
+        end = trajectory.size + trajectory.unit * trajectory.step[3:]
+        areas = trajectory.size[0] * trajectory.size[2] + end[0] * end[2]
         first, second = (length, flat), (along, height)
         if bending is not None:
             first, second = stretched(bending[3:], length, along, height)
@@ -182,15 +182,15 @@ class LocalRotations(nn.Module):
 
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """Quaternions of triangles, whose signs tell the way round. *Shape:* ``(B, V, 3), (B, V, 3) -> (4, B, F)``."""
-        return self._sensed(_frames(first, self.faces), _frames(second, self.faces))
+        return self._signed(_frames(first, self.faces), _frames(second, self.faces))
 
-    def _sensed(self, a: Frames, b: Frames) -> Tensor:
+    def _signed(self, a: Frames, b: Frames) -> Tensor:
         """Quaternions between frames, whose signs tell the way round. *Shape:* ``(4, B, F)``."""
         quaternions = _turn_between(a, b)
         areas = (a.doubled_areas + b.doubled_areas).detach()
-        return self._senses(quaternions.detach(), areas) * quaternions
+        return self._sign_votes(quaternions.detach(), areas) * quaternions
 
-    def _senses(self, quaternions: Tensor, areas: Tensor) -> Tensor:
+    def _sign_votes(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """A sign for each quaternion. *Shape:* ``(4, B, F), (B, F) -> (B, F)``."""
         signs = torch.where((quaternions * pick(quaternions, self.ancestors[0])).sum(0) < 0, -1.0, 1.0).to(areas)
         for ancestors in self.ancestors:

@@ -33,5 +33,5 @@ def merge_seams(shapes: NDArray[np.float64], faces: IntArray) -> IntArray:
     used = np.unique(faces)
     tolerance = TOLERANCE * float(np.linalg.norm(np.ptp(shapes[:, used], axis=1), axis=1).min())
     pairs = boundary[cKDTree(shapes[0, boundary]).query_pairs(tolerance, output_type="ndarray")]
-    apart = np.linalg.norm(shapes[:, pairs[:, 0]] - shapes[:, pairs[:, 1]], axis=2).max(axis=0, initial=0.0)
-    return connected_pieces(pairs[apart <= tolerance], n)
+    distance = np.linalg.norm(shapes[:, pairs[:, 0]] - shapes[:, pairs[:, 1]], axis=2).max(axis=0, initial=0.0)
+    return connected_pieces(pairs[distance <= tolerance], n)

@@ -181,7 +181,7 @@ class Between(nn.Module):
         usable = usable & (t >= 0) & (t <= 1)
         if pair.around is not None and self.bare:
             # The path is a shape at rest: there is nothing to minimise.
-            x, *starts = space.on_course(pair, samples.which, t)
+            x, *starts = space.on_trajectory(pair, samples.which, t)
             x, solution = self.compared(x, starts, unmoved(t, 0, usable), pair, samples, None)
         else:
             anchors = self.anchors(placed, t)
@@ -259,7 +259,7 @@ class Between(nn.Module):
         """What shapes on the fine mesh are compared with."""
         if pair.around is not None:
             return Energy.against(
-                self._fine_rest(self.space.on_course(pair, samples.which, samples.t)[0]), samples.stiffness
+                self._fine_rest(self.space.on_trajectory(pair, samples.which, samples.t)[0]), samples.stiffness
             )
         first, second = trees.picked([self._fine_rest(end) for end in (pair.first, pair.second)], samples.which)
         return self.fine.between(first, second, samples.t, samples.stiffness)
@@ -268,8 +268,8 @@ class Between(nn.Module):
         """What shapes on the coarse mesh are compared with."""
         levels, stiffness = self.space.levels, self._levelled(samples.stiffness)
         if pair.around is not None:
-            course = self.space.on_course(pair, samples.which, samples.t)[0]
-            return levels.against(course, self.frame.coarsen(course), stiffness)[0]
+            trajectory = self.space.on_trajectory(pair, samples.which, samples.t)[0]
+            return levels.against(trajectory, self.frame.coarsen(trajectory), stiffness)[0]
         ends = [levels.seen(x, self.frame.coarsen(x)) for x in (pair.first, pair.second)]
         return levels.between(*ends, samples.which, samples.t, stiffness)[0]
 
@@ -341,7 +341,7 @@ class Between(nn.Module):
         assert fused is not None
         first, second = trees.picked((pair.first, pair.second), samples.which)
         if pair.around is not None:
-            first = second = self.space.on_course(pair, samples.which, samples.t)[0]
+            first = second = self.space.on_trajectory(pair, samples.which, samples.t)[0]
         chunk = fine_chunk(self.mesh.n_vertices, samples.t.device)
         for i in range(0, len(samples.t), chunk):
             own = slice(i, i + chunk)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.functions import applied, lasting, traced
-from torch_modal.geometry.local_rotations import Course, LocalRotations, weights_per_length
+from torch_modal.geometry.local_rotations import LocalRotations, Trajectory, weights_per_length
 from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.vectors import pick
 from torch_modal.nn.adjoint import flattened
@@ -54,20 +54,20 @@ class RotationBlend(nn.Module):
         near = torch.lerp(first, second, t[:, None, None]) if straight is None else straight
         return self._reached(self.rotations(first, second, t), near)
 
-    def along(self, course: Course, which: Tensor, straight: Tensor, t: Tensor) -> Tensor:
+    def along(self, trajectory: Trajectory, which: Tensor, straight: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t`` of a course.
 
         Args:
-            course: Of :meth:`LocalRotations.course`.
+            trajectory: Of :meth:`LocalRotations.trajectory`.
             which: Of which pair of shapes. *Shape:* ``(B,)``.
             straight: Shapes whose pieces have their centroids where they are wanted. *Shape:* ``(B, V, 3)``.
             t: *Shape:* ``(B,)``.
         """
-        return self._reached(self.rotations.along(course, which, t), straight)
+        return self._reached(self.rotations.along(trajectory, which, t), straight)
 
-    def bent_along(self, course: Course, straight: Tensor, t: Tensor, bending: Tensor) -> Tensor:
+    def bent_along(self, trajectory: Trajectory, straight: Tensor, t: Tensor, bending: Tensor) -> Tensor:
         """The same of one pair of shapes, whose triangles also bend, see :meth:`LocalRotations.bent_along`."""
-        return self._reached(self.rotations.bent_along(course, t, bending), straight)
+        return self._reached(self.rotations.bent_along(trajectory, t, bending), straight)
 
     def _reached(self, edges: Tensor, near: Tensor) -> Tensor:
         rows = near.movedim(-1, 0)

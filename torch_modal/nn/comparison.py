@@ -130,8 +130,8 @@ class Distortion(nn.Module):
         stiffness: Sequence[Tensor],
     ) -> Tensor:
         def measures(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            spokes = _spokes(x, self.hinges)
-            return norm(_spokes(x, self.edges)[0]), dihedral_angle(spokes), _weights(spokes)
+            edge_vectors = _edge_vectors(x, self.hinges)
+            return norm(_edge_vectors(x, self.edges)[0]), dihedral_angle(edge_vectors), _weights(edge_vectors)
 
         found = [measures(x) for x in shapes]
         lengths, angles = (torch.stack([each[i] for each in found]) for i in (0, 1))
@@ -197,15 +197,15 @@ def no_worse(
     return x, worse
 
 
-def _spokes(x: Tensor, corners: Tensor) -> Tensor:
+def _edge_vectors(x: Tensor, corners: Tensor) -> Tensor:
     """Vectors from the first vertex of each element to the others. *Shape:* ``(B, V, 3) -> (n-1, 3, B, M)``."""
     first, *others = (x.index_select(-2, corner).movedim(-1, 0) for corner in corners)
     return torch.stack([other - first for other in others])
 
 
-def _weights(spokes: Tensor) -> Tensor:
+def _weights(edge_vectors: Tensor) -> Tensor:
     """The bounded weights of hinges; 0 where a triangle has collapsed. *Shape:* ``(3, 3, B, H) -> (B, H)``."""
-    e, a, b = spokes
+    e, a, b = edge_vectors
     n1, n2 = cross(e, a), cross(b, e)
     weight = 2 * (e * e).sum(0) * inverse(norm(n1) + norm(n2), collapsed(e, n1) | collapsed(e, n2))
     return weight.clamp_max(LARGEST_WEIGHT)

@@ -153,9 +153,9 @@ class ContactSearch:
         """Pairs of triangles that went through each other in a sample, and those of them that are not tolerated."""
         if not bool(x.isfinite().all()):
             return 0, 0
-        return self._told(i, self._search(i).crossings.far_pairs(x.detach().double().cpu().numpy()))
+        return self._as_tensors(i, self._search(i).crossings.far_pairs(x.detach().double().cpu().numpy()))
 
-    def _told(self, i: int, pairs: IntArray) -> tuple[int, int]:
+    def _as_tensors(self, i: int, pairs: IntArray) -> tuple[int, int]:
         """The number of pairs in a sample, and of those that are not tolerated. *Shape:* ``(P, 2)``."""
         return len(pairs), self._search(i).n_left(pairs, float(self.t[i])) if self.is_tolerant else len(pairs)
 
@@ -171,26 +171,28 @@ class ContactSearch:
         counts = [(0, 0)] * len(some)
         for k, i in enumerate(some):
             if bool(x[i].isfinite().all()):
-                held = found[i] = self._search(i)(x[i].detach().double().cpu().numpy(), self.watched[i])
-                self.watched[i] = held.watched if held.watched.any() else None
-                counts[k] = self._told(i, held.far)
+                active = found[i] = self._search(i)(x[i].detach().double().cpu().numpy(), self.watched[i])
+                self.watched[i] = active.watched if active.watched.any() else None
+                counts[k] = self._as_tensors(i, active.far)
         self._keep(some, counts)
-        if not any(held is not None and len(held.vertices) for held in found):
+        if not any(active is not None and len(active.vertices) for active in found):
             return None
         n = len(self.faces)
         nothing = torch.zeros(0, dtype=torch.int64)
-        codes = [nothing if held is None else torch.from_numpy(held.vertices * n + held.faces) for held in found]
+        codes = [
+            nothing if active is None else torch.from_numpy(active.vertices * n + active.faces) for active in found
+        ]
         every = torch.cat(codes).unique()
         vertices, faces = every // n, every % n
         elements = torch.cat([self.faces[faces], vertices[:, None]], 1)
         weights = torch.zeros(len(x), len(every), dtype=x.dtype)
         gaps = torch.full_like(weights, GAP)
-        for i, (code, held) in enumerate(zip(codes, found, strict=True)):
+        for i, (code, active) in enumerate(zip(codes, found, strict=True)):
             places = torch.searchsorted(every, code)
             weights[i, places] = STIFFNESS * self.areas[self.which[i]].cpu()[vertices[places]].to(x.dtype)
-            if self.is_tolerant and held is not None and held.slack.any():
-                slack = torch.from_numpy(held.slack).to(x.dtype)
-                ramps = torch.from_numpy(self._search(i).tolerance(held.slack, float(self.t[i]))).to(x.dtype)
+            if self.is_tolerant and active is not None and active.slack.any():
+                slack = torch.from_numpy(active.slack).to(x.dtype)
+                ramps = torch.from_numpy(self._search(i).tolerance(active.slack, float(self.t[i]))).to(x.dtype)
                 gaps[i, places] = GAP * (1 - ramps.amax(1)) - (slack * ramps).amax(1)
         own = torch.nonzero((weights > 0).any(1)).flatten()
         to = x.device
@@ -210,13 +212,13 @@ class ContactSearch:
         pairs = search.crossings.far_pairs(shape)
         return GAP + max(float(search.depth(shape, pairs).max()), search.crossings.reach(shape, pairs))
 
-    def watch(self, held: Contacts, around: int) -> None:
+    def watch(self, active: Contacts, around: int) -> None:
         """Watch what is held in a sample, and beside it, in that one and its neighbours in time."""
         crossings = self.searches[0].crossings
-        for i, weights in zip(held.samples.tolist(), held.weights, strict=True):
+        for i, weights in zip(active.samples.tolist(), active.weights, strict=True):
             if not bool(weights.any()):
                 continue
-            own = crossings.grown(held.elements[weights > 0].flatten().unique().cpu().numpy(), 2)
+            own = crossings.grown(active.elements[weights > 0].flatten().unique().cpu().numpy(), 2)
             for k in range(max(0, i - around), min(len(self.watched), i + around + 1)):
                 self.watched[k] = own if self.watched[k] is None else self.watched[k] | own
 

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.nn import trees
+from torch_modal.nn.active_contacts import ActiveContacts
 from torch_modal.nn.between import Batch, Between
 from torch_modal.nn.contact import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
-from torch_modal.nn.held import Held
 from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import InBetweenResult, Samples
 from torch_modal.nn.solver import Solution
@@ -104,7 +104,7 @@ class ContactRounds(Between):
         """Steps of all vertices of one sample with its contacts. *Shape:* ``(1, V, 3)``."""
         if self.kernels_serve(x):
             weights, gaps = active.weights.double(), active.gaps.double()
-            contacts = Held(active._replace(weights=weights, gaps=gaps), x.shape[1])
+            contacts = ActiveContacts(active._replace(weights=weights, gaps=gaps), x.shape[1])
             return self.descend(x, batch, [(FINE_STEPS, FINE_PRODUCTS)], [contacts])
         ((_, reference, fixed),) = self.fine_chunks(batch)
         energy = active.fine(self.mesh, self.terms)

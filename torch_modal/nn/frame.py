@@ -13,7 +13,7 @@ from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.functions import applied, lasting
-from torch_modal.geometry.hermite import Excess, Spacing, beyond, excess, squared_length
+from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, squared_length, tangent_offset
 from torch_modal.geometry.rigid import RigidMotion, best_fit, centroid
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.nn.columns import Columns, Directions
@@ -35,9 +35,9 @@ class Around(NamedTuple):
     """Turned on to the second. *Shape:* ``(B, V, 3)``."""
     spacing: Spacing
     """Durations of the three intervals."""
-    turn: Excess
+    turn: TangentOffset
     """Of the rotation, axis times angle in coordinates that turn along. *Shape:* ``(B, 3)``."""
-    move: Excess
+    move: TangentOffset
     """Of the centroid. *Shape:* ``(B, 3)``."""
 
 
@@ -102,8 +102,8 @@ class Alignment(nn.Module):
             back = best_fit(unturned, pair.second, self.weights)
             moves[1] = centroid(placed, self.weights) - pair.between.target
             after, turns[1] = back.apply(unturned), log(back.rotation.mT)
-        turn = excess(log(pair.between.rotation), turns[0], turns[1], wide, squared_length)
-        move = excess(pair.between.target - pair.between.source, moves[0], moves[1], wide, squared_length)
+        turn = tangent_offset(log(pair.between.rotation), turns[0], turns[1], wide, squared_length)
+        move = tangent_offset(pair.between.target - pair.between.source, moves[0], moves[1], wide, squared_length)
         return pair._replace(around=Around(before, after, spacing, turn, move))
 
     def motion(self, pair: Pair, t: Tensor) -> RigidMotion:
@@ -313,15 +313,15 @@ class _ClusterMeans(torch.autograd.Function):
         return _ClusterMeans.apply(flat.flatten(0, 1), *given).unflatten(0, flat.shape[:2]), 0
 
 
-def vertex_excess(pair: Pair) -> Excess:
+def vertex_tangent_offset(pair: Pair) -> TangentOffset:
     """What the neighbours in time say of the vertices of a pair. *Shape of each:* ``(B, V, 3)``."""
     step = pair.second - pair.first
     if pair.around is None:
-        return Excess(torch.zeros_like(step), torch.zeros_like(step))
+        return TangentOffset(torch.zeros_like(step), torch.zeros_like(step))
     before, after, spacing = pair.around[:3]
     earlier = None if before is None else pair.first - before
     later = None if after is None else after - pair.second
-    return excess(step, earlier, later, Spacing(*(h[:, None, None] for h in spacing)), squared_length)
+    return tangent_offset(step, earlier, later, Spacing(*(h[:, None, None] for h in spacing)), squared_length)
 
 
 def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def restore(frame: Alignment, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
     if pair.around is None:
         turn, moved, centre = x.new_empty(b, 3, 3), x.new_empty(b, 3), pair.between.source.contiguous()
         motions = [part.contiguous() for motion in (pair.between, placed) for part in motion]
-        launch(module.course, (b,), [t.contiguous(), *motions, frame.scale.reshape(1), turn, moved])
+        launch(module.trajectory, (b,), [t.contiguous(), *motions, frame.scale.reshape(1), turn, moved])
     else:
         motion, back = frame.motion(pair, t), placed.rotation.mT
         turn, centre = ((back @ motion.rotation) / frame.scale).contiguous(), motion.source.contiguous()

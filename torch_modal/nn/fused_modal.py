@@ -73,7 +73,7 @@ class FusedModalEnergy(ModalEnergy):
     blocks: Tensor
     pairs: Tensor
     slots: Tensor
-    wall_slots: Tensor
+    face_slots: Tensor
 
     def __init__(self, shell: FusedShell, mesh: Mesh, columns: Tensor) -> None:
         super().__init__(shell.energy, columns)
@@ -84,8 +84,8 @@ class FusedModalEnergy(ModalEnergy):
         slots[:, 0] = places[:n_edges]
         slots[shell.interior, 1:] = places[n_edges : n_edges + 5 * n_hinges].unflatten(0, (5, -1)).T
         self.register_buffer("slots", slots, persistent=False)
-        walls = places[n_edges + 5 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
-        self.register_buffer("wall_slots", walls, persistent=False)
+        capped_faces = places[n_edges + 5 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
+        self.register_buffer("face_slots", capped_faces, persistent=False)
         self.register_buffer("pairs", self.curvature.pairs.int(), persistent=False)
         self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
         rows = self.columns.permute(2, 1, 0).flatten(0, 1)
@@ -249,8 +249,8 @@ class FusedModalEnergy(ModalEnergy):
         found = x.new_zeros(len(x), 2 * n_pairs, 3, 3)
         given = [x, shell.record, to.stretch, to.bend, self.slots, shell.n_vertices, 2 * n_pairs, found]
         launch(kernels("modal").curved_edges, (len(x), len(shell.record)), given)
-        given = [x, shell.centre(x), shell.walls, moment, self.wall_slots, shell.n_vertices, 2 * n_pairs, found]
-        launch(kernels("modal").curved_walls, (len(x), len(shell.walls)), given)
+        given = [x, shell.centre(x), shell.capped_faces, moment, self.face_slots, shell.n_vertices, 2 * n_pairs, found]
+        launch(kernels("modal").curved_faces, (len(x), len(shell.capped_faces)), given)
         extra, columns, n = placement.extra, self.blocks.double(), len(self.columns)
         if extra is not None:
             extra = torch.cat([extra, shell.mean(extra)[:, None]], 1)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.geometry.functions import applied, traced
-from torch_modal.geometry.local_rotations import Course, LocalRotations
+from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 from torch_modal.nn.adjoint import flattened
 from torch_modal.nn.launch import kernels, launch
 
@@ -46,7 +46,7 @@ class FusedRotations(LocalRotations):
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """As the other's."""
         found = self._turned(first.contiguous(), second.contiguous())
-        return (self.sense(*found[:2])[..., None] * found[0]).movedim(-1, 0)
+        return (self.sign(*found[:2])[..., None] * found[0]).movedim(-1, 0)
 
     def _turned(self, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
         """Quaternions, twice both areas and sizes of all triangles. *Shape:* ``(B, F, 4), (B, F), (B, F, 12)``."""
@@ -55,60 +55,64 @@ class FusedRotations(LocalRotations):
         launch(kernels("rotations").turns, (b, n_faces), [first, second, self._face, n, *found])
         return found
 
-    def sense(self, quaternions: Tensor, areas: Tensor) -> Tensor:
+    def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """The sign of the quaternion of each triangle. *Shape:* ``(B, F)``."""
         module, b = kernels("rotations"), len(areas)
         if areas.device.type != "cpu":  # the walk down the tree is one thread's
-            return self._senses(quaternions.movedim(-1, 0), areas)
+            return self._sign_votes(quaternions.movedim(-1, 0), areas)
         n_pieces = self._n_pieces
         sign, vote = torch.empty_like(areas), areas.new_zeros(b, n_pieces)
         given = [quaternions, areas, self._order, self._parent, self._piece_of, n_pieces, sign, vote]
-        launch(module.senses, (b,), given)
+        launch(module.sign_votes, (b,), given)
         return sign
 
-    def sums(self, turns: tuple[Tensor, ...], sense: Tensor, t: Tensor) -> Tensor:
+    def sums(self, turns: tuple[Tensor, ...], sign: Tensor, t: Tensor) -> Tensor:
         """Sides by area, summed on the edges, and areas, where the senses are known. *Shape:* ``(B, E, 4)``."""
         n_edges = self.n_edges
         total = t.new_zeros(len(t), n_edges, 4)
-        given = [*turns, t, self._edge_of, self._signs.double(), sense, n_edges, total]
+        given = [*turns, t, self._edge_of, self._signs.double(), sign, n_edges, total]
         launch(kernels("rotations").part_turned, (len(t), len(self.faces)), given)
         return total
 
-    def from_sums(self, to_total: Tensor, sense: Tensor, first: Tensor, second: Tensor, t: Tensor) -> list[Tensor]:
+    def from_sums(self, to_total: Tensor, sign: Tensor, first: Tensor, second: Tensor, t: Tensor) -> list[Tensor]:
         """Gradients in both shapes and the times, of that in the sums."""
         found = [torch.zeros_like(value) for value in (first, second, t)]
-        given = [first, second, t, self._face, self._edge_of, self._signs.double(), sense, first.shape[1]]
+        given = [first, second, t, self._face, self._edge_of, self._signs.double(), sign, first.shape[1]]
         given += [self.n_edges, to_total, *found]
-        launch(kernels("rotations_adjoint").from_turned, (len(sense), len(self.faces)), given)
+        launch(kernels("rotations_adjoint").from_turned, (len(sign), len(self.faces)), given)
         return found
 
-    def along(self, course: Course, which: Tensor, t: Tensor) -> Tensor:
+    def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
         """As the other's."""
         if traced(t):
-            return super().along(course, which, t)
-        packed = torch.cat([part if part.dim() > 2 else part[None] for part in course])
-        return applied(_OnCourse, self, packed.movedim(0, -1).double(), which, t.double())[0].to(course.unit)
+            return super().along(trajectory, which, t)
+        packed = torch.cat([part if part.dim() > 2 else part[None] for part in trajectory])
+        return applied(_OnTrajectory, self, packed.movedim(0, -1).double(), which, t.double())[0].to(trajectory.unit)
 
-    def course_oracle(self, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
+    def trajectory_oracle(self, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
         """Edges on a packed course, by torch. *Shape:* ``(P, F, 31)``."""
         parts = packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6, 1])
-        return super().along(Course._make([*parts[:-1], parts[-1][0]]), which, t)
+        return super().along(Trajectory._make([*parts[:-1], parts[-1][0]]), which, t)
 
-    def course_sums(self, which: Tensor, packed: Tensor, t: Tensor) -> Tensor:
+    def trajectory_sums(self, which: Tensor, packed: Tensor, t: Tensor) -> Tensor:
         """Sides on courses by area, summed on the edges, and areas. *Shape:* ``(B, E, 4)``."""
         total = t.new_zeros(len(t), self.n_edges, 4)
-        launch(kernels("rotations").course_edges, (len(t), len(self.faces)), self._on_course(packed, which, t, total))
+        launch(
+            kernels("rotations").trajectory_edges,
+            (len(t), len(self.faces)),
+            self._on_trajectory(packed, which, t, total),
+        )
         return total
 
-    def from_course_sums(self, to_total: Tensor, total: Tensor, which: Tensor, *given: Tensor) -> list[Tensor]:
+    def from_trajectory_sums(self, to_total: Tensor, total: Tensor, which: Tensor, *given: Tensor) -> list[Tensor]:
         """Gradients in courses and times, of that in the sums, both of which are spoilt."""
         found = [torch.zeros_like(value) for value in given]
         adjoints = [found[0], None, found[1], *[None] * 3, to_total]
-        taken = self._on_course(given[0], which, given[1], total)
-        launch(kernels("rotations").course_edges, (len(which), len(self.faces)), taken, adjoints)
+        taken = self._on_trajectory(given[0], which, given[1], total)
+        launch(kernels("rotations").trajectory_edges, (len(which), len(self.faces)), taken, adjoints)
         return found
 
-    def _on_course(self, packed: Tensor, which: Tensor, t: Tensor, total: Tensor) -> list[Any]:
+    def _on_trajectory(self, packed: Tensor, which: Tensor, t: Tensor, total: Tensor) -> list[Any]:
         return [packed, which.int(), t, self._edge_of, self._signs.double(), self.n_edges, total]
 
 
@@ -126,12 +130,12 @@ def _to_sums(total: Tensor, to_means: Tensor) -> Tensor:
     return torch.cat([to_sums, torch.where(weights >= tiny, -to_weights, 0)], -1)
 
 
-class _OnCourse(torch.autograd.Function):
+class _OnTrajectory(torch.autograd.Function):
     """Edges, and what the way back needs: the sums."""
 
     @staticmethod
     def forward(fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        total = fused.course_sums(which, packed.detach().contiguous(), t.detach().contiguous())
+        total = fused.trajectory_sums(which, packed.detach().contiguous(), t.detach().contiguous())
         return _means(total), total
 
     @staticmethod
@@ -144,11 +148,11 @@ class _OnCourse(torch.autograd.Function):
     def backward(ctx: Any, to_edges: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         total, packed, which, t = ctx.saved_tensors
         if torch.is_grad_enabled():
-            back = torch.func.vjp(lambda packed, t: ctx.fused.course_oracle(packed, which, t), packed, t)[1]
+            back = torch.func.vjp(lambda packed, t: ctx.fused.trajectory_oracle(packed, which, t), packed, t)[1]
             to_packed, to_t = back(to_edges)
         else:
             given = packed.detach().contiguous(), t.detach().contiguous()
-            to_packed, to_t = ctx.fused.from_course_sums(_to_sums(total, to_edges), total.clone(), which, *given)
+            to_packed, to_t = ctx.fused.from_trajectory_sums(_to_sums(total, to_edges), total.clone(), which, *given)
         return None, to_packed, None, to_t
 
     @staticmethod
@@ -161,7 +165,7 @@ class _OnCourse(torch.autograd.Function):
             for x, dim in zip((packed, which, t), in_dims[1:], strict=True)
         )
         which = which + packed.shape[1] * torch.arange(n, device=which.device)[:, None]
-        edges, total = _OnCourse.apply(fused, packed.flatten(0, 1), which.flatten(), t.flatten())
+        edges, total = _OnTrajectory.apply(fused, packed.flatten(0, 1), which.flatten(), t.flatten())
         return (edges.unflatten(1, (n, -1)), total.unflatten(0, (n, -1))), (1, 0)
 
 
@@ -172,9 +176,9 @@ class _Turned(torch.autograd.Function):
     def forward(fused: FusedRotations, *given: Tensor) -> tuple[Tensor, ...]:
         first, second, t = (value.detach().contiguous() for value in given)
         turns = fused._turned(first, second)
-        sense = fused.sense(*turns[:2])
-        total = fused.sums(turns, sense, t)
-        return _means(total), sense, total
+        sign = fused.sign(*turns[:2])
+        total = fused.sums(turns, sign, t)
+        return _means(total), sign, total
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -184,19 +188,19 @@ class _Turned(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, to_edges: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        sense, total, *given = ctx.saved_tensors
+        sign, total, *given = ctx.saved_tensors
         if torch.is_grad_enabled():
             return (None, *torch.func.vjp(ctx.fused.oracle, *given)[1](to_edges))
         given = [value.detach().contiguous() for value in given]
-        return (None, *ctx.fused.from_sums(_to_sums(total, to_edges), sense, *given))
+        return (None, *ctx.fused.from_sums(_to_sums(total, to_edges), sign, *given))
 
     @staticmethod
     def vmap(
         info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, *given: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        edges, sense, total = _Turned.apply(fused, *flattened(info.batch_size, in_dims[1:], given))
+        edges, sign, total = _Turned.apply(fused, *flattened(info.batch_size, in_dims[1:], given))
         found = (
             edges.unflatten(1, (info.batch_size, -1)),
-            *(x.unflatten(0, (info.batch_size, -1)) for x in (sense, total)),
+            *(x.unflatten(0, (info.batch_size, -1)) for x in (sign, total)),
         )
         return found, (1, 0, 0)

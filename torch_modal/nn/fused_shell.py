@@ -60,7 +60,7 @@ class FusedShell(nn.Module):
     record: Tensor
     hinge: Tensor
     interior: Tensor
-    walls: Tensor
+    capped_faces: Tensor
     used: Tensor
 
     def __init__(self, energy: Energy, mesh: Mesh) -> None:
@@ -78,7 +78,7 @@ class FusedShell(nn.Module):
         self.register_buffer("interior", torch.nonzero(interior).flatten(), persistent=False)
         chain = torch.tensor(own.boundary_chain)
         cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], -1)], 1)
-        self.register_buffer("walls", torch.cat([mesh.faces, cones]).int(), persistent=False)
+        self.register_buffer("capped_faces", torch.cat([mesh.faces, cones]).int(), persistent=False)
         used = torch.zeros(own.n_vertices, 1, dtype=torch.bool).index_fill(0, energy.used.cpu(), True)
         self.n_used = len(energy.used)
         #: Vertices of faces. *Shape:* ``(V, 1)``, bool.
@@ -105,12 +105,12 @@ class FusedShell(nn.Module):
             stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
-        pull, shortest, whole, volume, apart = self._weighed(t, gamma, self.sizes(first, second))
+        pull, shortest, whole, volume, constant = self._weighed(t, gamma, self.sizes(first, second))
         (b, n), n_edges = first.shape[:2], len(self.record)
         stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 4)
         given = [first, second, self.record, self.hinge, pull, shortest, alpha, beta, n, alpha.shape[-1]]
-        launch(kernels("shell").rest, (b, n_edges), [*given, beta.shape[-1], stretch, bend, apart])
-        return ShellReference(stretch, bend, whole, volume, apart)
+        launch(kernels("shell").rest, (b, n_edges), [*given, beta.shape[-1], stretch, bend, constant])
+        return ShellReference(stretch, bend, whole, volume, constant)
 
     def _weighed(self, t: Tensor, gamma: Tensor, sizes: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Pulls and shortest lengths of both ends, *shape* ``(B, 2)``; of volumes stiffness, value, constant."""
@@ -134,10 +134,18 @@ class FusedShell(nn.Module):
         to_first, to_second = torch.zeros(2, *first.shape, dtype=first.dtype, device=first.device)
         to_alpha, to_beta = torch.zeros_like(alpha), torch.zeros_like(beta)
         centres = (None, None) if self.closed else first.new_zeros(2, b, 3).unbind()
-        given: list[Any] = [first, second, self.centre(first), self.centre(second), self.record, self.hinge, self.walls]
+        given: list[Any] = [
+            first,
+            second,
+            self.centre(first),
+            self.centre(second),
+            self.record,
+            self.hinge,
+            self.capped_faces,
+        ]
         given += [*weighed[:2], alpha, beta, n, alpha.shape[-1], beta.shape[-1], received.stretch, received.bend]
         given += [to_volumes, to_areas, to_first, to_second, *centres, to_pull, to_alpha, to_beta]
-        launch(kernels("shell_adjoint").from_reference, (b, n_edges + len(self.walls)), given)
+        launch(kernels("shell_adjoint").from_reference, (b, n_edges + len(self.capped_faces)), given)
         for found, centre in zip((to_first, to_second), centres, strict=True):
             self._spread(centre, found)
         to_t += to_pull[:, 1] - to_pull[:, 0]
@@ -176,8 +184,17 @@ class FusedShell(nn.Module):
 
     def _sizes(self, first: Tensor, second: Tensor, record: Tensor) -> tuple[Tensor, ...]:
         found = first.new_zeros(3, len(first), 2).unbind()
-        given = [first, second, self.centre(first), self.centre(second), record, self.walls, self.n_vertices, *found]
-        launch(kernels("shell").sizes, (len(first), len(record) + len(self.walls)), given)
+        given = [
+            first,
+            second,
+            self.centre(first),
+            self.centre(second),
+            record,
+            self.capped_faces,
+            self.n_vertices,
+            *found,
+        ]
+        launch(kernels("shell").sizes, (len(first), len(record) + len(self.capped_faces)), given)
         return found
 
     def centre(self, x: Tensor) -> Tensor | None:
@@ -196,8 +213,8 @@ class FusedShell(nn.Module):
     def volume(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The volume about the centre, and its gradient. *Shape:* ``(B,), (B, V, 3)``."""
         total, normal = x.new_zeros(len(x)), torch.zeros_like(x)
-        given = [x, self.centre(x), self.walls, self.n_vertices, total, normal]
-        launch(kernels("shell").volume, (len(x), len(self.walls)), given)
+        given = [x, self.centre(x), self.capped_faces, self.n_vertices, total, normal]
+        launch(kernels("shell").volume, (len(x), len(self.capped_faces)), given)
         return total, self.shared(normal)
 
     def shared(self, normal: Tensor) -> Tensor:
@@ -215,9 +232,9 @@ class FusedShell(nn.Module):
         # What starts as zeros lies together.
         energy, volume, gradient, normal, diagonal = zeros(x, (b,), (b,), (b, n, 3), (b, n, 3), (b, n, 6))
         edges, hinges = x.new_empty(b, n_edges, 5), x.new_empty(b, n_edges, 10)
-        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, n]
+        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.capped_faces, n]
         given += [energy, gradient, diagonal, edges, hinges, volume, normal]
-        launch(kernels("shell").linearise, (b, n_edges + len(self.walls)), given)
+        launch(kernels("shell").linearise, (b, n_edges + len(self.capped_faces)), given)
         off = volume - to.volume
         moment = to.stiffness * off
         energy = torch.addcmul(energy, moment, off, value=0.5)
@@ -254,9 +271,9 @@ class FusedShell(nn.Module):
             to_normal = to_normal - self.mean(to_normal)[:, None]
         centre = self.centre(x)
         to_centre = None if centre is None else torch.zeros_like(centre)
-        given = [x, self.record, to.stretch, to.bend, centre, self.walls, self.n_vertices, to_gradient, *others]
+        given = [x, self.record, to.stretch, to.bend, centre, self.capped_faces, self.n_vertices, to_gradient, *others]
         given += [to_volume, to_normal, to_x, to_reference.stretch, to_reference.bend, to_centre]
-        launch(kernels("shell_adjoint").from_point, (len(x), len(self.record) + len(self.walls)), given)
+        launch(kernels("shell_adjoint").from_point, (len(x), len(self.record) + len(self.capped_faces)), given)
         self._spread(to_centre, to_x)
         off = torch.where(to.stiffness > 0, at.moment / torch.where(to.stiffness > 0, to.stiffness, 1), 0)
         to_reference.stiffness.add_(to_moment * off)
@@ -266,9 +283,9 @@ class FusedShell(nn.Module):
         """The energy but for its constant, and its gradient. *Shape:* ``(B, V, 3) -> (B,), (B, V, 3)``."""
         b, n = x.shape[:2]
         energy, volume, gradient, normal = zeros(x, (b,), (b,), (b, n, 3), (b, n, 3))
-        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.walls, n]
+        given = [x, self.record, to.stretch, to.bend, self.centre(x), self.capped_faces, n]
         given += [energy, gradient, None, None, None, volume, normal]
-        launch(kernels("shell").linearise, (b, len(self.record) + len(self.walls)), given)
+        launch(kernels("shell").linearise, (b, len(self.record) + len(self.capped_faces)), given)
         off = volume - to.volume
         moment = to.stiffness * off
         gradient.addcmul_(moment[:, None, None], self.shared(normal))
@@ -277,8 +294,17 @@ class FusedShell(nn.Module):
     def value(self, x: Tensor, to: ShellReference) -> Tensor:
         """The energy but for its constant, of one shape or more for each reference. *Shape:* ``(D * B, V, 3)``."""
         energy, volume = x.new_zeros(2, len(x)).unbind()
-        given = [x, self.record, to.stretch, to.bend, self.n_vertices, len(to.volume), self.centre(x), self.walls]
-        launch(kernels("shell").value, (len(x), len(self.record) + len(self.walls)), [*given, energy, volume])
+        given = [
+            x,
+            self.record,
+            to.stretch,
+            to.bend,
+            self.n_vertices,
+            len(to.volume),
+            self.centre(x),
+            self.capped_faces,
+        ]
+        launch(kernels("shell").value, (len(x), len(self.record) + len(self.capped_faces)), [*given, energy, volume])
         if len(x) != len(to.volume):
             energy, volume = (value.unflatten(0, (-1, len(to.volume))) for value in (energy, volume))
         off = volume - to.volume

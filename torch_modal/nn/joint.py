@@ -12,7 +12,7 @@ from torch_modal.geometry.hermite import beyond
 from torch_modal.nn import trees
 from torch_modal.nn.blend import RotationBlend
 from torch_modal.nn.columns import Columns
-from torch_modal.nn.frame import Frame, Pair, vertex_excess
+from torch_modal.nn.frame import Frame, Pair, vertex_tangent_offset
 from torch_modal.nn.guess import Guess
 from torch_modal.nn.levels import Levels, Stiffness
 from torch_modal.nn.modal_energy import Placement, SumOfEnergies
@@ -144,7 +144,7 @@ class JointSpace(nn.Module):
         difference, extras = trees.picked((difference, extras), index)
         start = None
         if pair.around is not None:
-            starts = self.on_course(pair, index, t)
+            starts = self.on_trajectory(pair, index, t)
             base = starts[0]
             coarse = self.frame.coarsen(base)
             references = levels.against(base, coarse, stiffness)
@@ -181,7 +181,7 @@ class JointSpace(nn.Module):
             )
         return JointProblem(placement, start, base, starts, difference, energy)
 
-    def on_course(self, pair: Pair, index: Tensor | None, t: Tensor) -> tuple[Tensor, ...]:
+    def on_trajectory(self, pair: Pair, index: Tensor | None, t: Tensor) -> tuple[Tensor, ...]:
         """The shape on the smooth path through the neighbours in time, then what it is compared with.
 
         *Shape of each:* ``(B, V, 3)``.
@@ -190,14 +190,16 @@ class JointSpace(nn.Module):
         assert around is not None
         # Of one pair for all there is no need of copies.
         which = None if len(pair.first) == 1 else index
-        first, second, bend = trees.picked((pair.first, pair.second, vertex_excess(pair)), which)
+        first, second, bend = trees.picked((pair.first, pair.second, vertex_tangent_offset(pair)), which)
         u = t[:, None, None]
         straight = torch.lerp(first, second, u) + beyond(bend, u)
         if self.blend is None:
             return (straight,)
-        course = self.blend.rotations.course(around.before, pair.first, pair.second, around.after, around.spacing)
+        trajectory = self.blend.rotations.trajectory(
+            around.before, pair.first, pair.second, around.after, around.spacing
+        )
         which = torch.arange(len(t), device=t.device) if index is None else index
-        return self.blend.along(course, which, straight, t), straight
+        return self.blend.along(trajectory, which, straight, t), straight
 
     @staticmethod
     def require(t: Tensor) -> None:

@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.functions import broadcast_shapes, lasting, outlasting
-from torch_modal.geometry.hermite import Excess, Spacing, around, beyond, located
-from torch_modal.geometry.local_rotations import Course
+from torch_modal.geometry.hermite import Spacing, TangentOffset, around, beyond, located
+from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
 from torch_modal.keyframes.check import checked_arrays
 from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.blend import Blends, RotationBlend
-from torch_modal.nn.frame import Alignment, Pair, mean_areas, vertex_excess
+from torch_modal.nn.frame import Alignment, Pair, mean_areas, vertex_tangent_offset
 
 UNIT = 0.01
 """An amplitude of 1 moves the vertices of the key-frame by this part of its diagonal, in the root mean square."""
@@ -44,8 +44,8 @@ class Interval(NamedTuple):
     """Between two key-frames: all that does not depend on the time."""
 
     pair: Pair
-    course: Course
-    vertices: Excess
+    trajectory: Trajectory
+    vertices: TangentOffset
     """Of the vertices, which say where loose pieces are."""
 
 
@@ -221,13 +221,13 @@ class ModalDecoder(nn.Module):
 
     def bent(self, i: int, interval: Interval, a: Tensor, u: Tensor) -> Tensor:
         """Shapes of one interval, in the frame that the key-frames are aligned in. *Shape:* ``(B, k), (B,)``."""
-        pair, course, vertices = interval
+        pair, trajectory, vertices = interval
         wide = u[:, None, None]
         straight = torch.lerp(pair.first, pair.second, wide) + beyond(vertices, wide)
         if self.moves.shape[1]:
             straight = straight + (a @ self.moves).unflatten(1, (-1, 3))
         bending = (a @ self.columns.flatten(1)).unflatten(1, (6, -1)).movedim(1, 0)
-        return self.blend(i).bent_along(course, straight, u, bending)
+        return self.blend(i).bent_along(trajectory, straight, u, bending)
 
     def located(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
@@ -249,11 +249,11 @@ class ModalDecoder(nn.Module):
         rotations = self.blend(i).rotations
         if pair.around is None:
             still = Spacing(*(torch.ones_like(pair.first[:, 0, 0]),) * 3)
-            course = rotations.course(None, pair.first, pair.second, None, still)
+            trajectory = rotations.trajectory(None, pair.first, pair.second, None, still)
         else:
             before, after, spacing = pair.around[:3]
-            course = rotations.course(before, pair.first, pair.second, after, spacing)
-        return Interval(pair, course, vertex_excess(pair))
+            trajectory = rotations.trajectory(before, pair.first, pair.second, after, spacing)
+        return Interval(pair, trajectory, vertex_tangent_offset(pair))
 
     def _pair(self, i: int, keyframes: Tensor) -> Pair:
         n = len(keyframes)

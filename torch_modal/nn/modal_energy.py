@@ -51,13 +51,13 @@ class _Tables(nn.Module):
         of_vertices = columns.permute(2, 1, 0).contiguous()
         self.n_terms = len(energy.parts)
         for i, part in enumerate(energy.parts):
-            spokes = None if part.term.total else _spokes_of_rows(of_vertices, part.corners)
-            self.register_buffer(f"spokes_{i}", spokes, persistent=False)
+            edge_vectors = None if part.term.total else _edge_vectors_of_rows(of_vertices, part.corners)
+            self.register_buffer(f"edge_vectors_{i}", edge_vectors, persistent=False)
 
     @property
-    def spokes(self) -> list[Tensor | None]:
+    def edge_vectors(self) -> list[Tensor | None]:
         """Of each term's elements in each direction; None of a total. *Shape of each:* ``(M, 3(n-1), n)``."""
-        return [getattr(self, f"spokes_{i}") for i in range(self.n_terms)]
+        return [getattr(self, f"edge_vectors_{i}") for i in range(self.n_terms)]
 
 
 class ModalEnergy(nn.Module):
@@ -142,11 +142,11 @@ class ModalEnergy(nn.Module):
         at = energy.linearise(x, placement.reference)
         extra = None if placement.extra is None else placement.extra.transpose(0, 1)
         gradient, gauss_newton = [], []
-        for part, one, columns in zip(energy.parts, at, self.tables.spokes, strict=True):
+        for part, one, columns in zip(energy.parts, at, self.tables.edge_vectors, strict=True):
             if columns is None:
                 slope, product = self._of_total(one, extra)
             else:
-                own = None if extra is None else part.spokes(extra).flatten(0, 1)
+                own = None if extra is None else part.edge_vectors(extra).flatten(0, 1)
                 slope, product = _normal_equations(one, columns, own)
             gradient.append(slope)
             gauss_newton.append(product)
@@ -225,8 +225,8 @@ class ModalEnergy(nn.Module):
         return _bordered(inner, border, (extra * pushed).sum((0, -1)))
 
 
-def _spokes_of_rows(values: Tensor, corners: Tensor) -> Tensor:
-    """:meth:`torch_modal.energy.energy.OnMesh.spokes` of rows that lie together in memory.
+def _edge_vectors_of_rows(values: Tensor, corners: Tensor) -> Tensor:
+    """:meth:`torch_modal.energy.energy.OnMesh.edge_vectors` of rows that lie together in memory.
 
     *Shape:* ``(V, 3, n), (c, M) -> (M, 3 (c-1), n)``.
     """
@@ -239,8 +239,8 @@ def _normal_equations(one: Linearised, columns: Tensor, extra: Tensor | None) ->
 
     Args:
         one: The term.
-        columns: Spokes in each direction of the space. *Shape:* ``(M, c, n)``.
-        extra: Spokes in each sample's own direction. *Shape:* ``(c, B, M)``.
+        columns: Edge vectors in each direction of the space. *Shape:* ``(M, c, n)``.
+        extra: Edge vectors in each sample's own direction. *Shape:* ``(c, B, M)``.
 
     Returns:
         *Shape:* ``(B, n)``, ``(B, n, n)``; with an own direction, one more of each.

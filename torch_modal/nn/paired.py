@@ -149,8 +149,8 @@ class PairedSpace(nn.Module):
             return self.levels.place(modal, self.levels.seen(x, coarse), references, None, anchors)
 
         places = place(first, self.energy.first), place(second, self.energy.second)
-        apart = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)
-        placement = PairedPlacement(places[0], places[1], apart @ self.energy.gap.mT, (apart**2).sum(-1), mu)
+        difference = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)
+        placement = PairedPlacement(places[0], places[1], difference @ self.energy.gap.mT, (difference**2).sum(-1), mu)
         return PairedProblem(placement, None, first, second, (torch.lerp(first, second, t[:, None, None]),))
 
     @staticmethod

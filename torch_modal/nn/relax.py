@@ -29,7 +29,8 @@ class ConvexHessian:
         self.energy, self.at = energy, at
         #: Stiffness across each element of two vertices; along it, there is the curvature. *Shape:* ``(B, M)``.
         self.tensions = [
-            part.term.tension(one.spokes, one.slope, one.curvature) for part, one in zip(energy.parts, at, strict=True)
+            part.term.tension(one.edge_vectors, one.slope, one.curvature)
+            for part, one in zip(energy.parts, at, strict=True)
         ]
 
     def __call__(self, field: Tensor) -> Tensor:
@@ -39,12 +40,12 @@ class ConvexHessian:
             if part.term.total:
                 received.append(one.curvature * (one.gradients * field).sum((0, -1))[:, None])
                 continue
-            spokes = part.spokes(field)
-            rate = (one.gradients * spokes).sum((0, 1))
+            edge_vectors = part.edge_vectors(field)
+            rate = (one.gradients * edge_vectors).sum((0, 1))
             if tension is None:
                 received.append(one.curvature * rate * one.gradients)
             else:
-                received.append(tension * spokes + (one.curvature - tension) * rate * one.gradients)
+                received.append(tension * edge_vectors + (one.curvature - tension) * rate * one.gradients)
         return self.energy.scatter(self.at, received)
 
     def diagonal(self) -> Tensor:

@@ -92,11 +92,11 @@ def minimise(
     norms = [None] * len(a) if start is None else start.tolist()
     taken_before = [0] * len(a) if n_steps is None else n_steps.tolist()
     each = enumerate(zip(energy.tolist(), norms, taken_before, strict=True))
-    everyone = live = [_Course(row, *known) for row, known in each]
+    everyone = live = [_History(row, *known) for row, known in each]
     for _ in range(max_steps + 1):
         derivatives = step.energy.derivatives(a, placement, second_order=False)
-        told = torch.stack([derivatives.gradient.norm(dim=-1), step.floor(derivatives)], 1).tolist()
-        for own, (norm, floor) in zip(live, told, strict=True):
+        numbers = torch.stack([derivatives.gradient.norm(dim=-1), step.floor(derivatives)], 1).tolist()
+        for own, (norm, floor) in zip(live, numbers, strict=True):
             own.look(norm, floor, tolerance)
         going = [own.status == Status.OUT_OF_STEPS and own.n_steps < max_steps for own in live]
         if any(going):
@@ -132,7 +132,7 @@ def minimise(
 _STAY, _STEP, _NEWTON = range(3)
 
 
-class _Course:
+class _History:
     """What one sample has gone through."""
 
     def __init__(self, row: int, energy: float, start: float | None, n_steps: int) -> None:
@@ -154,9 +154,9 @@ class _Course:
         elif norm <= max(tolerance * self.start, floor) or (self.last and norm <= GROWN * before):
             self.status = Status.CONVERGED
 
-    def go(self, told: list[float], eps: float) -> int:
+    def go(self, numbers: list[float], eps: float) -> int:
         """Which way it goes from here, or the status with which it ends, by what is told of a step."""
-        energy, promised, moved, newton = told
+        energy, promised, moved, newton = numbers
         # Where all that is left to gain drowns in the rounding of the energy, nothing compares steps any more: a whole
         # Newton step is taken, and is the last.
         drowned = promised <= ENERGY_ROUNDING * eps * abs(self.energy)

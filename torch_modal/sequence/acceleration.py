@@ -22,15 +22,15 @@ class AccelerationLimit:
     """Accelerations that are held below a limit.
 
     Args:
-        course: Accelerations without the displacement. *Shape:* ``(3, N, V)``.
+        trajectory: Accelerations without the displacement. *Shape:* ``(3, N, V)``.
         differences: Accelerations of a displacement from what it is at each time. *Shape:* ``(N, T)``.
         turns: From the coordinates in which displacements are given, to those of the accelerations. *Shape:*
             ``(T, 3, 3)``.
         most: The largest that is allowed, of a vertex.
     """
 
-    def __init__(self, course: Tensor, differences: Tensor, turns: Tensor, most: float) -> None:
-        self.course, self.differences, self.turns, self.most = course, differences, turns, most
+    def __init__(self, trajectory: Tensor, differences: Tensor, turns: Tensor, most: float) -> None:
+        self.trajectory, self.differences, self.turns, self.most = trajectory, differences, turns, most
 
     def nearest(self, wanted: Tensor) -> tuple[Tensor, Tensor]:
         """The displacement nearest to a wanted one, in least squares, that keeps each vertex below the limit.
@@ -45,20 +45,20 @@ class AccelerationLimit:
             It, and the vertices that were kept back. *Shape:* ``(3, T, V), (m,)``.
         """
         seen = torch.einsum("tij,jtv->itv", self.turns, wanted)
-        own = torch.nonzero((self.course + self.differences @ seen).norm(dim=0).amax(0) > self.most).flatten()
+        own = torch.nonzero((self.trajectory + self.differences @ seen).norm(dim=0).amax(0) > self.most).flatten()
         if not len(own):
             return wanted, own
-        goal, course = (x[..., own].double().movedim(0, 1).flatten(1) for x in (seen, self.course))
+        goal, trajectory = (x[..., own].double().movedim(0, 1).flatten(1) for x in (seen, self.trajectory))
         # In frames: the unit of time drops out.
         unit = float(self.differences.abs().max()) / 2
-        rows, course, most = self.differences.double() / unit, course / unit, self.most / unit
+        rows, trajectory, most = self.differences.double() / unit, trajectory / unit, self.most / unit
         inverse = torch.linalg.inv(torch.eye(rows.shape[1]).to(rows) + PENALTY * rows.T @ rows)
         # What is found, and the accelerations there, of what accelerations are pulled to.
         pull, freely = PENALTY * inverse @ rows.T, inverse @ goal
-        reach, rest = rows @ pull, rows @ freely + course
-        split, dual = _clipped(rows @ goal + course, most), torch.zeros_like(course)
+        reach, rest = rows @ pull, rows @ freely + trajectory
+        split, dual = _clipped(rows @ goal + trajectory, most), torch.zeros_like(trajectory)
         for _ in range(ROUNDS):
-            pulled = split - dual - course
+            pulled = split - dual - trajectory
             reached = torch.addmm(rest, reach, pulled)
             if float(_lengths(reached).max()) <= (1 + TOLERANCE) * most:
                 break

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from torch_modal.nn import trees
+from torch_modal.nn.active import Pull, settled
 from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.frame import Pair
-from torch_modal.nn.held import Pull, settled
 from torch_modal.nn.samples import Samples
 from torch_modal.sequence.acceleration import AccelerationLimit
 from torch_modal.sequence.splines import through
@@ -124,15 +124,15 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
         # What a key-frame has comes out beside it.
         chosen |= set(torch.nonzero((t < BESIDE) | (t > 1 - BESIDE)).flatten().tolist())
     some = torch.tensor(sorted(chosen), device=start.device)
-    held = search(start, sorted(chosen - {i for i in few if i < first}))
-    if held is None or not bool(search.n_far.any()):
+    active = search(start, sorted(chosen - {i for i in few if i < first}))
+    if active is None or not bool(search.n_far.any()):
         return Displacement(None, t, search.n_far, search.n_far)
-    held = held.of_all(torch.arange(len(t), device=start.device))
-    search.watch(held, AROUND)
+    active = active.of_all(torch.arange(len(t), device=start.device))
+    search.watch(active, AROUND)
     search.count(start, search.beside(some))
-    moved = together(member, samples, pair, start, held, some)
+    moved = together(member, samples, pair, start, active, some)
     limit = _limit(member, samples, pair, shapes)
-    x = _at_rest(member, samples, pair, start, start + moved, held, some, search, limit)
+    x = _at_rest(member, samples, pair, start, start + moved, active, some, search, limit)
     search.count(start)
     n_before = search.n_far
     field = _never_worse(start, (x - start).movedim(-1, 0), search, limit)
@@ -173,8 +173,8 @@ def _never_worse(start: Tensor, field: Tensor, search: ContactSearch, limit: Acc
         if not bool((worse & ~bad).any()):
             reach = 2 * reach
         bad = bad | worse
-        apart = ((t[:, None] - t[bad]).abs().amin(1) / reach).clamp_max(1)
-        found, _ = limit.nearest(field * (apart**2 * (3 - 2 * apart))[:, None])
+        distance = ((t[:, None] - t[bad]).abs().amin(1) / reach).clamp_max(1)
+        found, _ = limit.nearest(field * (distance**2 * (3 - 2 * distance))[:, None])
 
 
 def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor) -> AccelerationLimit:
@@ -203,7 +203,7 @@ def _at_rest(
     pair: Pair,
     start: Tensor,
     x: Tensor,
-    held: Contacts,
+    active: Contacts,
     every: Tensor,
     search: ContactSearch,
     limit: AccelerationLimit,
@@ -219,7 +219,7 @@ def _at_rest(
         pair: The key-frames in the frame.
         start: Without contact. *Shape:* ``(T, V, 3)``.
         x: Where they begin. *Shape:* ``(T, V, 3)``.
-        held: Of all shapes.
+        active: Of all shapes.
         every: Those that take steps. *Shape:* ``(S,)``.
         search: Finds what crosses.
         limit: Of the displacement from ``start``.
@@ -235,12 +235,12 @@ def _at_rest(
     for k in range(1, ROUNDS[1] + 1):
         if k % 2:  # one step changes little of what is held
             fresh = search(x, searched.tolist())
-            held = held if fresh is None else fresh.of_all(held.samples).beside(held)
+            active = active if fresh is None else fresh.of_all(active.samples).beside(active)
         # Those whose rest is known, and those that take a step to it now.
         known = every[leading] if k < n_least else every
         own = known if k <= n_least else every[search.is_watched(every)]
         pull = Pull((x - dual)[own], stiffness)
-        rest = settled(member, samples.rows(own), pair, alone[own], held.rows(own), pull, PRODUCTS)
+        rest = settled(member, samples.rows(own), pair, alone[own], active.rows(own), pull, PRODUCTS)
         alone = alone.index_copy(0, own, rest)
         wanted = (alone + dual - start)[known].movedim(-1, 0)
         moved, kept = limit.nearest(wanted if len(known) == len(t) else through(t[known], t) @ wanted)

@@ -94,10 +94,10 @@ def subdivide(
     n_keys = len(keyframes)
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
     chosen = settings(preset, objective, solver, contact)
-    apart = None
+    contacts = None
     if chosen.objective.contact:
         require_contact()
-        apart = _Apart()
+        contacts = _ContactReport()
         # Not each shape on its own: what was done at one time would not fit what was done at the next.
         chosen = chosen._replace(objective=replace(chosen.objective, contact=False))
     if smooth is None:
@@ -113,15 +113,15 @@ def subdivide(
     total = len(places) - 1 if smooth else (len(places) - 1) * levels
     with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
         if smooth:
-            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, chosen, apart)
+            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, chosen, contacts)
         else:
-            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar, apart)
+            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar, contacts)
         for i, shapes in enumerate(parts):
             sequence[places[i] : places[i + 1] + 1] = shapes
             sequence[places[i]], sequence[places[i + 1]] = keyframes[i], keyframes[(i + 1) % n_keys]
             bar.update(smooth)
-    if apart is not None:
-        apart.report(keyframes, working_faces)
+    if contacts is not None:
+        contacts.report(keyframes, working_faces)
     return sequence[:-1] if cyclic else sequence
 
 
@@ -133,17 +133,17 @@ def _along_path(
     times: Tensor | Sequence[float] | None,
     cyclic: bool,
     chosen: Settings,
-    apart: "_Apart | None",
+    contacts: "_ContactReport | None",
 ) -> Iterator[Tensor]:
     """Shapes of each interval, smooth in time."""
     path = Path(bases, faces.cpu(), times, cyclic, objective=chosen.objective, solver=chosen.solver)
     path.to(keyframes.device)
     for i, when in enumerate(_times_of_intervals(path.times, places)):
         shapes = path(keyframes, when[1:-1])
-        if apart is not None and len(shapes):
+        if contacts is not None and len(shapes):
             u = (when[1:-1] - when[0]) / (when[-1] - when[0])
             samples = path.samples(keyframes[None], i, torch.zeros_like(u, dtype=torch.int64), u)
-            shapes = apart(path.layer.members[path.members[i]], samples, shapes)
+            shapes = contacts(path.layer.members[path.members[i]], samples, shapes)
         ends = keyframes[:1]  # the key-frames are put there by the caller
         yield torch.cat([ends, shapes, ends])
 
@@ -157,7 +157,7 @@ def _by_recursion(
     n_frames: int | None,
     chosen: Settings,
     bar: ProgressReport,
-    apart: "_Apart | None",
+    contacts: "_ContactReport | None",
 ) -> Iterator[Tensor]:
     """Shapes of each interval, of the pair alone."""
     weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
@@ -169,8 +169,8 @@ def _by_recursion(
             shapes = _interleave(shapes, segment.mid_shapes(shapes))
             bar.update()
         shapes = shapes if n_frames is None else _resample(shapes, n, weights)
-        if apart is not None and len(shapes) > 2:
-            shapes[1:-1] = apart(*segment.samples(shapes), shapes[1:-1])
+        if contacts is not None and len(shapes) > 2:
+            shapes[1:-1] = contacts(*segment.samples(shapes), shapes[1:-1])
         yield shapes
 
 
@@ -251,7 +251,7 @@ def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
     return torch.cat(parts if cyclic else [*parts, keyframes[-1:]])
 
 
-class _Apart:
+class _ContactReport:
     """Pushes the shapes of each interval apart, and remembers what is left."""
 
     def __init__(self) -> None:

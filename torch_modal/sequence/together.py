@@ -24,7 +24,7 @@ SOFTNESS = 0.1
 STEPS = 2
 
 
-def together(member: Between, samples: Samples, pair: Pair, x: Tensor, held: Contacts, some: Tensor) -> Tensor:
+def together(member: Between, samples: Samples, pair: Pair, x: Tensor, active: Contacts, some: Tensor) -> Tensor:
     """The displacement after Newton steps, never uphill.
 
     Args:
@@ -32,7 +32,7 @@ def together(member: Between, samples: Samples, pair: Pair, x: Tensor, held: Con
         samples: Of that pair, with the times of the shapes.
         pair: The key-frames in the frame.
         x: The shapes. *Shape:* ``(T, V, 3)``.
-        held: Of all shapes.
+        active: Of all shapes.
         some: Those whose energy is seen. *Shape:* ``(S,)``.
 
     Returns:
@@ -41,9 +41,9 @@ def together(member: Between, samples: Samples, pair: Pair, x: Tensor, held: Con
     every, bend = splines(samples.t)
     x, basis = x[some], every[some]
     columns, mass = member.space.columns, member.frame.weights / member.frame.weights.sum()
-    inner, contact = member.space.energy.parts[0], held.modal(member.mesh, columns.fine)
+    inner, contact = member.space.energy.parts[0], active.modal(member.mesh, columns.fine)
     energy, coarse = SumOfEnergies(inner, contact), member.coarse_reference(samples.rows(some), pair)
-    soft = held.rows(some)._replace(weights=SOFTNESS * held.weights[some])
+    soft = active.rows(some)._replace(weights=SOFTNESS * active.weights[some])
     places = inner.place(member.frame.coarsen(x), coarse), soft.place(contact, x, None)
     gram = (columns.fine * mass[:, None]).flatten(1) @ columns.fine.flatten(1).T
     # Half the Hessian of the squared acceleration, by row and column of the amplitudes of each function.

@@ -202,7 +202,7 @@ def carried(
 
 
 @wp.kernel(enable_backward=False)
-def course(
+def trajectory(
     time: wp.array(dtype=real),
     rotation: wp.array(dtype=wp.mat33d),
     source: wp.array(dtype=vec3),

@@ -73,10 +73,10 @@ def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
 
 @wp.func
 def middle_of(
-    x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), walls: wp.array(dtype=wp.vec3i), sample: int, at: int
+    x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), capped_faces: wp.array(dtype=wp.vec3i), sample: int, at: int
 ):
     """What volumes are relative to: the centre, or where the surface is closed and there is none, any vertex."""
-    found = x[place(at, walls[0][0])]
+    found = x[place(at, capped_faces[0][0])]
     if centre:
         found = centre[sample]
     return found

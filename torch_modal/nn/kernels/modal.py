@@ -227,10 +227,10 @@ def curved_columns(
 
 
 @wp.kernel(enable_backward=False)
-def curved_walls(
+def curved_faces(
     x: wp.array(dtype=vec3),
     centre: wp.array(dtype=vec3),
-    walls: wp.array(dtype=wp.vec3i),
+    capped_faces: wp.array(dtype=wp.vec3i),
     slope: wp.array(dtype=real),
     slots: wp.array(dtype=wp.vec3i),
     n: int,
@@ -243,10 +243,10 @@ def curved_walls(
     s = i // threads
     v = s * n
     to = s * n_slots
-    middle = middle_of(x, centre, walls, s, v)
+    middle = middle_of(x, centre, capped_faces, s, v)
     sixth = slope[s] / real(6.0)
-    for k in range(i - s * threads, walls.shape[0], threads):
-        q = walls[place(k, 0)]
+    for k in range(i - s * threads, capped_faces.shape[0], threads):
+        q = capped_faces[place(k, 0)]
         slot = slots[place(k, 0)]
         wp.atomic_add(out, place(to, slot[0]), -wp.skew(sixth * (corner(x, middle, v, q[2]) - middle)))
         wp.atomic_add(out, place(to, slot[1]), -wp.skew(sixth * (x[place(v, q[0])] - middle)))

@@ -5,8 +5,8 @@ import warp as wp
 from torch_modal.geometry import rotations, triangle_frames
 from torch_modal.nn.kernels.elements import HALF, TINIEST, length_of, place, real, vec3, vec4
 
-packed_course = wp.types.vector(length=31, dtype=real)
-"""A row of :meth:`torch_modal.geometry.local_rotations.Course`, in the order of its parts."""
+packed_trajectory = wp.types.vector(length=31, dtype=real)
+"""A row of :meth:`torch_modal.geometry.local_rotations.Trajectory`, in the order of its parts."""
 
 packed_turn = wp.types.vector(length=12, dtype=real)
 """Of a triangle, the sides' directions in the first shape; length, along and height there, and how they change."""
@@ -112,7 +112,7 @@ def turns(
 
 
 @wp.kernel(enable_backward=False)
-def senses(
+def sign_votes(
     quaternions: wp.array(dtype=vec4),
     areas: wp.array(dtype=real),
     order: wp.array(dtype=wp.int32),
@@ -285,7 +285,7 @@ def part_turned(
     time: wp.array(dtype=real),
     sides: wp.array(dtype=wp.vec3i),
     signs: wp.array(dtype=vec3),
-    sense: wp.array(dtype=real),
+    sign: wp.array(dtype=real),
     n_edges: int,
     total: wp.array(dtype=vec4),
     threads: int,
@@ -297,7 +297,7 @@ def part_turned(
     for k in range(i - s * threads, sides.shape[0], threads):
         at = place(s * sides.shape[0], k)
         c = packed[at]
-        turn = about(t * half_turn(sense[at] * quaternions[at]))
+        turn = about(t * half_turn(sign[at] * quaternions[at]))
         one = turned(turn, vec3(c[0], c[1], c[2]))
         two = turned(turn, vec3(c[3], c[4], c[5]))
         x = c[6] + t * c[9]
@@ -307,8 +307,8 @@ def part_turned(
 
 
 @wp.kernel
-def course_edges(
-    course: wp.array(dtype=packed_course),
+def trajectory_edges(
+    trajectory: wp.array(dtype=packed_trajectory),
     which: wp.array(dtype=wp.int32),
     time: wp.array(dtype=real),
     sides: wp.array(dtype=wp.vec3i),
@@ -324,7 +324,7 @@ def course_edges(
     a = u * (real(1.0) - u) * (real(1.0) - u)
     b = -u * (real(1.0) - u) * u
     for k in range(i - s * threads, sides.shape[0], threads):
-        c = course[place(which[s] * sides.shape[0], k)]
+        c = trajectory[place(which[s] * sides.shape[0], k)]
         e1 = vec3(c[0], c[1], c[2])
         e2 = vec3(c[3], c[4], c[5])
         normal = vec3(c[6], c[7], c[8])

@@ -34,21 +34,21 @@ def reached(turn: vec4, half: vec3, part: vec4, t: real, torque: vec3):
     squared = wp.dot(own, own)
     scale = sinc_of(part, own)
     along = scale * part[0]
-    excess = real(2.0) / real(3.0) - squared * (
+    remainder = real(2.0) / real(3.0) - squared * (
         real(2.0) / real(15.0) - squared * (real(4.0) / real(315.0) - squared * (real(2.0) / real(2835.0)))
     )
     if squared >= SMALL:
-        excess = (real(1.0) - along) / squared
-    found = along * torque + (excess * wp.dot(own, torque)) * own - (scale * scale) * wp.cross(own, torque)
+        remainder = (real(1.0) - along) / squared
+    found = along * torque + (remainder * wp.dot(own, torque)) * own - (scale * scale) * wp.cross(own, torque)
     squared = wp.dot(half, half)
-    excess = real(1.0) / real(3.0) + squared * (
+    remainder = real(1.0) / real(3.0) + squared * (
         real(1.0) / real(45.0) + squared * (real(2.0) / real(945.0) + squared * (real(1.0) / real(4725.0)))
     )
-    along = real(1.0) - squared * excess
+    along = real(1.0) - squared * remainder
     if squared >= SMALL:
         along = turn[0] / sinc_of(turn, half)
-        excess = (real(1.0) - along) / squared
-    return t * (along * found + (excess * wp.dot(half, found)) * half + wp.cross(half, found))
+        remainder = (real(1.0) - along) / squared
+    return t * (along * found + (remainder * wp.dot(half, found)) * half + wp.cross(half, found))
 
 
 @wp.func
@@ -73,7 +73,7 @@ def from_turned(
     faces: wp.array(dtype=wp.vec3i),
     sides: wp.array(dtype=wp.vec3i),
     signs: wp.array(dtype=vec3),
-    sense: wp.array(dtype=real),
+    sign: wp.array(dtype=real),
     n: int,
     n_edges: int,
     to_total: wp.array(dtype=vec4),
@@ -96,7 +96,7 @@ def from_turned(
         r = place(v, f[2])
         a = triangle(first[p], first[q], first[r])
         b = triangle(second[p], second[q], second[r])
-        turn = sense[place(s * faces.shape[0], k)] * quaternion(a, b)
+        turn = sign[place(s * faces.shape[0], k)] * quaternion(a, b)
         half = half_turn(turn)
         part = about(t * half)
         x = a.length + t * (b.length - a.length)

@@ -37,7 +37,7 @@ def sizes(
     first_centre: wp.array(dtype=vec3),
     second_centre: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
-    walls: wp.array(dtype=wp.vec3i),
+    capped_faces: wp.array(dtype=wp.vec3i),
     n: int,
     length: wp.array(dtype=wp.vec2d),
     volume: wp.array(dtype=wp.vec2d),
@@ -55,19 +55,19 @@ def sizes(
         e2 = second[place(v, q[1])] - second[place(v, q[0])]
         total += wp.vec2d(length_of(e1), length_of(e2))
     wp.atomic_add(length, s, total)
-    middle1 = middle_of(first, first_centre, walls, s, v)
-    middle2 = middle_of(second, second_centre, walls, s, v)
+    middle1 = middle_of(first, first_centre, capped_faces, s, v)
+    middle2 = middle_of(second, second_centre, capped_faces, s, v)
     sixth = real(1.0) / real(6.0)
     enclosed = wp.vec2d()
     around = wp.vec2d()
-    for k in range(i - s * threads, walls.shape[0], threads):
-        wall = walls[place(k, 0)]
-        a1 = first[place(v, wall[0])] - middle1
-        b1 = first[place(v, wall[1])] - middle1
-        c1 = corner(first, middle1, v, wall[2]) - middle1
-        a2 = second[place(v, wall[0])] - middle2
-        b2 = second[place(v, wall[1])] - middle2
-        c2 = corner(second, middle2, v, wall[2]) - middle2
+    for k in range(i - s * threads, capped_faces.shape[0], threads):
+        face = capped_faces[place(k, 0)]
+        a1 = first[place(v, face[0])] - middle1
+        b1 = first[place(v, face[1])] - middle1
+        c1 = corner(first, middle1, v, face[2]) - middle1
+        a2 = second[place(v, face[0])] - middle2
+        b2 = second[place(v, face[1])] - middle2
+        c2 = corner(second, middle2, v, face[2]) - middle2
         enclosed += sixth * wp.vec2d(wp.dot(a1, wp.cross(b1, c1)), wp.dot(a2, wp.cross(b2, c2)))
         around += HALF * wp.vec2d(length_of(wp.cross(b1 - a1, c1 - a1)), length_of(wp.cross(b2 - a2, c2 - a2)))
     wp.atomic_add(volume, s, enclosed)
@@ -206,7 +206,7 @@ def value(
     n: int,
     n_references: int,
     centre: wp.array(dtype=vec3),
-    walls: wp.array(dtype=wp.vec3i),
+    capped_faces: wp.array(dtype=wp.vec3i),
     energy: wp.array(dtype=real),
     total: wp.array(dtype=real),
     threads: int,
@@ -238,12 +238,12 @@ def value(
             d2 = wrapped(theta - w[3])
             found += w[0] * d1 * d1 + w[2] * d2 * d2
     wp.atomic_add(energy, s, HALF * found)
-    middle = middle_of(x, centre, walls, s, v)
+    middle = middle_of(x, centre, capped_faces, s, v)
     enclosed = real(0.0)
-    for k in range(i - s * threads, walls.shape[0], threads):
-        wall = walls[place(k, 0)]
-        c = corner(x, middle, v, wall[2]) - middle
-        enclosed += wp.dot(x[place(v, wall[0])] - middle, wp.cross(x[place(v, wall[1])] - middle, c))
+    for k in range(i - s * threads, capped_faces.shape[0], threads):
+        face = capped_faces[place(k, 0)]
+        c = corner(x, middle, v, face[2]) - middle
+        enclosed += wp.dot(x[place(v, face[0])] - middle, wp.cross(x[place(v, face[1])] - middle, c))
     wp.atomic_add(total, s, enclosed / real(6.0))
 
 
@@ -275,7 +275,7 @@ def enclosed(
 def volume(
     x: wp.array(dtype=vec3),
     centre: wp.array(dtype=vec3),
-    walls: wp.array(dtype=wp.vec3i),
+    capped_faces: wp.array(dtype=wp.vec3i),
     n: int,
     total: wp.array(dtype=real),
     gradient: wp.array(dtype=vec3),
@@ -285,10 +285,10 @@ def volume(
     i = wp.tid()
     s = i // threads
     v = s * n
-    middle = middle_of(x, centre, walls, s, v)
+    middle = middle_of(x, centre, capped_faces, s, v)
     found = real(0.0)
-    for k in range(i - s * threads, walls.shape[0], threads):
-        found += enclosed(x, middle, walls[place(k, 0)], v, gradient)
+    for k in range(i - s * threads, capped_faces.shape[0], threads):
+        found += enclosed(x, middle, capped_faces[place(k, 0)], v, gradient)
     wp.atomic_add(total, s, found / real(6.0))
 
 
@@ -299,7 +299,7 @@ def linearise(
     stretch: wp.array(dtype=wp.vec2d),
     bend: wp.array(dtype=vec4),
     centre: wp.array(dtype=vec3),
-    walls: wp.array(dtype=wp.vec3i),
+    capped_faces: wp.array(dtype=wp.vec3i),
     n: int,
     energy: wp.array(dtype=real),
     gradient: wp.array(dtype=vec3),
@@ -385,10 +385,10 @@ def linearise(
             hinges[at] = found
     if energy:
         wp.atomic_add(energy, s, HALF * own)
-    middle = middle_of(x, centre, walls, s, v)
+    middle = middle_of(x, centre, capped_faces, s, v)
     sixfold = real(0.0)
-    for k in range(i - s * threads, walls.shape[0], threads):
-        sixfold += enclosed(x, middle, walls[place(k, 0)], v, normal)
+    for k in range(i - s * threads, capped_faces.shape[0], threads):
+        sixfold += enclosed(x, middle, capped_faces[place(k, 0)], v, normal)
     wp.atomic_add(total, s, sixfold / real(6.0))
 
 

@@ -90,7 +90,7 @@ def from_reference(
     second_centre: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
     hinge: wp.array(dtype=wp.int32),
-    walls: wp.array(dtype=wp.vec3i),
+    capped_faces: wp.array(dtype=wp.vec3i),
     pull: wp.array(dtype=wp.vec2d),
     shortest: wp.array(dtype=wp.vec2d),
     alpha: wp.array(dtype=real),
@@ -186,18 +186,18 @@ def from_reference(
             wp.atomic_add(to_second, q0, -to_e2)
             wp.atomic_add(to_second, q1, to_e2)
     wp.atomic_add(to_pull, s, drawn)
-    middle1 = middle_of(first, first_centre, walls, s, v)
-    middle2 = middle_of(second, second_centre, walls, s, v)
+    middle1 = middle_of(first, first_centre, capped_faces, s, v)
+    middle2 = middle_of(second, second_centre, capped_faces, s, v)
     to_middle1 = vec3()
     to_middle2 = vec3()
     of_volume = to_volume[s]
     of_area = to_area[s]
-    for k in range(i - s * threads, walls.shape[0], threads):
-        wall = walls[place(k, 0)]
-        q0 = place(v, wall[0])
-        q1 = place(v, wall[1])
-        c1 = corner(first, middle1, v, wall[2]) - middle1
-        c2 = corner(second, middle2, v, wall[2]) - middle2
+    for k in range(i - s * threads, capped_faces.shape[0], threads):
+        face = capped_faces[place(k, 0)]
+        q0 = place(v, face[0])
+        q1 = place(v, face[1])
+        c1 = corner(first, middle1, v, face[2]) - middle1
+        c2 = corner(second, middle2, v, face[2]) - middle2
         to_a1, to_b1, to_c1 = from_volume_and_area(
             first[q0] - middle1, first[q1] - middle1, c1, of_volume[0], of_area[0]
         )
@@ -210,9 +210,9 @@ def from_reference(
         wp.atomic_add(to_second, q1, to_b2)
         to_middle1 -= to_a1 + to_b1
         to_middle2 -= to_a2 + to_b2
-        if wall[2] >= 0:
-            wp.atomic_add(to_first, place(v, wall[2]), to_c1)
-            wp.atomic_add(to_second, place(v, wall[2]), to_c2)
+        if face[2] >= 0:
+            wp.atomic_add(to_first, place(v, face[2]), to_c1)
+            wp.atomic_add(to_second, place(v, face[2]), to_c2)
             to_middle1 -= to_c1
             to_middle2 -= to_c2
     if to_first_centre:
@@ -238,7 +238,7 @@ def from_point(
     stretch: wp.array(dtype=wp.vec2d),
     bend: wp.array(dtype=vec4),
     centre: wp.array(dtype=vec3),
-    walls: wp.array(dtype=wp.vec3i),
+    capped_faces: wp.array(dtype=wp.vec3i),
     n: int,
     to_gradient: wp.array(dtype=vec3),
     to_diagonal: wp.array(dtype=symmetric),
@@ -371,31 +371,31 @@ def from_point(
                 to_origin -= to_edge + to_a + to_b
         wp.atomic_add(to_x, q0, to_origin)
         wp.atomic_add(to_x, q1, to_e)
-    middle = middle_of(x, centre, walls, s, v)
+    middle = middle_of(x, centre, capped_faces, s, v)
     to_middle = vec3()
     sixth = real(1.0) / real(6.0)
     swept = to_total[s]
-    for k in range(i - s * threads, walls.shape[0], threads):
-        wall = walls[place(k, 0)]
-        q0 = place(v, wall[0])
-        q1 = place(v, wall[1])
+    for k in range(i - s * threads, capped_faces.shape[0], threads):
+        face = capped_faces[place(k, 0)]
+        q0 = place(v, face[0])
+        q1 = place(v, face[1])
         a = x[q0] - middle
         b = x[q1] - middle
-        c = corner(x, middle, v, wall[2]) - middle
+        c = corner(x, middle, v, face[2]) - middle
         # Of a third of the normals at each corner, and of the volume.
         at_a = to_normal[q0] + swept * a
         at_b = to_normal[q1]
         at_c = vec3()
-        if wall[2] >= 0:
-            at_c = to_normal[place(v, wall[2])]
+        if face[2] >= 0:
+            at_c = to_normal[place(v, face[2])]
         to_a = sixth * (swept * wp.cross(b, c) + wp.cross(at_b, c) + wp.cross(b, at_c))
         to_b = sixth * (wp.cross(c, at_a) + wp.cross(at_c, a))
         to_c = sixth * (wp.cross(at_a, b) + wp.cross(a, at_b))
         wp.atomic_add(to_x, q0, to_a)
         wp.atomic_add(to_x, q1, to_b)
         to_middle -= to_a + to_b
-        if wall[2] >= 0:
-            wp.atomic_add(to_x, place(v, wall[2]), to_c)
+        if face[2] >= 0:
+            wp.atomic_add(to_x, place(v, face[2]), to_c)
             to_middle -= to_c
     if to_centre:
         wp.atomic_add(to_centre, s, to_middle)

@@ -18,26 +18,26 @@ from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import Samples
 
 
-class Held:
+class ActiveContacts:
     """The contact term where each vertex is held: pairs of a shape and an element, without the rest.
 
     Args:
-        held: Of all shapes.
+        active: Of all shapes.
         n: How many vertices a shape has, V.
     """
 
-    def __init__(self, held: Contacts, n: int) -> None:
+    def __init__(self, active: Contacts, n: int) -> None:
         #: The shape of each, and which element it is. *Shape:* ``(N,)``.
-        self.shapes, which = torch.nonzero(held.weights > 0, as_tuple=True)
+        self.shapes, which = torch.nonzero(active.weights > 0, as_tuple=True)
         #: The vertices of each, in rows of all shapes. *Shape:* ``(4, N)``.
-        self.corners = (held.elements[which] + (self.shapes * n)[:, None]).T.contiguous()
-        self.weights, self.gaps = held.weights[self.shapes, which], held.gaps[self.shapes, which]
-        self.term, self.n_shapes = Contact(held.elements), len(held.weights)
+        self.corners = (active.elements[which] + (self.shapes * n)[:, None]).T.contiguous()
+        self.weights, self.gaps = active.weights[self.shapes, which], active.gaps[self.shapes, which]
+        self.term, self.n_shapes = Contact(active.elements), len(active.weights)
 
     def _missing(self, flat: Tensor) -> tuple[Tensor, Tensor]:
         first, *others = (pick(flat, corner) for corner in self.corners)
-        spokes = torch.stack([other - first for other in others])
-        return spokes, self.term.difference(self.term.measures(spokes), self.gaps)
+        edge_vectors = torch.stack([other - first for other in others])
+        return edge_vectors, self.term.difference(self.term.measures(edge_vectors), self.gaps)
 
     def value(self, x: Tensor) -> Tensor:
         """Of each shape. *Shape:* ``(T, V, 3) -> (T,)``."""
@@ -45,9 +45,9 @@ class Held:
 
     def at(self, x: Tensor) -> AtOther:
         """Of the vertices that are too near. *Shape:* ``(T, V, 3)``."""
-        spokes, missing = self._missing(_flat(x))
+        edge_vectors, missing = self._missing(_flat(x))
         near = torch.nonzero(missing).flatten()
-        corners, gradients = self.corners[:, near].flatten(), self.term.gradients(spokes[..., near])
+        corners, gradients = self.corners[:, near].flatten(), self.term.gradients(edge_vectors[..., near])
         on_corners = torch.cat([-gradients.sum(0), *gradients], -1)
         stiffness = 2 * self.weights[near].repeat(4)
         gradient, diagonal = torch.zeros_like(x), x.new_zeros(*x.shape[:-1], 6)
@@ -99,7 +99,7 @@ class Pull(NamedTuple):
 
 @torch.no_grad()
 def settled(
-    member: Between, samples: Samples, pair: Pair, x: Tensor, held: Contacts, pull: Pull, n_products: int
+    member: Between, samples: Samples, pair: Pair, x: Tensor, active: Contacts, pull: Pull, n_products: int
 ) -> Tensor:
     """A Newton step of all vertices of each shape, with what is held in it, never uphill.
 
@@ -108,16 +108,16 @@ def settled(
         samples: Of that pair, with the times of the shapes.
         pair: The key-frames in the frame.
         x: Where to start. *Shape:* ``(T, V, 3)``.
-        held: Of all shapes.
+        active: Of all shapes.
         pull: What pulls them elsewhere.
         n_products: Iterations of conjugate gradients.
     """
     fixed = member.anchors(trees.picked(pair, samples.which), samples.t)
     if member.fused is None:
-        return _by_torch(member, samples, pair, x, held, pull, n_products, fixed)
+        return _by_torch(member, samples, pair, x, active, pull, n_products, fixed)
     moving, pull, parts = x.double(), Pull(pull.to.double(), pull.weights.double()), []
     for own, to, others in member.fused_chunks(samples, pair, fixed):
-        more = [*others, Held(held.rows(own), x.shape[1]), pull.rows(own)]
+        more = [*others, ActiveContacts(active.rows(own), x.shape[1]), pull.rows(own)]
         parts.append(member.fused.descend(moving[own].contiguous(), to, more, 1, n_products))
     return torch.cat(parts).to(x)
 
@@ -127,12 +127,12 @@ def _by_torch(
     samples: Samples,
     pair: Pair,
     x: Tensor,
-    held: Contacts,
+    active: Contacts,
     pull: Pull,
     n_products: int,
     fixed: Tensor | None,
 ) -> Tensor:
-    energy = held.fine(member.mesh, [*member.terms, Position(member.mesh.n_vertices)])
+    energy = active.fine(member.mesh, [*member.terms, Position(member.mesh.n_vertices)])
     origin = x.new_zeros(len(x), 1, 3)
     fixed = origin if fixed is None else torch.cat([fixed, origin], 1)
     reference = member.fine_reference(samples, pair)
@@ -140,7 +140,7 @@ def _by_torch(
     for i in range(0, len(x), size):
         own = slice(i, i + size)
         rest, anchors = trees.rows((reference, fixed), own)
-        rest = held.rows(own).joined(pull.rows(own).joined(rest))
+        rest = active.rows(own).joined(pull.rows(own).joined(rest))
         parts.append(relax(energy, x[own], rest, 1, n_products, anchors))
     return torch.cat(parts)
 
