@@ -96,10 +96,10 @@ class Term(nn.Module):
             def elements(self, mesh):
                 return mesh.faces
 
-            def measure(self, spokes):
-                return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+            def measure(self, edge_vectors):
+                return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
 
-    and goes where terms are asked for: ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a size of 100, like
+    and is passed as ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a size of 100, like
     those of Eq. 5.
 
     Args:

@@ -1,7 +1,7 @@
 """Which vertices are to stay in front of which faces: what a contact energy holds. NumPy and SciPy only.
 
-A vertex is held by a face where parts went through each other, or nearly touch beside such a place. It is never held
-by a face that it was behind in a known shape: what touches or crosses itself there is left as it is.
+A contact pairs a vertex with a face where parts went through each other, or nearly touch beside such a place. It never
+pairs a vertex with a face that it was behind in a known shape: what touches or crosses itself there stays as it is.
 """
 
 from functools import cached_property
@@ -53,7 +53,7 @@ class FoundContacts(NamedTuple):
 
 
 class Search:
-    """Finds what is to be held.
+    """Search for active contacts.
 
     Args:
         crossings: Of the connectivity, with the key-frames as its known shapes.
@@ -66,7 +66,7 @@ class Search:
         self._known = [Surface(crossings, x) for x in crossings.known]
 
     def __call__(self, x: FloatArray, watched: BoolArray | None = None) -> FoundContacts:
-        """What is to be held in a shape.
+        """The active contacts of a shape.
 
         Args:
             x: *Shape:* ``(V, 3)``.
@@ -133,7 +133,7 @@ class Search:
 
         Args:
             surface: The shape.
-            seeds: Vertices that are asked for, and corners of faces that may be found. *Shape:* ``(V,)``.
+            seeds: Requested vertices, and corners of faces that may be found. *Shape:* ``(V,)``.
             inside: Vertices that are inside the surface, and were not in any known shape. *Shape:* ``(V,)``.
             stuck: Vertices that are inside the surface, and were in a known shape. *Shape:* ``(V,)``.
 

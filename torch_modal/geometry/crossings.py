@@ -87,7 +87,7 @@ class Crossings:
         self.like = known[0] if like is None else like
         used = self.like[np.unique(mesh.faces)]
         self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
-        #: Of vertices that were asked for, those within :data:`FAR`.
+        #: Of the vertices searched so far, those within :data:`FAR`.
         self._near: dict[int, IntArray] = {}
 
     # ------------------------------------------------------------------------------------------------- once for a mesh

@@ -6,7 +6,7 @@ Of any quantity that steps by ``d`` from one key-frame to the next, in the time 
 .. math::
     q(u) = q_0 + u\, d + u (1 - u) \bigl((1 - u)\, e_0 - u\, e_1\bigr), \qquad e_i = h\, m_i - d,
 
-with ``u`` from 0 to 1 (Hermite). The excess ``e`` is all that neighbours in time have to say. Quantities may be
+with ``u`` from 0 to 1 (Hermite). Only the tangent offsets ``e`` depend on the neighbours in time. Quantities may be
 vectors, or rotations, whose steps are axis times angle in coordinates that turn along.
 """
 
@@ -43,7 +43,7 @@ def tangent_offset(
     spacing: Spacing,
     squared: Callable[[Tensor], Tensor] = torch.square,
 ) -> TangentOffset:
-    r"""The excess that follows from the steps before and after.
+    r"""The tangent offsets that follow from the steps before and after.
 
     Velocities are those of the parabola through three key-frames, :math:`(h_+ v_- + h_- v_+) / (h_- + h_+)` of the
     velocities of both steps, limited (:data:`LIMIT`). Evenly spaced, that is Catmull and Rom's spline, and half-way
@@ -141,7 +141,7 @@ def around(i: int, times: Tensor, cyclic: bool) -> tuple[int | None, int | None,
 
 
 def beyond(bend: TangentOffset, u: Tensor) -> Tensor:
-    """What the cubic adds to the straight step at ``u``, which broadcasts against the excess."""
+    """What the cubic adds to the straight step at ``u``, which broadcasts against the tangent offset."""
     return u * (1 - u) * ((1 - u) * bend.first - u * bend.last)
 
 

@@ -33,7 +33,7 @@ class Trajectory(NamedTuple):
     """To the shape at 1: axis times angle in the coordinates of the frames, then the growth of the size over the mean
     length, so that all are turns or strains. *Shape:* ``(6, P, F)``."""
     first: Tensor
-    """The excess of that. *Shape:* ``(6, P, F)``."""
+    """The tangent offset of the step at the start. *Shape:* ``(6, P, F)``."""
     last: Tensor
     unit: Tensor
     """The mean length. *Shape:* ``(P, F)``."""
@@ -102,7 +102,7 @@ class LocalRotations(nn.Module):
     def trajectory(
         self, before: Tensor | None, first: Tensor, second: Tensor, after: Tensor | None, spacing: Spacing
     ) -> Trajectory:
-        """A smooth course through four shapes, between the two in the middle. *Shape of each:* ``(P, V, 3)``.
+        """A smooth trajectory through four shapes, between the two in the middle. *Shape of each:* ``(P, V, 3)``.
 
         Args:
             before: The shape before the first; None where there is none.

@@ -16,7 +16,7 @@ def merge_seams(shapes: NDArray[np.float64], faces: IntArray) -> IntArray:
     """Which vertices are one, because the surface was cut there.
 
     Two vertices are one if both lie on a boundary and are at the same place in every shape. Surfaces that merely touch
-    are left apart: closed ones have no boundary, and open ones part in some shape.
+    stay separate: closed ones have no boundary, and open ones part in some shape.
 
     Args:
         shapes: *Shape:* ``(K, V, 3)``.

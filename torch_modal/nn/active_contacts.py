@@ -1,4 +1,4 @@
-"""What is held apart in many shapes: its energy and derivatives, and steps of all vertices with it."""
+"""The contact energy of many shapes, its derivatives, and Newton steps of all vertices with it."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from torch_modal.nn.samples import Samples
 
 
 class ActiveContacts:
-    """The contact term where each vertex is held: pairs of a shape and an element, without the rest.
+    """The contact term of the active contacts: pairs of a shape and an element.
 
     Args:
         active: Of all shapes.
@@ -101,7 +101,7 @@ class Pull(NamedTuple):
 def settled(
     member: Between, samples: Samples, pair: Pair, x: Tensor, active: Contacts, pull: Pull, n_products: int
 ) -> Tensor:
-    """A Newton step of all vertices of each shape, with what is held in it, never uphill.
+    """A Newton step of all vertices of each shape, with its active contacts, never uphill.
 
     Args:
         member: In-betweens of the pair of key-frames.

@@ -29,7 +29,7 @@ class Minimisation(NamedTuple):
     require: Callable[[Tensor], None]
     """Raises where there is no minimum at some of the times."""
     report: Callable[[Solution], None] | None
-    """Told how it went."""
+    """Receives the solution."""
 
 
 class _ArgMin(torch.autograd.Function):

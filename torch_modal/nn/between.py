@@ -81,7 +81,7 @@ class Shared(NamedTuple):
     distortion: Distortion
     """Judges results."""
     weights: Tensor
-    """Of the vertices in alignments, so that a motion through several has one course. *Shape:* ``(V,)``."""
+    """Of the vertices in alignments, so that a motion through several pairs has one trajectory. *Shape:* ``(V,)``."""
     collapses: Callable[..., Collapsing]
     """Those of pairs of references, by their places."""
     blends: Blends
@@ -173,7 +173,7 @@ class Between(nn.Module):
 
         Args:
             samples: The batch.
-            report: Told how it went.
+            report: Receives the solution.
         """
         space, t = self.space, samples.t
         pair, usable = self._placed_by_kernels(samples) or self._placed_by_torch(samples)

@@ -55,7 +55,7 @@ class RotationBlend(nn.Module):
         return self._reached(self.rotations(first, second, t), near)
 
     def along(self, trajectory: Trajectory, which: Tensor, straight: Tensor, t: Tensor) -> Tensor:
-        """The shape at the time ``t`` of a course.
+        """The shape at the time ``t`` of a trajectory.
 
         Args:
             trajectory: Of :meth:`LocalRotations.trajectory`.
@@ -109,7 +109,7 @@ class Blends:
         return RotationBlend(self.mesh, self.shapes[[i, j]], self.fused, self.first.poisson)
 
     def _is_plain(self, i: int, j: int) -> bool:
-        """Whether neighbours have the same sense by the first tree, as they then have by every other."""
+        """Whether neighbours have the same quaternion sign by the first tree, and so by every other."""
         rotations = self.first.rotations
         pair = self.shapes[[i, j]].to(rotations.piece.device)
         turns = rotations.turns(pair[:1], pair[1:])[:, 0]

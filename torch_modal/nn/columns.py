@@ -53,7 +53,7 @@ class Columns(nn.Module):
         self._shape = [len(coarse), *parts[0].given.shape[1:]]
         self.register_buffer("_fine", None, persistent=False)
         self.register_buffer("coarse", coarse, persistent=False)
-        #: What amplitudes are told by. *Shape:* ``(3 V_coarse, n)``.
+        #: Maps coarse shapes to amplitudes. *Shape:* ``(3 V_coarse, n)``.
         self.register_buffer("weighted", (coarse * weights[:, None]).flatten(1).mT.contiguous(), persistent=False)
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""Contacts of a batch of in-betweens: what is held in each, as a term of the modal solve and of the fine steps."""
+"""Active contacts of a batch of in-betweens, as a term of the steps of all vertices."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -21,12 +21,12 @@ FINE_PRODUCTS = 20
 
 
 class Contacts(NamedTuple):
-    """What is held in the samples of a batch that pass through themselves."""
+    """The active contacts of the samples of a batch that pass through themselves."""
 
     samples: Tensor
     """Which of the batch these are. *Shape:* ``(S,)``."""
     elements: Tensor
-    """A face and the vertex before it; all that is held in any sample. *Shape:* ``(M, 4)``."""
+    """A face and the vertex in front of it, of all samples together. *Shape:* ``(M, 4)``."""
     weights: Tensor
     """Stiffness times the area around the vertex; zero where a sample does not hold it. *Shape:* ``(S, M)``."""
     gaps: Tensor
@@ -137,7 +137,7 @@ class ContactSearch:
         return (i for i in some if self._counted(i, x[i])[1])
 
     def count(self, x: Tensor, some: Sequence[int] | None = None) -> None:
-        """Count what crosses in all samples, or some; nothing is looked for that is held. *Shape:* ``(B, V, 3)``."""
+        """Count the pairs that cross in all samples, or some, without a search for contacts. *Shape:* ``(B, V, 3)``."""
         some = range(len(x)) if some is None else some
         self._keep(some, [self._counted(i, x[i]) for i in some])
 
@@ -213,7 +213,7 @@ class ContactSearch:
         return GAP + max(float(search.depth(shape, pairs).max()), search.crossings.reach(shape, pairs))
 
     def watch(self, active: Contacts, around: int) -> None:
-        """Watch what is held in a sample, and beside it, in that one and its neighbours in time."""
+        """Watch the active contacts of a sample and their surroundings, in that sample and its neighbours in time."""
         crossings = self.searches[0].crossings
         for i, weights in zip(active.samples.tolist(), active.weights, strict=True):
             if not bool(weights.any()):

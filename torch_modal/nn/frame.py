@@ -53,10 +53,10 @@ class Pair(NamedTuple):
     between: RigidMotion
     """From the first key-frame's pose to the second's, in the frame and its units."""
     around: Around | None = None
-    """What the neighbours in time say, where the course is to be smooth."""
+    """The tangent offsets from the neighbours in time, for smooth trajectories."""
 
     def motions(self) -> "Pair":
-        """The same without vertices: what the way back to the caller is told by."""
+        """The same without vertices, for the way back to the caller's coordinates."""
         around = None if self.around is None else self.around._replace(before=None, after=None)
         return self._replace(first=self.first[:, :0], second=self.second[:, :0], around=around)
 
@@ -116,7 +116,7 @@ class Alignment(nn.Module):
         return RigidMotion(straight.rotation @ bent, straight.source, moved)
 
     def restore(self, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
-        """Bring a shape at the time ``t`` back to the caller, moved along the course of the rigid motion.
+        """Bring a shape at the time ``t`` back to the caller, moved along the trajectory of the rigid motion.
 
         Args:
             x: Shapes of the frame. *Shape:* ``(B, V, 3)``.

@@ -90,7 +90,7 @@ class FusedRotations(LocalRotations):
         return applied(_OnTrajectory, self, packed.movedim(0, -1).double(), which, t.double())[0].to(trajectory.unit)
 
     def trajectory_oracle(self, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
-        """Edges on a packed course, by torch. *Shape:* ``(P, F, 31)``."""
+        """Edges on a packed trajectory, by torch. *Shape:* ``(P, F, 31)``."""
         parts = packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6, 1])
         return super().along(Trajectory._make([*parts[:-1], parts[-1][0]]), which, t)
 

@@ -54,7 +54,7 @@ class Step(NamedTuple):
     moved: Tensor
     """False where no step was found that does not go uphill. *Shape:* ``(B,)``, bool."""
     newton: Tensor
-    """Where a whole Newton step leads; NaN where none was asked for or the Hessian is indefinite.
+    """Where a whole Newton step leads; NaN where none was requested or the Hessian is indefinite.
 
     *Shape:* ``(B, n)``.
     """

@@ -1,4 +1,8 @@
-"""Whether there are kernels, and how torch runs them: what NVIDIA Warp needs to be told."""
+"""Loading of Warp's kernels, and their launch on torch tensors.
+
+Arguments are written into commands that Warp has recorded, through the layout of its ctypes structures. Its documented
+calls take 47 microseconds for a kernel of 13 arrays, which is 13 % of an in-between; setup.py bounds the version.
+"""
 
 import ctypes
 import importlib
@@ -95,7 +99,7 @@ def load_kernels(backend: Backend) -> None:
 
 
 class _Commands(threading.local):
-    """What this thread has launched before, so that only what is new needs to be told to Warp."""
+    """The commands that this thread has recorded."""
 
     def __init__(self) -> None:
         self.known: dict[tuple[Any, ...], _Command] = {}
@@ -236,7 +240,7 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
 
 def _stream(device: torch.device) -> Any:
     """Torch's own, of a GPU."""
-    if device == _CPU:  # which is told sooner than its type
+    if device == _CPU:  # faster than comparing its type
         return None
     import warp as wp
 

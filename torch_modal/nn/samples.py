@@ -13,7 +13,7 @@ from torch_modal.nn.solver import Solution, Status
 
 
 class ConvergenceError(RuntimeError):
-    """A gradient was asked for through a minimisation that did not converge."""
+    """A gradient was requested through a minimisation that did not converge."""
 
 
 class InBetweenResult(NamedTuple):
@@ -41,11 +41,11 @@ class Samples(NamedTuple):
     stiffness: list[Tensor]
     """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
     before: Tensor | None = None
-    """The key-frames before those at 0, where the course is to be smooth in time. *Shape:* ``(P, V, 3)``."""
+    """The key-frames before those at 0, for trajectories that are smooth in time. *Shape:* ``(P, V, 3)``."""
     after: Tensor | None = None
     """The key-frames after those at 1. *Shape:* ``(P, V, 3)``."""
     spacing: Spacing | None = None
-    """Durations of the three intervals; None if the course is of the pair alone. *Shape of each:* ``(P,)``."""
+    """Durations of the three intervals; None for the pair alone. *Shape of each:* ``(P,)``."""
 
     def rows(self, some: Tensor) -> "Samples":
         """Some of the samples, of the same pairs. *Shape:* ``(S,)``."""
@@ -59,7 +59,7 @@ def report(solution: Solution, max_steps: int, forbid: bool) -> None:
 
     Args:
         solution: One value per sample.
-        max_steps: The limit that held.
+        max_steps: The limit of the solver.
         forbid: Whether it is an error.
 
     Raises:

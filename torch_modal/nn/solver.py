@@ -155,7 +155,7 @@ class _History:
             self.status = Status.CONVERGED
 
     def go(self, numbers: list[float], eps: float) -> int:
-        """Which way it goes from here, or the status with which it ends, by what is told of a step."""
+        """Choose the next step, or set the status with which the sample ends."""
         energy, promised, moved, newton = numbers
         # Where all that is left to gain drowns in the rounding of the energy, nothing compares steps any more: a whole
         # Newton step is taken, and is the last.

@@ -1,6 +1,6 @@
 r"""What a displacement in time may add to the accelerations of vertices, so that nothing pops.
 
-With the accelerations :math:`a` of a course of shapes, and a displacement :math:`d` that is added to it,
+With the accelerations :math:`a` of a trajectory of shapes, and a displacement :math:`d` that is added to it,
 
 .. math:: |a_{iv} + \ddot d_{iv}| \le \bar a
 
@@ -19,7 +19,7 @@ PENALTY = 0.5
 
 
 class AccelerationLimit:
-    """Accelerations that are held below a limit.
+    """A bound on accelerations.
 
     Args:
         trajectory: Accelerations without the displacement. *Shape:* ``(3, N, V)``.

@@ -1,4 +1,4 @@
-r"""Contact along a course of shapes: what passes through itself is pushed apart, the same way at all times.
+r"""Contact along a trajectory of shapes: parts that pass through each other are pushed apart, alike at all times.
 
 Shapes that are pushed apart one by one jump where a contact begins and ends. Here one displacement serves all times of
 an interval between two key-frames. It vanishes at both, and is the one of
@@ -29,7 +29,7 @@ from torch_modal.sequence.together import together
 ROOM = 1.27
 """A vertex may be accelerated so many times as much as the one that is most without contact."""
 LEAST_LIMIT = 30.0
-"""That is never less than this, at a diagonal of 100: a straight course has to be left, too."""
+"""That is never less than this, at a diagonal of 100: a straight trajectory must bend, too."""
 LOOKED_AT = 8
 SEARCHED = 16
 """:func:`push_apart` has it."""
@@ -101,7 +101,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
 
     A few of many shapes are looked at first: where parts go through each other in none of these, there is nothing to
     do. What is found pushes about :data:`SEARCHED` of the shapes apart, and the others along with them; all are looked
-    at as they come to rest.
+    at as they relax.
 
     Args:
         member: In-betweens of the pair.
@@ -140,7 +140,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
 
 
 def _search(member: Between, samples: Samples, pair: Pair) -> ContactSearch:
-    """A search in the shapes of a course, in which nothing is tolerated."""
+    """A search in the shapes of a trajectory, with no tolerated crossings."""
     return ContactSearch(
         member.mesh, pair.first, pair.second, samples.which, samples.t, member.crossing_pairs, is_tolerant=False
     )
@@ -180,7 +180,7 @@ def _never_worse(start: Tensor, field: Tensor, search: ContactSearch, limit: Acc
 def _limit(member: Between, samples: Samples, pair: Pair, shapes: Tensor) -> AccelerationLimit:
     """Of the accelerations between shapes that follow each other, as the caller sees them.
 
-    At a key-frame at which the course goes on, either side has half of the room: it is not to be bounced off.
+    At a key-frame at which the trajectory goes on, either side has half of the room: it is not to be bounced off.
     """
     t = samples.t
     n = len(t) + 1
@@ -208,7 +208,7 @@ def _at_rest(
     search: ContactSearch,
     limit: AccelerationLimit,
 ) -> Tensor:
-    """Shapes at rest with what is held, as far as accelerations allow.
+    """Relaxed shapes with their active contacts, as far as accelerations allow.
 
     Some take steps, and the others follow along a cubic spline; what passes through itself there takes steps, too.
     What leaves the fewest crossings is kept.
@@ -228,12 +228,12 @@ def _at_rest(
     best: tuple[int, Tensor] | None = None
     # Where each shape would rest alone, what it was kept from in all rounds, and the vertices that ever were.
     alone, dual, stiffness = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
-    # What holds nothing is near to its neighbours in time: some of these shapes lead the others at first.
+    # Shapes without contacts are close to their neighbours in time: some of these shapes lead the others at first.
     leading = search.is_watched(every)
     searched = every[leading]
     leading[::LEADING] = True
     for k in range(1, ROUNDS[1] + 1):
-        if k % 2:  # one step changes little of what is held
+        if k % 2:  # one step changes few of the contacts
             fresh = search(x, searched.tolist())
             active = active if fresh is None else fresh.of_all(active.samples).beside(active)
         # Those whose rest is known, and those that take a step to it now.

@@ -31,7 +31,7 @@ SAME_TIME = 2e-15
 
 
 class _Lazy(InBetween):
-    """Pairs of a smooth path, which minimises nothing: what would is made only when asked for."""
+    """Pairs of a smooth path, which minimises nothing: the tables of the minimisation are made on first use."""
 
     def prepare(self) -> None:
         """Nothing."""

@@ -252,7 +252,7 @@ def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
 
 
 class _ContactReport:
-    """Pushes the shapes of each interval apart, and remembers what is left."""
+    """Pushes the shapes of each interval apart, and counts the crossings that are left."""
 
     def __init__(self) -> None:
         self.n_before = self.n_left = self.n_searched = 0

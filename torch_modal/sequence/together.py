@@ -1,4 +1,4 @@
-r"""One displacement in the modes that pushes all shapes of a course apart.
+r"""One displacement in the modes that pushes all shapes of a trajectory apart.
 
 It is a cubic spline in time that vanishes at the key-frames, :math:`d(t) = \sum_j B_j(t)\, c_j`. What is minimised is
 the sum of the energies of all shapes, on the coarse mesh, with the contact term, and of its squared acceleration:
@@ -20,7 +20,7 @@ from torch_modal.sequence.splines import splines
 SMOOTHNESS = 30.0
 """``lambda``, at a diagonal of 100, with the time between two key-frames as the unit."""
 SOFTNESS = 0.1
-"""Of the contact term: the modes alone would free what is held at far more energy than it takes."""
+"""Of the contact term: the modes alone would resolve contacts with far more energy than necessary."""
 STEPS = 2
 
 

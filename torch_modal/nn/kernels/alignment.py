@@ -1,4 +1,4 @@
-"""Key-frames brought into the frame, and shapes back on the course of the rigid motion."""
+"""Key-frames brought into the frame, and shapes back along the rigid motion."""
 
 import warp as wp
 

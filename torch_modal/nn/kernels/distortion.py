@@ -52,7 +52,7 @@ def distortion(
     out: wp.array(dtype=real),
     threads: int,
 ):
-    """The shapes of a sample lie ``t.shape[0] * n`` entries apart, and so do the sums, for edges and hinges apart."""
+    """The shapes of a sample lie ``t.shape[0] * n`` entries from each other; edges and hinges have separate sums."""
     i = wp.tid()
     s = i // threads
     samples = t.shape[0]

@@ -317,7 +317,7 @@ def trajectory_edges(
     total: wp.array(dtype=vec4),
     threads: int,
 ):
-    """The same of triangles on a smooth course."""
+    """The same of triangles on a smooth trajectory."""
     i = wp.tid()
     s = i // threads
     u = time[s]

@@ -312,7 +312,7 @@ def linearise(
 ):
     """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and what a product with it needs.
 
-    The volume's are apart: the volume and its gradient, see there. Without arrays for the others there are only these
+    The volume and its gradient are separate outputs. Without arrays for the others, the kernel computes only these
     and the gradient.
     """
     i = wp.tid()
