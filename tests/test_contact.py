@@ -9,7 +9,6 @@ import torch
 from conftest import Shapes
 from scipy.optimize import minimize
 from torch import Tensor
-from torch_modal.nn.active import ActiveContacts, Pull, settled
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
@@ -22,6 +21,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import Search, _nearest_faces
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.nn import contact_rounds, trees
+from torch_modal.nn.active_contacts import ActiveContacts, Pull, settled
 from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.contact_rounds import ContactRounds

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.nn import trees
-from torch_modal.nn.active import Pull, settled
+from torch_modal.nn.active_contacts import Pull, settled
 from torch_modal.nn.between import Between
 from torch_modal.nn.contact import Contacts, ContactSearch
 from torch_modal.nn.frame import Pair
