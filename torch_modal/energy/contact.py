@@ -53,7 +53,7 @@ class Contact(Term):
         return torch.full_like(measures, self.gap)
 
     def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
-        """What is missing; nothing where the gap is kept."""
+        """The missing distance; zero where the gap is kept."""
         return (measures - rest).clamp_max(0)
 
     def gradients(self, edge_vectors: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from torch_modal.geometry.vectors import inverse, pick
 
 
 class Rest(NamedTuple):
-    """A rest shape as an energy sees it: what costs nothing, and the weight of each measure, term by term."""
+    """Measures of a rest shape and their weights, term by term."""
 
     measures: tuple[Tensor, ...]
     """*Shape of each:* ``(..., M)``."""
@@ -26,7 +26,7 @@ class Rest(NamedTuple):
 
 
 class Reference(NamedTuple):
-    r"""What shapes are compared with: :math:`\sum_{rm} W_{rm} (q_m - Q_{rm})^2 + c`, with R of 1 or 2."""
+    r"""The reference of an energy: :math:`\sum_{rm} W_{rm} (q_m - Q_{rm})^2 + c`, with R of 1 or 2."""
 
     measures: tuple[Tensor, ...]
     """``Q``. *Shape of each:* ``(..., R, M)``."""
@@ -97,7 +97,7 @@ class OnMesh(nn.Module):
         return torch.stack([other - first for other in others])
 
     def measures(self, edge_vectors: Tensor) -> Tensor:
-        """What the energy sees of them: the measures, or their sum. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
+        """The measures, or their sum for a total. *Shape:* ``(n-1, 3, ..., M) -> (..., M or 1)``."""
         measures = self.term.measures(edge_vectors)
         return measures.sum(-1, keepdim=True) if self.term.total else measures
 
@@ -175,7 +175,7 @@ class Energy(nn.Module):
         return torch.cat([rows, centre, fixed.expand(*rows.shape[:-1], n_anchors)], -1)
 
     def fold(self, extended: Tensor) -> Tensor:
-        """The adjoint of :meth:`extend`: the vertices share what the centre received. *Shape:* ``(3, ..., V)``."""
+        """The adjoint of :meth:`extend`: distributes the centre's value to the vertices. *Shape:* ``(3, ..., V)``."""
         share = extended[..., self.n_vertices, None] / len(self.used)
         own = extended[..., : self.n_vertices].contiguous()
         return own.index_add(-1, self.used, share.expand(*share.shape[:-1], len(self.used)).contiguous())

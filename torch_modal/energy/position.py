@@ -1,4 +1,4 @@
-"""Coordinates of vertices: what pulls them to places."""
+"""Coordinates of vertices as measures: pulls vertices to places."""
 
 import torch
 from torch import Tensor

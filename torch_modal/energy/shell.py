@@ -19,7 +19,7 @@ DIAGONAL = 100.0
 
 
 class Measures(NamedTuple):
-    """What Eq. 5 measures on a shape."""
+    """The measures of Eq. 5 on a shape."""
 
     length: Tensor
     """Edge lengths. *Shape:* ``(..., E)``."""
@@ -92,7 +92,7 @@ class ShellEnergy(nn.Module):
         return self.energy.rest(self._rows(x_rest))
 
     def against(self, x_rest: Tensor) -> Reference:
-        """Rest shapes as what others are compared with, with the stiffnesses. *Shape:* ``(..., V, 3)``."""
+        """Rest shapes as references, with the stiffnesses. *Shape:* ``(..., V, 3)``."""
         return Energy.against(self.rest(x_rest), self.stiffness)
 
     def measure(self, x: Tensor) -> Measures:

@@ -1,4 +1,4 @@
-r"""Terms of an energy: what is measured on the elements of a mesh, and how much a difference from rest counts.
+r"""Terms of an energy: measures of the elements of a mesh, and their weights.
 
 A term has the energy :math:`\sum_m k_m w_m (q_m - \bar q_m)^2` over its elements ``m``, with a measure ``q`` of each,
 its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. All that a term must say is
@@ -232,7 +232,7 @@ class Stretch(Term):
         return [-slope * length_hessian(edge_vectors[0])]
 
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
-        """What a stretched string has; nearly none where compressed, without a kink in between."""
+        """Transverse stiffness of a stretched string; smoothly near zero under compression."""
         length = norm(edge_vectors[0])
         width = SLACK * curvature * length
         return 0.5 * (slope + (slope * slope + width * width + torch.finfo(slope.dtype).tiny).sqrt()) / length
@@ -313,7 +313,7 @@ class Volume(Term):
         return torch.stack([cross(q, r), cross(r, p), cross(p, q)]) / 6
 
     def pairs(self, mesh: Mesh) -> Tensor:
-        """The sides of all faces; on a closed surface, what the centre feels cancels."""
+        """The sides of all faces; on a closed surface, the centre's blocks cancel."""
         i, j, k = self.elements(mesh)[:, 1:].unbind(1)
         return torch.cat([torch.stack(side, 1) for side in ((i, j), (j, k), (k, i))])
 

@@ -1,4 +1,4 @@
-"""Which vertices are to stay in front of which faces: what a contact energy holds. NumPy and SciPy only.
+"""Search for contacts: which vertices must stay in front of which faces. NumPy and SciPy only.
 
 A contact pairs a vertex with a face where parts went through each other, or nearly touch beside such a place. It never
 pairs a vertex with a face that it was behind in a known shape: what touches or crosses itself there stays as it is.
@@ -22,7 +22,7 @@ NEAR = 0.015
 FACING = -0.1
 """Most cosine between the normals of a vertex and of a face that face each other."""
 DEEP = 0.12
-"""Along the surface: how far from where it crosses what went in is looked for."""
+"""Distance along the surface, from a crossing, within which penetrating vertices are searched."""
 SPREAD = 0.05
 """How far along the surface from where a key-frame passes through itself the same depth is tolerated."""
 LENIENT = 0.06

@@ -30,7 +30,7 @@ PACKAGES = ("ipctk", "igl")
 RINGS = 2
 """Pairs within so many rings of a crossing of a key-frame belong to it: it grows and shrinks with every rounding."""
 FAR = 0.06
-"""Of the diagonal, along the surface: what crosses nearer is a fold, not two parts that meet."""
+"""Part of the diagonal, along the surface; nearer crossings are folds, not two parts that meet."""
 _OFFSET = 1e-4
 """Of the diagonal, outwards: where the winding number of a vertex is taken. On the surface itself it is a half."""
 _FACES = attrgetter("face0_id", "face1_id")
@@ -65,7 +65,7 @@ def has_contact() -> bool:
 
 
 class Crossings:
-    """Finds what crosses, on shapes of one connectivity.
+    """Finds crossing triangles of shapes of one connectivity.
 
     Args:
         mesh: The connectivity.

@@ -1,4 +1,4 @@
-r"""Cubic motion through key-frames: what it has beyond the straight step between two of them.
+r"""Cubic motion through key-frames, relative to the straight step between two of them.
 
 Of any quantity that steps by ``d`` from one key-frame to the next, in the time ``h``, the cubic with the velocities
 ``m_0`` and ``m_1`` at both is
@@ -141,7 +141,7 @@ def around(i: int, times: Tensor, cyclic: bool) -> tuple[int | None, int | None,
 
 
 def beyond(bend: TangentOffset, u: Tensor) -> Tensor:
-    """What the cubic adds to the straight step at ``u``, which broadcasts against the tangent offset."""
+    """The difference between the cubic and the straight step at ``u``, which broadcasts against the tangent offset."""
     return u * (1 - u) * ((1 - u) * bend.first - u * bend.last)
 
 

@@ -9,7 +9,7 @@ from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 IntArray = NDArray[np.int64]
 
 TOLERANCE = 1e-7
-"""Of the bounding-box diagonal: what float32 and texts of seven digits make of equal places."""
+"""Part of the bounding-box diagonal: the rounding of float32 and of text with seven digits."""
 
 
 def merge_seams(shapes: NDArray[np.float64], faces: IntArray) -> IntArray:

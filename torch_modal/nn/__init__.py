@@ -1,4 +1,4 @@
-"""Layers: in-betweens in a modal space, and what they are made of (torch only)."""
+"""Layers: in-betweens in a modal space, and their parts (torch only)."""
 
 import lazy_loader
 

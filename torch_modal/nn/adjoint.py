@@ -19,7 +19,7 @@ class ConvergenceWarning(UserWarning):
 
 
 class Minimisation(NamedTuple):
-    """What is minimised, and how far."""
+    """The step, its limits, and the report of a minimisation."""
 
     step: GaussNewtonStep
     max_steps: int

@@ -1,4 +1,4 @@
-"""In-betweens of one pair of bases, for flat batches: what all layers share."""
+"""In-betweens of one pair of bases, for flat batches; all layers use it."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -70,7 +70,7 @@ class Batch(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """What is the same for all pairs of a layer."""
+    """Data shared by all pairs of a layer."""
 
     energy: Energy
     """On the caller's mesh."""
@@ -156,7 +156,7 @@ class Between(nn.Module):
         return FusedPairs(self.mesh.connectivity, self.frame.reference.detach().cpu().double().numpy()[None])
 
     def prepare(self) -> None:
-        """Make at once what would be made at the first minimisation."""
+        """Build the tables of the minimisation, otherwise built on first use."""
         if isinstance(self.space, JointSpace):
             self.space.modal  # noqa: B018
 
@@ -200,7 +200,7 @@ class Between(nn.Module):
         return InBetweenResult(torch.where(valid[:, None, None], shapes, torch.nan), solution)
 
     def solved(self, batch: Batch) -> tuple[Tensor, Solution]:
-        """The fine shapes of the frame, with what they came from. *Shape:* ``(B, V, 3)``."""
+        """Fine shapes in the frame, and their solutions. *Shape:* ``(B, V, 3)``."""
         x, solution = self.modal(batch)
         if len(x) and (self.solver.local_steps or self.solver.polish):
             x = self._refine(x, batch)
@@ -215,7 +215,7 @@ class Between(nn.Module):
         samples: Samples,
         anchors: Tensor | None,
     ) -> tuple[Tensor, Solution]:
-        """Shapes that are no worse than their starts, by what is the same for all of them; solutions that say so."""
+        """Replace shapes that are worse than their starts, and mark their solutions."""
         if not starts or not len(x):
             return x, solution
         with torch.no_grad():
@@ -229,7 +229,7 @@ class Between(nn.Module):
         return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
 
     def modal(self, batch: Batch) -> tuple[Tensor, Solution]:
-        """The shapes of the modal space that have the least energy, likewise."""
+        """Shapes of least energy in the modal space, and their solutions."""
         solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         problem = batch.problem
         given = problem.placement, batch.start, batch.usable, batch.samples.t, batch.energy
@@ -256,7 +256,7 @@ class Between(nn.Module):
         return pair, finite
 
     def fine_reference(self, samples: Samples, pair: Pair) -> Reference:
-        """What shapes on the fine mesh are compared with."""
+        """The reference of Eq. 5 on the fine mesh."""
         if pair.around is not None:
             return Energy.against(
                 self._fine_rest(self.space.on_trajectory(pair, samples.which, samples.t)[0]), samples.stiffness
@@ -265,7 +265,7 @@ class Between(nn.Module):
         return self.fine.between(first, second, samples.t, samples.stiffness)
 
     def coarse_reference(self, samples: Samples, pair: Pair) -> Any:
-        """What shapes on the coarse mesh are compared with."""
+        """The reference of Eq. 5 on the coarse mesh."""
         levels, stiffness = self.space.levels, self._levelled(samples.stiffness)
         if pair.around is not None:
             trajectory = self.space.on_trajectory(pair, samples.which, samples.t)[0]
@@ -285,11 +285,11 @@ class Between(nn.Module):
 
     @property
     def step(self) -> GaussNewtonStep:
-        """What is repeated. It has no state: registered, it would name all buffers of the energy twice."""
+        """The Gauss-Newton step. It has no state: registered, it would name all buffers of the energy twice."""
         return GaussNewtonStep(self.space.energy)
 
     def _refine(self, x: Tensor, batch: Batch) -> Tensor:
-        """Local interpolation and polish: what the modes cannot do. *Shape:* ``(B, V, 3)``."""
+        """Local interpolation and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
         solver, samples = self.solver, batch.samples
         stages = (solver.local_steps, LOCAL_PRODUCTS), (solver.polish, POLISH_PRODUCTS)
         if self.fused is not None and self.further is None:
@@ -309,7 +309,7 @@ class Between(nn.Module):
         return torch.cat(parts)
 
     def kernels_serve(self, x: Tensor) -> bool:
-        """Whether kernels take the steps of all vertices where there are other energies beside Eq. 5."""
+        """Whether kernels compute the local steps with energies beside Eq. 5."""
         recorded = torch.is_grad_enabled() and x.requires_grad
         return self.fused is not None and not (recorded or traced(x) or transformed(x))
 
@@ -336,7 +336,7 @@ class Between(nn.Module):
     def fused_chunks(
         self, samples: Samples, pair: Pair, anchors: Tensor | None
     ) -> Iterator[tuple[slice, ShellReference, list[Other]]]:
-        """Samples that kernels relax at a time, what Eq. 5 compares them with, and further terms."""
+        """Chunks of samples for the kernels, with their references and further terms."""
         fused = self.fused
         assert fused is not None
         first, second = trees.picked((pair.first, pair.second), samples.which)
@@ -355,7 +355,7 @@ class Between(nn.Module):
             yield own, fused.reference(a, b, t, *stiffness[:N_SHELL_TERMS]), others
 
     def fine_chunks(self, batch: Batch) -> Iterator[tuple[slice, Reference, Tensor | None]]:
-        """Samples that are relaxed at a time, what they are compared with on the fine mesh, and their anchors."""
+        """Chunks of samples, with their references on the fine mesh and their anchors."""
         pair, samples = batch.pair, batch.samples
         ends = pair.first, pair.second
         known = None if samples.which is None else [self._fine_rest(end) for end in ends]
@@ -445,7 +445,7 @@ class Between(nn.Module):
         return usable & ~self._mirrored(pair, first * second < 0)
 
     def _mirrored(self, pair: Pair, turned: Tensor) -> Tensor:
-        """Which samples have a mirror image, of those whose volumes have turned over. *Shape:* ``(P,)``."""
+        """Samples with a mirrored key-frame, among those whose volumes differ in sign. *Shape:* ``(P,)``."""
         if not traced(turned) and not transformed(turned) and not turned.any():
             return turned
         return turned & looks_mirrored(pair.first, pair.second, self.frame.faces)

@@ -1,4 +1,4 @@
-"""A shape between two key-frames by local rotations, with every vertex free: what the modes then improve."""
+"""A shape between two key-frames by local rotations of all triangles; the base of the modal space."""
 
 from functools import cached_property
 from typing import Any
@@ -103,7 +103,7 @@ class Blends:
 
     @lasting
     def of(self, i: int, j: int) -> RotationBlend:
-        """That of two of the shapes; several have the same."""
+        """The blend of two of the shapes."""
         if (i, j) == self._pair or self._is_plain(i, j):
             return self.first
         return RotationBlend(self.mesh, self.shapes[[i, j]], self.fused, self.first.poisson)

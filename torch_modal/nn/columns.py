@@ -16,7 +16,7 @@ class Directions(NamedTuple):
     given: Tensor
     """*Shape:* ``(m, V, 3)``."""
     turn: Tensor | None = None
-    """What turns them into the frame. *Shape:* ``(3, 3)``."""
+    """The rotation into the frame. *Shape:* ``(3, 3)``."""
 
     def turned(self, x: Tensor) -> Tensor:
         """Vectors of the given coordinates in those of the frame. *Shape:* ``(..., 3)``."""

@@ -14,7 +14,7 @@ from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
 from torch_modal.nn.modal_energy import ModalEnergy, Placement
 
 ROUNDS = 4
-"""How often it is looked for contacts; what was pushed apart may touch elsewhere."""
+"""Most searches for contacts: parts that were pushed apart may touch elsewhere."""
 FINE_STEPS = 3
 FINE_PRODUCTS = 20
 """Newton steps of all vertices with contacts, and iterations in each: contacts are stiff."""
@@ -48,7 +48,7 @@ class Contacts(NamedTuple):
         )
 
     def beside(self, former: "Contacts") -> "Contacts":
-        """These, and of former ones of the same samples those of vertices that nothing holds any more.
+        """These contacts, and former ones of vertices that have none any more.
 
         What was pushed far enough not to be found again would fall back.
         """

@@ -131,7 +131,7 @@ class Alignment(nn.Module):
 
 
 class Coarse(nn.Module):
-    """The coarse mesh that the energy is evaluated on, and what is restricted to it.
+    """The coarse mesh on which the energy is evaluated, and the restriction to it.
 
     Args:
         shapes: Two shapes in the frame, float64 on the CPU. *Shape:* ``(2, V, 3)``.
@@ -231,7 +231,7 @@ class Frame(Alignment):
 
     @property
     def coarse(self) -> Coarse:
-        """What a smooth path does without, made at the first use."""
+        """Tables that only minimisations need, built on first use."""
         if self._coarse is None:
             self._coarse, self._make = lasting(self._make)(), None
         return self._coarse  # type: ignore[no-any-return]
@@ -257,7 +257,7 @@ class Frame(Alignment):
         return self.coarse.restrict(x)
 
     def split(self, coarse: Tensor, columns: Columns) -> tuple[Tensor, Tensor]:
-        """Amplitudes of columns in coarse directions, and what is left. *Shape:* ``(..., n), (..., V_coarse, 3)``."""
+        """Amplitudes of columns in coarse directions, and the remainder. *Shape:* ``(..., n), (..., V_coarse, 3)``."""
         amplitudes = coarse.flatten(-2) @ columns.weighted
         return amplitudes, coarse - (amplitudes @ columns.coarse.flatten(1)).unflatten(-1, (-1, 3))
 
@@ -314,7 +314,7 @@ class _ClusterMeans(torch.autograd.Function):
 
 
 def vertex_tangent_offset(pair: Pair) -> TangentOffset:
-    """What the neighbours in time say of the vertices of a pair. *Shape of each:* ``(B, V, 3)``."""
+    """Tangent offsets of the vertices of a pair, from its neighbours in time. *Shape of each:* ``(B, V, 3)``."""
     step = pair.second - pair.first
     if pair.around is None:
         return TangentOffset(torch.zeros_like(step), torch.zeros_like(step))

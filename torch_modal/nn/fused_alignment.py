@@ -1,4 +1,4 @@
-"""What :class:`torch_modal.nn.frame.Alignment` does, by kernels of NVIDIA Warp, where no gradient is recorded."""
+""":class:`torch_modal.nn.frame.Alignment` by Warp kernels, without gradients."""
 
 import math
 

@@ -94,12 +94,12 @@ class FusedModalEnergy(ModalEnergy):
         self.register_buffer("blocks", blocks, persistent=False)
 
     def _prepare(self) -> None:
-        """Kernels have tables of their own: torch's are made where torch takes over."""
+        """Do nothing: kernels have their own tables, and torch's are built on first use."""
         self._kept: tuple[Tensor, Any] | None = None
 
     @property
     def tables(self) -> Any:
-        """As the other's, of what the columns are now: others may stand in for them, as in functional_call."""
+        """As in the base class, for the present columns, which functional_call may have replaced."""
         if self._kept is None or self._kept[0] is not self.columns:
             self._kept = self.columns, made_outside(self._made_tables)
         return self._kept[1]
@@ -122,7 +122,7 @@ class FusedModalEnergy(ModalEnergy):
     def place(
         self, base: Tensor, reference: Any, extra: Tensor | None = None, anchors: Tensor | None = None
     ) -> Placement:
-        """As the other's."""
+        """As in the base class."""
         if not isinstance(reference, ShellReference):
             return super().place(base, reference, extra, anchors)
         return Placement(base.double(), None if extra is None else extra.double(), reference)  # type: ignore[arg-type]
@@ -151,14 +151,14 @@ class FusedModalEnergy(ModalEnergy):
         return x.flatten(0, -3)
 
     def rows(self, a: Tensor, placement: Placement) -> Tensor:
-        """As the other's."""
+        """As in the base class."""
         if not isinstance(placement.reference, ShellReference):
             return super().rows(a, placement)
         x = self._shapes(a, placement.base, placement.extra).unflatten(0, a.shape[:-1])
         return self.energy.extend(x.movedim(-1, 0))
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
-        """As the other's."""
+        """As in the base class."""
         plain = self._plain(placement)
         if plain is not None:
             return super().value(a.to(plain.base), plain).to(placement.base)
@@ -167,7 +167,7 @@ class FusedModalEnergy(ModalEnergy):
         return found.unflatten(0, a.shape[:-1]) + to.constant
 
     def base_value(self, placement: Placement) -> Tensor:
-        """As the other's."""
+        """As in the base class."""
         plain = self._plain(placement)
         if plain is not None:
             return super().base_value(plain).to(placement.base)
@@ -176,7 +176,7 @@ class FusedModalEnergy(ModalEnergy):
         return found.unflatten(0, placement.base.shape[:-2]) + to.constant
 
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
-        """As the other's."""
+        """As in the base class."""
         plain = self._plain(placement)
         if plain is not None:
             found = super().derivatives(a.to(plain.base), plain, second_order)
@@ -222,7 +222,7 @@ class FusedModalEnergy(ModalEnergy):
         return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
-        """As the other's."""
+        """As in the base class."""
         plain = self._plain(placement)
         if plain is not None:
             value, gradient = super().value_and_gradient(a.to(plain.base), plain)
@@ -232,7 +232,7 @@ class FusedModalEnergy(ModalEnergy):
         return value + to.constant, along_columns(x, self.flat.double(), placement.extra)
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
-        """As the other's."""
+        """As in the base class."""
         plain = self._plain(placement)
         if plain is not None:
             return super().second_order(a.to(plain.base), plain).to(placement.base)
@@ -265,7 +265,7 @@ class FusedModalEnergy(ModalEnergy):
         return curved
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
-        """As the other's."""
+        """As in the base class."""
         to: Any = placement.reference
         if not isinstance(to, ShellReference):
             return super().pull_back(a, direction, placement)

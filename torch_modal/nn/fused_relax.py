@@ -1,4 +1,4 @@
-"""The local steps by kernels of NVIDIA Warp, where that is installed; torch's are what they are tested against."""
+"""The local steps by Warp kernels, tested against those in torch."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -239,7 +239,7 @@ class FusedRelax(FusedShell):
         length: Tensor,
         to_reference: ShellReference,
     ) -> Tensor:
-        """The gradient where a step started, of that where it led; what the reference receives is added to its own."""
+        """The gradient at the start of a step from that at its end; the reference's is added to ``to_reference``."""
         x, to, at, done = taken
         module, shell, (b, n) = kernels("steps_adjoint"), kernels("shell"), x.shape[:2]
         vertices, records = (b, n), (b, len(self.record))
@@ -341,7 +341,7 @@ class Terms:
 
 
 class _Iterations(NamedTuple):
-    """What conjugate gradients went through."""
+    """The iterations of conjugate gradients."""
 
     solution: Tensor
     """*Shape:* ``(B, V, 3)``."""
@@ -367,7 +367,7 @@ class _Taken(NamedTuple):
     x: Tensor
     """Where it started. *Shape:* ``(B, V, 3)``."""
     to: ShellReference
-    """What is compared with."""
+    """The reference."""
     at: ShellPoint
     """The energy there, its diagonal inverted."""
     done: _Iterations

@@ -1,4 +1,4 @@
-"""Local rotations by kernels of NVIDIA Warp, where that is installed; torch's are what they are tested against."""
+"""Local rotations by Warp kernels, tested against those in torch."""
 
 from typing import Any
 
@@ -131,7 +131,7 @@ def _to_sums(total: Tensor, to_means: Tensor) -> Tensor:
 
 
 class _OnTrajectory(torch.autograd.Function):
-    """Edges, and what the way back needs: the sums."""
+    """Edges, and the sums that backward needs."""
 
     @staticmethod
     def forward(fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -170,7 +170,7 @@ class _OnTrajectory(torch.autograd.Function):
 
 
 class _Turned(torch.autograd.Function):
-    """Edges, and what the way back needs: the senses and the sums."""
+    """Edges, and the signs and sums that backward needs."""
 
     @staticmethod
     def forward(fused: FusedRotations, *given: Tensor) -> tuple[Tensor, ...]:

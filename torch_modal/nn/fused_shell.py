@@ -91,12 +91,12 @@ class FusedShell(nn.Module):
 
     @property
     def energy(self) -> Energy:
-        """What the kernels compute, in torch."""
+        """The same energy in torch."""
         return self._energy[0]
 
     # ---------------------------------------------------------------------------------------------------- the reference
     def reference(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
-        """What shapes are compared with.
+        """The reference of shapes.
 
         Args:
             first: Rest shapes of the weight ``1 - t``. *Shape:* ``(B, V, 3)``.
@@ -121,7 +121,7 @@ class FusedShell(nn.Module):
     def from_reference(
         self, received: ShellReference, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor
     ) -> tuple[Tensor, ...]:
-        """Gradients in all that :meth:`reference` takes, of that in what it finds but for the constant."""
+        """Adjoint of :meth:`reference`: gradients of its arguments, from those of its result without the constant."""
         (b, n), n_edges = first.shape[:2], len(self.record)
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
         sizes = self.sizes(first, second)
@@ -198,7 +198,7 @@ class FusedShell(nn.Module):
         return found
 
     def centre(self, x: Tensor) -> Tensor | None:
-        """What volumes are relative to: the mean; None, any vertex, where it does not matter. *Shape:* ``(B, 3)``."""
+        """The origin of volumes: the mean; None, for any vertex, where the surface is closed. *Shape:* ``(B, 3)``."""
         return None if self.closed else self.mean(x)
 
     def mean(self, x: Tensor) -> Tensor:
@@ -206,7 +206,7 @@ class FusedShell(nn.Module):
         return x.mean(1) if self.n_used == self.n_vertices else (x * self.used).sum(1) / self.n_used
 
     def _spread(self, to_centre: Tensor | None, to_x: Tensor) -> None:
-        """Add what shapes receive of the centre. *Shape:* ``(B, 3), (B, V, 3)``."""
+        """Distribute the gradient of the centre to the vertices. *Shape:* ``(B, 3), (B, V, 3)``."""
         if to_centre is not None:
             to_x.add_(to_centre[:, None] / self.n_used * self.used)
 
@@ -218,9 +218,9 @@ class FusedShell(nn.Module):
         return total, self.shared(normal)
 
     def shared(self, normal: Tensor) -> Tensor:
-        """What vertices receive that stand still with the centre, with what they receive as it moves with them.
+        """Gradients with a fixed centre, plus those through the centre.
 
-        Of a closed surface that is nothing. *Shape:* ``(B, V, 3)``.
+        On a closed surface the latter vanish. *Shape:* ``(B, V, 3)``.
         """
         if self.closed:
             return normal
@@ -251,7 +251,7 @@ class FusedShell(nn.Module):
         others: Sequence[Tensor | None] = (None, None, None),
         to_normal: Tensor | None = None,
     ) -> None:
-        """Add what shapes and references receive of what :meth:`at` finds.
+        """Adjoint of :meth:`at`: add the gradients of shapes and references.
 
         Args:
             x: The shapes. *Shape:* ``(B, V, 3)``.

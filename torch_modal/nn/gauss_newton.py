@@ -22,7 +22,7 @@ ENERGY_ROUNDING = 64.0
 
 
 class AmplitudeEnergy(Protocol):
-    """What can be minimised here: an energy of amplitudes, with its derivatives."""
+    """Protocol of an energy of amplitudes with its derivatives."""
 
     def value(self, a: Tensor, placement: Any) -> Tensor:
         """Energy. *Shape:* ``(..., B, n) -> (..., B)``."""
@@ -34,7 +34,7 @@ class AmplitudeEnergy(Protocol):
         """Energy and gradient. *Shape:* ``(B, n) -> (B,), (B, n)``."""
 
     def second_order(self, a: Tensor, placement: Any) -> Tensor:
-        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Any) -> Any:
         """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""

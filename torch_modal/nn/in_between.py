@@ -92,7 +92,7 @@ class InBetween(nn.Module):
 
     @lasting
     def _build(self) -> None:
-        """What follows from the bases, on their device and in their dtype."""
+        """Build everything that follows from the bases, on their device and in their dtype."""
         like = self.bases[0].reference
         shapes = [basis.reference.double().cpu() for basis in self.bases]
         connectivity = checked_surface(shapes, self.faces.cpu())[1]
@@ -118,7 +118,7 @@ class InBetween(nn.Module):
         self.members.to(like)
 
     def prepare(self) -> None:
-        """Make what minimisations need."""
+        """Build the tables of the minimisations."""
         for member in self.members:
             member.prepare()
 
@@ -161,7 +161,7 @@ class InBetween(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """What is computed in."""
+        """The dtype of the computation."""
         return self.members[0].frame.reference.dtype
 
     def _batched(
@@ -219,7 +219,7 @@ class InBetween(nn.Module):
         return joined(parts, order)
 
     def report(self) -> Callable[[Solution], None]:
-        """What ``forward`` says of samples that did not converge."""
+        """The function that ``forward`` passes solutions to, for warnings."""
         forbid = self.solver.unconverged == "raise" and torch.is_grad_enabled()
         return partial(report, max_steps=self.solver.max_steps, forbid=forbid)
 
@@ -236,7 +236,7 @@ class InBetween(nn.Module):
         return pair if last else None
 
     def check(self, x_a: Tensor, x_b: Tensor, t: Tensor | float) -> Tensor:
-        """Refuse what does not fit; times as a tensor."""
+        """Check the arguments, and convert times to a tensor."""
         reference = self.members[0].frame.reference
         for name, x in (("x_a", x_a), ("x_b", x_b)):
             if not isinstance(x, Tensor):
@@ -289,7 +289,7 @@ class InBetween(nn.Module):
 
 
 class _Basis(nn.Module):
-    """What a layer keeps of a basis: all else follows from it."""
+    """The buffers that a layer keeps of a basis; all else follows from them."""
 
     reference: Tensor
     modes: Tensor
@@ -302,7 +302,7 @@ class _Basis(nn.Module):
 
 
 def _rebuild(layer: InBetween, *_: Any) -> None:
-    """After other bases were loaded, what follows from them is made anew."""
+    """Rebuild everything that follows from the bases after others were loaded."""
     layer._build()
 
 

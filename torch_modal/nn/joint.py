@@ -28,14 +28,14 @@ class Difference(NamedTuple):
     modal: Tensor
     """How much of the rest is modal. *Shape:* ``(B, n)``."""
     scale: Tensor
-    """One over the length of what is left. *Shape:* ``(B,)``."""
+    """One over the length of the remainder. *Shape:* ``(B,)``."""
 
 
 class JointProblem(NamedTuple):
     """The in-between of each sample as a minimisation."""
 
     placement: tuple[Placement, ...]
-    """What the minimiser depends on."""
+    """The inputs that the minimiser depends on."""
     start: Tensor | None
     """Where the minimisation may start; None: at zeros. *Shape:* ``(B, n)``."""
     base: Tensor
@@ -98,7 +98,7 @@ class JointSpace(nn.Module):
 
     @property
     def modal(self) -> "_Modal":
-        """What a smooth path does without, made at the first use."""
+        """Tables that only minimisations need, built on first use."""
         if self._modal is None:
             self._modal, self._make = lasting(self._make)(), None
         return self._modal
@@ -182,7 +182,7 @@ class JointSpace(nn.Module):
         return JointProblem(placement, start, base, starts, difference, energy)
 
     def on_trajectory(self, pair: Pair, index: Tensor | None, t: Tensor) -> tuple[Tensor, ...]:
-        """The shape on the smooth path through the neighbours in time, then what it is compared with.
+        """The shape on the smooth path through the neighbours in time, then the shapes that it is compared with.
 
         *Shape of each:* ``(B, V, 3)``.
         """

@@ -37,7 +37,7 @@ Module = Literal[
 ]
 PACKAGE = "torch_modal.nn.kernels"
 IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps", "distortion")
-"""What in-betweens need that record no gradient."""
+"""The modules for in-betweens without gradients."""
 MOST_ENTRIES = 2**31 - 1
 """Kernels index with 32 bits: no array of theirs, and no launch, may be longer."""
 
@@ -110,7 +110,7 @@ _COMMANDS = _Commands()
 
 @cache
 def _kinds(kernel: Any) -> list[tuple[int, torch.dtype] | None]:
-    """Numbers in an entry of each array that a kernel takes, and of what; None of what is no array, but an integer."""
+    """Width and dtype of each array argument of a kernel; None for integers."""
     import warp as wp
 
     types = [argument.type for argument in kernel.adj.args]
@@ -122,14 +122,14 @@ def _kinds(kernel: Any) -> list[tuple[int, torch.dtype] | None]:
 
 @cache
 def _array() -> Any:
-    """What Warp hands arrays over in: address, address of the gradient, dimensions, shape, strides in bytes."""
+    """Warp's ctypes structure of an array: address, address of the gradient, dimensions, shape, strides in bytes."""
     import warp as wp
 
     return type(wp.from_torch(torch.zeros(1), return_ctype=True))
 
 
 def _slot(kind: tuple[int, torch.dtype] | None, memory: Any, offset: int = 0) -> tuple[Any, ...]:
-    """What :func:`_kinds` says, and where an argument is written: address and length of an array, or an integer."""
+    """The entry of :func:`_kinds`, and the memory of an argument: address and length of an array, or an integer."""
     if kind is None:
         return 0, None, None, ctypes.c_int32.from_buffer(memory, offset)
     places = offset + _array().data.offset, offset + _array().shape.offset
@@ -137,7 +137,7 @@ def _slot(kind: tuple[int, torch.dtype] | None, memory: Any, offset: int = 0) ->
 
 
 class _Command:
-    """A launch that Warp has recorded; the next ones only write over what changes, in the places that are read."""
+    """A recorded launch, whose arguments are overwritten in place."""
 
     def __init__(self, kernel: Any, dim: tuple[int, ...], device: torch.device, adjoint: bool) -> None:
         import warp as wp
@@ -162,7 +162,7 @@ class _Command:
             self.run = recorded.launch
             self.slots = [_slot(*both) for both in zip(kinds * (1 + adjoint), values, strict=True)]
             return
-        # Warp would put the arguments together at each launch, which takes longer than a small kernel.
+        # Warp would pack the arguments at each launch, which takes longer than a small kernel.
         fields = [(f"_{i}", type(value)) for i, value in enumerate(values[: len(kinds)])]
         packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
         given = [packed(*values[i : i + len(kinds)]) for i in range(0, len(values), len(kinds))]
@@ -222,7 +222,7 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
         ValueError: A tensor is not contiguous, of another type, or has more entries than 32 bits count.
     """
     if 0 in dim:
-        return  # Warp would not, either, but has no command to tell of it
+        return
     device = given[0].device
     if len(dim) == 2:
         threads = 1 if device == _CPU else dim[1]

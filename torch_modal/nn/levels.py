@@ -23,7 +23,7 @@ class Stiffness(NamedTuple):
     fine: list[Tensor]
     """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
     levels: list[list[Tensor]]
-    """Of the terms of each level, likewise."""
+    """Of the terms of each level. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
 
 
 class Levels(nn.Module):
@@ -75,7 +75,7 @@ class Levels(nn.Module):
         t: Tensor,
         stiffness: Stiffness,
     ) -> list[Any]:
-        """What in-betweens at the times ``t`` are compared with, of the pairs ``index`` (each its own where None).
+        """References of in-betweens at the times ``t``, of the pairs ``index`` (each its own where None).
 
         Args:
             first: Rest shapes as each energy sees them, of the weight ``1 - t``. *Shape of each:* ``(P, V, 3)``.
@@ -96,7 +96,7 @@ class Levels(nn.Module):
         return found
 
     def against(self, x: Tensor, coarse: Tensor, stiffness: Stiffness) -> list[Reference]:
-        """Shapes as what others are compared with. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
+        """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
         parts = zip(self.energies, self.seen(x, coarse), stiffness.levels, strict=True)
         return [Energy.against(_rest(energy, own), factors) for energy, own, factors in parts]
 

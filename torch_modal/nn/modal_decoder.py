@@ -1,4 +1,4 @@
-r"""Shapes of a motion from amplitudes: what modes do beside the smooth path through key-frames.
+r"""Shapes of a motion from amplitudes: modal deformation of the smooth path through key-frames.
 
 A mode is a displacement of one key-frame. To first order it turns and strains each triangle, and both are kept in the
 triangle's own coordinates, which go along with it (rotation-strain coordinates; Huang et al. 2011). So the modes of one
@@ -111,7 +111,7 @@ class ModalDecoder(nn.Module):
 
     @lasting
     def _align(self) -> None:
-        """Make what follows from the key-frames, their times and the reference."""
+        """Build everything that follows from the key-frames, their times and the reference."""
         keyframes, reference = self.keyframes.detach(), self.reference.detach()
         self.cyclic = len(self.times) > len(keyframes)
         used = reference[self.faces.unique()]
@@ -234,7 +234,7 @@ class ModalDecoder(nn.Module):
         return located(t, self.times, self.cyclic)
 
     def interval(self, i: int, keyframes: Tensor | None = None) -> Interval:
-        """What does not depend on the time; kept, of the decoder's own key-frames."""
+        """Data of an interval that does not depend on the time; cached for the decoder's own key-frames."""
         self._current()
         return self._kept(i) if keyframes is None else self._interval(i, keyframes)
 

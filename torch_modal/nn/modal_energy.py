@@ -27,18 +27,18 @@ class Derivatives(NamedTuple):
     gauss_newton: Tensor
     """``2 J^T J``, always positive semi-definite. *Shape:* ``(B, n, n)``."""
     second_order: Tensor | None
-    """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+    """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
     resolution: Tensor
     """Gradient norm that the rounding of the positions alone explains. *Shape:* ``(B,)``."""
 
 
 class Placement(NamedTuple):
-    """The affine space of each sample, ``x(a) = base + columns a[:n] (+ extra a[n])``, and what it is compared with."""
+    """The affine space of each sample, ``x(a) = base + columns a[:n] (+ extra a[n])``, and its reference."""
 
     base: Tensor
     """Components before vertices, extended. *Shape:* ``(B, 3, V)``."""
     extra: Tensor | None
-    """A column of the sample's own, likewise. *Shape:* ``(B, 3, V)``."""
+    """An additional column of each sample. *Shape:* ``(B, 3, V)``."""
     reference: Reference
 
 
@@ -90,7 +90,7 @@ class ModalEnergy(nn.Module):
 
     @property
     def tables(self) -> "_Tables":
-        """What the derivatives are gathered by."""
+        """The tables through which derivatives are gathered."""
         return self._tables
 
     def place(
@@ -174,7 +174,7 @@ class ModalEnergy(nn.Module):
         return value.detach(), gradient
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
-        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
         at = self.energy.linearise(self.rows(a, placement), placement.reference)
         return self._curved(at, None if placement.extra is None else placement.extra.transpose(0, 1))
 
@@ -208,7 +208,7 @@ class ModalEnergy(nn.Module):
         return Placement(to_base, to_extra, Reference(tuple(to_measures), tuple(to_weights), to_constant))
 
     def _of_total(self, one: Linearised, extra: Tensor | None) -> tuple[Tensor, Tensor]:
-        """What a total adds to the gradient and to Gauss-Newton's Hessian."""
+        """Contribution of a total to the gradient and to Gauss-Newton's Hessian."""
         row = one.gradients.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
         if extra is not None:
             row = torch.cat([row, (one.gradients * extra).sum((0, -1))[:, None]], -1)
@@ -235,7 +235,7 @@ def _edge_vectors_of_rows(values: Tensor, corners: Tensor) -> Tensor:
 
 
 def _normal_equations(one: Linearised, columns: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor]:
-    """What the measures of one term add to the gradient and to Gauss-Newton's Hessian.
+    """Contribution of one term to the gradient and to Gauss-Newton's Hessian.
 
     Args:
         one: The term.
@@ -305,7 +305,7 @@ class SumOfEnergies(nn.Module):
         return reduce(torch.add, [value for value, _ in found]), reduce(torch.add, [gradient for _, gradient in found])
 
     def second_order(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
-        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
         return reduce(torch.add, [part.second_order(a.to(own.base.dtype), own) for part, own in self._each(placement)])
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Sequence[Placement]) -> list[Placement]:

@@ -30,7 +30,7 @@ class PairedProblem(NamedTuple):
     """The mid-shape of each sample as a minimisation."""
 
     placement: PairedPlacement
-    """What the minimiser depends on."""
+    """The inputs that the minimiser depends on."""
     start: None
     """At zeros, which are the key-frames, as in the paper."""
     first: Tensor
@@ -103,7 +103,7 @@ class PairedEnergy(nn.Module):
         return PairedPlacement(first, second, to_linear, torch.zeros_like(placement.constant), to_mu)
 
     def second_order(self, a: Tensor, placement: PairedPlacement) -> Tensor:
-        """What the full Hessian has more than Gauss-Newton's. *Shape:* ``(B, n, n)``."""
+        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
         return _block_diagonal(*(energy.second_order(part, place) for energy, part, place in self._ends(a, placement)))
 
     def _ends(

@@ -21,7 +21,7 @@ SHORTEST = 0.02
 
 
 class _State(NamedTuple):
-    """What is known of each sample. Vectors have a last dimension of 1, as products of matrices have them."""
+    """The state of each sample. Vectors have a last dimension of 1, for matrix products."""
 
     row: Tensor
     """Which sample of the batch it is. *Shape:* ``(B,)``."""
@@ -36,13 +36,13 @@ class _State(NamedTuple):
     inverse: Tensor
     """The approximate inverse of the Hessian. *Shape:* ``(B, n, n)``."""
     length: Tensor
-    """Of the next step, relative to the quasi-Newton step; 0 of what has converged. *Shape:* ``(B,)``."""
+    """Of the next step, relative to the quasi-Newton step; 0 of converged samples. *Shape:* ``(B,)``."""
     goal: Tensor
     """The gradient norm at which it has converged. *Shape:* ``(B,)``."""
     n_steps: Tensor
     """Steps taken. *Shape:* ``(B,)``, int64."""
     placement: Any
-    """What the energy knows of each sample."""
+    """The arguments of the energy for each sample."""
 
 
 def descend(
@@ -53,9 +53,9 @@ def descend(
     tolerance: float = 3e-7,
     energy: Tensor | None = None,
 ) -> Solution:
-    """Minimise by the BFGS method, whose first Hessian is Gauss-Newton's, then by Newton steps what did not converge.
+    """Minimise by BFGS from the Gauss-Newton Hessian, then by Newton steps where that does not converge.
 
-    A step is taken if the energy falls; otherwise the next one is half as long. What has converged takes one more step,
+    A step is taken if the energy falls; otherwise the next one is half as long. A converged sample takes one more step,
     whose gradient is not evaluated: the gradient norm of the solution is the one before. A sample's result does not
     depend on its batch. Arguments as for :func:`torch_modal.nn.solver.minimise`.
     """

@@ -1,4 +1,4 @@
-"""What goes into in-betweens of one pair of bases and what comes out, as flat batches; what did not converge."""
+"""Flat batches of inputs and results of one pair of bases; warnings about samples that did not converge."""
 
 import warnings
 from typing import NamedTuple
@@ -55,7 +55,7 @@ class Samples(NamedTuple):
 
 
 def report(solution: Solution, max_steps: int, forbid: bool) -> None:
-    """Say what did not converge.
+    """Warn about samples that did not converge.
 
     Args:
         solution: One value per sample.

@@ -1,4 +1,4 @@
-"""What is minimised, how it is solved, and named pairs of both: the settings that all in-betweens share."""
+"""Objective, solver and presets: the settings of all in-betweens."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -21,7 +21,7 @@ def _whole(name: str, value: int, lowest: int) -> None:
 
 @dataclass(frozen=True)
 class Objective:
-    r"""What is minimised: :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)` or Eq. 4, with the energy of Eq. 5 for ``d``.
+    r"""The objective: :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)` or Eq. 4, with the energy of Eq. 5 for ``d``.
 
     Attributes:
         space: ``"joint"`` (one shape in the sum of both modal spaces) or ``"paired"`` (Eq. 4 of the paper: one near
@@ -124,13 +124,13 @@ PRESETS = {
     "fast": Settings(Objective(coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
     "paper": Settings(Objective(space="paired"), Solver(local_steps=0)),
 }
-"""What the names stand for; docs/layer.md says what each costs and gives."""
+"""The presets; docs/layer.md compares them."""
 
 
 def settings(
     preset: str, objective: Objective | None = None, solver: Solver | None = None, contact: bool | None = None
 ) -> Settings:
-    """The settings of a preset, with what is given in the place of its own.
+    """The settings of a preset; given ones replace its own.
 
     Raises:
         ValueError: There is no such preset.

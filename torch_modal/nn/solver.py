@@ -29,8 +29,8 @@ class Status(IntEnum):
     INVALID = 3
     """No in-between exists: NaN or infinite entries, no size, or one key-frame of a closed mesh is a mirror image."""
     FELL_BACK = 4
-    """What was found is worse than what it started from, which is returned: the blend by local rotations, or linear
-    interpolation. Gradients are those of the shape returned; amplitudes and energy are those of what was found."""
+    """The minimiser is worse than its start, which is returned: the blend by local rotations, or linear
+    interpolation. Gradients are those of the returned shape; amplitudes and energy are those of the minimiser."""
 
 
 class Solution(NamedTuple):
@@ -133,7 +133,7 @@ _STAY, _STEP, _NEWTON = range(3)
 
 
 class _History:
-    """What one sample has gone through."""
+    """The state of one sample."""
 
     def __init__(self, row: int, energy: float, start: float | None, n_steps: int) -> None:
         self.row, self.energy, self.n_steps = row, energy, n_steps

@@ -17,7 +17,7 @@ def leaves(tree: Any) -> list[Tensor]:
 
 
 def mapped(tree: Any, function: Callable[[Any], Any]) -> Any:
-    """The same tree with a function of each tensor in its place; what is no tensor stays."""
+    """Apply a function to each tensor of a tree; other leaves stay."""
     if isinstance(tree, (Tensor, str)):
         return function(tree)
     if isinstance(tree, (tuple, list)):
@@ -32,7 +32,7 @@ def skeleton(tree: Any) -> Any:
 
 
 def filled(tree: Any, tensors: Iterable[Tensor]) -> Any:
-    """A tree or skeleton with other tensors in the places of its own, in order."""
+    """Replace the tensors of a tree or skeleton, in order."""
     each = iter(tensors)
     return mapped(tree, lambda _: next(each))
 

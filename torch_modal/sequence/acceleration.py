@@ -1,4 +1,4 @@
-r"""What a displacement in time may add to the accelerations of vertices, so that nothing pops.
+r"""A bound on the accelerations that a displacement adds to a trajectory, so that nothing pops.
 
 With the accelerations :math:`a` of a trajectory of shapes, and a displacement :math:`d` that is added to it,
 

@@ -37,7 +37,7 @@ BESIDE = 0.125
 FADE = 0.0625
 """Over how much of the time a displacement is faded out beside a shape that it makes worse, at first."""
 AROUND = 2
-"""Shapes beside those that hold something in which the same is watched."""
+"""Neighbours in time of shapes with contacts, in which the same vertices are watched."""
 ROUNDS = 4, 8
 """How often shapes take a step of their own, at least and at most."""
 LEADING = 4
@@ -45,11 +45,11 @@ LEADING = 4
 PRODUCTS = 20
 """Iterations of conjugate gradients in such a step."""
 PULL = 40.0
-"""How much shapes are pulled to what may be accelerated, by area; a contact has 3,000."""
+"""Stiffness of the pull to shapes of bounded acceleration, by area; a contact has 3,000."""
 
 
 class Displacement(NamedTuple):
-    """What pushes the shapes between two key-frames apart, at all times."""
+    """The displacement that separates the shapes between two key-frames, at all times."""
 
     field: Tensor | None
     """At the times of the shapes, in the frame; None where nothing passes through anything. *Shape:* ``(3, T, V)``."""
@@ -97,7 +97,7 @@ class Displacement(NamedTuple):
 
 @torch.no_grad()
 def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacement:
-    """Find what pushes shapes between two key-frames apart where parts went through each other.
+    """Find the displacement that separates parts of shapes between two key-frames.
 
     A few of many shapes are looked at first: where parts go through each other in none of these, there is nothing to
     do. What is found pushes about :data:`SEARCHED` of the shapes apart, and the others along with them; all are looked

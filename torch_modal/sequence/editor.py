@@ -1,4 +1,4 @@
-"""A motion that is edited by hand: key-frames replaced and added, and only what they touch computed again."""
+"""A motion that is edited by hand: key-frames replaced and added, with only the affected intervals computed again."""
 
 import torch
 from torch import Tensor

@@ -214,7 +214,7 @@ class Path(nn.Module):
         return Samples(x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), stiffness, **neighbours)
 
     def _in_contact(self, keyframes: Tensor, i: int, samples: Samples, result: InBetweenResult) -> InBetweenResult:
-        """Shapes of one interval pushed apart, by what is found at even times of each motion."""
+        """Shapes of one interval pushed apart, by a displacement found at even times of each motion."""
         member = self.layer.members[self.members[i]]
         even = torch.arange(1, N_SEARCHED + 1).to(samples.t) / (N_SEARCHED + 1)
         shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)

@@ -237,7 +237,7 @@ def _times_of_intervals(when: Tensor, places: Sequence[int]) -> Iterator[Tensor]
 
 
 def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
-    """Straight lines of all vertices between key-frames: what :func:`subdivide` is compared with.
+    """Linear interpolation of all vertices, to compare :func:`subdivide` with.
 
     Args:
         keyframes: *Shape:* ``(K, V, 3)``.
@@ -267,7 +267,7 @@ class _ContactReport:
         return found.apply(member, samples, given)[0].to(shapes)
 
     def report(self, keyframes: Tensor, faces: Tensor) -> None:
-        """Say which key-frames pass through themselves, and what is left."""
+        """Warn about key-frames that pass through themselves, and crossings that are left."""
         mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
         for i, shape in enumerate(keyframes.detach().double().cpu().numpy()):
             pairs = Crossings(mesh, shape[None]).pairs(shape)

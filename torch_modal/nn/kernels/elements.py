@@ -1,4 +1,4 @@
-"""What kernels share: types, and functions of one edge, one hinge, one vertex."""
+"""Types and functions of one edge, hinge or vertex, shared by all kernels."""
 
 import warp as wp
 
@@ -24,7 +24,7 @@ LARGEST = wp.constant(0x7FFFFFFF)
 
 @wp.func
 def place(start: int, i: int):
-    """Of the i-th of what starts there. Warp counts from the end what is below zero, which this tells never to be."""
+    """Index of the i-th element of a row. The mask shows Warp that it is not negative (it would count from the end)."""
     return (start + i) & LARGEST
 
 
@@ -75,7 +75,7 @@ def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
 def middle_of(
     x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), capped_faces: wp.array(dtype=wp.vec3i), sample: int, at: int
 ):
-    """What volumes are relative to: the centre, or where the surface is closed and there is none, any vertex."""
+    """The origin of volumes: the centre; any vertex where the surface is closed."""
     found = x[place(at, capped_faces[0][0])]
     if centre:
         found = centre[sample]

@@ -81,7 +81,7 @@ def turns(
     packed: wp.array(dtype=packed_turn),
     threads: int,
 ):
-    """Quaternions between the frames of triangles, twice both areas, and what else :func:`part_turned` needs."""
+    """Quaternions between the frames of triangles, twice both areas, and the other inputs of :func:`part_turned`."""
     i = wp.tid()
     s = i // threads
     v = s * n
@@ -354,7 +354,7 @@ def pulls(
     out: wp.array(dtype=vec3),
     threads: int,
 ):
-    """What edges ask of their ends: the right side of the Poisson problem."""
+    """The right side of the Poisson problem: the divergence of the edges."""
     i = wp.tid()
     s = i // threads
     for k in range(i - s * threads, ends.shape[0], threads):

@@ -1,4 +1,4 @@
-"""Back through :mod:`torch_modal.nn.kernels.rotations`: what shapes receive of the sides of triangles that turn.
+"""Adjoints of :mod:`torch_modal.nn.kernels.rotations`: from sides of rotated triangles to shapes.
 
 A part ``exp(t log R)`` of a rotation turns by ``J(t theta) (t dtheta + theta dt)`` where ``R = exp(theta)`` turns by
 ``J(theta) dtheta``, with the left Jacobian ``J`` of the rotations (Chirikjian 2012, section 10.6).
@@ -29,7 +29,7 @@ def sinc_of(q: vec4, half: vec3):
 
 @wp.func
 def reached(turn: vec4, half: vec3, part: vec4, t: real, torque: vec3):
-    """What a rotation by twice ``half`` receives as a torque, where its part ``t`` receives one."""
+    """The torque on a rotation by twice ``half``, from that on its part ``t``."""
     own = t * half
     squared = wp.dot(own, own)
     scale = sinc_of(part, own)
@@ -53,7 +53,7 @@ def reached(turn: vec4, half: vec3, part: vec4, t: real, torque: vec3):
 
 @wp.func
 def from_triangle(t: Triangle, torque: vec3, to_length: real, to_along: real, to_height: real):
-    """What the two sides from the first corner receive, where the frame of a triangle and its size do."""
+    """Gradients of the two sides from the first corner, from those of a triangle's frame and size."""
     per_length = real(0.0)
     if t.length > NO_LENGTH:
         per_length = real(1.0) / t.length
@@ -82,7 +82,7 @@ def from_turned(
     to_time: wp.array(dtype=real),
     threads: int,
 ):
-    """What both shapes and the times receive of ``rotations.part_turned``: is added to what is there."""
+    """Adjoint of ``rotations.part_turned``: adds the gradients of both shapes and the times."""
     i = wp.tid()
     s = i // threads
     v = s * n

@@ -93,7 +93,7 @@ def weigh(
     volume: wp.array(dtype=real),
     constant: wp.array(dtype=real),
 ):
-    """What both rest shapes weigh, which edges count, and both volumes as one: Eq. 8. The stiffness is doubled."""
+    """Weights of both rest shapes, the shortest edge that counts, both volumes as one (Eq. 8), and twice its stiffness."""
     s = wp.tid()
     t = time[s]
     pull[s] = wp.vec2d(real(1.0) - t, t)
@@ -310,7 +310,7 @@ def linearise(
     normal: wp.array(dtype=vec3),
     threads: int,
 ):
-    """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and what a product with it needs.
+    """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and the factors of products with it.
 
     The volume and its gradient are separate outputs. Without arrays for the others, the kernel computes only these
     and the gradient.

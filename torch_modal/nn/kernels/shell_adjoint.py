@@ -1,4 +1,4 @@
-"""Back through :mod:`torch_modal.nn.kernels.shell`: what rest shapes and shapes receive of what is found of them.
+"""Adjoints of :mod:`torch_modal.nn.kernels.shell`: gradients of rest shapes and shapes.
 
 ``to_y`` is the gradient in ``y`` of what is differentiated. All is added to what is there.
 """
@@ -31,7 +31,7 @@ TWO = wp.constant(real(2.0))
 # ----------------------------------------------------------------------------------------------------------- references
 @wp.func
 def from_rest_hinge(e: vec3, a: vec3, b: vec3, to_weight: real, to_angle: real):
-    """What the edge and the tips of a hinge at rest receive, and its weight: ``shell.bend_weight``."""
+    """Adjoint of ``shell.bend_weight``: gradients of the edge and the tips of a hinge at rest, and its weight."""
     to_e = vec3()
     to_a = vec3()
     to_b = vec3()
@@ -64,7 +64,7 @@ def from_rest_hinge(e: vec3, a: vec3, b: vec3, to_weight: real, to_angle: real):
 
 @wp.func
 def from_volume_and_area(a: vec3, b: vec3, c: vec3, to_volume: real, to_area: real):
-    """What the corners of a triangle receive, from the middle, of the volume of the tetrahedron and the area."""
+    """Gradients of a triangle's corners relative to the middle, from those of the tetrahedron's volume and area."""
     sixth = to_volume / real(6.0)
     to_a = sixth * wp.cross(b, c)
     to_b = sixth * wp.cross(c, a)
@@ -111,7 +111,7 @@ def from_reference(
     to_beta: wp.array(dtype=real),
     threads: int,
 ):
-    """What both rest shapes, their pulls and the stiffnesses receive of ``shell.rest`` and ``shell.sizes``."""
+    """Adjoint of ``shell.rest`` and ``shell.sizes``: gradients of both rest shapes, weights and stiffnesses."""
     i = wp.tid()
     s = i // threads
     v = s * n
@@ -223,7 +223,7 @@ def from_reference(
 # ---------------------------------------------------------------------------------------------------------- derivatives
 @wp.func
 def from_squared(m: symmetric, g: vec3):
-    """What a vector receives of its square: ``elements.squared``."""
+    """Adjoint of ``elements.squared``."""
     return vec3(
         TWO * m[0] * g[0] + m[1] * g[1] + m[2] * g[2],
         m[1] * g[0] + TWO * m[3] * g[1] + m[4] * g[2],
@@ -252,7 +252,7 @@ def from_point(
     to_centre: wp.array(dtype=vec3),
     threads: int,
 ):
-    """What shapes and the reference receive of ``shell.linearise``, but for the energy.
+    """Adjoint of ``shell.linearise`` without the energy: gradients of shapes and the reference.
 
     There may be no arrays of what the diagonal, the edges and the hinges receive.
     """

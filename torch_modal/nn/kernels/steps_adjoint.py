@@ -18,7 +18,7 @@ def back_to_length(
     to_length: wp.array(dtype=real),
     threads: int,
 ):
-    """What the last iteration's step length receives."""
+    """Gradient of the last iteration's step length."""
     i = wp.tid()
     s = i // threads
     found = real(0.0)
@@ -47,7 +47,7 @@ def back_to_direction(
     to_swept: wp.array(dtype=real),
     threads: int,
 ):
-    """What a direction receives but through the Hessian, and the field that the Hessian is to be applied to for that.
+    """Gradient of a direction except through the Hessian, and the field to which the Hessian is applied for the rest.
 
     Where there is no next size, there is no next direction either.
     """
@@ -89,7 +89,7 @@ def back_to_normal(
     to_ratio: wp.array(dtype=real),
     threads: int,
 ):
-    """The volume's part of the Hessian; what the ratio to the previous direction receives, where there is one."""
+    """The volume's part of the Hessian, and the gradient of the ratio to the previous direction, if any."""
     i = wp.tid()
     s = i // threads
     across = stiffness[s] * swept[s]
@@ -131,7 +131,7 @@ def back_to_residual(
     to_previous_length: wp.array(dtype=real),
     threads: int,
 ):
-    """What a residual and the preconditioner receive, and then the previous step length, where there is one."""
+    """Gradients of a residual, of the preconditioner, and of the previous step length, if any."""
     i = wp.tid()
     s = i // threads
     to_size = quotient(to_length[s], form[s] + stiffness[s] * swept[s] * swept[s])
@@ -179,7 +179,7 @@ def back_to_elements(
     to_hinges: wp.array(dtype=bent),
     threads: int,
 ):
-    """What the elements of the Hessian receive where ``field . H direction`` of each of several products counts."""
+    """Gradients of the Hessian's elements from ``field . H direction``, summed over several products."""
     i = wp.tid()
     s = i // threads
     for k in range(i - s * threads, record.shape[0], threads):
