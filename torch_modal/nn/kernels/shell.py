@@ -93,7 +93,7 @@ def weigh(
     volume: wp.array(dtype=real),
     constant: wp.array(dtype=real),
 ):
-    """Weights of both rest shapes, the shortest edge that counts, both volumes as one (Eq. 8), and twice its stiffness."""
+    """Weights of both rest shapes, the shortest edge, both volumes as one (Eq. 8). The stiffness is doubled."""
     s = wp.tid()
     t = time[s]
     pull[s] = wp.vec2d(real(1.0) - t, t)
