@@ -534,7 +534,7 @@ def test_in_a_course_nothing_is_tolerated(hand: Shapes) -> None:
     pairs = at_tip[:2].numpy()[None]
     alone, trajectory = (ContactSearch(mesh, first, second, None, t, is_tolerant=each) for each in (True, False))
     assert alone.has_crossed and trajectory.has_crossed
-    assert alone._told(0, pairs) == (1, 0) and trajectory._told(0, pairs) == (1, 1)
+    assert alone._counts(0, pairs) == (1, 0) and trajectory._counts(0, pairs) == (1, 1)
 
 
 def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:

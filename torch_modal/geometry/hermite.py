@@ -28,12 +28,26 @@ class TangentOffset(NamedTuple):
     last: Tensor
 
 
+Tangents = Callable[[Tensor, Tensor, Tensor, Tensor, Callable[[Tensor], Tensor]], Tensor]
+"""A path scheme: the velocity at a key-frame.
+
+From the velocities of the steps before and after it, the durations of both, and a function for the squared size of a
+quantity. Quantities are vectors or rotation vectors, with components in a dimension that this function knows.
+"""
+
+
 class Spacing(NamedTuple):
     """How long the intervals are: the one before, this one, and the one after. *Shape of each:* ``(B,)``."""
 
     before: Tensor
     own: Tensor
     after: Tensor
+    tangents: Tangents | None = None
+    """The path scheme; the limited parabola where None."""
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> "Spacing":
+        """Durations of another shape or dtype."""
+        return Spacing(function(self.before), function(self.own), function(self.after), self.tangents)
 
 
 def tangent_offset(
@@ -47,7 +61,8 @@ def tangent_offset(
 
     Velocities are those of the parabola through three key-frames, :math:`(h_+ v_- + h_- v_+) / (h_- + h_+)` of the
     velocities of both steps, limited (:data:`LIMIT`). Evenly spaced, that is Catmull and Rom's spline, and half-way
-    the four-point scheme of Dyn, Levin and Gregory 1987. An end has no acceleration (a natural end).
+    the four-point scheme of Dyn, Levin and Gregory 1987. Another scheme is :attr:`Spacing.tangents`. An end has no
+    acceleration (a natural end).
 
     Args:
         step: From one key-frame to the next. *Shape:* ``(...)``.
@@ -58,11 +73,12 @@ def tangent_offset(
     """
     first: Tensor | None = None
     last: Tensor | None = None
+    velocity = spacing.tangents or _velocity
     if before is not None:
-        speed = _velocity(before / spacing.before, step / spacing.own, spacing.before, spacing.own, squared)
+        speed = velocity(before / spacing.before, step / spacing.own, spacing.before, spacing.own, squared)
         first = spacing.own * speed - step
     if after is not None:
-        speed = _velocity(step / spacing.own, after / spacing.after, spacing.own, spacing.after, squared)
+        speed = velocity(step / spacing.own, after / spacing.after, spacing.own, spacing.after, squared)
         last = spacing.own * speed - step
     if first is None and last is None:
         return TangentOffset(torch.zeros_like(step), torch.zeros_like(step))
@@ -137,7 +153,8 @@ def around(i: int, times: Tensor, cyclic: bool) -> tuple[int | None, int | None,
     n = len(h) + (not cyclic)
     before = (i - 1) % n if cyclic or i > 0 else None
     after = (i + 2) % n if cyclic or i < len(h) - 1 else None
-    return before, after, Spacing(*(h[j % len(h)] for j in (i - 1, i, i + 1)))
+    previous, own, following = (h[j % len(h)] for j in (i - 1, i, i + 1))
+    return before, after, Spacing(previous, own, following)
 
 
 def beyond(bend: TangentOffset, u: Tensor) -> Tensor:

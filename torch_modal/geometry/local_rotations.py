@@ -126,7 +126,7 @@ class LocalRotations(nn.Module):
 
         own = step(a, b, a)
         assert own is not None
-        wide = Spacing(*(h[:, None] for h in spacing))
+        wide = spacing.mapped(lambda h: h[:, None])
         bend = tangent_offset(own, step(earlier, a, a), step(b, later, b), wide, lambda x: x.square().sum(0))
         return Trajectory(a.e1, a.e2, a.normal, torch.stack(a[3:]), own, *bend, unit)
 

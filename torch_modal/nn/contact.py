@@ -153,9 +153,9 @@ class ContactSearch:
         """Pairs of triangles that went through each other in a sample, and those of them that are not tolerated."""
         if not bool(x.isfinite().all()):
             return 0, 0
-        return self._as_tensors(i, self._search(i).crossings.far_pairs(x.detach().double().cpu().numpy()))
+        return self._counts(i, self._search(i).crossings.far_pairs(x.detach().double().cpu().numpy()))
 
-    def _as_tensors(self, i: int, pairs: IntArray) -> tuple[int, int]:
+    def _counts(self, i: int, pairs: IntArray) -> tuple[int, int]:
         """The number of pairs in a sample, and of those that are not tolerated. *Shape:* ``(P, 2)``."""
         return len(pairs), self._search(i).n_left(pairs, float(self.t[i])) if self.is_tolerant else len(pairs)
 
@@ -173,7 +173,7 @@ class ContactSearch:
             if bool(x[i].isfinite().all()):
                 active = found[i] = self._search(i)(x[i].detach().double().cpu().numpy(), self.watched[i])
                 self.watched[i] = active.watched if active.watched.any() else None
-                counts[k] = self._as_tensors(i, active.far)
+                counts[k] = self._counts(i, active.far)
         self._keep(some, counts)
         if not any(active is not None and len(active.vertices) for active in found):
             return None

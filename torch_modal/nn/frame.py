@@ -89,7 +89,7 @@ class Alignment(nn.Module):
 
     def surround(self, pair: Pair, before: Tensor | None, after: Tensor | None, spacing: Spacing) -> Pair:
         """The pair with its neighbours in time, of the caller. *Shape of each:* ``(B, V, 3)``."""
-        wide = Spacing(*(h[:, None] for h in spacing))
+        wide = spacing.mapped(lambda h: h[:, None])
         turns: list[Tensor | None] = [None, None]
         moves: list[Tensor | None] = [None, None]
         if before is not None:
@@ -321,7 +321,7 @@ def vertex_tangent_offset(pair: Pair) -> TangentOffset:
     before, after, spacing = pair.around[:3]
     earlier = None if before is None else pair.first - before
     later = None if after is None else after - pair.second
-    return tangent_offset(step, earlier, later, Spacing(*(h[:, None, None] for h in spacing)), squared_length)
+    return tangent_offset(step, earlier, later, spacing.mapped(lambda h: h[:, None, None]), squared_length)
 
 
 def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:

@@ -263,7 +263,7 @@ class ModalDecoder(nn.Module):
             return pair
         before, after, spacing = around(i, self.times, self.cyclic)
         earlier, later = (None if j is None else x[j] for j in (before, after))
-        return self.alignment.surround(pair, earlier, later, Spacing(*(h.to(x)[None] for h in spacing)))
+        return self.alignment.surround(pair, earlier, later, spacing.mapped(lambda h: h.to(x)[None]))
 
 
 def _same(x: Tensor, y: Tensor) -> bool:

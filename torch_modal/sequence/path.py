@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.functions import broadcast_shapes, lasting
-from torch_modal.geometry.hermite import Spacing, around, located, wrapped
+from torch_modal.geometry.hermite import Tangents, around, located, wrapped
 from torch_modal.keyframes.times import checked_times
 from torch_modal.nn.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
 from torch_modal.nn.samples import InBetweenResult, Samples
@@ -49,7 +49,8 @@ class Path(nn.Module):
         times: When the key-frames are, ascending; if cyclic, one more, when the first comes again. Default: 0, 1, 2,
             and so on. *Shape:* ``(K,)``, or ``(K + 1,)`` if cyclic.
         cyclic: Whether the last key-frame leads on to the first. Times are then taken modulo the period.
-        smooth: Whether neighbours in time have a say; False treats each pair alone.
+        smooth: Whether neighbours in time have a say; False treats each pair alone. A function is another path scheme:
+            :data:`torch_modal.geometry.hermite.Tangents` (docs/extending.md).
         preset: As for :class:`torch_modal.InBetween`; not ``"paper"``, which knows the middle of a pair only.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
@@ -72,7 +73,7 @@ class Path(nn.Module):
         faces: Tensor,
         times: Tensor | Sequence[float] | None = None,
         cyclic: bool = False,
-        smooth: bool = True,
+        smooth: bool | Tangents = True,
         preset: Preset = "accurate",
         *,
         objective: Objective | None = None,
@@ -96,7 +97,9 @@ class Path(nn.Module):
         kind = _Lazy if smooth and n > 2 and not objective.terms else InBetween
         self.layer = kind(list(bases), faces, objective=objective, solver=solver, pairs=pairs)
         self.cyclic = cyclic
-        self.smooth = smooth
+        self.smooth = bool(smooth)
+        #: The path scheme; None for the default.
+        self.tangents = smooth if callable(smooth) else None
         #: Which pair of bases each interval has the modes of.
         self.members = list(range(len(pairs)))
 
@@ -128,7 +131,8 @@ class Path(nn.Module):
             raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
         other = Path.__new__(Path)
         nn.Module.__init__(other)
-        other.layer, other.cyclic, other.smooth, other.contact = self.layer, self.cyclic, self.smooth, self.contact
+        other.layer, other.cyclic, other.contact = self.layer, self.cyclic, self.contact
+        other.smooth, other.tangents = self.smooth, self.tangents
         other.members = [*self.members[: i + 1], *self.members[i:]]
         other.register_buffer("times", torch.cat([self.times[: i + 1], at, self.times[i + 1 :]]))
         return other
@@ -208,7 +212,7 @@ class Path(nn.Module):
         if self.smooth and n > 2:
             before, after, spacing = around(i, self.times, self.cyclic)
             neighbours["before"], neighbours["after"] = (None if j is None else x[:, j] for j in (before, after))
-            neighbours["spacing"] = Spacing(*(h.to(x).expand(len(x)) for h in spacing))
+            neighbours["spacing"] = spacing.mapped(lambda h: h.to(x).expand(len(x)))._replace(tangents=self.tangents)
         u = u.to(x)
         stiffness = layer.stiffness_of(u, u.shape)
         return Samples(x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), stiffness, **neighbours)
