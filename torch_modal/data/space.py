@@ -270,7 +270,7 @@ class ShapeSpace:
         """The file of a table, and what it must have been made of; None where it is not to be kept.
 
         Warns:
-            CacheWarning: What the energy is made of cannot be looked through: tables are made anew by each process.
+            CacheWarning: The objective has a term of the user's own, so that each process computes its tables again.
         """
         if self.folder is None:
             return None, {}
@@ -278,7 +278,8 @@ class ShapeSpace:
             content = self._content(i, j)
         except ContentError as error:
             warnings.warn(
-                f"tables of in-betweens are not kept in {self.folder}, as a term of the objective has no key: {error}",
+                f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
+                f"terms: {error}",
                 CacheWarning,
                 stacklevel=5,
             )
@@ -291,8 +292,8 @@ class ShapeSpace:
         span = self._span(i, j)
         bases = [self.bases[key] for key in (span.keyframes if span else (i, j))]
         tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
-        code = __version__, torch.__version__, code_digest()
-        return content_digest([*code, tensors, self.faces, span and span.times, tuple(self.settings)])
+        code = __version__, str(torch.__version__), code_digest()
+        return content_digest([*code, tensors, self.faces, span and span.times, self.settings])
 
     # -------------------------------------------------------------------------------------------------- in-betweens
     def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:
