@@ -104,8 +104,8 @@ def run(args: argparse.Namespace) -> int:
     if threading.current_thread() is threading.main_thread():  # a batch system's request ends it as Ctrl-C does
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
-    from torch_modal.data.engines import dask_cluster, local_processes
-    from torch_modal.data.precompute import DONE, Options, Shard, precompute_tree
+    from torch_modal.data.batch.engines import dask_cluster, local_processes
+    from torch_modal.data.batch.precompute import DONE, Options, Shard, precompute_tree
 
     say: Callable[[str], None] = (lambda _: None) if args.quiet else _say
     options = Options(

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
-from torch_modal.data.engines import Engine
-from torch_modal.data.record import DONE, FAILED, LEFT_OUT, Record, read_record
-from torch_modal.data.set_task import Options, Outcome, SetTask, run_set
+from torch_modal.data.batch.engines import Engine
+from torch_modal.data.batch.record import DONE, FAILED, LEFT_OUT, Record, read_record
+from torch_modal.data.batch.set_task import Options, Outcome, SetTask, run_set
+from torch_modal.data.batch.tree import find_keyframe_sets, places, printable
 from torch_modal.data.stored import RECORD_FILE
-from torch_modal.data.tree import find_keyframe_sets, places, printable
 from torch_modal.io.files import write_atomically
 
 SHOWN = 20
@@ -46,12 +46,12 @@ def precompute_tree(
 ) -> list[Record]:
     """Compute the bases of every key-frame set below a folder.
 
-    Each set is a task with a process and a time limit of its own, see :func:`~torch_modal.data.set_task.run_set`; what
-    goes wrong with one is written to the report and the others go on. Sets that have a result already are passed over,
-    unless their files or the options changed.
+    Each set is a task with a process and a time limit of its own
+    (:func:`~torch_modal.data.batch.set_task.run_set`). The report names the sets that failed; the others go on. Sets
+    with a result are skipped, unless their files or the options changed.
 
     Args:
-        root: The folder tree. See :func:`~torch_modal.data.tree.find_keyframe_sets` for what a set is.
+        root: The folder tree. See :func:`~torch_modal.data.batch.tree.find_keyframe_sets` for what a set is.
         out: Gets a folder for each set, see :mod:`torch_modal.data.stored`, and the report.
         engine: Where the tasks run.
         options: How.

@@ -19,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torch_modal.data.batch.record import DONE, FAILED, REFUSED, Record, inputs_key
+from torch_modal.data.batch.set_task import Options
 from torch_modal.data.motion import Motion
-from torch_modal.data.record import DONE, FAILED, REFUSED, Record, inputs_key
-from torch_modal.data.set_task import Options
 from torch_modal.data.stored import RECORD_FILE, write_set
 from torch_modal.errors import MeshError
 from torch_modal.io.files import write_atomically

@@ -18,9 +18,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch_modal.data.record import CRASHED, DONE, FAILED, REFUSED, TIMEOUT, Record, inputs_key, read_record
+from torch_modal.data.batch.record import CRASHED, DONE, FAILED, REFUSED, TIMEOUT, Record, inputs_key, read_record
+from torch_modal.data.batch.tree import mesh_files
 from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, RECORD_FILE, open_set, why_not_replaceable
-from torch_modal.data.tree import mesh_files
 from torch_modal.io.cache import CACHE_VERSION
 from torch_modal.io.files import write_atomically
 from torch_modal.io.processes import describe_exit, end_process, last_line
@@ -31,10 +31,10 @@ import sys
 root = sys.argv.pop(1)
 if root not in sys.path:
     sys.path.insert(0, root)
-from torch_modal.data._set_worker import main
+from torch_modal.data.batch.set_worker import main
 main(sys.argv[1])
 """
-COMMAND = [sys.executable, "-c", BOOT, str(Path(__file__).resolve().parents[2])]
+COMMAND = [sys.executable, "-c", BOOT, str(Path(__file__).resolve().parents[3])]
 """What is started, with the path of the result after it."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 TIMES_FILE = "times.txt"
