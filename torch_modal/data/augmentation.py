@@ -199,18 +199,11 @@ class ShapeAugmentation(nn.Module):
             ValueError: The rows of ``params`` or ``pool`` do not fit.
         """
         space = self.space if space is None else space
-        n = len(batch.shapes)
-        wrong = {name: tuple(value.shape) for name, value in params.items() if len(value) != n}
-        if wrong:
-            raise ValueError(f"{n} shapes need parameters with {n} rows; got {wrong}")
+        own = self._own_rows(batch.shapes, params)
         chosen = torch.nonzero(params["batch_prob"].cpu()).flatten()
         if not len(chosen):
             return batch
-        like = batch.shapes
-        own = {
-            name: value[chosen.to(value.device)].to(like.device, like.dtype if value.is_floating_point() else None)
-            for name, value in params.items()
-        }
+        own = {name: value[chosen.to(value.device)] for name, value in own.items()}
         if space is None or not self.uses_keyframes:
             return batch.put(chosen, self.apply_transform(batch.rows(chosen), own, space, Pool(batch, chosen)))
         batch = batch.located(space)

@@ -92,29 +92,19 @@ def write_page(
     faces: Array,
     out: str | Path,
     *,
-    keyframe_indices: Sequence[int] | None = None,
-    times: Sequence[float] | None = None,
-    fps: float = 24.0,
-    cyclic: bool = False,
-    view: tuple[float, float] | None = None,
-    up: Literal["y", "z"] | None = None,
     title: str | None = None,
     overwrite: bool = False,
+    **options: Any,
 ) -> Path:
     """Write a page to look at sequences of shapes, as one HTML file that works without a network.
 
     Args:
-        sequences: As for :func:`show`, like all that is not named here.
+        sequences: As for :func:`show`.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         out: File to write, ``*.html``.
-        keyframe_indices: Frames that are key-frames.
-        times: The time of each frame. *Shape:* ``(N,)``.
-        fps: Frames a second.
-        cyclic: Add the step from the last frame back to the first.
-        view: Azimuth and elevation of the first view in degrees.
-        up: ``"y"`` or ``"z"``.
         title: Of the page; by default the file's name.
         overwrite: Replace the file if it exists.
+        options: Further arguments of :func:`show`, such as ``keyframe_indices``.
 
     Returns:
         The file.
@@ -124,18 +114,7 @@ def write_page(
         FileExistsError: The file exists and ``overwrite`` is off.
     """
     path = checked_path(out, overwrite)
-    page = show(
-        sequences,
-        faces,
-        keyframe_indices=keyframe_indices,
-        times=times,
-        fps=fps,
-        cyclic=cyclic,
-        view=view,
-        up=up,
-        title=path.stem if title is None else title,
-    )
-    return page.save(path, overwrite)
+    return show(sequences, faces, title=path.stem if title is None else title, **options).save(path, overwrite)
 
 
 def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
