@@ -4,6 +4,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from torch_modal.cli.arguments import add_debug
+from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import PICTURES
+
 SUMMARY = "what passes through itself, in key-frames and results"
 DESCRIPTION = """\
 Say for each mesh which of its triangles pass through others, and colour them in a
@@ -28,21 +32,17 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--picture", type=Path, metavar="FILE", help="draw the meshes with what crosses in colour, as .png or .pdf"
     )
     sub.add_argument("--overwrite", action="store_true", help="replace the picture if it exists (default: refuse)")
-    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_debug(sub)
     sub.set_defaults(quiet=False, verbose=False)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run ``torch-modal check``: 0 where no parts go through each other that do not in the key-frames, else 3."""
-    if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
-        args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
-    from torch_modal.geometry.crossings import require_contact
-    from torch_modal.io.write import refuse_existing
-
+    check_name(args, "--picture", args.picture, PICTURES)
     if args.picture:
-        if args.picture.resolve() in {mesh.resolve() for mesh in [*args.meshes, *args.keyframes]}:
-            raise ValueError(f"{args.picture} is one of the meshes; choose another file")
-        refuse_existing(args.picture, args.overwrite)
+        check_output([args.picture], [*args.meshes, *args.keyframes], args.overwrite, option="--picture")
+    from torch_modal.geometry.crossings import require_contact
+
     require_contact()
 
     import torch_modal as tm

@@ -8,7 +8,8 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+from torch_modal.cli.arguments import add_common, add_modes, number
 
 SUMMARY = "bases of every key-frame set of a folder tree, in several processes or machines"
 
@@ -35,13 +36,8 @@ INCOMPLETE = 3
 """Exit status when some sets have no bases."""
 
 
-def add_arguments(sub: argparse.ArgumentParser, number: Callable[..., Callable[[str], Any]]) -> None:
-    """Add what this command alone has.
-
-    Args:
-        sub: Its parser.
-        number: Makes the type of an argument: a number of a kind, with a lower bound.
-    """
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``precompute``."""
     sub.add_argument("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the bases and the report go")
     sub.add_argument(
@@ -72,23 +68,13 @@ def add_arguments(sub: argparse.ArgumentParser, number: Callable[..., Callable[[
         "one, says when each is, and when the first comes again if it is a cycle (default: even times)",
     )
     sub.add_argument("--retry", action="store_true", help="try sets again that failed before")
-
-
-def add_common(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments about files and messages, which mean something else for many sets."""
-    group = sub.add_argument_group("files and messages")
-    group.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="replace stored sets that this command did not write (default: refuse those sets)",
+    add_modes(sub)
+    add_common(
+        sub,
+        overwrite="replace stored sets that this command did not write (default: refuse those sets)",
+        cache_dir="keep tetrahedra and modes in this cache as well (default: keep the bases only)",
+        all_of=False,
     )
-    group.add_argument(
-        "--cache-dir",
-        metavar="DIR",
-        help="keep tetrahedra and modes in this cache as well (default: keep the bases only)",
-    )
-    group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import tempfile
 import webbrowser
-from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torch_modal.cli.arguments import add_common, number
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import PAGES
 
@@ -43,8 +43,8 @@ examples:
     torch-modal view --live open.obj fist.obj"""
 
 
-def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None:
-    """Add the arguments of the command; ``number`` makes argument types."""
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``view``."""
     sub.add_argument("meshes", nargs="+", type=Path, metavar="FILE", help="shapes in their order, a folder, or one GLB")
     sub.add_argument(
         "--compare",
@@ -91,10 +91,7 @@ def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None
     sub.add_argument(
         "--port", type=number(int, 1), metavar="N", default=8080, help="of --live, the first to try (default: 8080)"
     )
-    group = sub.add_argument_group("files and messages")
-    group.add_argument("--overwrite", action="store_true", help="replace the file if it exists (default: refuse)")
-    group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_common(sub, overwrite="replace the file if it exists (default: refuse)", cache_dir=None, all_of=False)
 
 
 def run(args: argparse.Namespace) -> None:

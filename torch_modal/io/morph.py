@@ -66,7 +66,7 @@ def _attributes(
     for number, shape in enumerate(local[1:], start=1):
         # Against the rounded base, so that its rounding is not carried into every frame.
         target = {"POSITION": document.add((shape - base).astype(np.float32), "VEC3", ARRAY_BUFFER, bounds=True)}
-        if move_normals and primitive.normals is not None:
+        if move_normals and primitive.normals is not None and normals is not None:
             turned = (_unit(primitive.normals(number)) - normals).astype(np.float32)
             target["NORMAL"] = document.add(turned, "VEC3", ARRAY_BUFFER)
         targets.append(target)
