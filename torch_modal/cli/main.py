@@ -1,6 +1,6 @@
 """The command line: ``torch-modal subdivide``, ``register``, ``modes`` and the others.
 
-Nothing heavy is imported before the arguments are known to make sense.
+Checks the arguments before any heavy import.
 """
 
 import argparse
@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("interrupted")
         return 130
     except BrokenPipeError:
-        # The reader (head, less) has what it wanted. Python flushes once more at exit: into nothing.
+        # The reader (head, less) has closed the pipe. Python flushes once more at exit, into the null device.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -132,9 +132,9 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _expected_errors() -> tuple[type[Exception], ...]:
-    """What input, files and machine can cause; anything else is a bug and shows its traceback."""
+    """Errors of input, files and machine; all others are bugs and show their traceback."""
     expected: list[type[Exception]] = [ValueError, OSError, MemoryError, ImportError]
-    # Their modules are heavy: if one was never imported, it raised nothing.
+    # Their modules are heavy; one that was not imported raised nothing.
     for module, name in (
         ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
         ("torch_modal.precompute.eigen", "ModalAnalysisError"),

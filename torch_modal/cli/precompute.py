@@ -20,7 +20,7 @@ A set is a folder that directly holds two or more meshes of one connectivity. Th
 mirrors the tree, with the key-frames and bases of each set as safetensors. Every set has a
 process and a time limit of its own: one that crashes, hangs or is refused is written to
 precompute-report.jsonl, and the others go on. The same command again continues where it
-stopped, and works anew on sets whose files or options changed.
+stopped, and recomputes sets whose files or options changed.
 
 exit status: 0 all sets have their bases, 3 some have not, 1 an error, 130 interrupted"""
 
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         shard = args.shard or ((1, 1) if args.scheduler else _shard_by_environment())
     except (ValueError, argparse.ArgumentTypeError) as error:
         args.fail(f"the variables SLURM_ARRAY_TASK_* or RANK and WORLD_SIZE make no sense ({error}); give --shard")
-    if threading.current_thread() is threading.main_thread():  # a batch system's request ends it as Ctrl-C does
+    if threading.current_thread() is threading.main_thread():  # SIGTERM of a batch system acts like Ctrl-C
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
     from torch_modal.data.batch.engines import dask_cluster, local_processes
@@ -109,12 +109,12 @@ def run(args: argparse.Namespace) -> int:
         records = precompute_tree(args.root, args.out, engine, options, shard=Shard(*shard), say=say, bar=bar)
     if all(record.status == DONE for record in records):
         return 0
-    # torchrun would end the other shards, now and each time that it is started again.
+    # A non-zero status would make torchrun end the other shards.
     return 0 if "TORCHELASTIC_RUN_ID" in os.environ else INCOMPLETE
 
 
 def _shard_by_environment() -> tuple[int, int]:
-    """The part of the sets that falls to this process of an array of jobs or a group of processes."""
+    """The shard of this process in an array of jobs or a group of processes."""
     for job, first, count in (
         ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_MIN", "SLURM_ARRAY_TASK_COUNT"),
         ("RANK", "", "WORLD_SIZE"),
@@ -132,6 +132,6 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _say(line: str) -> None:
-    """Print a line, whatever names are in it."""
+    """Print a line; escapes characters that the terminal cannot show."""
     encoding = sys.stdout.encoding or "utf-8"
     print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)

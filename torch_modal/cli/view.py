@@ -16,10 +16,10 @@ from torch_modal.io.formats import PAGES
 if TYPE_CHECKING:
     from torch_modal.view.document import Page
 
-SUMMARY = "look at sequences of shapes, in a page for the browser"
+SUMMARY = "show sequences of shapes, in a page for the browser"
 
 DESCRIPTION = """\
-Look at sequences of shapes in a page: play, orbit, compare, colour by edge strain,
+Show sequences of shapes in a page: play, orbit, compare, colour by edge strain,
 distance or volume change, pick vertices and copy their indices.
 
 The page is one HTML file that needs no network. Shapes are numbered mesh files, a
@@ -28,7 +28,7 @@ folder of them, or a GLB that `subdivide` or save_animation wrote.
 With --landmarks, they are meshes of any connectivity, side by side, on which vertices
 that belong together are picked, for `register` and `subdivide --register`.
 
-With --live, they are key-frames, and what lies between is computed while you drag
+With --live, they are key-frames, and in-betweens are computed while you drag
 the time, the stiffnesses, single modes, or handles of the key-frames."""
 
 EXAMPLES = """\
@@ -39,7 +39,7 @@ examples:
     torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
   pick landmarks on two meshes, and save them as the file that --landmarks of `register` takes:
     torch-modal view cat.obj dog.obj --landmarks
-  drag what lies between two key-frames (pip install 'torch_modal[view]'):
+  drag in-betweens of two key-frames (pip install 'torch_modal[view]'):
     torch-modal view --live open.obj fist.obj"""
 
 
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _open(page: Page, what: str, args: argparse.Namespace) -> None:
-    """Write the page, and open it if it is not wanted as a file."""
+    """Write the page; open it unless --page names a file."""
     written = page.save(args.page or _temporary_file(), args.overwrite)
     if not args.quiet:
         print(f"{what}: {written}", flush=True)
@@ -211,7 +211,7 @@ def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[dict[
 
 
 def _name(paths: list[Path]) -> str:
-    """What a sequence is called: its one file or folder, or the folder of its files."""
+    """The name of a sequence: of its only file or folder, or of its files' folder."""
     path = paths[0].absolute() if len(paths) == 1 else paths[0].absolute().parent
     return path.stem if path.is_file() else path.name
 
@@ -231,5 +231,5 @@ def _linear(frames: Any, keys: list[int], cyclic: bool) -> Any:
 
 
 def _temporary_file() -> Path:
-    """Where a page that is only to be looked at goes; it stays, as the browser reads it after this process."""
+    """The path of a page without --page; it stays, as the browser reads it after this process."""
     return Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")

@@ -87,10 +87,10 @@ def compress(
         n_modes: Amplitudes of a frame.
         keyframes: Where to begin with, as for :func:`torch_modal.encode`; more are added if the error needs them.
         times: As for :func:`torch_modal.encode`.
-        cyclic: Likewise.
-        cache_dir: Likewise.
-        cache: Likewise.
-        progress: Likewise.
+        cyclic: As for :func:`torch_modal.encode`, like the following.
+        cache_dir: Where modes are cached.
+        cache: Whether they are.
+        progress: See :data:`torch_modal.progress.Progress`.
 
     Raises:
         MeshError: Frames that cannot be used.

@@ -194,7 +194,7 @@ class Document:
 
 
 def _index(number: Any) -> int:
-    """Indices of damaged files may be negative, which Python would take."""
+    """A checked index; damaged files may have negative ones, which Python accepts."""
     if not isinstance(number, int) or number < 0:
         raise ValueError(f"an index {number!r}")
     return number

@@ -35,9 +35,10 @@ class _Primitive(NamedTuple):
 
 
 class GltfAsset(Asset):
-    """A GLB or GLTF file. Every node that shows triangles is taken, where its transforms put it.
+    """A GLB or GLTF file. All nodes with triangles count, at the places of their transforms.
 
-    It is written as GLB, with the same nodes, cameras, lights, materials, textures and further attributes.
+    It is written as GLB, with the same nodes, cameras, lights, materials, textures and further attributes. Tangents are
+    left out: viewers compute them from normals and texture coordinates.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,7 +59,7 @@ class GltfAsset(Asset):
 
     @property
     def keeps(self) -> Collection[str]:
-        """All but what moves the mesh."""
+        """All but skeletons, animations and morph targets."""
         return set(FEATURES) - {"posing"}
 
     def _collect(self) -> None:
@@ -108,7 +109,9 @@ class GltfAsset(Asset):
             return np.asarray(np.linalg.inv(self._world[node]), dtype=np.float64)
         except np.linalg.LinAlgError:
             name = self.document.get("nodes", node).get("name", node)
-            raise MeshError(f"{self.path}: the node {name} flattens its mesh, so positions have no way back") from None
+            raise MeshError(
+                f"{self.path}: the node {name} flattens its mesh, so that positions cannot be transformed back"
+            ) from None
 
     def _triangles(self, primitive: Json, n_points: int) -> IntArray:
         if "indices" in primitive:
@@ -146,7 +149,7 @@ class GltfAsset(Asset):
 
     # ------------------------------------------------------------------------------------------------ the file again
     def rebuilt(self, frames: FloatArray) -> tuple[Document, list[Drawn], list[int]]:
-        """A copy without positions and normals, with nothing in it that is not used.
+        """A copy without positions and normals, and without unused content.
 
         Args:
             frames: *Shape:* ``(N, V, 3)``.

@@ -14,7 +14,7 @@ TARGET_NAME = "frame-{:03d}"
 
 
 class Drawn(NamedTuple):
-    """A primitive of a document whose positions are still to come."""
+    """A primitive of a document without its positions."""
 
     json: Json
     points: Any
@@ -31,7 +31,7 @@ def rows_of(vectors: Callable[[int], FloatArray], rows: IntArray | slice, number
 
 
 def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray, move_normals: bool = True) -> None:
-    """Give primitives their positions, those of frame 0, and a morph target for each further frame.
+    """Add the positions of frame 0 to primitives, and a morph target for each further frame.
 
     Args:
         document: The document.

@@ -38,7 +38,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArra
 
 
 def open_asset(path: str | os.PathLike[str]) -> Asset:
-    """Read a mesh file with everything that it carries.
+    """Read a mesh file with all its content.
 
     Args:
         path: An OBJ, PLY, OFF, GLB or GLTF file.
@@ -71,7 +71,7 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
         asset: Asset = getattr(import_module(module), name)(path)
     except MeshError:
         raise
-    except Exception as error:  # A reader fed with garbage may raise anything; the file's name must not get lost.
+    except Exception as error:  # Damaged files may raise any exception; the message names the file.
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: cannot be read as {suffix[1:].upper()} ({reason[:200]})") from error
     vertices, faces = asset.positions, asset.faces
@@ -95,7 +95,7 @@ def require_same_mesh(
     other_vertices: NDArray[np.float64],
     other_faces: NDArray[np.int64],
 ) -> None:
-    """Refuse a file whose vertices or faces do not match those of the first."""
+    """Raise unless the vertices and faces of a file match those of the first."""
     hint = "all key-frames need the same vertices and faces, in the same vertex order"
     for what, mine, its in (("vertices", vertices, other_vertices), ("faces", faces, other_faces)):
         if len(mine) != len(its):
