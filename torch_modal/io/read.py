@@ -5,8 +5,8 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset
 
@@ -21,7 +21,7 @@ READERS = {
 SUFFIXES = tuple(READERS)
 
 
-def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_mesh(path: str | os.PathLike[str]) -> tuple[FloatArray, IntArray]:
     """Read the positions and triangles of a file.
 
     Args:
@@ -89,11 +89,11 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
 
 def require_same_mesh(
     first: str | os.PathLike[str],
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64],
+    vertices: FloatArray,
+    faces: IntArray,
     other: str | os.PathLike[str],
-    other_vertices: NDArray[np.float64],
-    other_faces: NDArray[np.int64],
+    other_vertices: FloatArray,
+    other_faces: IntArray,
 ) -> None:
     """Raise unless the vertices and faces of a file match those of the first."""
     hint = "all key-frames need the same vertices and faces, in the same vertex order"
