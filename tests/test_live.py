@@ -144,9 +144,9 @@ def test_session_handles_and_their_ways(session: LiveSession, bars: Shapes) -> N
     session.add_handle(0, 20)  # is there already
     session.move_handle(0, 20, target)
     until(lambda: bool(np.abs(session._from_scene(session.ghosts[0].vertices[20]) - target).max() < 1e-4))
-    until(lambda: session._shown_ways == {(0, 20)})
+    until(lambda: session._shown_paths == {(0, 20)})
     session._undo()
-    until(lambda: session._shown_ways == set())
+    until(lambda: session._shown_paths == set())
     torch.testing.assert_close(session.shapes.keyframes, bars.keyframes)
     assert not session._handles
 

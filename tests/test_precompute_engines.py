@@ -20,10 +20,10 @@ from safetensors.torch import load_file
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.data.engines import Engine, dask_cluster, local_processes
-from torch_modal.data.precompute import Shard, precompute_tree
-from torch_modal.data.record import DONE, UNFINISHED
-from torch_modal.data.set_task import Options
+from torch_modal.data.batch.engines import Engine, dask_cluster, local_processes
+from torch_modal.data.batch.precompute import Shard, precompute_tree
+from torch_modal.data.batch.record import DONE, UNFINISHED
+from torch_modal.data.batch.set_task import Options
 from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, find_sets, open_set
 from torch_modal.io.frames import save_frames
 
@@ -102,7 +102,7 @@ def test_shard_is_given_or_that_of_the_environment(
         seen.append(tuple(shard))
         return []
 
-    monkeypatch.setattr("torch_modal.data.precompute.precompute_tree", compute)
+    monkeypatch.setattr("torch_modal.data.batch.precompute.precompute_tree", compute)
     if wanted is None:
         with pytest.raises(SystemExit):
             cli.main(["precompute", "shapes", "--out", "bases", *options])
@@ -128,7 +128,7 @@ class Elsewhere(AtOnce):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:  # type: ignore[type-arg]
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("torch_modal.data.set_task.CACHE_VERSION", "another")
+            patch.setattr("torch_modal.data.batch.set_task.CACHE_VERSION", "another")
             return super().submit(fn, *args, **kwargs)
 
 

@@ -12,9 +12,9 @@ from conftest import Shapes, processes, wait_until
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.data import _set_worker, set_task
-from torch_modal.data.precompute import Shard
-from torch_modal.data.record import Record, inputs_key
+from torch_modal.data.batch import set_task, set_worker
+from torch_modal.data.batch.precompute import Shard
+from torch_modal.data.batch.record import Record, inputs_key
 from torch_modal.data.stored import BASES_FILE, LABELS_FILE, find_sets, open_set, write_set
 from torch_modal.io.frames import save_frames
 
@@ -378,8 +378,8 @@ def test_worker_says_what_is_wrong(
         def extract(*_: object, **__: object) -> None:
             raise error
 
-        monkeypatch.setattr(_set_worker, "extract_bases", extract)
-        return _set_worker.compute(job)
+        monkeypatch.setattr(set_worker, "extract_bases", extract)
+        return set_worker.compute(job)
 
     refused = outcome(tm.MeshError("it is\nflat"))
     assert (refused.status, refused.reason, refused.vertices) == ("refused", "it is flat", len(capsule[0]))
@@ -389,7 +389,7 @@ def test_worker_says_what_is_wrong(
     bug = outcome(KeyError("k"))
     assert (bug.status, bug.reason) == ("failed", "KeyError: 'k'") and "Traceback" in bug.log
     files[0].write_text(files[0].read_text() + "# more")
-    assert "were written to while they were read" in _set_worker.compute(job).reason
+    assert "were written to while they were read" in set_worker.compute(job).reason
 
 
 def test_times_of_a_sequence(
@@ -401,7 +401,7 @@ def test_times_of_a_sequence(
         some = torch.ones(1, dtype=torch.float64)
         return [tm.ModalBasis(x, some, torch.ones_like(x)[None], some.expand(6)) for x in keyframes]
 
-    monkeypatch.setattr(_set_worker, "extract_bases", extract)
+    monkeypatch.setattr(set_worker, "extract_bases", extract)
     files = save_frames(np.stack([capsule[0] * s for s in (1, 1.1, 1.2)]), capsule[1], tmp_path / "a", fmt="obj")
     job = {"options": {"sequence": True}, "source": str(tmp_path / "a"), "target": str(tmp_path / "out" / "a")}
 
@@ -410,7 +410,7 @@ def test_times_of_a_sequence(
         for file in beside:
             file.write_text(times or "")
         record = {"set": "a", "files": [file.name for file in files], "inputs": inputs_key([*files, *beside])}
-        return _set_worker.compute({**job, "record": record})
+        return set_worker.compute({**job, "record": record})
 
     for text, expected, cyclic in (
         (None, (0, 1, 2), False),
@@ -427,7 +427,7 @@ def test_times_of_a_sequence(
         assert "times.txt needs one number for each of the 3 key-frames, ascending" in wrong.reason
     job["options"] = {}
     assert (
-        _set_worker.compute(
+        set_worker.compute(
             {**job, "record": {"set": "a", "files": [f.name for f in files], "inputs": inputs_key(files)}}
         ).status
         == "done"

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from torch_modal.data.record import CRASHED, DONE, Record, inputs_key, read_record
-from torch_modal.data.tree import find_keyframe_sets, mesh_files, natural, places, printable
+from torch_modal.data.batch.record import CRASHED, DONE, Record, inputs_key, read_record
+from torch_modal.data.batch.tree import find_keyframe_sets, mesh_files, natural, places, printable
 
 
 def make(root: Path, *files: str) -> Path:

@@ -1,17 +1,21 @@
-"""``torch-modal check``: what passes through itself, in files."""
+"""``torch-modal check``: self-contacts of meshes."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-SUMMARY = "what passes through itself, in key-frames and results"
+from torch_modal.cli.arguments import add_debug
+from torch_modal.cli.output import check_name, check_output
+from torch_modal.io.formats import PICTURES
+
+SUMMARY = "parts that pass through each other, in key-frames and results"
 DESCRIPTION = """\
-Say for each mesh which of its triangles pass through others, and colour them in a
+Count for each mesh the triangles that pass through others, and colour them in a
 picture. All meshes have the same faces.
 
-With --keyframes, what crosses in these already is told apart from what is new, and
-of that, what are two parts that went through each other (far) from crossings that
-only grew, and from folds. Without, everything is new."""
+With --keyframes, crossings of the key-frames are not counted as new; far ones are of
+two parts that went through each other, not crossings that grew or folds. Without, all
+are new."""
 EXAMPLES = """\
 examples:
   torch-modal check open.obj fist.obj
@@ -25,24 +29,20 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known"
     )
     sub.add_argument(
-        "--picture", type=Path, metavar="FILE", help="draw the meshes with what crosses in colour, as .png or .pdf"
+        "--picture", type=Path, metavar="FILE", help="draw the meshes with crossings in colour, as .png or .pdf"
     )
     sub.add_argument("--overwrite", action="store_true", help="replace the picture if it exists (default: refuse)")
-    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_debug(sub)
     sub.set_defaults(quiet=False, verbose=False)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``torch-modal check``: 0 where no parts go through each other that do not in the key-frames, else 3."""
-    if args.picture and args.picture.suffix.lower() not in (".png", ".pdf"):
-        args.fail(f"--picture must end in .png or .pdf, got {args.picture.name!r}")
-    from torch_modal.geometry.crossings import require_contact
-    from torch_modal.io.write import refuse_existing
-
+    """Run ``torch-modal check``: 3 if parts newly pass through each other, else 0."""
+    check_name(args, "--picture", args.picture, PICTURES)
     if args.picture:
-        if args.picture.resolve() in {mesh.resolve() for mesh in [*args.meshes, *args.keyframes]}:
-            raise ValueError(f"{args.picture} is one of the meshes; choose another file")
-        refuse_existing(args.picture, args.overwrite)
+        check_output([args.picture], [*args.meshes, *args.keyframes], args.overwrite, option="--picture")
+    from torch_modal.geometry.crossings import require_contact
+
     require_contact()
 
     import torch_modal as tm
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _marks(found: Any, faces: Any, shapes: Any) -> Any:
-    """0 of vertices where nothing crosses, 1 where something does, 2 where that is new. *Shape:* ``(N, V)``."""
+    """Of each vertex: 0, 1 for a crossing, 2 for a new one. *Shape:* ``(N, V)``."""
     marks = shapes.new_zeros(shapes.shape[:2])
     for value, chosen in ((1.0, found.new == found.new), (2.0, found.new)):
         which = found.shape[chosen].repeat_interleave(6)

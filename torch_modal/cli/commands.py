@@ -1,6 +1,6 @@
-"""What the commands of the command line do, from parsed arguments to files and lines.
+"""The commands of the command line, from parsed arguments to files and printed lines.
 
-Each refuses what it could not write before it imports anything heavy, and before any work.
+Each checks its output paths before any heavy import and any work.
 """
 
 import argparse
@@ -175,7 +175,7 @@ def cache(args: argparse.Namespace) -> None:
 
 
 def _registration(args: argparse.Namespace) -> dict[str, Any]:
-    """What `load_keyframes` is told of meshes of different connectivity."""
+    """Options of `load_keyframes` for meshes of different connectivity."""
     if not args.register:
         return {}
     return {
@@ -190,7 +190,7 @@ def _registration(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:
-    """What `extract_bases` is told besides the key-frames."""
+    """Options of `extract_bases`."""
     return {
         "mesher": args.mesher,
         "settings": args.quality,
@@ -224,7 +224,7 @@ def _looks_like_file(out: Path) -> bool:
 
 
 def _warn_of_leftovers(folder: Path, pattern: str | None, written: list[Path]) -> None:
-    """Frames of an earlier, longer run would pass for the end of this one."""
+    """Warn of frames of an earlier, longer run, which look like the end of this one."""
     left = sorted(set(folder.glob(pattern or "")) - set(written))
     if left:
         warnings.warn(f"{folder} also holds {len(left)} frames of an earlier run, from {left[0].name}", stacklevel=2)

@@ -2,10 +2,9 @@
 
 import argparse
 import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+from torch_modal.cli.arguments import number
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
@@ -43,7 +42,7 @@ def part(text: str) -> float:
     return value
 
 
-def add_compress(sub: argparse.ArgumentParser, number: Callable[..., Callable[[str], Any]]) -> None:
+def add_compress(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``compress`` besides the common ones."""
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="frames, two or more, in their order")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE.tms", help="the file")
@@ -61,7 +60,7 @@ def add_compress(sub: argparse.ArgumentParser, number: Callable[..., Callable[[s
     sub.add_argument("--cyclic", action="store_true", help="the last frame leads on to the first")
 
 
-def add_expand(sub: argparse.ArgumentParser, number: Callable[..., Callable[[str], Any]]) -> None:
+def add_expand(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``expand`` besides the common ones."""
     sub.add_argument("file", type=Path, metavar="FILE.tms", help="a file that compress wrote")
     sub.add_argument(

@@ -1,6 +1,6 @@
 """The command line: ``torch-modal subdivide``, ``register``, ``modes`` and the others.
 
-Nothing heavy is imported before the arguments are known to make sense.
+Checks the arguments before any heavy import.
 """
 
 import argparse
@@ -12,6 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from torch_modal.cli import check, commands, compress, precompute, register, view
+from torch_modal.cli.arguments import (
+    CACHE_DIR,
+    Formatter,
+    add_common,
+    add_debug,
+    add_levels,
+    add_modes,
+    number,
+    times,
+)
 from torch_modal.cli.messages import PROGRAM, log_as_lines, say, warnings_as_lines
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 from torch_modal.version import __version__
@@ -102,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("interrupted")
         return 130
     except BrokenPipeError:
-        # The reader (head, less) has what it wanted. Python flushes once more at exit: into nothing.
+        # The reader (head, less) has closed the pipe. Python flushes once more at exit, into the null device.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -122,9 +132,9 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _expected_errors() -> tuple[type[Exception], ...]:
-    """What input, files and machine can cause; anything else is a bug and shows its traceback."""
+    """Errors of input, files and machine; all others are bugs and show their traceback."""
     expected: list[type[Exception]] = [ValueError, OSError, MemoryError, ImportError]
-    # Their modules are heavy: if one was never imported, it raised nothing.
+    # Their modules are heavy; one that was not imported raised nothing.
     for module, name in (
         ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
         ("torch_modal.precompute.eigen", "ModalAnalysisError"),
@@ -143,47 +153,17 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-# ------------------------------------------------------------------------------------------------- arguments
-class _Formatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=30, width=100)
-
-
-def _number(kind: Callable[[str], Any], low: float, above: bool = False) -> Callable[[str], Any]:
-    """An argument type: a finite number of at least (or above) a bound."""
-
-    def convert(text: str) -> Any:
-        wanted = f"a {'whole ' if kind is int else ''}number {'above' if above else 'of at least'} {low:g}"
-        try:
-            value = kind(text)
-        except ValueError:
-            value = float("nan")
-        if not (low < value if above else low <= value) or value == float("inf"):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
-        return value
-
-    return convert
-
-
-def _times(text: str) -> list[float]:
-    """An argument type: numbers with commas between them."""
-    try:
-        return [float(word) for word in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
-
-
 def build_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     parser = argparse.ArgumentParser(
-        prog=PROGRAM, description=DESCRIPTION, epilog=MAIN_EXAMPLES, formatter_class=_Formatter
+        prog=PROGRAM, description=DESCRIPTION, epilog=MAIN_EXAMPLES, formatter_class=Formatter
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND ...")
 
     def command(name: str, run: Callable[[Any], int | None], summary: str, text: str, examples: str) -> Any:
         sub = subparsers.add_parser(
-            name, help=summary, description=text, epilog=examples, formatter_class=_Formatter, allow_abbrev=False
+            name, help=summary, description=text, epilog=examples, formatter_class=Formatter, allow_abbrev=False
         )
         sub.set_defaults(command=run, fail=sub.error)
         return sub
@@ -197,23 +177,17 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="FILE_OR_FOLDER",
         help=f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb",
     )
-    sub.add_argument(
-        "--levels",
-        type=_number(int, 0),
-        metavar="L",
-        default=3,
-        help="how often the number of intervals doubles (default: %(default)s, 8 frames an interval)",
-    )
+    add_levels(sub, 0)
     sub.add_argument(
         "--frames",
-        type=_number(int, 2),
+        type=number(int, 2),
         metavar="N",
         help="number of frames of the result, filled in linearly between the levels' shapes (default: all of those)",
     )
     sub.add_argument("--cyclic", action="store_true", help="the last key-frame leads on to the first")
     sub.add_argument(
         "--times",
-        type=_times,
+        type=times,
         metavar="T,T,...",
         help="when the key-frames are, ascending, in any unit; of a cycle, with the time when it begins again",
     )
@@ -235,13 +209,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--mu",
-        type=_number(float, 0, above=True),
+        type=number(float, 0, above=True),
         metavar="X",
         help="how strongly --preset paper pulls its two shapes together (default: 1)",
     )
     sub.add_argument(
         "--polish",
-        type=_number(int, 0),
+        type=number(int, 0),
         metavar="N",
         default=0,
         help="further steps on the fine mesh, towards the optimum over all vertices (default: %(default)s)",
@@ -254,13 +228,13 @@ def build_parser() -> argparse.ArgumentParser:
     group = sub.add_argument_group("animation")
     group.add_argument(
         "--duration",
-        type=_number(float, 0, above=True),
+        type=number(float, 0, above=True),
         metavar="SECONDS",
         help="of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)",
     )
     group.add_argument(
         "--fps",
-        type=_number(float, 0, above=True),
+        type=number(float, 0, above=True),
         metavar="X",
         help="frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)",
     )
@@ -276,12 +250,12 @@ def build_parser() -> argparse.ArgumentParser:
         "--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others"
     )
     register.add_options(sub)
-    _add_modes(sub)
-    _add_common(sub)
+    add_modes(sub)
+    add_common(sub)
 
     sub = command("register", register.run, register.SUMMARY, register.DESCRIPTION, register.EXAMPLES)
     register.add_arguments(sub)
-    _add_common(sub)
+    add_common(sub)
 
     sub = command("check", check.run, check.SUMMARY, check.DESCRIPTION, check.EXAMPLES)
     check.add_arguments(sub)
@@ -301,26 +275,24 @@ def build_parser() -> argparse.ArgumentParser:
         default="edge",
         help="of the energy's Hessian; vertex is the paper's (default: %(default)s)",
     )
-    _add_modes(sub)
-    _add_common(sub)
+    add_modes(sub)
+    add_common(sub)
 
     sub = command("precompute", precompute.run, precompute.SUMMARY, precompute.DESCRIPTION, precompute.EXAMPLES)
-    precompute.add_arguments(sub, _number)
-    _add_modes(sub)
-    precompute.add_common(sub)
+    precompute.add_arguments(sub)
 
     sub = command(
         "compress", compress.compress, compress.COMPRESS, compress.COMPRESS_DESCRIPTION, compress.COMPRESS_EXAMPLES
     )
-    compress.add_compress(sub, _number)
-    _add_common(sub)
+    compress.add_compress(sub)
+    add_common(sub)
 
     sub = command("expand", compress.expand, compress.EXPAND, compress.EXPAND_DESCRIPTION, compress.EXPAND_EXAMPLES)
-    compress.add_expand(sub, _number)
-    _add_common(sub)
+    compress.add_expand(sub)
+    add_common(sub)
 
     sub = command("view", view.run, view.SUMMARY, view.DESCRIPTION, view.EXAMPLES)
-    view.add_arguments(sub, _number)
+    view.add_arguments(sub)
 
     sub = command("demo", commands.demo, "try it on the samples that come with it", DEMO, DEMO_EXAMPLES)
     sub.add_argument(
@@ -331,15 +303,9 @@ def build_parser() -> argparse.ArgumentParser:
         help="where the files go (default: %(default)s)",
     )
     sub.add_argument("--sample", choices=("creature", "hand"), help="only this one (default: both)")
-    sub.add_argument(
-        "--levels",
-        type=_number(int, 1),
-        metavar="L",
-        default=3,
-        help="how often the number of intervals doubles (default: %(default)s, 8 frames an interval)",
-    )
-    _add_modes(sub)
-    _add_common(sub)
+    add_levels(sub, 1)
+    add_modes(sub)
+    add_common(sub)
 
     sub = command("cache", commands.cache, "size of the cache of tetrahedra and modes", CACHE, CACHE_EXAMPLES)
     which = sub.add_mutually_exclusive_group()
@@ -349,45 +315,6 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="SIZE",
         help="remove what was not used for the longest, until the rest is no larger than SIZE (500M, 4G)",
     )
-    sub.add_argument(
-        "--cache-dir", metavar="DIR", help="another folder (default: TORCH_MODAL_CACHE, or the user's cache folder)"
-    )
-    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    sub.add_argument("--cache-dir", metavar="DIR", help=CACHE_DIR)
+    add_debug(sub)
     return parser
-
-
-def _add_modes(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
-        "--modes",
-        type=_number(int, 1),
-        default=30,
-        metavar="N",
-        help="elastic modes of each key-frame; 20 to 100 are usual (default: %(default)s)",
-    )
-    sub.add_argument(
-        "--mesher",
-        choices=("lattice", "tetwild"),
-        default="lattice",
-        help="what fills the surfaces: a lattice of cubes (deterministic, takes every surface), or fTetWild (default: "
-        "%(default)s)",
-    )
-    sub.add_argument(
-        "--quality",
-        choices=("fast", "fine"),
-        default="fast",
-        help="how fine the tetrahedra are (default: %(default)s)",
-    )
-
-
-def _add_common(sub: argparse.ArgumentParser) -> None:
-    group = sub.add_argument_group("files and messages")
-    group.add_argument("--overwrite", action="store_true", help="replace files that exist (default: refuse)")
-    group.add_argument(
-        "--cache-dir",
-        metavar="DIR",
-        help="where tetrahedra and modes are kept (default: TORCH_MODAL_CACHE, or the user's cache folder)",
-    )
-    group.add_argument("--no-cache", action="store_true", help="compute everything anew and keep nothing")
-    group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
-    group.add_argument("--verbose", action="store_true", help="also say what is done step by step")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")

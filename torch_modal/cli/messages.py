@@ -1,4 +1,4 @@
-"""What the command line says on the error output: one line each."""
+"""Messages of the command line on the error output, one line each."""
 
 import argparse
 import contextlib
@@ -18,7 +18,7 @@ def say(message: str) -> None:
 
 @contextlib.contextmanager
 def warnings_as_lines() -> Iterator[None]:
-    """Show each warning about input or result once, as one line; leave those of libraries to developers."""
+    """Show each warning about input or result once, as one line; ignore those of libraries."""
     seen = set()
 
     def show(message: Warning | str, category: type[Warning], *_: Any) -> None:

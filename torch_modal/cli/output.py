@@ -1,4 +1,4 @@
-"""What the commands may write: refused before any work, and before anything heavy is imported."""
+"""Checks of output paths, before any work and any heavy import."""
 
 import argparse
 import os
@@ -16,18 +16,18 @@ def check_output(
     folder: Path | None = None,
     pattern: str | None = None,
 ) -> None:
-    """Refuse what could not or must not be written at the end.
+    """Raise if an output file could not or must not be written.
 
     Args:
         files: Files that will be written.
-        inputs: Files that are read, which stay.
+        inputs: Files that are read, and must not be replaced.
         overwrite: Whether files that exist may be replaced.
-        option: What names the files.
-        folder: Where there will be further files.
+        option: The option that names the files.
+        folder: Folder of further files.
         pattern: The names of those.
 
     Raises:
-        ValueError: It says which file, and why not.
+        ValueError: The message names the file and the reason.
     """
     read = {path.resolve() for path in inputs}
     existing = [file for file in files if file.exists() or file.resolve() in read]
@@ -49,7 +49,7 @@ def check_output(
 
 
 def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixes: Collection[str]) -> None:
-    """Leave with the usage if an option names a file of another kind."""
+    """Exit with the usage if an option names a file of another kind."""
     from torch_modal.io.write import check_suffix
 
     try:

@@ -8,7 +8,8 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+from torch_modal.cli.arguments import add_common, add_modes, number
 
 SUMMARY = "bases of every key-frame set of a folder tree, in several processes or machines"
 
@@ -19,7 +20,7 @@ A set is a folder that directly holds two or more meshes of one connectivity. Th
 mirrors the tree, with the key-frames and bases of each set as safetensors. Every set has a
 process and a time limit of its own: one that crashes, hangs or is refused is written to
 precompute-report.jsonl, and the others go on. The same command again continues where it
-stopped, and works anew on sets whose files or options changed.
+stopped, and recomputes sets whose files or options changed.
 
 exit status: 0 all sets have their bases, 3 some have not, 1 an error, 130 interrupted"""
 
@@ -35,13 +36,8 @@ INCOMPLETE = 3
 """Exit status when some sets have no bases."""
 
 
-def add_arguments(sub: argparse.ArgumentParser, number: Callable[..., Callable[[str], Any]]) -> None:
-    """Add what this command alone has.
-
-    Args:
-        sub: Its parser.
-        number: Makes the type of an argument: a number of a kind, with a lower bound.
-    """
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``precompute``."""
     sub.add_argument("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the bases and the report go")
     sub.add_argument(
@@ -72,23 +68,13 @@ def add_arguments(sub: argparse.ArgumentParser, number: Callable[..., Callable[[
         "one, says when each is, and when the first comes again if it is a cycle (default: even times)",
     )
     sub.add_argument("--retry", action="store_true", help="try sets again that failed before")
-
-
-def add_common(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments about files and messages, which mean something else for many sets."""
-    group = sub.add_argument_group("files and messages")
-    group.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="replace stored sets that this command did not write (default: refuse those sets)",
+    add_modes(sub)
+    add_common(
+        sub,
+        overwrite="replace stored sets that this command did not write (default: refuse those sets)",
+        cache_dir="keep tetrahedra and modes in this cache as well (default: keep the bases only)",
+        all_of=False,
     )
-    group.add_argument(
-        "--cache-dir",
-        metavar="DIR",
-        help="keep tetrahedra and modes in this cache as well (default: keep the bases only)",
-    )
-    group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -101,11 +87,11 @@ def run(args: argparse.Namespace) -> int:
         shard = args.shard or ((1, 1) if args.scheduler else _shard_by_environment())
     except (ValueError, argparse.ArgumentTypeError) as error:
         args.fail(f"the variables SLURM_ARRAY_TASK_* or RANK and WORLD_SIZE make no sense ({error}); give --shard")
-    if threading.current_thread() is threading.main_thread():  # a batch system's request ends it as Ctrl-C does
+    if threading.current_thread() is threading.main_thread():  # SIGTERM of a batch system acts like Ctrl-C
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
-    from torch_modal.data.engines import dask_cluster, local_processes
-    from torch_modal.data.precompute import DONE, Options, Shard, precompute_tree
+    from torch_modal.data.batch.engines import dask_cluster, local_processes
+    from torch_modal.data.batch.precompute import DONE, Options, Shard, precompute_tree
 
     say: Callable[[str], None] = (lambda _: None) if args.quiet else _say
     options = Options(
@@ -123,12 +109,12 @@ def run(args: argparse.Namespace) -> int:
         records = precompute_tree(args.root, args.out, engine, options, shard=Shard(*shard), say=say, bar=bar)
     if all(record.status == DONE for record in records):
         return 0
-    # torchrun would end the other shards, now and each time that it is started again.
+    # A non-zero status would make torchrun end the other shards.
     return 0 if "TORCHELASTIC_RUN_ID" in os.environ else INCOMPLETE
 
 
 def _shard_by_environment() -> tuple[int, int]:
-    """The part of the sets that falls to this process of an array of jobs or a group of processes."""
+    """The shard of this process in an array of jobs or a group of processes."""
     for job, first, count in (
         ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_MIN", "SLURM_ARRAY_TASK_COUNT"),
         ("RANK", "", "WORLD_SIZE"),
@@ -146,6 +132,6 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _say(line: str) -> None:
-    """Print a line, whatever names are in it."""
+    """Print a line; escapes characters that the terminal cannot show."""
     encoding = sys.stdout.encoding or "utf-8"
     print(line.encode(encoding, "backslashreplace").decode(encoding), flush=True)

@@ -5,21 +5,21 @@ from __future__ import annotations
 import argparse
 import tempfile
 import webbrowser
-from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torch_modal.cli.arguments import add_common, number
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import PAGES
 
 if TYPE_CHECKING:
     from torch_modal.view.document import Page
 
-SUMMARY = "look at sequences of shapes, in a page for the browser"
+SUMMARY = "show sequences of shapes, in a page for the browser"
 
 DESCRIPTION = """\
-Look at sequences of shapes in a page: play, orbit, compare, colour by edge strain,
+Show sequences of shapes in a page: play, orbit, compare, colour by edge strain,
 distance or volume change, pick vertices and copy their indices.
 
 The page is one HTML file that needs no network. Shapes are numbered mesh files, a
@@ -28,7 +28,7 @@ folder of them, or a GLB that `subdivide` or save_animation wrote.
 With --landmarks, they are meshes of any connectivity, side by side, on which vertices
 that belong together are picked, for `register` and `subdivide --register`.
 
-With --live, they are key-frames, and what lies between is computed while you drag
+With --live, they are key-frames, and in-betweens are computed while you drag
 the time, the stiffnesses, single modes, or handles of the key-frames."""
 
 EXAMPLES = """\
@@ -39,12 +39,12 @@ examples:
     torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
   pick landmarks on two meshes, and save them as the file that --landmarks of `register` takes:
     torch-modal view cat.obj dog.obj --landmarks
-  drag what lies between two key-frames (pip install 'torch_modal[view]'):
+  drag in-betweens of two key-frames (pip install 'torch_modal[view]'):
     torch-modal view --live open.obj fist.obj"""
 
 
-def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None:
-    """Add the arguments of the command; ``number`` makes argument types."""
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``view``."""
     sub.add_argument("meshes", nargs="+", type=Path, metavar="FILE", help="shapes in their order, a folder, or one GLB")
     sub.add_argument(
         "--compare",
@@ -91,10 +91,7 @@ def add_arguments(sub: Any, number: Callable[..., Callable[[str], Any]]) -> None
     sub.add_argument(
         "--port", type=number(int, 1), metavar="N", default=8080, help="of --live, the first to try (default: 8080)"
     )
-    group = sub.add_argument_group("files and messages")
-    group.add_argument("--overwrite", action="store_true", help="replace the file if it exists (default: refuse)")
-    group.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_common(sub, overwrite="replace the file if it exists (default: refuse)", cache_dir=None, all_of=False)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -132,7 +129,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _open(page: Page, what: str, args: argparse.Namespace) -> None:
-    """Write the page, and open it if it is not wanted as a file."""
+    """Write the page; open it unless --page names a file."""
     written = page.save(args.page or _temporary_file(), args.overwrite)
     if not args.quiet:
         print(f"{what}: {written}", flush=True)
@@ -214,7 +211,7 @@ def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[dict[
 
 
 def _name(paths: list[Path]) -> str:
-    """What a sequence is called: its one file or folder, or the folder of its files."""
+    """The name of a sequence: of its only file or folder, or of its files' folder."""
     path = paths[0].absolute() if len(paths) == 1 else paths[0].absolute().parent
     return path.stem if path.is_file() else path.name
 
@@ -234,5 +231,5 @@ def _linear(frames: Any, keys: list[int], cyclic: bool) -> Any:
 
 
 def _temporary_file() -> Path:
-    """Where a page that is only to be looked at goes; it stays, as the browser reads it after this process."""
+    """The path of a page without --page; it stays, as the browser reads it after this process."""
     return Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")

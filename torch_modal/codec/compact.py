@@ -46,7 +46,7 @@ def pack(
         steps: Of amplitudes, rotations and translations, in single precision.
         modes: Of the first key-frame.
         origin: In the caller's units, in single precision.
-        scale: Likewise.
+        scale: The diagonal, in single precision.
     """
     clusters = modes.clusters.numpy()
     probe = np.rint(PROBE_UNIT * modes.probe().numpy()).astype(np.int64)

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from torch_modal.arrays import IntArray
 from torch_modal.codec.amplitudes import column_steps, from_sines, runs, to_sines
 from torch_modal.codec.compact import pack, to_callers_units
 from torch_modal.codec.file import compact_bytes, read
@@ -87,10 +87,10 @@ def compress(
         n_modes: Amplitudes of a frame.
         keyframes: Where to begin with, as for :func:`torch_modal.encode`; more are added if the error needs them.
         times: As for :func:`torch_modal.encode`.
-        cyclic: Likewise.
-        cache_dir: Likewise.
-        cache: Likewise.
-        progress: Likewise.
+        cyclic: As for :func:`torch_modal.encode`, like the following.
+        cache_dir: Where modes are cached.
+        cache: Whether they are.
+        progress: See :data:`torch_modal.progress.Progress`.
 
     Raises:
         MeshError: Frames that cannot be used.
@@ -199,7 +199,7 @@ class _Compression:
         between = runs(keys, len(self.x), self.motion.cyclic)
         series = torch.cat([exact.amplitudes, exact.motions], 1).numpy()
 
-        def tried(step: float) -> tuple[NDArray[np.int64], list[float], float]:
+        def tried(step: float) -> tuple[IntArray, list[float], float]:
             steps = [step, *[_single(step * MOTION_STEP)] * 2]
             columns = column_steps(exact.n_modes, *steps)
             numbers = to_sines(series, columns, between)

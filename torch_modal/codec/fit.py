@@ -18,7 +18,7 @@ RIDGE = 1e-4
 DIFFERENCE = 1e-3
 """Of amplitudes, in the finite differences of the Jacobian."""
 MAX_ROTATION = 0.35
-"""Radians that triangles on the path may rotate before the Jacobian is computed anew."""
+"""Radians that triangles on the path may rotate before the Jacobian is recomputed."""
 QUANTILE = 0.95
 """Of the triangles' rotations, which is compared with that limit."""
 

@@ -62,9 +62,9 @@ def reproducible_modes(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: How many; a few more or fewer, if that would cut a cluster.
         clusters: Sizes of the clusters, as a file has them. Default: found here.
-        seed: Likewise.
+        seed: Of the directions, as a file has it. Default: found here.
         cache_dir: As for :func:`torch_modal.extract_modes`.
-        cache: Likewise.
+        cache: As for :func:`torch_modal.extract_modes`.
 
     Raises:
         MeshError: The shape cannot have modes.

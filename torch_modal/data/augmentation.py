@@ -1,4 +1,4 @@
-"""What all random transforms of shapes share; the conventions are those of kornia's augmentations."""
+"""The base class of random transforms of shapes, with the conventions of kornia's augmentations."""
 
 import math
 from functools import partial
@@ -14,14 +14,14 @@ Parameters = dict[str, Tensor]
 
 
 class ShapeBatch(NamedTuple):
-    """Shapes with what goes along with them."""
+    """Shapes with their key-frames and labels."""
 
     shapes: Tensor
     """*Shape:* ``(B, V, 3)``."""
     nearest: Tensor | None = None
-    """The key-frame whose modes a shape is given; found by distance where None. On the CPU. *Shape:* ``(B,)``."""
+    """Index of the key-frame whose modes a shape uses; None: the nearest one. On the CPU. *Shape:* ``(B,)``."""
     given: Tensor | None = None
-    """Whether a shape is that key-frame as it stands; none is where None. On the CPU. *Shape:* ``(B,)``, bool."""
+    """Whether a shape equals that key-frame; None: no shape does. On the CPU. *Shape:* ``(B,)``, bool."""
     vertex_labels: Tensor | None = None
     """*Shape:* ``(B, V, ...)``."""
     shape_labels: Tensor | None = None
@@ -32,7 +32,7 @@ class ShapeBatch(NamedTuple):
         return ShapeBatch._make(None if part is None else part[index.to(part.device)] for part in self)
 
     def put(self, index: Tensor, other: "ShapeBatch") -> "ShapeBatch":
-        """The same with some of the shapes exchanged."""
+        """A copy with some of the shapes replaced."""
         parts = (
             mine if mine is None or its is None else mine.index_copy(0, index.to(mine.device), its)
             for mine, its in zip(self, other, strict=True)
@@ -51,7 +51,7 @@ class ShapeBatch(NamedTuple):
 
         Args:
             space: The space.
-            like: Gives dtype and device.
+            like: A tensor of the wanted dtype and device.
             vertex_labels: *Shape:* ``(K, V, ...)``.
             shape_labels: *Shape:* ``(K, ...)``.
         """
@@ -60,35 +60,35 @@ class ShapeBatch(NamedTuple):
         return cls(space.keyframes(like), number, given, vertex_labels, shape_labels)
 
     def located(self, space: ShapeSpace) -> "ShapeBatch":
-        """With the nearest key-frame of each shape."""
+        """A copy with the nearest key-frame of each shape."""
         nearest = space.nearest(self.shapes) if self.nearest is None else self.nearest
         given = torch.zeros(len(nearest), dtype=torch.bool) if self.given is None else self.given
         return self._replace(nearest=nearest, given=given)
 
 
 class Pool(NamedTuple):
-    """Where partners come from."""
+    """The shapes that partners are drawn from."""
 
     batch: ShapeBatch
-    """Located."""
+    """With their nearest key-frames."""
     own: Tensor | None
-    """Which of them each shape is itself, or is nearest to. On the CPU. *Shape:* ``(B,)``."""
+    """Index in the pool of each shape, or of its nearest key-frame. On the CPU. *Shape:* ``(B,)``."""
     neighbours: Tensor | None = None
-    """Those before and after each in time, if the pool is a motion. *Shape:* ``(K, 2)``."""
+    """Key-frames before and after each in time, if the pool is a motion. *Shape:* ``(K, 2)``."""
 
 
 class ShapeAugmentation(nn.Module):
     """A random transform of shapes of one connectivity, batched, differentiable in the shapes.
 
-    Parameters are drawn on the device of the generator, sample by sample, whatever the device and dtype of the shapes.
-    Those of the last call are in :attr:`params`; given to a call, they are used again instead of new ones.
+    Parameters are drawn for each sample on the device of the generator, independent of the shapes' device and dtype.
+    :attr:`params` has those of the last call; a call with ``params`` repeats them.
 
     Args:
         p: Probability that a shape is transformed.
         same_on_batch: Whether all shapes of a batch get the same parameters.
-        keepdim: Whether one shape ``(V, 3)`` comes back as such, and not as a batch of one.
-        generator: Where random numbers come from; by default PyTorch's own generator.
-        space: The key-frames and modes that shapes are drawn from, unless a call names others.
+        keepdim: Whether one shape ``(V, 3)`` gives ``(V, 3)`` rather than a batch of one.
+        generator: Source of random numbers; by default PyTorch's own generator.
+        space: Default key-frames and modes of the calls.
 
     Raises:
         ValueError: ``p`` is no probability.
@@ -114,7 +114,7 @@ class ShapeAugmentation(nn.Module):
         self._params: Parameters = {}
 
     uses_keyframes = True
-    """Whether a transform needs to know which key-frame a shape is nearest to."""
+    """Whether the transform uses the nearest key-frame of a shape."""
 
     @property
     def params(self) -> Parameters:
@@ -136,10 +136,10 @@ class ShapeAugmentation(nn.Module):
         """Transform all shapes of a batch.
 
         Args:
-            batch: The shapes, located if there is a space.
+            batch: The shapes, with their nearest key-frames if there is a space.
             params: Their parameters, on their device.
             space: Key-frames and modes.
-            pool: Where partners come from.
+            pool: The shapes that partners are drawn from.
         """
         raise NotImplementedError
 
@@ -150,7 +150,9 @@ class ShapeAugmentation(nn.Module):
             shapes: Transformed shapes. *Shape:* ``(B, V, 3)``.
             params: Their parameters, on their device.
         """
-        raise NotImplementedError(f"{type(self).__name__} has no inverse: a deformation cannot be told from the shape")
+        raise NotImplementedError(
+            f"{type(self).__name__} has no inverse: a deformation cannot be recovered from the shape"
+        )
 
     # -------------------------------------------------------------------------------------------------------- calls
     def forward_parameters(
@@ -186,31 +188,24 @@ class ShapeAugmentation(nn.Module):
         space: ShapeSpace | None = None,
         pool: ShapeBatch | None = None,
     ) -> ShapeBatch:
-        """Transform those shapes of a batch that the parameters say, with what goes along with them.
+        """Transform the shapes that the parameters select, and their labels.
 
         Args:
             batch: The shapes.
             params: From :meth:`forward_parameters`, or :attr:`params`.
             space: Key-frames and modes; by default the module's.
-            pool: The key-frames of the space with their labels (:meth:`ShapeBatch.of_keyframes`), if partners come from
-                there; by default they come from the batch.
+            pool: The key-frames of the space with their labels (:meth:`ShapeBatch.of_keyframes`), if partners are drawn
+                from these; by default they are drawn from the batch.
 
         Raises:
             ValueError: The rows of ``params`` or ``pool`` do not fit.
         """
         space = self.space if space is None else space
-        n = len(batch.shapes)
-        wrong = {name: tuple(value.shape) for name, value in params.items() if len(value) != n}
-        if wrong:
-            raise ValueError(f"{n} shapes need parameters with {n} rows; got {wrong}")
+        own = self._own_rows(batch.shapes, params)
         chosen = torch.nonzero(params["batch_prob"].cpu()).flatten()
         if not len(chosen):
             return batch
-        like = batch.shapes
-        own = {
-            name: value[chosen.to(value.device)].to(like.device, like.dtype if value.is_floating_point() else None)
-            for name, value in params.items()
-        }
+        own = {name: value[chosen.to(value.device)] for name, value in own.items()}
         if space is None or not self.uses_keyframes:
             return batch.put(chosen, self.apply_transform(batch.rows(chosen), own, space, Pool(batch, chosen)))
         batch = batch.located(space)
@@ -237,11 +232,11 @@ class ShapeAugmentation(nn.Module):
             shapes: Vertex positions. *Shape:* ``(B, V, 3)`` or ``(V, 3)``.
             params: Parameters of an earlier call, to repeat it.
             space: Key-frames and modes; by default the module's.
-            pool: The key-frames of the space (:meth:`ShapeBatch.of_keyframes`), if partners come from there; by
-                default they come from the batch.
+            pool: The key-frames of the space (:meth:`ShapeBatch.of_keyframes`), if partners are drawn from these; by
+                default they are drawn from the batch.
 
         Returns:
-            *Shape:* ``(B, V, 3)``; ``(V, 3)`` if that came and ``keepdim`` is set.
+            *Shape:* ``(B, V, 3)``; ``(V, 3)`` for one shape if ``keepdim`` is set.
 
         Raises:
             ValueError: The shapes, or the rows of ``params``, do not fit.
@@ -255,10 +250,10 @@ class ShapeAugmentation(nn.Module):
         return out[0] if single and self.keepdim else out
 
     def inverse(self, shapes: Tensor, params: Parameters | None = None) -> Tensor:
-        """Undo a call, where that is possible: of rigid motions.
+        """Undo a call; rigid motions only.
 
         Args:
-            shapes: What the call returned, or other shapes that were moved likewise. *Shape:* ``(B, V, 3)`` or
+            shapes: The call's result, or other shapes with the same motion. *Shape:* ``(B, V, 3)`` or
                 ``(V, 3)``.
             params: Parameters of the call; by default those of the last.
 
@@ -273,7 +268,7 @@ class ShapeAugmentation(nn.Module):
         batch = shapes[None] if shapes.dim() == 2 else shapes
         params = self._params if params is None else params
         if not params:
-            raise ValueError("inverse undoes a call: make one first, or pass its params")
+            raise ValueError("there is no call to invert: make one first, or pass its params")
         own = self._own_rows(batch, params)
         moved = own["batch_prob"]
         out = torch.where(moved[:, None, None], self.undo(batch, own), batch)
@@ -301,10 +296,10 @@ class ShapeAugmentation(nn.Module):
 
 
 def check_shapes(shapes: Tensor, space: ShapeSpace | None) -> None:
-    """Refuse what is no batch of shapes of a space.
+    """Raise unless a tensor is a batch of shapes of a space.
 
     Raises:
-        ValueError: Says what arrived.
+        ValueError: The message names shape and dtype.
     """
     v: Any = "V" if space is None else space.n_vertices
     fits = shapes.dim() in (2, 3) and shapes.shape[-1] == 3 and (space is None or shapes.shape[-2] == v)
@@ -316,10 +311,10 @@ def check_shapes(shapes: Tensor, space: ShapeSpace | None) -> None:
 
 
 def check_range(name: str, given: tuple[float, float], lowest: float, highest: float) -> tuple[float, float]:
-    """A range of numbers within bounds.
+    """Check a range of numbers.
 
     Raises:
-        ValueError: Says which bounds.
+        ValueError: It is no range within the bounds.
     """
     try:
         low, high = map(float, given)

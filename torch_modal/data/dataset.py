@@ -24,7 +24,7 @@ Sample = dict[str, Any]
 
 
 def stored_labels(stored: StoredSet) -> Labels:
-    """What stands in the file ``labels.safetensors`` of a set's folder, if there is one."""
+    """The contents of ``labels.safetensors`` in a set's folder, if there is one."""
     path = stored.folder / LABELS_FILE
     return load_file(path) if path.is_file() else {}
 
@@ -40,23 +40,22 @@ class _Opened(NamedTuple):
 class ShapeDataset(Dataset[Sample]):
     """Random shapes of all key-frame sets of a folder (``torch-modal precompute``, :func:`torch_modal.write_set`).
 
-    A sample starts from a key-frame of its set, each in turn, and is transformed; partners are other key-frames of the
-    set. It depends on the seed, the epoch and its index alone, not on workers or their number. (Samples that a loader
-    asks for together are computed together: with another batch size they agree up to rounding.) Sets are opened when
-    they are needed, in the process that needs them, and only the most recent are kept open, so that memory does not
-    grow with their number.
+    A sample is a transformed key-frame of its set, each in turn; partners are other key-frames of the set. It depends
+    on the seed, the epoch and its index alone, not on workers or their number. (Samples of a batch are computed
+    together: with another batch size they agree up to rounding.) Each process opens sets at first use and keeps only
+    the most recent open, so that memory does not grow with their number.
 
-    A sample is a dict: ``vertices`` (V, 3); ``set``, the number of its set in :attr:`sets`; ``keyframe``, where it
-    started; and where asked for or there, ``faces`` (F, 3), ``normals`` (V, 3), ``vertex_labels`` and ``shape_labels``.
+    A sample is a dict: ``vertices`` (V, 3); ``set``, the index of its set in :attr:`sets`; ``keyframe``, its
+    key-frame; and if requested or stored, ``faces`` (F, 3), ``normals`` (V, 3), ``vertex_labels`` and ``shape_labels``.
 
     Args:
         root: Folder of stored sets, at any depth.
-        transform: What is done to key-frames; in-betweens by default. Its ``same_on_batch`` has no effect here.
+        transform: Transforms the key-frames; in-betweens by default. Its ``same_on_batch`` has no effect here.
         samples_per_set: Samples of each set in an epoch.
-        labels: Tells the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
+        labels: Returns the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
             each if there are any. A function of a module, if workers are spawned. By default those in the file
             ``labels.safetensors`` of the set's folder.
-        seed: Of all that is random.
+        seed: Of all random numbers.
         dtype: Of the vertices.
         faces: Whether samples have their faces. A loader stacks them with the rest; :meth:`faces` gives them once.
         normals: Whether samples have normals.
@@ -112,7 +111,7 @@ class ShapeDataset(Dataset[Sample]):
 
     @property
     def epoch(self) -> int:
-        """Which epoch samples are drawn for."""
+        """The epoch of the samples."""
         return int(self._epoch)
 
     def set_epoch(self, epoch: int) -> None:
@@ -151,7 +150,7 @@ class ShapeDataset(Dataset[Sample]):
         start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
         drawn = [self.transform.forward_parameters(1, space, self._generator(index)) for index in indices]
         batch = pool.rows(start)
-        alike: dict[tuple[int, ...], list[int]] = {}  # samples that the same transforms are applied to, in one order
+        alike: dict[tuple[int, ...], list[int]] = {}  # samples with the same transforms in the same order
         for row, own in enumerate(drawn):
             alike.setdefault(self.transform.order(own), []).append(row)
         for rows in alike.values():

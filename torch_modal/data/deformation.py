@@ -1,4 +1,4 @@
-"""Random deformations along vibration modes, that bend where modes alone would shear."""
+"""Random deformations along vibration modes, in rotation-strain coordinates."""
 
 from typing import Any
 
@@ -12,15 +12,15 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Bend, bend, bent_sides, frames, sides
 from torch_modal.geometry.vectors import pick
 
-# A draw beyond the bound is scaled down to this part of it, as if its largest strain were linear, which it nearly is.
+# A draw beyond the bound is scaled to this part of it; its largest strain is nearly linear in the scale.
 _INSIDE = 0.98
 _STEEPEST = 0.05
 _ROUNDS = 8
 
-# The same draw with and without gradients differs by rounding, which must not carry it over the bound.
+# The same draw with and without gradients differs by rounding; both must stay within the bound.
 _ROUNDING = 1e-4
 
-# So many numbers of all side vectors together are worked on at a time.
+# Numbers of all edge vectors that are computed at a time.
 _CHUNK_NUMBERS = 2**22
 
 
@@ -31,7 +31,7 @@ class RandomModalDeformation(ShapeAugmentation):
     energy on average: limbs bend far, thickness hardly changes. The linear displacement gives each triangle a rotation
     and a strain, the rotation is made finite, and vertices follow by a Poisson problem (rotation-strain coordinates,
     Huang et al. 2011): large draws bend. A draw whose largest edge strain would exceed the bound is scaled down until
-    it does not. The result is aligned with the shape that came.
+    it does not. The result is aligned with the input.
 
     Args:
         strain: Range of the expected root mean square edge strain (which is sigma, in other units), drawn uniformly; a
@@ -63,7 +63,7 @@ class RandomModalDeformation(ShapeAugmentation):
         return f"strain={self.strain}, max_strain={self.max_strain}, {super().extra_repr()}"
 
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
-        """``noise``, standard normal, one number for each mode; and the ``strain``."""
+        """``noise``, a standard normal number for each mode, and the ``strain``."""
         space = self._space(space)
         strain = self.strain[0] + (self.strain[1] - self.strain[0]) * uniform(n, generator)
         return {"strain": strain, "noise": normal(n, generator, space.n_modes)}
@@ -94,7 +94,7 @@ class RandomModalDeformation(ShapeAugmentation):
         if not (torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)):
             return deformed
         deformed = deform(x, scale[:, None] * amplitudes, reference, reconstruction)
-        # Nothing is left to chance: what does not come within the bound stays as it was.
+        # Shapes beyond the bound stay as they were.
         with torch.no_grad():
             within = (space.strain(deformed, x).abs() <= self.max_strain).all(1) & (scale > 0)
         return torch.where(within[:, None, None], deformed, x)
@@ -102,7 +102,7 @@ class RandomModalDeformation(ShapeAugmentation):
     def _bounded(
         self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, reference: Reference, reconstruction: Reconstruction
     ) -> tuple[Tensor, Tensor]:
-        """How far each draw may go, ``(B,)``, and the shapes that this gives; where nothing helps, those that came."""
+        """The scale of each draw within the bound, ``(B,)``, and the shapes; unchanged shapes if none is found."""
         bound = (1 - _ROUNDING) * self.max_strain
         expected = linear_strain(amplitudes, reference, reconstruction.edges)
         scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
@@ -124,8 +124,8 @@ class RandomModalDeformation(ShapeAugmentation):
 def deform(x: Tensor, amplitudes: Tensor, reference: Reference, reconstruction: Reconstruction) -> Tensor:
     """Shapes bent along a key-frame's modes.
 
-    Rotations and strains are those of the key-frame, where the modes belong; a shape that has another pose is turned by
-    the same rotations, and strained along its own triangles.
+    The modes give rotations and strains of the key-frame's triangles. A shape of another pose gets the same
+    rotations, and strains along its own triangles.
 
     Args:
         x: Shapes near the key-frame. *Shape:* ``(B, V, 3)``.

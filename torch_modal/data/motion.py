@@ -10,12 +10,12 @@ from torch_modal.keyframes.times import checked_times
 
 
 class Span(NamedTuple):
-    """The way from one key-frame to another that follows it in time, or comes before it, and what it depends on."""
+    """An interval between two successive key-frames, in either direction, with their neighbours."""
 
     keyframes: list[int]
-    """These two and their neighbours, three or four in all, in the order in which they are passed."""
+    """Indices of these two and their neighbours, three or four in all, in the order of time."""
     times: Tensor
-    """When that is: 0 at the start of the way, 1 at its end. *Shape:* ``(3,)`` or ``(4,)``."""
+    """Times of these: 0 at the start of the interval, 1 at its end. *Shape:* ``(3,)`` or ``(4,)``."""
 
 
 class Motion:
@@ -38,10 +38,10 @@ class Motion:
 
     @classmethod
     def of(cls, times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> "Motion | None":
-        """The motion; None of key-frames that have no times.
+        """The motion of key-frames; None without times.
 
         Raises:
-            ValueError: As for the constructor, or there are no times though it is said to be cyclic.
+            ValueError: As for the constructor, or cyclic key-frames without times.
         """
         if times is None and cyclic:
             raise ValueError(f"cyclic key-frames are a motion and need their times: range({n_keyframes + 1}) if even")
@@ -55,10 +55,10 @@ class Motion:
         return both % self.n_keyframes if self.cyclic else last - (last - both.abs()).abs()
 
     def span(self, i: int, j: int) -> Span | None:
-        """The way from key-frame ``i`` to ``j``.
+        """The interval from key-frame ``i`` to ``j``.
 
         Returns:
-            None where they do not follow each other, or have no neighbours.
+            None if they are not successive, or have no neighbours.
         """
         n, ahead, back = self.n_keyframes, j - i, i - j
         if self.cyclic:
@@ -66,12 +66,12 @@ class Motion:
         if n < 3 or 1 not in (ahead, back):
             return None
         if ahead == 1:
-            return self._onwards(i)
-        keyframes, times = self._onwards(j)
+            return self._to_next(i)
+        keyframes, times = self._to_next(j)
         return Span(keyframes[::-1], 1 - times.flip(0))
 
-    def _onwards(self, i: int) -> Span:
-        """The way from a key-frame to the next."""
+    def _to_next(self, i: int) -> Span:
+        """The interval from a key-frame to the next."""
         n = self.n_keyframes
         places = [place for place in range(i - 1, i + 3) if self.cyclic or 0 <= place < n]
         period = self.times[-1] - self.times[0]

@@ -1,4 +1,4 @@
-"""Batches as other libraries hold them: shapes of different sizes packed one after the other (PyTorch3D).
+"""Packed batches of shapes of different sizes, in the layout of PyTorch3D.
 
 For PyTorch Geometric see :mod:`torch_modal.data.pyg`.
 """
@@ -70,8 +70,8 @@ def collate_packed(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     Returns:
         ``verts_packed`` (N, 3), ``faces_packed`` (M, 3) with indices into them, ``num_verts_per_mesh`` and
-        ``num_faces_per_mesh`` (B,), ``mesh_to_verts_packed_first_idx`` (B,); what belongs to vertices is packed too,
-        and all else is stacked.
+        ``num_faces_per_mesh`` (B,), ``mesh_to_verts_packed_first_idx`` (B,); data of vertices is packed
+        too, and all else is stacked.
     """
     counts = torch.tensor([len(sample["vertices"]) for sample in samples])
     first = counts.cumsum(0) - counts

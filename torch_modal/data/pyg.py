@@ -17,12 +17,12 @@ from torch_geometric.transforms import BaseTransform  # noqa: E402
 class RandomShape(BaseTransform):
     """A random transform of ``Data(pos, face)``, or of a ``Batch`` of them; compose it with others as usual.
 
-    Partners of in-betweens are the key-frames of the space. ``normal`` is computed anew where a graph has it; all else,
-    labels of nodes among it, stays as it is, since nodes keep their order. Only ``y`` changes, and only if the
-    key-frames' own ``y`` are given: then it is taken along as the transform's ``blend_labels`` says.
+    Partners of in-betweens are the key-frames of the space. ``normal`` is recomputed where a graph has it; all else,
+    labels of nodes included, stays, since nodes keep their order. ``y`` changes only if the key-frames' own ``y`` are
+    given, as by the transform's ``blend_labels``.
 
     Args:
-        augmentation: What is done; with its space.
+        augmentation: The transform, with its space.
         space: Key-frames and modes; by default the augmentation's.
         y: Labels of the key-frames. *Shape:* ``(K, ...)``.
 
@@ -51,7 +51,7 @@ class RandomShape(BaseTransform):
         )
 
     def forward(self, data: Data) -> Data:
-        """Transform a graph or a ``Batch`` of graphs, in place (``BaseTransform`` hands over a copy).
+        """Transform a graph or a ``Batch`` of graphs, in place (``BaseTransform`` passes a copy).
 
         Raises:
             ValueError: A graph has not as many nodes as the space has vertices.

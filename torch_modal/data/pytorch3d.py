@@ -1,7 +1,7 @@
-"""PyTorch3D's ``Meshes`` in and out. PyTorch3D itself is not imported: what is used of a ``Meshes`` is named here.
+"""PyTorch3D's ``Meshes`` in and out, without importing PyTorch3D.
 
-That is ``verts_padded``, ``faces_padded``, ``verts_packed``, ``num_verts_per_mesh``, ``num_faces_per_mesh``,
-``offset_verts``, ``extend``, ``update_padded`` and indexing. Textures come along.
+Uses ``verts_padded``, ``faces_padded``, ``verts_packed``, ``num_verts_per_mesh``, ``num_faces_per_mesh``,
+``offset_verts``, ``extend``, ``update_padded`` and indexing of a ``Meshes``. Textures stay.
 """
 
 from collections.abc import Sequence

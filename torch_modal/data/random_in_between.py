@@ -13,7 +13,7 @@ from torch_modal.geometry.triangle_frames import frames, mirrored_sides, sides
 
 
 class _Pairwise(ShapeAugmentation):
-    """Draws a partner and a time for each shape, and takes labels along.
+    """Draws a partner and a time for each shape, and mixes labels.
 
     Args:
         blend_labels: See :class:`RandomInBetween`.
@@ -30,9 +30,9 @@ class _Pairwise(ShapeAugmentation):
         raise NotImplementedError
 
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
-        """``partner``, in [0, 1): how far along the others of the pool the partner stands; and the times ``t``.
+        """``partner`` in [0, 1), the partner's place among the other shapes of the pool, and the times ``t``.
 
-        The others are two if the pool is a motion: the key-frame before in time, below a half, and the one after.
+        In a motion these are the key-frame before (below 0.5) and the one after.
         """
         return {"partner": uniform(n, generator), "t": self.draw_times(n, generator)}
 
@@ -114,16 +114,16 @@ class _Pair:
 class RandomInBetween(_Pairwise):
     """Replaces a shape by one between it and a partner, of least elastic energy (:class:`torch_modal.InBetween`).
 
-    Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames, if a call names a pool.
+    Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames of a call's ``pool``.
 
     Where the key-frames are a motion (``keyframe_times`` of the :class:`ShapeSpace`), the partner from a pool is the
-    key-frame before or after in time, each as likely, and the shape between is that of :class:`torch_modal.Path`. This
-    is for key-frames as they stand: any other shape has its partner likewise, but is solved with it alone.
+    key-frame before or after in time, with equal probability, and the in-between is that of :class:`torch_modal.Path`.
+    Shapes that are not key-frames have the same partners; their in-betweens depend on these two shapes only.
 
     Args:
         t: Range of times, drawn uniformly: 0 is the shape itself, 1 its partner.
         blend_labels: Whether labels become ``(1-t) y_a + t y_b``; they must be floating-point then (one-hot vectors,
-            for classes). Otherwise a shape has the labels of the end that it is nearer to in time.
+            for classes). Otherwise a shape has the labels of the nearer end in time.
         p: Probability that a shape is transformed.
         options: As for :class:`ShapeAugmentation`.
 
@@ -151,17 +151,17 @@ class RandomInBetween(_Pairwise):
 
 
 class RandomExtrapolation(_Pairwise):
-    r"""Replaces a shape by one that goes on where the motion between it and a partner ends.
+    r"""Replaces a shape by an extrapolation of the motion between it and a partner.
 
     The shape at :math:`1 + s` is the mirror image of the in-between at :math:`1 - s` in the partner, and the one at
-    :math:`-s` that of the in-between at :math:`s` in the shape itself: each triangle turns back by the rotation that it
-    came by and stretches by the inverse, and vertices follow by a Poisson problem. So the partner is the shape half-way
+    :math:`-s` that of the in-between at :math:`s` in the shape itself: each triangle gets the inverse of its
+    rotation and stretch, and a Poisson problem gives the vertices. So the partner is the shape half-way
     between the two, as the discrete geodesics of shells continue (Heeren et al. 2014), and position and velocity are
     continuous at the ends. (With a negative weight, the energies of the in-between would have no minimum.)
 
     Args:
-        beyond: Range of s, how far outside [0, 1] the times are, drawn uniformly; 1 at most. Which end it is beyond is
-            drawn too.
+        beyond: Range of s, how far outside [0, 1] the times are, drawn uniformly; at most 1. The end is drawn
+            with equal probability.
         blend_labels: As for :class:`RandomInBetween`, with times of 0 and 1: labels are those of the nearer end.
         p: Probability that a shape is transformed.
         options: As for :class:`ShapeAugmentation`.

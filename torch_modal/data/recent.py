@@ -1,4 +1,7 @@
-"""What is expensive to make, kept for a while."""
+"""A small cache of the most recently used objects.
+
+cachetools.LRUCache makes room after the new object is made; ours before, so that large objects never exceed the limit.
+"""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -8,14 +11,14 @@ from torch_modal.geometry.functions import lasting
 
 
 class Recent:
-    """The few most recently used of what is expensive to make."""
+    """The most recently used objects, up to a limit."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The thing of this key, made where it is not kept; see :func:`lasting`."""
+        """The object of a key; computed if it is not in the cache, as by :func:`lasting`."""
         if key not in self._kept:
             while len(self._kept) >= self.limit:  # before making, so that there are never more
                 self._kept.popitem(last=False)

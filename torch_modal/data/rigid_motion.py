@@ -16,12 +16,12 @@ from torch_modal.geometry.rotations import exp
 
 
 class RandomRigidMotion(ShapeAugmentation):
-    """Turns shapes about the mean of their vertices, and moves them.
+    """Rotates shapes about the mean of their vertices, and translates them.
 
     Args:
         degrees: Range of the angle, drawn uniformly; a number is the range from it to its negative. With None,
-            rotations are uniform over all there are (``axis`` has no effect).
-        axis: What is turned about, ``(0, 1, 0)`` for shapes that stand upright in y; by default any direction.
+            rotations are uniform over SO(3) (``axis`` has no effect).
+        axis: Axis of rotation, such as ``(0, 1, 0)`` for shapes with y up; by default uniform directions.
         translation: Largest move along each axis, in diagonals of the shape's bounding box.
         p: Probability that a shape is transformed.
         options: As for :class:`ShapeAugmentation`.
@@ -84,18 +84,18 @@ class RandomRigidMotion(ShapeAugmentation):
         space: ShapeSpace | None = None,
         pool: ShapeBatch | None = None,
     ) -> ShapeBatch:
-        """Move those shapes of a batch that the parameters say, and keep :attr:`transform_matrix`."""
+        """Move the shapes that the parameters select, and set :attr:`transform_matrix`."""
         out = super().transform(batch, params, space, pool)
         self._matrix = lasting(self.compute_transformation)(batch.shapes, params)
         return out
 
     @property
     def transform_matrix(self) -> Tensor | None:
-        """What the last call did: ``y = R x + s`` as homogeneous matrices; None before. *Shape:* ``(B, 4, 4)``."""
+        """The last call, ``y = R x + s``, as homogeneous matrices; None before. *Shape:* ``(B, 4, 4)``."""
         return self._matrix
 
     def compute_transformation(self, shapes: Tensor, params: Parameters) -> Tensor:
-        """The motions that parameters mean for shapes, as homogeneous matrices; the unit matrix for those that stay.
+        """Homogeneous matrices of the motions of shapes; identity for shapes that are not transformed.
 
         Args:
             shapes: *Shape:* ``(B, V, 3)``.
@@ -112,7 +112,7 @@ class RandomRigidMotion(ShapeAugmentation):
         return torch.where(own["batch_prob"][:, None, None], moved, stay)
 
     def undo(self, shapes: Tensor, params: Parameters) -> Tensor:
-        """Move back. The diagonal that the translation is counted in is that of the shape turned back."""
+        """Move back. The translation is in units of the rotated-back shape's diagonal."""
         rotation = exp(params["rotation"])
         centre = shapes.mean(1)
         back = (shapes - centre[:, None]) @ rotation

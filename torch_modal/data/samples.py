@@ -26,7 +26,7 @@ SAMPLES = {
 
 
 class Sample(NamedTuple):
-    """Key-frames, and what lies between them in truth: the same joint curves at other times."""
+    """Key-frames, and the true shapes between them: the same joint curves at other times."""
 
     keyframes: torch.Tensor
     """*Shape:* ``(K, V, 3)``, Y up."""
@@ -35,7 +35,7 @@ class Sample(NamedTuple):
     truth: torch.Tensor
     """Frames between the key-frames. *Shape:* ``(T, V, 3)``."""
     true_times: tuple[float, ...]
-    """When those are, in intervals of key-frames: 0.5 is half-way between the first two. T numbers."""
+    """Times of these, in intervals of key-frames: 0.5 is half-way between the first two. T numbers."""
     cyclic: bool
     """Whether the last key-frame leads on to the first."""
     seconds: float

@@ -14,7 +14,7 @@ DATA_KEYS = ("shapes", "normals", "vertex_labels", "shape_labels")
 
 
 class AugmentationSequential(nn.Module):
-    """Random transforms one after the other, that take labels along; named after kornia's.
+    """Random transforms in sequence, which also transform labels; named after kornia's.
 
     A call takes one argument for each data key and returns as many, in the same order:
 
@@ -23,17 +23,17 @@ class AugmentationSequential(nn.Module):
     - ``"vertex_labels"``: ``(B, V, ...)``, or ``(V, ...)`` for one shape;
     - ``"shape_labels"``: ``(B, ...)``, or of one shape without the B.
 
-    Since vertices keep their order, labels, landmarks and correspondences stay right as they are; only transforms that
-    take in a second shape change labels, as their ``blend_labels`` says.
+    Vertices keep their order, so that labels, landmarks and correspondences stay valid. Only transforms with a second
+    shape change labels (``blend_labels``).
 
     Args:
-        transforms: What is done, in order.
-        data_keys: What a call takes and returns; ``"shapes"`` must be among them.
+        transforms: The transforms, in order.
+        data_keys: Arguments and results of a call; ``"shapes"`` must be among them.
         same_on_batch: Overrides that of the transforms, unless None.
-        keepdim: Whether one shape comes back as such, and not as a batch of one.
-        generator: Where random numbers come from, for all transforms; by default each has its own.
+        keepdim: Whether one shape gives one shape rather than a batch of one.
+        generator: Source of random numbers of all transforms; by default each has its own.
         space: Key-frames and modes, for all transforms; by default each has its own.
-        random_apply: Which transforms a call applies, drawn anew each time. False: all, in order. True: all, in random
+        random_apply: Which transforms a call applies, drawn at each call. False: all, in order. True: all, in random
             order. A number: so many of them, in random order. ``(a,)`` or ``(a, b)``: a number from a to b (to all).
         random_apply_weights: How likely each is drawn; by default all the same.
 
@@ -41,7 +41,7 @@ class AugmentationSequential(nn.Module):
     as for a list.
 
     Raises:
-        ValueError: An unknown or doubled data key, no shapes, or a ``random_apply`` that means nothing.
+        ValueError: An unknown or doubled data key, no shapes, or an invalid ``random_apply``.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class AugmentationSequential(nn.Module):
         options = {
             name: getattr(self, name) for name in ("data_keys", "same_on_batch", "keepdim", "generator", "space")
         }
-        # How many are drawn is said of all of them: of some, all are drawn if any are.
+        # A number of transforms refers to all of them; a slice draws all of its own, or none at random.
         weights = None if self.random_apply_weights is None else list(self.random_apply_weights)[index]
         chosen = self._each()[index]
         return AugmentationSequential(
@@ -107,13 +107,13 @@ class AugmentationSequential(nn.Module):
 
     @property
     def transform_matrix(self) -> Tensor:
-        """What the last call did, if all that it applied are rigid motions. *Shape:* ``(B, 4, 4)``.
+        """The matrix of the last call, if it applied rigid motions only. *Shape:* ``(B, 4, 4)``.
 
         Raises:
             ValueError: There was no call yet, or one of its transforms is no rigid motion.
         """
         if not self._params:
-            raise ValueError("transform_matrix is that of a call that applied a transform: make one first")
+            raise ValueError("there is no call with a transform_matrix: make one first")
         matrix: Tensor | None = None
         for index in self.order(self._params):
             own = getattr(self.transforms[index], "transform_matrix", None)
@@ -127,7 +127,7 @@ class AugmentationSequential(nn.Module):
         """Undo a call, last transform first; as :meth:`ShapeAugmentation.inverse`."""
         params = self._params if params is None else params
         if params is None:
-            raise ValueError("inverse undoes a call: make one first, or pass its params")
+            raise ValueError("there is no call to invert: make one first, or pass its params")
         for index, own in reversed(list(zip(self.order(params), params, strict=True))):
             shapes = self.transforms[index].inverse(shapes, own)  # type: ignore[operator]
         return shapes
@@ -144,7 +144,7 @@ class AugmentationSequential(nn.Module):
     def forward_parameters(
         self, n: int, space: ShapeSpace | None = None, generator: torch.Generator | None = None
     ) -> list[Parameters]:
-        """Draw parameters of all transforms for ``n`` shapes, or of those that ``random_apply`` chooses."""
+        """Draw parameters for ``n`` shapes, of all transforms or of those that ``random_apply`` chooses."""
         space = self.space if space is None else space
         generator = self.generator if generator is None else generator
         each = self._each()
@@ -187,14 +187,14 @@ class AugmentationSequential(nn.Module):
         space: ShapeSpace | None = None,
         pool: ShapeBatch | None = None,
     ) -> Any:
-        """Transform shapes, and what goes along with them.
+        """Transform shapes, their normals and labels.
 
         Args:
             inputs: One for each data key.
             params: Parameters of an earlier call, to repeat it.
             space: Key-frames and modes; by default the module's.
             pool: The key-frames of the space (:meth:`ShapeBatch.of_keyframes`), with labels if ``inputs`` have any, if
-                partners come from there; by default they come from the batch.
+                partners are drawn from these; by default they are drawn from the batch.
 
         Returns:
             A tensor, or a tuple of one for each data key.
@@ -240,7 +240,7 @@ def _range_of(given: Any, n: int) -> tuple[int, int] | None:
     """Least and greatest number of transforms that are applied; None for all in order.
 
     Raises:
-        ValueError: It means nothing.
+        ValueError: It is invalid.
     """
     if given is False:
         return None

@@ -1,4 +1,4 @@
-"""What augmentations know of a connectivity: its key-frames, their modes, and what is made from them when needed."""
+"""Key-frames of one connectivity with their modes, and what augmentations compute from them at first use."""
 
 import os
 import warnings
@@ -35,15 +35,14 @@ from torch_modal.version import __version__
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8
 
-# What one space keeps of each kind; the rest is made again when it is needed. Fewer than a batch needs would make all
-# of them again for each batch.
+# Sizes of the caches of a space. Smaller ones than a batch needs would be recomputed for each batch.
 _N_LAYERS, _N_TABLES, _N_REFERENCES = 32, 64, 16
-# Dtypes and devices that it keeps key-frames in.
+# Dtypes and devices of cached key-frames.
 _N_PLACES = 4
 
 
 class Reference(NamedTuple):
-    """One key-frame as modal deformation needs it."""
+    """A key-frame with scaled modes and triangle frames, for modal deformation."""
 
     shape: Tensor
     """*Shape:* ``(V, 3)``."""
@@ -55,25 +54,25 @@ class Reference(NamedTuple):
 
 
 class ShapeSpace:
-    """Key-frames of one connectivity with their modes: what a random shape is drawn from.
+    """Key-frames of one connectivity with their modes; random shapes are drawn from it.
 
-    Layers, factorisations and tables are made when they are first needed, in the process and on the device that need
-    them, and only the most recent are kept. Pickling leaves them out: a space can be handed to worker processes.
+    Layers, factorisations and tables are computed at first use, in the process and on the device that use them; only
+    the most recent stay in memory. Pickling leaves them out, so that worker processes can receive a space.
 
     Args:
         bases: The basis of each key-frame (:func:`torch_modal.extract_bases`).
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         preset: Of the in-betweens, as for :class:`torch_modal.InBetween`.
-        objective: What they minimise, in the place of the preset's.
-        solver: How they are solved, in the place of the preset's.
-        times: In-betweens of two key-frames are solved at so many even times, once, and interpolated among them by
-            cubics; None solves each anew. At least 4.
-        dtype: What tables are kept in.
-        folder: Where tables are kept between runs; by default nowhere.
+        objective: What they minimise; replaces the preset's.
+        solver: How they are solved; replaces the preset's.
+        times: Number of even times at which the in-betweens of two key-frames are solved once; cubics interpolate
+            among them. None solves each in-between. At least 4.
+        dtype: Of the tables.
+        folder: Stores tables between runs; by default none is stored.
         keyframe_times: When the key-frames are, if they are a motion, as for :class:`torch_modal.Path`. Partners of
-            key-frames are then those before and after them in time, and what is between is that path's.
+            key-frames are then those before and after them in time, and in-betweens are shapes of that path.
         cyclic: Whether the last key-frame of the motion leads on to the first.
-        contact: Whether parts are kept from passing through each other, in the place of what the objective says
+        contact: Whether contact keeps parts from passing through each other; replaces the objective's setting
             (docs/contact.md; extra ``contact``).
 
     Raises:
@@ -104,8 +103,8 @@ class ShapeSpace:
         if len(sizes) > 1:
             raise ValueError(f"the bases belong to meshes of {sorted(sizes)} vertices; a space has one connectivity")
         if times is not None and times < 4:
-            raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between anew")
-        # What is wrong with the faces is said here, and repaired as everywhere.
+            raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between")
+        # Checks and repairs the faces, as everywhere.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact)
         if self.settings.objective.contact:
@@ -118,7 +117,7 @@ class ShapeSpace:
 
     @classmethod
     def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
-        """The space of a stored key-frame set, a motion if that is one; tables are kept in its folder.
+        """The space of a stored key-frame set, with its times if it is a motion; its folder stores the tables.
 
         Options as for the constructor.
         """
@@ -167,7 +166,7 @@ class ShapeSpace:
         return self._keyframes.get((like.dtype, like.device), make)
 
     def nearest(self, x: Tensor) -> Tensor:
-        """Which key-frame each shape is closest to, apart from a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
+        """Index of the closest key-frame, up to a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
         if len(self) == 1:
             return torch.zeros(len(x), dtype=torch.int64)
         with torch.no_grad():
@@ -186,7 +185,7 @@ class ShapeSpace:
         after, before = (norm(pick(y, j) - pick(y, i)) for y in rows)
         return after / before - 1
 
-    # ------------------------------------------------------------------------------------------- made when needed
+    # ------------------------------------------------------------------------------------------- computed at first use
     def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
         """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
 
@@ -235,20 +234,20 @@ class ShapeSpace:
         span = self._span(i, j)
         objective, solver = self.settings
         if span is None and objective.contact:
-            # Pushed apart the same way at all times, so that tables are smooth.
+            # A path separates contacts the same way at all times, so that tables are smooth.
             pair = MotionPath([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver).to(like)
             return partial(pair.solve, self._keyframes_like(like)[[i, j]])
         if span is None:
             return partial(self._layer(i, j).to(like).solve, *self._keyframes_like(like)[[i, j]])
         bases = [self.bases[key] for key in span.keyframes]
-        # The neighbours are all that it depends on; a path of all key-frames would be made anew for each table.
-        course = MotionPath(bases, self.faces, span.times, objective=objective, solver=solver).to(like)
-        return partial(course.solve, self._keyframes_like(like)[span.keyframes])
+        # The shapes depend on the neighbours only; a path of all key-frames would be computed for each table.
+        path = MotionPath(bases, self.faces, span.times, objective=objective, solver=solver).to(like)
+        return partial(path.solve, self._keyframes_like(like)[span.keyframes])
 
     def table(self, i: int, j: int) -> Tensor:
-        """In-betweens of two key-frames at even times, from disk where they are. *Shape:* ``(T, V, 3)``."""
+        """In-betweens of two key-frames at even times, from disk if stored. *Shape:* ``(T, V, 3)``."""
         if self.times is None:
-            raise ValueError("a space of times=None solves each in-between anew: it has no tables")
+            raise ValueError("a space of times=None solves each in-between: it has no tables")
 
         def make() -> Tensor:
             path, key = self._place(i, j)
@@ -259,7 +258,7 @@ class ShapeSpace:
             with torch.no_grad():
                 result = self._between(i, j, t)(t)
             table = _shapes(result, i, j).to(self.dtype)
-            # What did not converge is warned of by every run: it is not kept.
+            # Tables that did not converge are not stored, so that each run warns.
             if path is not None and bool(result.solution.usable.all()):
                 write_table(path, table, key)
             return table
@@ -267,10 +266,10 @@ class ShapeSpace:
         return self._tables.get((i, j), make)
 
     def _place(self, i: int, j: int) -> tuple[Path | None, dict[str, str]]:
-        """The file of a table, and what it must have been made of; None where it is not to be kept.
+        """The file of a table and its key; None where it is not stored.
 
         Warns:
-            CacheWarning: What the energy is made of cannot be looked through: tables are made anew by each process.
+            CacheWarning: The objective has a term of the user's own, so that each process computes its tables again.
         """
         if self.folder is None:
             return None, {}
@@ -278,7 +277,8 @@ class ShapeSpace:
             content = self._content(i, j)
         except ContentError as error:
             warnings.warn(
-                f"tables of in-betweens are not kept in {self.folder}, as a term of the objective has no key: {error}",
+                f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
+                f"terms: {error}",
                 CacheWarning,
                 stacklevel=5,
             )
@@ -287,12 +287,12 @@ class ShapeSpace:
         return self.folder / f"between-{i}-{j}.safetensors", key
 
     def _content(self, i: int, j: int) -> str:
-        """A hash of all that a table follows from: bases, times, faces, settings, and what made it."""
+        """A hash of all inputs of a table: bases, times, faces, settings and code."""
         span = self._span(i, j)
         bases = [self.bases[key] for key in (span.keyframes if span else (i, j))]
         tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
-        code = __version__, torch.__version__, code_digest()
-        return content_digest([*code, tensors, self.faces, span and span.times, tuple(self.settings)])
+        code = __version__, str(torch.__version__), code_digest()
+        return content_digest([*code, tensors, self.faces, span and span.times, self.settings])
 
     # -------------------------------------------------------------------------------------------------- in-betweens
     def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:
@@ -316,7 +316,7 @@ class ShapeSpace:
 
 
 def _shapes(result: InBetweenResult, i: int, j: int) -> Tensor:
-    """The in-betweens. What training must never see is said here, and what it should not see."""
+    """The in-betweens; raises for invalid shapes and warns of unconverged ones."""
     if not bool(result.shapes.isfinite().all()):
         raise ValueError(
             f"there is no in-between of some shapes near the key-frames {i} and {j}: one is not finite, has no size, "

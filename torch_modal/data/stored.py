@@ -38,22 +38,22 @@ BASES_FILE = "bases.safetensors"
 LABELS_FILE = "labels.safetensors"
 #: How the set was made, if ``torch-modal precompute`` made it.
 RECORD_FILE = "precompute.json"
-#: Made from a set and kept beside it: replaced along with it.
+#: Derived from a set and stored beside it; removed when the set is replaced.
 DERIVED_FILES = "between-*.safetensors"
 STALE = 86400.0
-"""Seconds after which a temporary folder is no longer somebody's who is about to rename it."""
+"""Age in seconds after which a temporary folder is abandoned."""
 _PARTS = tuple(field.name for field in fields(ModalBasis))
 
 
 class StoredSet:
-    """A key-frame set on disk. Opening reads two headers; tensors are mapped into memory when they are asked for.
+    """A key-frame set on disk. Opening reads two headers; each tensor is memory-mapped at first use.
 
-    Each is then compared with its digest. The mapping is private: pages can be dropped again by the system, and writing
-    into a tensor does not change the file. Pickling keeps the path alone, so that a set can be
-    handed to worker processes, forked or spawned.
+    It is then compared with its digest. The mapping is private: the system can drop pages, and writing into a tensor
+    does not change the file. Pickling keeps the path alone, so that worker processes, forked or spawned, can receive a
+    set.
 
     Args:
-        folder: Where it stands.
+        folder: The folder.
 
     Raises:
         FileNotFoundError: The folder or one of its two files is not there.
@@ -132,23 +132,23 @@ def write_set(
 ) -> None:
     """Write a key-frame set; its folder is whole or absent.
 
-    The files are written to a temporary folder beside it, which is then renamed. A stored set that is there already is
-    replaced, with the tables that were made from it; all other files in its folder stay. Of several processes that
-    write one set at once, the last one's stays.
+    The files are written to a temporary folder beside it, which is then renamed. An existing set is replaced,
+    and its derived tables are removed; all other files in its folder stay. Of several processes that write one set at
+    once, the last one wins.
 
     Args:
-        folder: Where to; the folders above it are made.
+        folder: The folder; its parents are created.
         keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         bases: The basis of each key-frame.
         names: Name of each key-frame, for example its file's.
-        times: When the key-frames are, ascending, if they are a motion; if cyclic, one more, when the first comes
-            again. *Shape:* ``(K,)``, or ``(K + 1,)`` if cyclic.
+        times: Of the key-frames, ascending, if they are a motion; if cyclic, one more, at which the first
+            repeats. *Shape:* ``(K,)``, or ``(K + 1,)`` if cyclic.
         cyclic: Whether the last key-frame of the motion leads on to the first.
-        beside: Name and content of files that are to appear in the folder at the same moment.
+        beside: Name and content of further files of the folder.
 
     Raises:
-        FileExistsError: Something else is there.
+        FileExistsError: The folder holds something else.
         OSError: It cannot be written. Nothing is left behind.
         ValueError: The parts do not fit each other.
     """
@@ -181,7 +181,7 @@ def write_set(
 
 
 def why_not_replaceable(folder: Path) -> str:
-    """What is at the place of a set and cannot be replaced; empty if a set can be written there."""
+    """Why a set cannot be written to a folder; empty if it can."""
     while os.path.lexists(folder):
         if folder.is_symlink() and not folder.exists():
             return f"{folder} is a link to nothing"
@@ -210,7 +210,7 @@ def _put_in_place(fresh: Path, folder: Path, old: Path) -> None:
     """Rename a complete folder to its place, with the user's files of the one that was there."""
     while True:
         try:
-            with contextlib.suppress(FileNotFoundError):  # there is none, or another process is replacing it too
+            with contextlib.suppress(FileNotFoundError):  # missing, or another process is replacing it too
                 folder.rename(old)
                 _keep_users_files(old, fresh)
             fresh.rename(folder)
@@ -230,14 +230,14 @@ def _keep_users_files(old: Path, fresh: Path) -> None:
     for path in old.iterdir():
         if path.name in own or path.match(DERIVED_FILES) or path.match(".*.tmp") or (fresh / path.name).exists():
             continue
-        try:  # a second name for it, so that it is in neither folder alone at any time
+        try:  # a hard link, so that the file is in one of the folders at any time
             os.link(path, fresh / path.name, follow_symlinks=False)
         except (OSError, NotImplementedError):
             shutil.copy2(path, fresh / path.name, follow_symlinks=False)
 
 
 def _remove_stale(folder: Path) -> None:
-    """Remove what processes that were killed while they wrote this set have left, but nobody's work."""
+    """Remove temporary folders of killed processes; other files stay."""
     mark = re.compile(rf"\.{re.escape(folder.name)}\.\d+-[0-9a-f]{{8}}\.tmp")
     for path in folder.parent.iterdir():
         with contextlib.suppress(OSError):
@@ -246,7 +246,7 @@ def _remove_stale(folder: Path) -> None:
 
 
 def find_sets(root: str | os.PathLike[str]) -> list[Path]:
-    """Folders of stored key-frame sets at and below a folder, sorted. Hidden folders are passed over.
+    """Folders of stored key-frame sets at and below a folder, sorted. Skips hidden folders.
 
     Raises:
         FileNotFoundError: There is no such folder.

@@ -15,7 +15,7 @@ VERSION = "1"
 def interpolate(table: Tensor, t: Tensor) -> Tensor:
     """Cubic Lagrange interpolation among the four nearest of even times in [0, 1].
 
-    Only these four are read, so that a table mapped from disk is not loaded whole. Exact at the times of the table.
+    Reads these four only, so that a memory-mapped table is not loaded whole. Exact at the times of the table.
 
     Args:
         table: Four shapes or more. *Shape:* ``(T, V, 3)``.
@@ -39,7 +39,7 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
 
 
 def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
-    """A table mapped from disk; None where there is none, it is damaged, or it was made with other settings."""
+    """A memory-mapped table; None if it is missing, damaged, or of another key."""
     with contextlib.suppress(OSError, ValueError), opened(path) as file:
         if file.metadata == _metadata(key):
             return file.tensor("shapes")
@@ -47,7 +47,7 @@ def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
 
 
 def write_table(path: Path, table: Tensor, key: dict[str, str]) -> None:
-    """Keep a table; a folder that cannot be written is passed over, as it can be computed again."""
+    """Store a table, if its folder is writable."""
     with contextlib.suppress(OSError):
         write_atomically(path, to_bytes({"shapes": table}, _metadata(key)))
 

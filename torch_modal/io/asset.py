@@ -1,4 +1,4 @@
-"""Mesh files with everything that they carry besides positions."""
+"""Mesh files with all their content besides positions."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Part(NamedTuple):
 
 
 class Polygons(NamedTuple):
-    """Faces before they were cut into triangles."""
+    """Faces before triangulation."""
 
     sizes: IntArray
     """Corners of each. *Shape:* ``(P,)``."""
@@ -85,7 +85,7 @@ class Polygons(NamedTuple):
 
 
 class Asset(ABC):
-    """A mesh file: positions and triangles for the solve, everything else for writing it with other positions.
+    """A mesh file: positions and triangles for the solve, the rest for writing it with other positions.
 
     Args:
         path: The file.
@@ -94,7 +94,7 @@ class Asset(ABC):
     positions: FloatArray
     """In the file's units, transforms of a scene applied. *Shape:* ``(V, 3)``."""
     faces: IntArray
-    """Polygons are cut into triangles. *Shape:* ``(F, 3)``."""
+    """Polygons are triangulated. *Shape:* ``(F, 3)``."""
     carries: dict[str, str]
     """Further content of the file: some of :data:`FEATURES`, each with a description for messages."""
 
@@ -135,12 +135,12 @@ class Asset(ABC):
         return {}
 
     def write(self, path: str | os.PathLike[str], positions: Any, overwrite: bool = False) -> Path:
-        """Write the file with other positions, and beside it the material libraries and textures that it names.
+        """Write the file with other positions, and its material libraries and textures beside it.
 
         Args:
-            path: Ends like the file itself; ``.glb`` where that is ``.gltf``.
+            path: Of the file's own suffix; ``.glb`` for ``.gltf``.
             positions: A tensor or array. *Shape:* ``(V, 3)``.
-            overwrite: Replace files that exist. One with the same content is no obstacle.
+            overwrite: Replace files that exist. Files of equal content need no overwriting.
 
         Returns:
             The file.
@@ -174,7 +174,7 @@ class Asset(ABC):
         return missing
 
     def check(self, frames: Any) -> FloatArray:
-        """Refuse frames that are not of this mesh. *Shape:* ``(N, V, 3)``."""
+        """Raise unless frames are of this mesh. *Shape:* ``(N, V, 3)``."""
         shapes, _ = check_frames(frames, self.faces)
         if shapes.shape[1] != len(self.positions):
             raise ValueError(
@@ -189,11 +189,11 @@ class Asset(ABC):
         return self.carries
 
     def warn_lost(self, name: str, holds: Collection[str]) -> None:
-        """Warn of features that a file will not have.
+        """Warn of features that a file loses.
 
         Args:
             name: Of the file.
-            holds: Those of :data:`FEATURES` that it will have.
+            holds: Those of :data:`FEATURES` that it has.
         """
         lost = [name for feature, name in self.carries.items() if feature not in holds]
         if lost:

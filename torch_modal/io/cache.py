@@ -137,7 +137,7 @@ class Cache:
             return None
         path = self._path(self.folder, kind, inputs, parameters)
         if (found := _read(path)) is not None:
-            with contextlib.suppress(OSError):  # gone since, or not ours to write
+            with contextlib.suppress(OSError):  # removed meanwhile, or not writable
                 os.utime(path)  # the time of the last use
         return found
 
@@ -201,7 +201,7 @@ def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheConte
 def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
     """Remove the entries of a cache folder, and partial files of killed processes. Other files stay.
 
-    Processes that use the folder at the same time compute again what they miss.
+    Other processes recompute what they miss.
 
     Args:
         cache_dir: The folder, by default :func:`default_cache_dir`.
@@ -238,7 +238,7 @@ def _make_room(folder: Path, limit: int, newest: Path) -> None:
         size = newest.stat().st_size
         if _oldest(others, limit - size):
             for path in _oldest(others, int(KEPT_PART * limit) - size):
-                with contextlib.suppress(OSError):  # removed by another process, or open there on some systems
+                with contextlib.suppress(OSError):  # another process removed it, or has it open
                     path.unlink()
 
 
@@ -252,7 +252,7 @@ def _oldest(files: list[Path], limit: int) -> list[Path]:
     now, total, chosen = time.time(), sum(size for _, size, _ in used), []
     for moment, size, path in sorted(used):
         if path.suffix != SUFFIX and now - moment / 1e9 < ABANDONED:
-            continue  # somebody is writing it
+            continue  # another process is writing it
         if total <= limit:
             break
         chosen.append(path)
@@ -302,7 +302,7 @@ def _read(path: Path) -> Arrays | None:
     try:
         arrays = load_arrays(path.read_bytes())
     except (OSError, SafetensorError, KeyError, ValueError):
-        # Whatever is wrong with the file, computing again is right.
+        # Any damaged file is computed again.
         return None
     written = arrays.pop(_DIGEST, None)
     return arrays if written is not None and np.array_equal(written, _digest(arrays)) else None

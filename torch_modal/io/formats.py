@@ -1,4 +1,4 @@
-"""Output formats by suffix. A format is one function that registers itself.
+"""Output formats by suffix. A format is a function that registers itself.
 
 Modules of built-in formats are imported when their format is first used, so that listing formats costs nothing.
 """
@@ -84,8 +84,8 @@ def mesh_format(*suffixes: str, holds: Collection[str] = ()) -> Callable[[Writer
 def animation_format(*suffixes: str, modules: Collection[str] = (), extra: str = "") -> Callable[[Writer], Writer]:
     """Register a function that writes a sequence, for :func:`torch_modal.save_animation`.
 
-    The function takes an :class:`torch_modal.Animation` and the path of a new file, which is moved to its place when
-    the function returns.
+    The function takes an :class:`torch_modal.Animation` and the path of a new file, which is renamed when the
+    function returns.
 
     Args:
         suffixes: In small letters with their dots, such as ``".csv"``.
@@ -101,7 +101,7 @@ def _registration(
     def register(write: Writer) -> Writer:
         built_in = write.__module__.startswith("torch_modal.")
         for suffix in suffixes:
-            if not built_in or not isinstance(table.get(suffix), OutputFormat):  # a user's own is not replaced
+            if not built_in or not isinstance(table.get(suffix), OutputFormat):  # a user's format stays
                 table[suffix] = OutputFormat(write, **options)
         return write
 

@@ -120,7 +120,7 @@ def _document(
 
 def _normals(
     parts: Sequence[Part], shapes: FloatArray, faces: IntArray, asset: Asset | None
-) -> list[Callable[[int], dict[str, FloatArray]]]:
+) -> list[Callable[[int], FloatArray]]:
     """For each part, its normals in a frame: the file's, rotated with the surface, or smooth ones."""
     own = [part for part in parts if part.normals is not None]
     starts = np.cumsum([len(part.vertices) for part in own])
@@ -138,13 +138,13 @@ def _normals(
         )
         carried = cache(lambda number: from_file.at(shapes[number][vertices]))
     ends = iter(starts.tolist())
-    found: list[Callable[[int], dict[str, FloatArray]]] = []
+    found: list[Callable[[int], FloatArray]] = []
     for part in parts:
         if part.normals is None or carried is None:
-            found.append(partial(rows_of, {"NORMAL": smooth}, part.vertices))
+            found.append(partial(rows_of, smooth, part.vertices))
         else:
             end = next(ends)
-            found.append(partial(rows_of, {"NORMAL": carried}, slice(end - len(part.vertices), end)))
+            found.append(partial(rows_of, carried, slice(end - len(part.vertices), end)))
     return found
 
 

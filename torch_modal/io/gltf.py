@@ -12,6 +12,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray
+
 Json = dict[str, Any]
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -122,7 +124,7 @@ class Document:
             array[at[:, 0]] = new
         return array
 
-    def floats(self, index: int) -> NDArray[np.float64]:
+    def floats(self, index: int) -> FloatArray:
         """The numbers of an accessor; normalised integers as fractions. *Shape:* ``(count, width)``."""
         array = self.accessor(index)
         numbers = array.astype(np.float64)
@@ -194,7 +196,7 @@ class Document:
 
 
 def _index(number: Any) -> int:
-    """Indices of damaged files may be negative, which Python would take."""
+    """A checked index; damaged files may have negative ones, which Python accepts."""
     if not isinstance(number, int) or number < 0:
         raise ValueError(f"an index {number!r}")
     return number
@@ -208,7 +210,7 @@ def _strided(data: bytes, dtype: np.dtype, count: int, width: int, offset: int, 
     return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
 
 
-def world_transforms(document: Document) -> dict[int, NDArray[np.float64]]:
+def world_transforms(document: Document) -> dict[int, FloatArray]:
     """The nodes of the scene, parents first, and where each is. *Shape of each:* ``(4, 4)``."""
     nodes = document.get("nodes")
     if document.get("scenes"):
@@ -216,7 +218,7 @@ def world_transforms(document: Document) -> dict[int, NDArray[np.float64]]:
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in children]
-    found: dict[int, NDArray[np.float64]] = {}
+    found: dict[int, FloatArray] = {}
     waiting = [(number, np.eye(4)) for number in reversed(roots)]
     while waiting:
         number, parent = waiting.pop()
@@ -228,7 +230,7 @@ def world_transforms(document: Document) -> dict[int, NDArray[np.float64]]:
     return found
 
 
-def _local_transform(node: Json) -> NDArray[np.float64]:
+def _local_transform(node: Json) -> FloatArray:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,9 +35,10 @@ class _Primitive(NamedTuple):
 
 
 class GltfAsset(Asset):
-    """A GLB or GLTF file. Every node that shows triangles is taken, where its transforms put it.
+    """A GLB or GLTF file. All nodes with triangles count, at the places of their transforms.
 
-    It is written as GLB, with the same nodes, cameras, lights, materials, textures and further attributes.
+    It is written as GLB, with the same nodes, cameras, lights, materials, textures and further attributes. Tangents are
+    left out: viewers compute them from normals and texture coordinates.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,7 +59,7 @@ class GltfAsset(Asset):
 
     @property
     def keeps(self) -> Collection[str]:
-        """All but what moves the mesh."""
+        """All but skeletons, animations and morph targets."""
         return set(FEATURES) - {"posing"}
 
     def _collect(self) -> None:
@@ -108,7 +109,9 @@ class GltfAsset(Asset):
             return np.asarray(np.linalg.inv(self._world[node]), dtype=np.float64)
         except np.linalg.LinAlgError:
             name = self.document.get("nodes", node).get("name", node)
-            raise MeshError(f"{self.path}: the node {name} flattens its mesh, so positions have no way back") from None
+            raise MeshError(
+                f"{self.path}: the node {name} flattens its mesh, so that positions cannot be transformed back"
+            ) from None
 
     def _triangles(self, primitive: Json, n_points: int) -> IntArray:
         if "indices" in primitive:
@@ -146,7 +149,7 @@ class GltfAsset(Asset):
 
     # ------------------------------------------------------------------------------------------------ the file again
     def rebuilt(self, frames: FloatArray) -> tuple[Document, list[Drawn], list[int]]:
-        """A copy without positions and normals, with nothing in it that is not used.
+        """A copy without positions and normals, and without unused content.
 
         Args:
             frames: *Shape:* ``(N, V, 3)``.
@@ -180,7 +183,7 @@ class GltfAsset(Asset):
             mesh.pop("weights", None)
             mesh["primitives"] = []
             inverse = self._inverse(node)
-            follow = self._directions(mine, inverse, frames)
+            normals = self._normals(mine, inverse, frames)
             for primitive in mine:
                 attributes = primitive.json["attributes"]
                 copied: Json = {"attributes": {}}
@@ -193,53 +196,39 @@ class GltfAsset(Asset):
                 if "indices" in primitive.json:
                     copied["indices"] = self._take(document, primitive.json["indices"], ELEMENT_ARRAY_BUFFER, taken)
                 mesh["primitives"].append(copied)
-                directions = follow.get(primitive.place, (None, None))
-                drawn.append(Drawn(copied, primitive.points, inverse, *directions))
+                drawn.append(Drawn(copied, primitive.points, inverse, normals.get(primitive.place)))
             node_json["mesh"] = document.append("meshes", mesh)
             nodes.append(node)
         return document, drawn, nodes
 
-    def _directions(
-        self, mine: Sequence[_Primitive], inverse: FloatArray, frames: FloatArray
-    ) -> dict[int, tuple[Any, FloatArray | None]]:
-        """How normals and tangents of a node's primitives follow the frames, and the tangents' handedness.
+    def _normals(
+        self, primitives: Sequence[_Primitive], inverse: FloatArray, frames: FloatArray
+    ) -> dict[int, Callable[[int], FloatArray]]:
+        """How the normals of a node's primitives follow the frames, by the primitives' places.
 
-        All primitives of the node together: where materials meet, normals that were one stay one.
+        All primitives of the node together: where materials meet, equal normals stay equal.
         """
-        with_normals = [p for p in mine if "NORMAL" in p.json["attributes"]]
-        if not with_normals:
+        own = [p for p in primitives if "NORMAL" in p.json["attributes"]]
+        if not own:
             return {}
 
-        def read(name: str) -> list[FloatArray]:
-            return [self.document.floats(p.json["attributes"][name]) for p in with_normals]
+        def read(name: str) -> FloatArray:
+            return np.concatenate([self.document.floats(p.json["attributes"][name]) for p in own])
 
-        sizes = [p.points.stop - p.points.start for p in with_normals]
-        starts = np.cumsum(sizes) - sizes
-        triangles = [p.triangles + start for p, start in zip(with_normals, starts, strict=True)]
-        everything = np.concatenate([np.arange(p.points.start, p.points.stop) for p in with_normals])
-        normals = CarriedNormals(
-            np.concatenate(read("NORMAL")), np.concatenate(read("POSITION")), np.concatenate(triangles)
-        )
+        points = np.concatenate([np.arange(p.points.start, p.points.stop) for p in own])
+        ends = np.cumsum([p.points.stop - p.points.start for p in own])
+        starts = [0, *ends[:-1].tolist()]
+        triangles = np.concatenate([p.triangles + start for p, start in zip(own, starts, strict=True)])
+        carried = CarriedNormals(read("NORMAL"), read("POSITION"), triangles)
 
-        def local(x: FloatArray) -> FloatArray:
-            return x[everything] @ inverse[:3, :3].T + inverse[:3, 3]
+        @cache
+        def normals_at(number: int) -> FloatArray:
+            return carried.at(frames[number][points] @ inverse[:3, :3].T + inverse[:3, 3])
 
-        normal_at = cache(lambda number: normals.at(local(frames[number])))
-        found: dict[int, tuple[Any, FloatArray | None]] = {}
-        for primitive, start, size in zip(with_normals, starts.tolist(), sizes, strict=True):
-            own = slice(start, start + size)
-            if "TANGENT" not in primitive.json["attributes"]:
-                found[primitive.place] = partial(rows_of, {"NORMAL": normal_at}, own), None
-                continue
-            tangents = self.document.floats(primitive.json["attributes"]["TANGENT"])
-            whole = np.zeros((len(everything), 3))
-            whole[own] = tangents[:, :3]
-            tangent_at = cache(partial(lambda vectors, number: normals.at(local(frames[number]), vectors), whole))
-            found[primitive.place] = (
-                partial(rows_of, {"NORMAL": normal_at, "TANGENT": tangent_at}, own),
-                tangents[:, 3:],
-            )
-        return found
+        return {
+            p.place: partial(rows_of, normals_at, slice(start, end))
+            for p, start, end in zip(own, starts, ends.tolist(), strict=True)
+        }
 
     def _take(self, document: Document, accessor: int, target: int, taken: dict[int, int]) -> int:
         """Copy an accessor as it is; its number in the copy."""

@@ -14,38 +14,34 @@ TARGET_NAME = "frame-{:03d}"
 
 
 class Drawn(NamedTuple):
-    """A primitive of a document whose positions are still to come."""
+    """A primitive of a document without its positions."""
 
     json: Json
     points: Any
     """Its vertices among all; indices or a slice. *Shape:* ``(P,)``."""
     inverse: FloatArray | None = None
     """From the scene to the node. *Shape:* ``(4, 4)``."""
-    directions: Callable[[int], dict[str, FloatArray]] | None = None
-    """``NORMAL`` and ``TANGENT`` on the surface of a frame. *Shape of each:* ``(P, 3)``."""
-    handedness: FloatArray | None = None
-    """Fourth number of the tangents. *Shape:* ``(P, 1)``."""
+    normals: Callable[[int], FloatArray] | None = None
+    """The normals of a frame, by its number. *Shape:* ``(P, 3)``."""
 
 
-def rows_of(
-    vectors: dict[str, Callable[[int], FloatArray]], rows: IntArray | slice, number: int
-) -> dict[str, FloatArray]:
-    """Some rows of the vectors of a frame, as :attr:`Drawn.directions` returns them."""
-    return {name: of_frame(number)[rows] for name, of_frame in vectors.items()}
+def rows_of(vectors: Callable[[int], FloatArray], rows: IntArray | slice, number: int) -> FloatArray:
+    """Some rows of the vectors of a frame, for :attr:`Drawn.normals`."""
+    return vectors(number)[rows]
 
 
 def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray, move_normals: bool = True) -> None:
-    """Give primitives their positions, those of frame 0, and a morph target for each further frame.
+    """Add the positions of frame 0 to primitives, and a morph target for each further frame.
 
     Args:
         document: The document.
         drawn: Its primitives.
         frames: Positions of all vertices, in the scene. *Shape:* ``(N, V, 3)``.
-        move_normals: Whether morph targets hold normals (and tangents) too.
+        move_normals: Whether morph targets hold normals too.
     """
     made: dict[tuple[int, int], tuple[Json, list[Json]]] = {}
     for primitive in drawn:
-        key = (id(primitive.points), id(primitive.directions))
+        key = (id(primitive.points), id(primitive.normals))
         if key not in made:
             made[key] = _attributes(document, primitive, frames, move_normals)
         attributes, targets = made[key]
@@ -62,23 +58,17 @@ def _attributes(
         local = local @ primitive.inverse[:3, :3].T + primitive.inverse[:3, 3]
     base = local[0].astype(np.float32)
     attributes = {"POSITION": document.add(base, "VEC3", ARRAY_BUFFER, bounds=True)}
-    directions = {} if primitive.directions is None else primitive.directions(0)
-    rounded = {name: _unit(vectors).astype(np.float32) for name, vectors in directions.items()}
-    for name, vectors in rounded.items():
-        if name == "TANGENT":
-            assert primitive.handedness is not None
-            whole = np.concatenate([vectors, primitive.handedness], axis=1).astype(np.float32)
-            attributes[name] = document.add(whole, "VEC4", ARRAY_BUFFER)
-        else:
-            attributes[name] = document.add(vectors, "VEC3", ARRAY_BUFFER)
+    normals = None
+    if primitive.normals is not None:
+        normals = _unit(primitive.normals(0)).astype(np.float32)
+        attributes["NORMAL"] = document.add(normals, "VEC3", ARRAY_BUFFER)
     targets = []
     for number, shape in enumerate(local[1:], start=1):
         # Against the rounded base, so that its rounding is not carried into every frame.
         target = {"POSITION": document.add((shape - base).astype(np.float32), "VEC3", ARRAY_BUFFER, bounds=True)}
-        if move_normals and primitive.directions is not None:
-            for name, moved in primitive.directions(number).items():
-                turned = (_unit(moved) - rounded[name]).astype(np.float32)
-                target[name] = document.add(turned, "VEC3", ARRAY_BUFFER)
+        if move_normals and primitive.normals is not None and normals is not None:
+            turned = (_unit(primitive.normals(number)) - normals).astype(np.float32)
+            target["NORMAL"] = document.add(turned, "VEC3", ARRAY_BUFFER)
         targets.append(target)
     return attributes, targets
 

@@ -16,7 +16,7 @@ _OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1, "-colorspace": 1}
 
 
 class Libraries(NamedTuple):
-    """Contents of the material libraries of a file."""
+    """Materials and files of the material libraries of an OBJ file."""
 
     materials: dict[str, Material]
     files: dict[str, bytes]
@@ -26,7 +26,7 @@ class Libraries(NamedTuple):
 def read_libraries(path: Path, names: list[str]) -> Libraries:
     """Read material libraries.
 
-    Textures outside of the file's folder get a place beside it in a copy, and the library's line their new name.
+    A copy has textures from outside the file's folder beside it, and the library names them there.
 
     Args:
         path: The OBJ file.
@@ -37,7 +37,7 @@ def read_libraries(path: Path, names: list[str]) -> Libraries:
     """
     found = Libraries({}, {})
     for line in names:
-        # One name may hold blanks; several are parted by them.
+        # One name may hold blanks; blanks also separate several names.
         each = [line] if (path.parent / line).is_file() else line.split()
         for name in each:
             library = path.parent / name
@@ -86,7 +86,7 @@ def _property(material: Material, key: str, words: list[str]) -> Material:
 
 
 def _take_texture(path: Path, library: Path, line: str, key: str, material: str, found: Libraries) -> str:
-    """Note a texture; the line as a copy of the library has it."""
+    """Record a texture; returns its line for a copy of the library."""
     name = _texture_name(line)
     if not name:
         return line

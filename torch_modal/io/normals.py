@@ -35,14 +35,10 @@ class CarriedNormals:
         x = positions[self.first]
         return surface_frames(vertex_normals(x, self.triangles), x[self.neighbour] - x)[self.group]
 
-    def at(self, positions: FloatArray, vectors: FloatArray | None = None) -> FloatArray:
-        """The normals, or other vectors (tangents), on the surface with other positions.
-
-        Where the surface has not moved they are those of the file, bit for bit.
+    def at(self, positions: FloatArray) -> FloatArray:
+        """The normals of the surface with other positions; bit for bit those of the file where it has not moved.
 
         Args:
             positions: *Shape:* ``(P, 3)``.
-            vectors: *Shape:* ``(P, 3)``.
         """
-        vectors = self.normals if vectors is None else vectors
-        return turn(vectors, self.before, self._surface(positions))
+        return turn(self.normals, self.before, self._surface(positions))

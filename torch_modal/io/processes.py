@@ -7,7 +7,7 @@ import subprocess
 
 
 def end_process(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process that leads a session of its own, and whatever it started; take in its exit status."""
+    """Kill a process that leads a session of its own, and all its children; wait for its exit status."""
     if process.poll() is not None:
         return
     with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -29,5 +29,5 @@ def describe_exit(code: int) -> str:
 
 
 def last_line(text: str) -> str:
-    """The last line that says something; of a traceback, the error."""
+    """The last line that is not blank; of a traceback, the error."""
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")

@@ -5,8 +5,8 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset
 
@@ -21,7 +21,7 @@ READERS = {
 SUFFIXES = tuple(READERS)
 
 
-def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_mesh(path: str | os.PathLike[str]) -> tuple[FloatArray, IntArray]:
     """Read the positions and triangles of a file.
 
     Args:
@@ -38,7 +38,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArra
 
 
 def open_asset(path: str | os.PathLike[str]) -> Asset:
-    """Read a mesh file with everything that it carries.
+    """Read a mesh file with all its content.
 
     Args:
         path: An OBJ, PLY, OFF, GLB or GLTF file.
@@ -71,7 +71,7 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
         asset: Asset = getattr(import_module(module), name)(path)
     except MeshError:
         raise
-    except Exception as error:  # A reader fed with garbage may raise anything; the file's name must not get lost.
+    except Exception as error:  # Damaged files may raise any exception; the message names the file.
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: cannot be read as {suffix[1:].upper()} ({reason[:200]})") from error
     vertices, faces = asset.positions, asset.faces
@@ -89,13 +89,13 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
 
 def require_same_mesh(
     first: str | os.PathLike[str],
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64],
+    vertices: FloatArray,
+    faces: IntArray,
     other: str | os.PathLike[str],
-    other_vertices: NDArray[np.float64],
-    other_faces: NDArray[np.int64],
+    other_vertices: FloatArray,
+    other_faces: IntArray,
 ) -> None:
-    """Refuse a file whose vertices or faces do not match those of the first."""
+    """Raise unless the vertices and faces of a file match those of the first."""
     hint = "all key-frames need the same vertices and faces, in the same vertex order"
     for what, mine, its in (("vertices", vertices, other_vertices), ("faces", faces, other_faces)):
         if len(mine) != len(its):

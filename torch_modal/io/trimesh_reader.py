@@ -14,8 +14,8 @@ def read_triangles(path: Path, n_vertices: int, n_faces: int) -> tuple[FloatArra
 
     Args:
         path: The file.
-        n_vertices: As its header has it.
-        n_faces: Likewise, polygons included; 0 if that is not known.
+        n_vertices: From its header.
+        n_faces: From its header, polygons included; 0 if unknown.
 
     Raises:
         MeshError: The file was cut off, which trimesh accepts.

@@ -1,7 +1,7 @@
-"""One HTML file that needs nothing else, neither files nor a network.
+"""A page as one HTML file that needs no other files and no network.
 
-The files in page_assets are joined with the data of a page, which names the scripts that may run by their hashes, and
-forbids itself all else, so that nothing that stands in a file name or title can do anything.
+Joins the files in page_assets with the data of a page. Its content security policy allows its own scripts by their
+hashes and forbids all else, so that text in file names or titles cannot run.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ POLICY = "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 
 
 
 class Page:
-    """A page of shapes: shown by notebooks where it is the last value of a cell, or saved.
+    """A page of shapes, which notebooks display and :meth:`save` writes.
 
     Attributes:
         html: The whole page.
-        height: Pixels that it takes in a notebook.
+        height: In pixels, in a notebook.
 
     Raises:
         ValueError: A height below 1.
@@ -46,7 +46,7 @@ class Page:
         return f"<torch_modal.Page of {len(self.html) / 1e6:.1f} MB; its save(path) writes it>"
 
     def _repr_html_(self) -> str:
-        # The sandbox keeps the page's scripts apart from the notebook's.
+        # The sandbox isolates the page's scripts from the notebook's.
         return (
             '<iframe sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy" '
             f'style="width: 100%; height: {self.height}px; border: 1px solid #dde3e9; border-radius: 8px" '
@@ -81,13 +81,13 @@ def checked_path(out: str | Path, overwrite: bool) -> Path:
 
 
 def document(template: str, scripts: Sequence[str], title: str, data: dict[str, Any]) -> str:
-    """A page's text. What callers named is escaped; scripts and style are allowed by their hashes.
+    """The text of a page. Titles and names are escaped; scripts and style are allowed by their hashes.
 
     Args:
         template: Its file in page_assets.
-        scripts: Those that it runs besides three.js, in their order.
+        scripts: Its scripts besides three.js, in order.
         title: Of the page.
-        data: What the scripts show.
+        data: The data of the scripts.
     """
     assets = files("torch_modal.view") / "page_assets"
 
@@ -95,7 +95,7 @@ def document(template: str, scripts: Sequence[str], title: str, data: dict[str, 
         return "\n".join((assets / name).read_text(encoding="utf-8") for name in names)
 
     style, library = asset("page.css"), asset("three.min.js")
-    # In a function of its own, and strict.
+    # In a function scope, strict.
     program = f'(() => {{\n"use strict";\n{asset(*scripts)}}})();\n'
     policy = f"{POLICY}; style-src {_hash(style)}; script-src {_hash(library)} {_hash(program)}"
     parts = {
@@ -107,7 +107,7 @@ def document(template: str, scripts: Sequence[str], title: str, data: dict[str, 
         "@LIBRARY@": library,
         "@PROGRAM@": program,
     }
-    # Each marker is replaced where it stands in the template, not in what came in its place.
+    # Replaces markers of the template, not those inside inserted text.
     text, pieces = asset(template), []
     while text:
         place, marker = min(((text.find(m), m) for m in parts if m in text), default=(len(text), ""))
@@ -117,5 +117,5 @@ def document(template: str, scripts: Sequence[str], title: str, data: dict[str, 
 
 
 def _hash(text: str) -> str:
-    """What a content security policy calls an inline script or style."""
+    """The source expression of an inline script or style in a content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"

@@ -1,4 +1,4 @@
-"""A page on which landmarks are picked, on meshes of any connectivity side by side."""
+"""A page to pick landmarks on meshes of any connectivity, side by side."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ def show_landmarks(
 ) -> Page:
     """A page to pick landmarks for :func:`torch_modal.register`: vertices of several meshes that belong together.
 
-    Each mesh is turned on its own. The first click on each gives the first landmark, and so on; the result is copied or
-    saved as the text file that ``landmarks=`` of :func:`torch_modal.load_keyframes` and ``--landmarks`` take.
+    Each mesh has its own camera. The first click on each gives the first landmark, and so on. The page copies or saves
+    the text file for ``landmarks=`` of :func:`torch_modal.load_keyframes` and for ``--landmarks``.
 
     Args:
-        meshes: Vertices ``(V, 3)`` and faces ``(F, 3)`` under the names that are shown; two or more, of any
-            connectivity.
-        landmarks: Those that are there already. Vertex indices, a column for each mesh: *shape* ``(n, K)``.
+        meshes: Name, vertices ``(V, 3)`` and faces ``(F, 3)`` of two or more meshes of any connectivity.
+        landmarks: Landmarks to start from: vertex indices, a column for each mesh. *Shape:* ``(n, K)``.
         title: Of the page.
-        height: Pixels that it takes in a notebook.
+        height: In pixels, in a notebook.
 
     Returns:
         The page. Notebooks show it; ``save(path)`` writes it.

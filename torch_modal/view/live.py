@@ -1,8 +1,8 @@
 """A live session: in-betweens computed while time, stiffnesses, modes and handles of key-frames are dragged.
 
-Shown by viser (extra ``view``), which serves a page for the browser. While something is dragged, each shape is the
-modal solve of the fast preset; when nothing has changed for a moment, the accurate preset's local steps follow, and
-the ways of the handles.
+Shown by viser (extra ``view``), which serves a page for the browser. While the user drags, each shape is the modal
+solve of the fast preset. When nothing has changed for a moment, the accurate preset's local steps and the paths of the
+handles follow.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LiveSession", "live"]
 
-REST_SECONDS = 0.25  # without a change: then the accurate shape is computed
+IDLE_SECONDS = 0.25  # without a change, before the accurate shape is computed
 STIFFNESS_RANGE = 2.0  # powers of ten, both ways
 
 
@@ -45,8 +45,8 @@ def live(
     Args:
         keyframes: *Shape:* ``(K, V, 3)``, K of 2 or more.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        bases: A basis of each key-frame; made if not given.
-        host: Who may connect: this machine only, or ``"0.0.0.0"`` for all that reach it.
+        bases: A basis of each key-frame; computed if not given.
+        host: Address of the server: this machine only, or ``"0.0.0.0"`` for the network.
         port: The first port to try.
 
     Returns:
@@ -72,7 +72,7 @@ def require_viser() -> Any:
 
 
 class LiveSession:
-    """What :func:`live` starts: a server, its controls, and a thread that computes what they ask for."""
+    """The session of :func:`live`: a server, its controls, and a thread that computes the shapes."""
 
     def __init__(self, shapes: LiveShapes, host: str, port: int) -> None:
         viser = require_viser()
@@ -82,11 +82,11 @@ class LiveSession:
         low, high = shapes.given.amin((0, 1)).numpy(), shapes.given.amax((0, 1)).numpy()
         self.centre, self.size = 0.5 * (low + high), float(np.linalg.norm(high - low))
         self.n_updates = 0
-        self._lock = threading.Lock()  # around all that changes shapes
+        self._lock = threading.Lock()  # guards self.shapes
         self._changed = threading.Event()
         self._stopped = threading.Event()
         self._handles: dict[tuple[int, int], Any] = {}  # key-frame and vertex: its control
-        self._shown_ways: set[tuple[int, int]] = set()
+        self._shown_paths: set[tuple[int, int]] = set()
 
         self.server: Any = viser.ViserServer(host=host, port=port, verbose=False, label="torch_modal")
         self.url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
@@ -166,7 +166,7 @@ class LiveSession:
         self.show_ghosts.on_update(lambda _: self._show_ghosts())
         self.undo.on_click(lambda _: self._undo())
 
-    # -------------------------------------------------------------------------------------------- what is asked for
+    # ------------------------------------------------------------------------------------------------- callbacks
     def _set_stiffness(self) -> None:
         with self._lock:
             self.shapes.set_stiffness(*(10.0**slider.value for slider in self.stiffness))
@@ -228,27 +228,27 @@ class LiveSession:
             slider.value = 0.0
         self._set_stiffness()
 
-    # ------------------------------------------------------------------------------------------------- what is shown
+    # ------------------------------------------------------------------------------------------------- updates
     def _run(self) -> None:
-        """Compute what was asked for last, whatever was asked for since it began."""
-        at_rest = False
+        """Compute the latest state; skips states that changed meanwhile."""
+        idle = False
         while not self._stopped.is_set():
-            if self._changed.wait(REST_SECONDS):
+            if self._changed.wait(IDLE_SECONDS):
                 self._changed.clear()
-                at_rest = False
-            elif at_rest:
+                idle = False
+            elif idle:
                 continue
             else:
-                at_rest = True
+                idle = True
             if not self._stopped.is_set():
-                self._update(accurate=at_rest)
+                self._update(accurate=idle)
 
     def _update(self, accurate: bool) -> None:
         start = time.perf_counter()
         with self._lock:
             shape = self.shapes.shape(self.time.value, accurate).numpy()
             keyframes = self.shapes.keyframes.numpy().copy()
-            ways = {key: self.shapes.path(key[1]).numpy() for key in self._handles} if accurate else {}
+            paths = {key: self.shapes.path(key[1]).numpy() for key in self._handles} if accurate else {}
         with self.server.atomic():
             self.between.vertices = self._to_scene(shape).astype(np.float32)
             for ghost, keyframe in zip(self.ghosts, keyframes, strict=True):
@@ -256,25 +256,25 @@ class LiveSession:
                 if not np.array_equal(ghost.vertices, points):
                     ghost.vertices = points
             if accurate:
-                self._show_ways(ways)
+                self._show_paths(paths)
         self.n_updates += 1
         milliseconds = 1000 * (time.perf_counter() - start)
         if accurate:
             self.says.content = f"With local steps: {milliseconds:.0f} ms. Click on a key-frame to add a handle."
 
-    def _show_ways(self, ways: dict[tuple[int, int], FloatArray]) -> None:
-        """The ways of the handles' vertices through all in-betweens."""
-        for key in self._shown_ways - set(ways):
-            self.server.scene.remove_by_name(f"/way {key[0]} {key[1]}")
-        for (keyframe, vertex), way in ways.items():
+    def _show_paths(self, paths: dict[tuple[int, int], FloatArray]) -> None:
+        """Draw the paths of the handles' vertices through all in-betweens."""
+        for key in self._shown_paths - set(paths):
+            self.server.scene.remove_by_name(f"/path {key[0]} {key[1]}")
+        for (keyframe, vertex), path in paths.items():
             self.server.scene.add_spline_catmull_rom(
-                f"/way {keyframe} {vertex}",
-                self._to_scene(way),
+                f"/path {keyframe} {vertex}",
+                self._to_scene(path),
                 color=(74, 120, 171),
                 thickness=3.0,
                 thickness_units="screen",
             )
-        self._shown_ways = set(ways)
+        self._shown_paths = set(paths)
 
 
 def hit_vertex(origin: FloatArray, direction: FloatArray, shape: FloatArray, faces: IntArray) -> int | None:

@@ -1,4 +1,4 @@
-"""Key-frames that are changed by hand, and what lies between them: what a live session shows, without showing it."""
+"""Key-frames that handles and modes deform, and their in-betweens: the model of a live session."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch_modal.nn.in_between import InBetween
 from torch_modal.nn.settings import PRESETS, Preset
 from torch_modal.precompute.basis import ModalBasis
 
-# Handles are met up to this part of how compliant they are, so that handles that lie together do not fight.
+# Part of the mean compliance by which handles may be missed, so that close handles do not conflict.
 HANDLE_SLACK = 1e-6
 
 
@@ -48,7 +48,7 @@ class LiveShapes:
         self._layers = {preset: self._layer(bases, preset) for preset in ("fast", "accurate")}
 
     def _layer(self, bases: Sequence[ModalBasis], preset: Preset) -> InBetween:
-        """A layer whose stiffnesses are tensors, so that they can be set without building anything anew."""
+        """A layer whose stiffnesses are tensors, so that they can be changed in place."""
         objective, solver = PRESETS[preset]
         alpha, beta, gamma = (
             torch.as_tensor(value, dtype=torch.float64).clone()
@@ -81,7 +81,7 @@ class LiveShapes:
         self._deform(keyframe)
 
     def reset(self) -> None:
-        """The key-frames as they were given."""
+        """Restore the given key-frames."""
         self.handles, self.amounts = [{} for _ in self.handles], [{} for _ in self.amounts]
         self.keyframes = self.given.clone()
 
@@ -114,7 +114,7 @@ class LiveShapes:
 
     @torch.no_grad()
     def path(self, vertex: int, n_steps: int = 6) -> Tensor:
-        """Where a vertex goes, with so many steps an interval. *Shape:* ``((K-1) n_steps + 1, 3)``."""
+        """The path of a vertex, with so many steps an interval. *Shape:* ``((K-1) n_steps + 1, 3)``."""
         times = torch.linspace(0, len(self.given) - 1, (len(self.given) - 1) * n_steps + 1, dtype=torch.float64)
         return self._between(times, False)[:, vertex]
 
@@ -123,6 +123,6 @@ class LiveShapes:
         first = times.floor().long().clamp(0, len(self.given) - 2)
         layer = self._layers["accurate" if accurate else "fast"]
         found = layer.solve(self.keyframes[first], self.keyframes[first + 1], times - first, first).shapes
-        # A shape that cannot be solved for, as of key-frames turned inside out, is a straight line's.
+        # Linear interpolation where there is no solution, such as of inverted key-frames.
         straight = torch.lerp(self.keyframes[first], self.keyframes[first + 1], (times - first)[:, None, None])
         return torch.where(found.isfinite(), found, straight)

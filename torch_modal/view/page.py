@@ -1,4 +1,4 @@
-"""A page to look at: sequences of shapes, packed by page_data.py, in one HTML file."""
+"""A page that plays sequences of shapes, packed by page_data.py, in one HTML file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def show(
     title: str = "torch_modal",
     height: int = 600,
 ) -> Page:
-    """A page to look at sequences of shapes, in a notebook or saved: play, orbit, compare, measure, pick vertices.
+    """A page that shows sequences of shapes, in a notebook or saved: play, orbit, compare, measure, pick vertices.
 
     In the page, shapes between two neighbouring frames are blended linearly. Positions are stored in 65,535 steps along
     the longest side of all shapes together, so they are off by at most 8e-6 of it.
@@ -42,7 +42,7 @@ def show(
             shown side by side or overlaid. *Shape of each:* ``(N, V, 3)``, the same for all.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         keyframe_indices: Frames that are key-frames: drawn in the other colour and marked on the time line; an empty
-            list is none. The first and the last by default.
+            list means none. By default the first and the last.
         times: The time of each frame, rising; shown beside its number, and the time line keeps their distances. Evenly
             spaced by default. *Shape:* ``(N,)``.
         fps: Frames a second, on average if ``times`` are given.
@@ -50,7 +50,7 @@ def show(
         view: Azimuth and elevation of the first view in degrees, as for :func:`torch_modal.render_sequence`.
         up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
         title: Of the page.
-        height: Pixels that it takes in a notebook.
+        height: In pixels, in a notebook.
 
     Returns:
         The page. Notebooks show it; ``save(path)`` writes it.
@@ -92,29 +92,19 @@ def write_page(
     faces: Array,
     out: str | Path,
     *,
-    keyframe_indices: Sequence[int] | None = None,
-    times: Sequence[float] | None = None,
-    fps: float = 24.0,
-    cyclic: bool = False,
-    view: tuple[float, float] | None = None,
-    up: Literal["y", "z"] | None = None,
     title: str | None = None,
     overwrite: bool = False,
+    **options: Any,
 ) -> Path:
-    """Write a page to look at sequences of shapes, as one HTML file that works without a network.
+    """Write a page that shows sequences of shapes, as one HTML file that works without a network.
 
     Args:
-        sequences: As for :func:`show`, like all that is not named here.
+        sequences: As for :func:`show`.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         out: File to write, ``*.html``.
-        keyframe_indices: Frames that are key-frames.
-        times: The time of each frame. *Shape:* ``(N,)``.
-        fps: Frames a second.
-        cyclic: Add the step from the last frame back to the first.
-        view: Azimuth and elevation of the first view in degrees.
-        up: ``"y"`` or ``"z"``.
         title: Of the page; by default the file's name.
         overwrite: Replace the file if it exists.
+        options: Further arguments of :func:`show`, such as ``keyframe_indices``.
 
     Returns:
         The file.
@@ -124,18 +114,7 @@ def write_page(
         FileExistsError: The file exists and ``overwrite`` is off.
     """
     path = checked_path(out, overwrite)
-    page = show(
-        sequences,
-        faces,
-        keyframe_indices=keyframe_indices,
-        times=times,
-        fps=fps,
-        cyclic=cyclic,
-        view=view,
-        up=up,
-        title=path.stem if title is None else title,
-    )
-    return page.save(path, overwrite)
+    return show(sequences, faces, title=path.stem if title is None else title, **options).save(path, overwrite)
 
 
 def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
@@ -154,12 +133,12 @@ def packed(
     view: tuple[float, float] | None = None,
     up: Literal["y", "z"] | None = None,
 ) -> dict[str, Any]:
-    """Shapes and faces for a page, and how they are first seen; lengths in steps of the grid."""
+    """Shapes, faces and the first view of a page; lengths in steps of the grid."""
     first = next(iter(sequences.values()))[0]
     rotation = view_rotation(first, view, up)
     grid = grid_of(list(sequences.values()))
     numbers = {name: quantise(frames, grid) for name, frames in sequences.items()}
-    # The box around everything along right, up and front: its middle is what the camera turns around.
+    # The box around everything along right, up and front; the camera orbits its middle.
     low = np.min([_extreme(frames, rotation, np.min) for frames in numbers.values()], axis=0)
     high = np.max([_extreme(frames, rotation, np.max) for frames in numbers.values()], axis=0)
     return {

@@ -1,14 +1,14 @@
-"""What a page holds of shapes and faces: whole numbers, predicted from those before, deflated, as base64 text.
+"""Shapes and faces of a page: quantised, predicted from earlier frames, deflated, as base64 text.
 
 decode.js reads it back. All sequences of a page share one grid of 16 bits a coordinate, whose step is the longest side
 of the box around everything, divided by 65,535. So a position is off by at most half of that, 8e-6 of the longest side.
 
-Shapes of a smooth motion are predicted well from the two before them: what is stored of frame n is
+Two frames predict the next one of a smooth motion well. Frame n is stored as
 
     r_n = q_n - 2 q_{n-1} + q_{n-2}    (mod 2^16)                                                      (1)
 
-with r_1 = q_1 - q_0, small numbers around zero. These are made positive (0, -1, 1, -2, ... -> 0, 1, 2, 3, ...), laid
-out in planes of low and of high bytes (the second is almost all zeros), and deflated.
+with r_1 = q_1 - q_0, small numbers around zero. They are folded to positive numbers (0, -1, 1, -2, ... -> 0, 1, 2,
+3, ...), split into planes of low and of high bytes (almost all zeros), and deflated.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ LEVELS = 65_535
 
 
 class Grid(NamedTuple):
-    """Where the whole numbers lie: position = origin + step * number."""
+    """Quantisation: position = origin + step * number."""
 
     origin: FloatArray  # (3,)
     step: float
 
 
 def grid_of(sequences: Sequence[FloatArray]) -> Grid:
-    """The grid that holds all shapes ``(N, V, 3)`` of all sequences."""
+    """The grid of the bounding box of all shapes ``(N, V, 3)`` of all sequences."""
     low = np.min([frames.min(axis=(0, 1)) for frames in sequences], axis=0)
     high = np.max([frames.max(axis=(0, 1)) for frames in sequences], axis=0)
     longest = float((high - low).max())
@@ -56,7 +56,7 @@ def pack_frames(numbers: NDArray[np.uint16]) -> str:
 
 
 def pack_faces(faces: IntArray) -> str:
-    """Faces ``(F, 3)`` as text: each corner as what it is more than the one before."""
+    """Faces ``(F, 3)`` as text: the difference of each corner from the one before."""
     steps = faces.reshape(-1).astype(np.int32)
     steps[1:] -= steps[:-1].copy()
     return _pack(_positive(steps))

@@ -21,7 +21,7 @@ GENERATOR = "torch_modal"
 
 
 class Shapes(NamedTuple):
-    """A sequence of shapes of one connectivity, and what its files say of it."""
+    """A sequence of shapes of one connectivity, with the metadata of its files."""
 
     frames: FloatArray
     """*Shape:* ``(N, V, 3)``."""
@@ -74,10 +74,10 @@ def _numbered(folder: Path) -> list[Path]:
 
 
 def _read_animation(path: Path) -> Shapes | None:
-    """The frames of a GLB with morph targets; None if it has none, and is a mesh that stands still.
+    """The frames of a GLB with morph targets; None if it has none.
 
-    What `save_animation` writes is read back: frame 0 and a target for each further frame, which shows fully at its
-    time. Of other programs' files it is not known what their targets are.
+    Reads files of `save_animation`: frame 0 and a target for each further frame, which is shown at its time. The
+    meaning of other programs' targets is unknown.
     """
     asset = open_asset(path)
     assert isinstance(asset, GltfAsset)
@@ -103,7 +103,7 @@ def _read_animation(path: Path) -> Shapes | None:
             raise ValueError(f"{n} shapes, {len(kept)} frames, {len(seconds)} times")
     except MeshError:
         raise
-    except Exception as error:  # A reader fed with garbage may raise anything; the file's name must not get lost.
+    except Exception as error:  # Damaged files may raise any exception; the message names the file.
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: cannot be read as an animation of this package ({reason[:200]})") from error
     # Frames left out of a long sequence leave wider steps in time; so does ease.

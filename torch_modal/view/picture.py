@@ -29,7 +29,7 @@ MARGIN = 1.06  # of a cell against the largest shape in it
 
 
 def check_view(view: tuple[float, float] | None, up: str | None) -> None:
-    """Raise if these do not say from where to look."""
+    """Raise if these are no valid view."""
     if view is not None and not (len(view) == 2 and np.isfinite(view).all()):
         raise ValueError(f"view must be two numbers of degrees, azimuth and elevation, got {view}.")
     if up not in (None, "y", "z"):
@@ -37,7 +37,7 @@ def check_view(view: tuple[float, float] | None, up: str | None) -> None:
 
 
 def up_axis(shape: FloatArray, up: Literal["y", "z"] | None = None) -> Literal["y", "z"]:
-    """What is up, if not said: Y, unless the shape is flat in Y (less than half of both other extents), then Z."""
+    """The up axis; by default Y, unless the shape is flat in Y (less than half of both other extents), then Z."""
     extent = np.ptp(shape, axis=0)
     return up or ("z" if extent[1] < 0.5 * min(extent[0], extent[2]) else "y")
 
@@ -67,8 +67,8 @@ def view_rotation(shape: FloatArray, view: tuple[float, float] | None, up: Liter
 def centred(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Move shapes ``(R, C, V, 3)`` into their cells; also the half width and height that hold them all.
 
-    One centre serves all cells, so that what rests stays at its place and rows can be compared. Where the
-    shapes lie further apart than their own size, each column gets a centre, and if need be each shape.
+    One centre serves all cells, so that static parts stay in place and rows can be compared. Where shapes are
+    separated by more than their own size, each column gets a centre, or if necessary each shape.
     """
     own = np.ptp(points, axis=2).max(axis=(0, 1))
     for together in ((0, 1, 2), (0, 2), (2,)):

@@ -1,7 +1,7 @@
-"""The process that computes one set, seen from inside: ``main(RESULT)``, with a line of JSON on its standard input.
+"""The process of one set: ``main(RESULT)``, with a line of JSON on its standard input.
 
 The line has the set's ``record`` so far, its folders ``source`` and ``target``, and ``options``. The result is the
-record of the set with its end, which stands beside the bases too. A crash leaves neither.
+finished record of the set, which is also written beside the bases. A crash writes neither.
 """
 
 import _thread
@@ -19,33 +19,33 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torch_modal.data.batch.record import DONE, FAILED, REFUSED, Record, inputs_key
+from torch_modal.data.batch.set_task import Options
 from torch_modal.data.motion import Motion
-from torch_modal.data.record import DONE, FAILED, REFUSED, Record, inputs_key
-from torch_modal.data.set_task import Options
 from torch_modal.data.stored import RECORD_FILE, write_set
 from torch_modal.errors import MeshError
 from torch_modal.io.files import write_atomically
 from torch_modal.precompute.modes import extract_bases
 from torch_modal.registration.load import load_keyframes
 
-ENOUGH = 30.0
-"""Seconds after which a process that was told to end does so at once."""
+GRACE = 30.0
+"""Seconds that the process has to end by itself before it is killed."""
 
 
 def main(result_path: str) -> None:
-    """Compute a set and say how it went."""
-    # Whatever started the command may have SIGINT ignored, which children inherit.
+    """Compute a set and write its record."""
+    # A parent that ignores SIGINT passes this on to its children.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     job = json.loads(sys.stdin.buffer.readline())
-    # Of a crash, the stack. And an end, even where a library hangs that lets no other thread of Python run.
+    # Prints the stack of a crash, and ends the process even if a library hangs with the interpreter's lock.
     faulthandler.enable()
-    faulthandler.dump_traceback_later(job["options"]["timeout"] + ENOUGH, exit=True)
+    faulthandler.dump_traceback_later(job["options"]["timeout"] + GRACE, exit=True)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     write_atomically(Path(result_path), compute(job).line())
 
 
 def compute(job: dict[str, Any]) -> Record:
-    """Write the bases of a set; its record, or what is wrong with it."""
+    """Compute and write the bases of a set; returns its record."""
     record, options, started = Record(**job["record"]), Options(**job["options"]), time.monotonic()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -59,9 +59,7 @@ def compute(job: dict[str, Any]) -> Record:
             files = [Path(job["source"], name) for name in record.files]
             stem, n_files = Counter(file.stem for file in files).most_common(1)[0]
             if n_files > 1:
-                raise MeshError(
-                    f"{n_files} files have the name {stem}; one shape in several formats is to be there once"
-                )
+                raise MeshError(f"{n_files} files have the name {stem}; a shape must be there in one format only")
             beside = options.beside(Path(job["source"]))
             keyframes, faces = load_keyframes(files)
             motion = _motion(beside, len(files)) if options.sequence else None
@@ -74,7 +72,7 @@ def compute(job: dict[str, Any]) -> Record:
                 options.n_modes,
                 mesher=options.mesher,  # type: ignore[arg-type]
                 settings=options.quality,
-                timeout=options.timeout / 2,  # so that its failure can still be told, or made good
+                timeout=options.timeout / 2,  # leaves time to report its failure, or for a second mesher
                 cache_dir=options.cache_dir,
                 cache=options.cache_dir is not None,
                 progress=False,
@@ -93,7 +91,7 @@ def compute(job: dict[str, Any]) -> Record:
             return done
         except (ValueError, RuntimeError) as error:
             return ended(REFUSED if isinstance(error, ValueError) else FAILED, " ".join(str(error).split()))
-        except Exception as error:  # the machine, or a bug, which should not take the other sets' time
+        except Exception as error:  # the machine or a bug: the other sets go on
             return ended(FAILED, f"{type(error).__name__}: {error}", traceback.format_exc()[-2000:])
 
 
@@ -118,5 +116,5 @@ def _end_with_parent() -> None:
     while os.read(0, 1):  # not sys.stdin, whose lock would be missed at the interpreter's end
         pass
     _thread.interrupt_main()
-    time.sleep(ENOUGH)
+    time.sleep(GRACE)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Which key-frame sets a folder tree holds, and where their bases go."""
+"""Key-frame sets of a folder tree, and the folders of their bases."""
 
 import os
 import re
@@ -9,13 +9,13 @@ from typing import NamedTuple
 from torch_modal.io.read import SUFFIXES
 
 MESH_SUFFIXES = (*SUFFIXES, ".stl")
-"""STL cannot serve as a key-frame, but it is better refused with a reason than passed over."""
+"""STL cannot serve as a key-frame; it is listed so that its set is refused with a reason."""
 ROOT = "."
 """Name of the set whose files lie in the root itself."""
 
 
 class Tree(NamedTuple):
-    """What was found below a folder.
+    """Sets and other folders below a folder.
 
     Names of sets are their folders' paths below the root, with ``/`` between the parts.
     """
@@ -23,23 +23,22 @@ class Tree(NamedTuple):
     sets: list[str]
     """Folders that directly hold two or more mesh files, in natural order."""
     left_out: dict[str, str]
-    """Folders that may have been meant as sets, and why they are none."""
+    """Folders with one mesh or unreadable ones, and why they are no sets."""
 
 
 def find_keyframe_sets(root: Path, skip: Path | None = None) -> Tree:
     """Walk a folder tree.
 
-    Hidden files and folders (a dot before the name) are passed over. Links to folders are followed, except to one that
-    they lie in.
+    Skips hidden files and folders (a dot before the name). Follows links to folders, except to a parent.
 
     Args:
         root: Where to start.
-        skip: A folder that is not entered: the results of an earlier run, perhaps.
+        skip: A folder that is not entered, such as the results of an earlier run.
 
     Raises:
         OSError: The root cannot be read.
     """
-    os.listdir(root)  # os.walk is silent about a root that is not there
+    os.listdir(root)  # os.walk does not report a missing root
     tree = Tree([], {})
 
     def unreadable(error: OSError) -> None:
@@ -72,11 +71,11 @@ def mesh_files(folder: Path) -> list[Path]:
 
 
 def places(names: Sequence[str], root: Path) -> dict[str, str]:
-    """Where the bases of each set go, as a path below the output folder.
+    """The folder of each set's bases, as a path below the output folder.
 
-    That is the set's own name, so that the output mirrors the tree. A folder with sets below it cannot hold the files
-    of a set as well, and the output folder itself holds the report: such a set goes one level deeper, into a folder of
-    the same name, with ``_`` after it if that is taken.
+    It is the set's own name, so that the output mirrors the tree. A folder with sets below it cannot hold the files of
+    a set too, and the output folder itself holds the report: such a set goes one level deeper, into a folder of the
+    same name, with ``_`` after it if that name is taken.
     """
     above = {str(parent) for name in names for parent in PurePosixPath(name).parents if name != ROOT}
     taken = above | set(names)
@@ -93,7 +92,7 @@ def places(names: Sequence[str], root: Path) -> dict[str, str]:
 
 
 def natural(name: str) -> list[tuple[list[str | int], str]]:
-    """A key to sort by, with which ``frame-2`` comes before ``frame-10``, and a folder before what is in it."""
+    """A sort key: ``frame-2`` before ``frame-10``, a folder before its contents."""
     return [
         ([int(part) if i % 2 else part.casefold() for i, part in enumerate(re.split(r"([0-9]+)", level))], level)
         for level in name.split("/")

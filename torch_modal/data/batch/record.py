@@ -1,4 +1,4 @@
-"""How work on a set of a folder tree went: a file in the set's folder, and a line of the report."""
+"""The record of a set of a folder tree: a file in the set's folder, and a line of the report."""
 
 import contextlib
 import hashlib
@@ -15,7 +15,7 @@ UNFINISHED, LEFT_OUT = "unfinished", "left out"
 
 @dataclass(frozen=True)
 class Record:
-    """How work on a set went; ``docs/precompute.md`` says what the fields are."""
+    """State and result of a set; ``docs/precompute.md`` describes the fields."""
 
     set: str
     status: str = UNFINISHED
@@ -33,16 +33,16 @@ class Record:
     host: str = ""
 
     def ended(self, status: str, reason: str = "", **details: Any) -> "Record":
-        """The same with its end."""
+        """A copy with its final status."""
         now = datetime.now().astimezone().isoformat("T", "seconds")
         return replace(self, status=status, reason=reason or self.reason, finished=now, **details)
 
     def line(self) -> bytes:
-        """One line of JSON, without what is empty."""
+        """One line of JSON, without empty fields."""
         return json.dumps({name: value for name, value in asdict(self).items() if value}).encode() + b"\n"
 
     def what_changed(self, new: "Record") -> str:
-        """Why a set has to be done again; nothing if this record still speaks of the same files and settings."""
+        """Why a set must be computed again; empty if files and settings are the same."""
         reasons = [] if self.inputs == new.inputs else ["its files changed"]
         for name, now in new.parameters.items():
             if (before := self.parameters.get(name)) != now:
@@ -58,7 +58,7 @@ def read_record(file: Path) -> Record | None:
 
 
 def inputs_key(files: Sequence[Path]) -> str:
-    """SHA-256 of the names and the content of a set's files, and of the buffers that lie beside those of glTF.
+    """SHA-256 of the names and the content of a set's files, and of the buffers beside its glTF files.
 
     Raises:
         OSError: A file cannot be read.

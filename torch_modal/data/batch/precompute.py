@@ -11,15 +11,15 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
-from torch_modal.data.engines import Engine
-from torch_modal.data.record import DONE, FAILED, LEFT_OUT, Record, read_record
-from torch_modal.data.set_task import Options, Outcome, SetTask, run_set
+from torch_modal.data.batch.engines import Engine
+from torch_modal.data.batch.record import DONE, FAILED, LEFT_OUT, Record, read_record
+from torch_modal.data.batch.set_task import Options, Outcome, SetTask, run_set
+from torch_modal.data.batch.tree import find_keyframe_sets, places, printable
 from torch_modal.data.stored import RECORD_FILE
-from torch_modal.data.tree import find_keyframe_sets, places, printable
 from torch_modal.io.files import write_atomically
 
 SHOWN = 20
-"""Sets that the summary names; the report has them all."""
+"""Most sets that the summary names; the report has all."""
 
 
 class Shard(NamedTuple):
@@ -46,21 +46,21 @@ def precompute_tree(
 ) -> list[Record]:
     """Compute the bases of every key-frame set below a folder.
 
-    Each set is a task with a process and a time limit of its own, see :func:`~torch_modal.data.set_task.run_set`; what
-    goes wrong with one is written to the report and the others go on. Sets that have a result already are passed over,
-    unless their files or the options changed.
+    Each set is a task with a process and a time limit of its own
+    (:func:`~torch_modal.data.batch.set_task.run_set`). The report names the sets that failed; the others go on. Sets
+    with a result are skipped, unless their files or the options changed.
 
     Args:
-        root: The folder tree. See :func:`~torch_modal.data.tree.find_keyframe_sets` for what a set is.
+        root: The folder tree. See :func:`~torch_modal.data.batch.tree.find_keyframe_sets` for what a set is.
         out: Gets a folder for each set, see :mod:`torch_modal.data.stored`, and the report.
         engine: Where the tasks run.
-        options: How.
-        shard: Which part of the sets this call is for; by default all.
-        say: Takes lines: one for each set that was worked on, and the summary.
-        bar: Whether a bar shows how far it is, and lines the sets alone that went wrong.
+        options: Options of the sets.
+        shard: The part of the sets that this call computes; by default all.
+        say: Receives lines: one for each computed set, and the summary.
+        bar: Whether to show a progress bar, and lines of failed sets only.
 
     Returns:
-        How each set of the shard stands.
+        The record of each set of the shard.
 
     Raises:
         ValueError: There are no sets, or the folders cannot be used.
@@ -104,7 +104,7 @@ def precompute_tree(
                         say(f"[{len(known)}/{len(tasks)}] {_line(record)}")
     except BaseException:
         _cancel(futures, engine)
-        with contextlib.suppress(OSError):  # what is known so far
+        with contextlib.suppress(OSError):  # the records so far
             write_report()
         raise
     records = write_report()
@@ -123,13 +123,13 @@ def _outcome(future: Future[Outcome], record: Record) -> Outcome:
         return future.result()
     except CancelledError as error:
         raise ConnectionError("the cluster dropped a set, or is gone; start the same command again to go on") from error
-    except Exception as error:  # of the engine: a machine died of the set again and again, or lacks the folders
+    except Exception as error:  # of the engine: the set killed several machines, or a machine lacks the folders
         log = "".join(traceback.format_exception(error))[-2000:]
         return Outcome(record.ended(FAILED, " ".join(f"{type(error).__name__}: {error}".split()), log=log), True)
 
 
 def _cancel(futures: Iterable[Future[Outcome]], engine: Engine) -> None:
-    """End all tasks; wait for those that cannot be cancelled, which takes seconds if they are told to stop."""
+    """End all tasks; waits for those that cannot be cancelled, seconds after the stop event."""
     for future in futures:
         future.cancel()
     if engine.stop is not None:

@@ -1,6 +1,6 @@
-"""What the tasks of a folder tree run on: processes of this machine, or a Dask cluster.
+"""Executors of the tasks of a folder tree: processes of this machine, or a Dask cluster.
 
-Any other executor of `concurrent.futures` will do as well, as tasks share nothing.
+Any other executor of `concurrent.futures` works too, as tasks share nothing.
 """
 
 import os
@@ -14,7 +14,7 @@ from torch_modal.extras import require
 from torch_modal.precompute.parallel import n_cpus
 
 RETRIES = 2
-"""How often a cluster tries a task again that has raised an error: a machine without the package or the folders."""
+"""Retries of a task that raised an error: a machine may lack the package or the folders."""
 
 
 class Engine(NamedTuple):
@@ -22,13 +22,13 @@ class Engine(NamedTuple):
 
     executor: Executor
     stop: Any = None
-    """An event of `threading` or `distributed` that tells the tasks to end."""
+    """An event of `threading` or `distributed` that ends the tasks."""
     name: str = ""
 
 
 @contextmanager
 def local_processes(workers: int | None = None) -> Iterator[Engine]:
-    """A thread for each set at a time, which waits for the process of its set.
+    """Threads that each wait for the process of one set.
 
     Args:
         workers: Sets at a time; by default one for each processor, shared with the neighbours of the same ``torchrun``.
@@ -47,9 +47,9 @@ def local_processes(workers: int | None = None) -> Iterator[Engine]:
 def dask_cluster(address: str) -> Iterator[Engine]:
     """The workers of a running Dask cluster, a set for each of their threads at a time.
 
-    The scheduler gives the sets of a dead worker to others, and a set that has taken several with it is given up
-    (``distributed.scheduler.allowed-failures``). A task that runs cannot be cancelled from outside, so the tasks look
-    at an event on the scheduler.
+    The scheduler gives the sets of a dead worker to others, and gives up a set that killed several workers
+    (``distributed.scheduler.allowed-failures``). A running task cannot be cancelled from outside, so the tasks check
+    an event on the scheduler.
 
     Args:
         address: Of the scheduler, ``tcp://HOST:8786`` for example.

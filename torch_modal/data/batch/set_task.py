@@ -1,7 +1,10 @@
-"""The task of one set of a folder tree: compute its bases, in a process of its own, unless they are there.
+"""The task of one set of a folder tree: compute its bases, in a process of its own, unless they exist.
 
-It is idempotent and shares nothing with other tasks but the file system: what is known of a set stands in its folder,
-which is renamed into place as a whole. So it can be run anywhere, any number of times, and by several at once.
+Tasks are idempotent and share nothing but the file system: the state of a set is in its folder, which is renamed into
+place as a whole. So any machine can run a task, any number of times, several at once.
+
+Each set has a fresh process rather than one of joblib's loky: loky has no time limit for a task that ends its process
+and the mesher's, and a crash there fails all tasks of the pool.
 """
 
 import contextlib
@@ -18,9 +21,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch_modal.data.record import CRASHED, DONE, FAILED, REFUSED, TIMEOUT, Record, inputs_key, read_record
+from torch_modal.data.batch.record import CRASHED, DONE, FAILED, REFUSED, TIMEOUT, Record, inputs_key, read_record
+from torch_modal.data.batch.tree import mesh_files
 from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, RECORD_FILE, open_set, why_not_replaceable
-from torch_modal.data.tree import mesh_files
 from torch_modal.io.cache import CACHE_VERSION
 from torch_modal.io.files import write_atomically
 from torch_modal.io.processes import describe_exit, end_process, last_line
@@ -31,11 +34,11 @@ import sys
 root = sys.argv.pop(1)
 if root not in sys.path:
     sys.path.insert(0, root)
-from torch_modal.data._set_worker import main
+from torch_modal.data.batch.set_worker import main
 main(sys.argv[1])
 """
-COMMAND = [sys.executable, "-c", BOOT, str(Path(__file__).resolve().parents[2])]
-"""What is started, with the path of the result after it."""
+COMMAND = [sys.executable, "-c", BOOT, str(Path(__file__).resolve().parents[3])]
+"""The command of the process; the path of the result follows."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 TIMES_FILE = "times.txt"
 POLL = 0.5
@@ -45,13 +48,13 @@ GRACE = 5.0
 
 @dataclass(frozen=True)
 class Options:
-    """How sets are worked on: as for `extract_bases`, and whether to try again or to replace sets of others."""
+    """Options of `extract_bases`, and whether to retry failed sets or to replace sets of other origin."""
 
     n_modes: int = 30
     mesher: str = "lattice"
     quality: str = "fast"
     cache_dir: str | None = None
-    """None keeps nothing but the results."""
+    """None: no cache."""
     timeout: float = 600.0
     """Seconds for a set; the mesher may take half of them."""
     retry: bool = False
@@ -60,7 +63,7 @@ class Options:
     """Whether the key-frames of a set are a motion, in the order of their files."""
 
     def parameters(self) -> dict[str, Any]:
-        """What the result depends on besides the files."""
+        """All that the result depends on besides the files."""
         settings = asdict(QUALITIES[self.quality])
         made = {"n_modes": self.n_modes, "mesher": self.mesher, "settings": settings, "algorithm": CACHE_VERSION}
         return {**made, "sequence": self.sequence or None}  # as in records from before there was this option
@@ -71,7 +74,7 @@ class Options:
 
 
 class SetTask(NamedTuple):
-    """A set that is to have its bases; with absolute paths, as it may be done elsewhere."""
+    """A set whose bases are computed; with absolute paths, as another machine may run it."""
 
     record: Record
     """Its name, its place below the output folder, and the parameters."""
@@ -88,11 +91,11 @@ class SetTask(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of a task."""
+    """Result of a task."""
 
     record: Record
     now: bool
-    """Whether it was found out by this task, and not by an earlier one."""
+    """Whether this task found the result, rather than an earlier one."""
 
 
 def run_set(task: SetTask, stop: threading.Event | None = None) -> Outcome:
@@ -127,7 +130,7 @@ def run_set(task: SetTask, stop: threading.Event | None = None) -> Outcome:
     record = _in_own_process(task._replace(record=new), stop)
     if record.status == DONE or not record.finished:
         return Outcome(record, True)
-    meanwhile = read_record(target / RECORD_FILE)  # another run may have had more luck
+    meanwhile = read_record(target / RECORD_FILE)  # another run may have succeeded
     if meanwhile is not None and meanwhile.status == DONE and not meanwhile.what_changed(new):
         return Outcome(meanwhile, True)
     if (target / BASES_FILE).exists():
@@ -139,7 +142,7 @@ def run_set(task: SetTask, stop: threading.Event | None = None) -> Outcome:
 
 
 def _why_again(before: Record, task: SetTask) -> str:
-    """Why a set is worked on again though nothing changed; nothing if it is not."""
+    """Why an unchanged set is computed again; empty if it is not."""
     if before.status != DONE:
         return f"tried again after: {before.reason}" if task.options.retry else ""
     try:
@@ -150,7 +153,7 @@ def _why_again(before: Record, task: SetTask) -> str:
 
 
 def _obstacle(folder: Path, overwrite: bool) -> str:
-    """What is in the way of the bases; files of the user are never touched, sets of others only if asked."""
+    """Why the bases cannot be written; the user's files stay, sets of other origin unless ``overwrite``."""
     if obstacle := why_not_replaceable(folder):
         return f"{obstacle}; move it away"
     there = any((folder / name).exists() for name in (KEYFRAMES_FILE, BASES_FILE))
@@ -160,10 +163,10 @@ def _obstacle(folder: Path, overwrite: bool) -> str:
 
 
 def _in_own_process(task: SetTask, stop: threading.Event | None) -> Record:
-    """Start a fresh interpreter on the set and wait for it; unfinished if that was stopped.
+    """Start a new interpreter for the set and wait for it; the record is unfinished if it was stopped.
 
-    It has a session of its own, so that Ctrl-C reaches this process alone, and a pipe from it, whose end tells it that
-    this process is gone. It is no process of `multiprocessing`, as a Dask worker is daemonic and may not have those.
+    It has a session of its own, so that Ctrl-C reaches this process alone, and ends itself when the pipe from this
+    process closes. `multiprocessing` does not serve: a Dask worker is daemonic and may not start its processes.
     """
     started, timeout = time.monotonic(), task.options.timeout
     job = {"record": asdict(task.record), "options": asdict(task.options), "source": task.source, "target": task.target}

@@ -1,0 +1,1 @@
+"""Modal bases of every key-frame set of a folder tree."""
