@@ -75,6 +75,29 @@ def messages() -> list[re.Pattern[str]]:
     return found
 
 
+def test_words_are_those_of_the_field() -> None:
+    """Edge vectors, capped faces, trajectories, active contacts, tangent offsets: no other names for the same."""
+    other = re.compile(r"\b(spokes?|walls|told|held|excess|(?<!of )course)\b", re.IGNORECASE)
+    files = [*(ROOT / "torch_modal").rglob("*.py"), *DOCS.rglob("*.md"), ROOT / "README.md"]
+    found = [
+        f"{f.relative_to(ROOT)}: {line.strip()}"
+        for f in files
+        for line in f.read_text().splitlines()
+        if other.search(line)
+    ]
+    assert found == []
+
+
+def test_class_names_are_unique() -> None:
+    names = [
+        node.name
+        for file in (ROOT / "torch_modal").rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    assert sorted(names) == sorted(set(names))
+
+
 def test_messages_of_the_questions_are_those_of_the_package() -> None:
     known = [pattern for pattern in messages() if len(pattern.pattern.replace(".*", "")) > 20]
     quoted = [" ".join(block.text.split()) for block in blocks(DOCS / "faq.md") if block.language == "text"]

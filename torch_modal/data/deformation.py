@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
-from torch_modal.data.space import Reference, ShapeSpace
+from torch_modal.data.space import KeyframeReference, ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Bend, bend, bent_sides, frames, sides
@@ -100,7 +100,12 @@ class RandomModalDeformation(ShapeAugmentation):
         return torch.where(within[:, None, None], deformed, x)
 
     def _bounded(
-        self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, reference: Reference, reconstruction: Reconstruction
+        self,
+        x: Tensor,
+        amplitudes: Tensor,
+        space: ShapeSpace,
+        reference: KeyframeReference,
+        reconstruction: Reconstruction,
     ) -> tuple[Tensor, Tensor]:
         """The scale of each draw within the bound, ``(B,)``, and the shapes; unchanged shapes if none is found."""
         bound = (1 - _ROUNDING) * self.max_strain
@@ -121,7 +126,7 @@ class RandomModalDeformation(ShapeAugmentation):
         return scale.index_fill(0, rows, 0), shapes
 
 
-def deform(x: Tensor, amplitudes: Tensor, reference: Reference, reconstruction: Reconstruction) -> Tensor:
+def deform(x: Tensor, amplitudes: Tensor, reference: KeyframeReference, reconstruction: Reconstruction) -> Tensor:
     """Shapes bent along a key-frame's modes.
 
     The modes give rotations and strains of the key-frame's triangles. A shape of another pose gets the same
@@ -147,7 +152,7 @@ def deform(x: Tensor, amplitudes: Tensor, reference: Reference, reconstruction: 
     return best_fit(bent, x, weights).apply(bent)
 
 
-def linear_strain(amplitudes: Tensor, reference: Reference, edges: Tensor) -> Tensor:
+def linear_strain(amplitudes: Tensor, reference: KeyframeReference, edges: Tensor) -> Tensor:
     """Largest edge strain of the linear displacement: that of the bent shape to first order. *Shape:* ``(B,)``."""
     i, j = edges.unbind(1)
     displacement = _displacement(amplitudes, reference)
@@ -156,7 +161,7 @@ def linear_strain(amplitudes: Tensor, reference: Reference, edges: Tensor) -> Te
     return (along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)).abs().amax(1)
 
 
-def _displacement(amplitudes: Tensor, reference: Reference) -> Tensor:
+def _displacement(amplitudes: Tensor, reference: KeyframeReference) -> Tensor:
     """Of the vertices, components first. *Shape:* ``(B, n) -> (3, B, V)``."""
     modes = reference.modes
     return (amplitudes[:, : len(modes)] @ modes).unflatten(1, (3, -1)).movedim(1, 0)

@@ -41,7 +41,7 @@ _N_LAYERS, _N_TABLES, _N_REFERENCES = 32, 64, 16
 _N_PLACES = 4
 
 
-class Reference(NamedTuple):
+class KeyframeReference(NamedTuple):
     """A key-frame with scaled modes and triangle frames, for modal deformation."""
 
     shape: Tensor
@@ -194,10 +194,10 @@ class ShapeSpace:
 
         return self._reconstructions.get(torch.device(device), make)
 
-    def reference(self, index: int, like: Tensor) -> Reference:
+    def reference(self, index: int, like: Tensor) -> KeyframeReference:
         """A key-frame for modal deformation, in the dtype and on the device of another tensor."""
 
-        def make() -> Reference:
+        def make() -> KeyframeReference:
             basis = self.bases[index]
             x = basis.reference.double()
             values = basis.eigenvalues.double()
@@ -210,7 +210,7 @@ class ShapeSpace:
             expected = slopes.square().mean(1).sum().sqrt()
             modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
             own = frames(sides(x.mT[:, None], self.faces))
-            return Reference(x.to(like), modes.mT.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
+            return KeyframeReference(x.to(like), modes.mT.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
 
         return self._references.get((index, like.dtype, like.device), make)
 
