@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torch_modal.geometry.crossings import FloatArray, IntArray
+from torch_modal.arrays import FloatArray, IntArray
 
 
 def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:

@@ -6,10 +6,8 @@ NumPy only.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import FloatArray, IntArray
 
 SIZE = 100.0
 """The size of shapes as :func:`placed` gives them."""

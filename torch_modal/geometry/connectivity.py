@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import FloatArray, IntArray
 
 
 class Connectivity:
@@ -95,7 +95,7 @@ class Connectivity:
         return _shared(sides)
 
     @cached_property
-    def signs(self) -> NDArray[np.float64]:
+    def signs(self) -> FloatArray:
         """+1 for a side that runs along its edge from the smaller vertex to the larger, otherwise -1.
 
         *Shape:* ``(3F,)``.
@@ -182,7 +182,7 @@ def connected_pieces(pairs: IntArray, n: int) -> IntArray:
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tuple[IntArray, IntArray]:
+def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArray, IntArray]:
     """The cheapest connections that hold all together.
 
     Args:
@@ -209,25 +209,25 @@ def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tupl
     return np.where(parents == n, np.arange(n), parents).astype(np.int64), piece
 
 
-def half_cotangents(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
+def half_cotangents(vertices: FloatArray, mesh: Connectivity) -> FloatArray:
     """Half the cotangent of the angle across each side, finite on slivers too. *Shape:* ``(3F,)``."""
     tip = vertices[mesh.opposite]
     u, v = vertices[mesh.start] - tip, vertices[mesh.end] - tip
     twice_area = np.linalg.norm(np.cross(u, v), axis=1)
     least = 1e-12 * (u * u).sum(1) + np.finfo(np.float64).tiny
-    halves: NDArray[np.float64] = 0.5 * (u * v).sum(1) / np.maximum(twice_area, least)
+    halves: FloatArray = 0.5 * (u * v).sum(1) / np.maximum(twice_area, least)
     return halves
 
 
-def double_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
+def double_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Twice the area of each face. *Shape:* ``(F,)``."""
     a, b, c = (np.stack([x[corner] for x in vertices.T]) for corner in faces.T)
     (ux, uy, uz), (vx, vy, vz) = b - a, c - a
-    found: NDArray[np.float64] = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
+    found: FloatArray = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
     return found
 
 
-def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
+def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """A third of the area of the faces around each vertex. *Shape:* ``(V,)``."""
     summed = np.bincount(faces.reshape(-1), np.repeat(double_areas(vertices, faces) / 6, 3), minlength=len(vertices))
     return summed.astype(np.float64)  # of no face at all it is of integers

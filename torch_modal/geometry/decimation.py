@@ -9,12 +9,9 @@ from typing import NamedTuple
 
 import fast_simplification
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.canonical import ordered_faces, placed, vertex_order
-from torch_modal.geometry.connectivity import IntArray
-
-FloatArray = NDArray[np.float64]
 
 # It keeps its mesh in static memory, and has absolute thresholds.
 _NOT_THREAD_SAFE = threading.Lock()

@@ -6,13 +6,9 @@ Nothing here raises or warns: `keyframes/check.py` decides what a finding means.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 
 class Winding(NamedTuple):

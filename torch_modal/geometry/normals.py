@@ -2,17 +2,16 @@
 
 from typing import TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.vectors import cross, pick
 
-Array = TypeVar("Array", Tensor, NDArray[np.float64])
+Array = TypeVar("Array", Tensor, FloatArray)
 
 
-def vertex_normals(x: Array, faces: Tensor | NDArray[np.int64]) -> Array:
+def vertex_normals(x: Array, faces: Tensor | IntArray) -> Array:
     """Unit normals: means of those of the faces around each vertex, weighted by area.
 
     Args:

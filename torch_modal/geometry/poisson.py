@@ -4,11 +4,11 @@ from functools import cache, partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from torch_modal.geometry.connectivity import Connectivity, IntArray, half_cotangents, vertex_areas
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.connectivity import Connectivity, half_cotangents, vertex_areas
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import Sides, edge_means
@@ -146,7 +146,7 @@ class Reconstruction(nn.Module):
         """The vertices of all pieces but the largest, and those of the largest that they follow."""
         return [(getattr(self, f"piece_{i}"), getattr(self, f"anchors_{i}")) for i in range(self.n_loose)]
 
-    def _loose(self, shape: NDArray[np.float64], mesh: Connectivity) -> list[tuple[IntArray, IntArray]]:
+    def _loose(self, shape: FloatArray, mesh: Connectivity) -> list[tuple[IntArray, IntArray]]:
         labels, areas = mesh.vertex_pieces, self.areas.numpy()
         pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[mesh.used])]
         pieces.sort(key=lambda piece: -float(areas[piece].sum()))
@@ -177,12 +177,12 @@ def _equal(a: Tensor, b: Tensor) -> bool:
     return a is b or (a.dtype == b.dtype and a.device == b.device and torch.equal(a, b))
 
 
-def _side_weights(shape: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
+def _side_weights(shape: FloatArray, mesh: Connectivity) -> FloatArray:
     """Half the cotangent of the angle across each side, within bounds. *Shape:* ``(3F,)``."""
     return np.clip(half_cotangents(shape, mesh), *_WEIGHT_RANGE)
 
 
-def _nearest(points: NDArray[np.float64], piece: NDArray[np.float64]) -> IntArray:
+def _nearest(points: FloatArray, piece: FloatArray) -> IntArray:
     """Which points are nearest to a piece, a few of them."""
     count = min(_N_ANCHORS, len(points))
     distances, found = KDTree(points).query(piece, k=min(count, 4))

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.functions import applied
 
 try:
@@ -54,7 +54,7 @@ class SparseSolver:
         free: Unknowns to solve for; the others are zero. Default: all.
     """
 
-    def __init__(self, matrix: sparse.spmatrix, free: NDArray[np.int64] | None = None) -> None:
+    def __init__(self, matrix: sparse.spmatrix, free: IntArray | None = None) -> None:
         self.n = matrix.shape[0]
         self.free = np.arange(self.n) if free is None else free
         self._inner = matrix.tocsr() if free is None else matrix.tocsr()[free][:, free]
@@ -72,7 +72,7 @@ class SparseSolver:
         """
         return solve_by(lambda: self, right)
 
-    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(self, right: FloatArray) -> FloatArray:
         """The same for arrays. *Shape:* ``(V, m) -> (V, m)``."""
         return self.solved(torch.from_numpy(right)).numpy()
 
@@ -159,7 +159,7 @@ class _Solve(torch.autograd.Function):
         return _Solve.apply(solver, right.movedim(in_dims[1], 0)), 0
 
 
-def graph_laplacian(edges: NDArray[np.int64], weights: NDArray[np.float64], n: int) -> sparse.csr_matrix:
+def graph_laplacian(edges: IntArray, weights: FloatArray, n: int) -> sparse.csr_matrix:
     """``sum_e w_e (x_i - x_j)^2`` as a matrix. *Shape:* ``(E, 2), (E,) -> (n, n)``."""
     half = sparse.coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
     adjacency = (half + half.T).tocsr()

@@ -1,12 +1,9 @@
 """Whether two triangles pass through each other: a test with a margin, and an exact one. NumPy and libigl."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torch_modal import extras
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from torch_modal.arrays import BoolArray, FloatArray
 
 MARGIN = 1e-12
 """Of the cube of the largest length in a determinant: more than its rounding error."""

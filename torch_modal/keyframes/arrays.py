@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from torch_modal.arrays import IntArray
 from torch_modal.errors import MeshError
 
 
@@ -34,7 +34,7 @@ def as_positions(keyframes: Any) -> torch.Tensor:
     return positions
 
 
-def as_faces(faces: Any) -> NDArray[np.int64]:
+def as_faces(faces: Any) -> IntArray:
     """An int64 array of what came in."""
     tensor = _as_tensor("faces", faces)
     # An empty list becomes a float array; that there are no faces is said where shapes are checked.

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry import inspect
 from torch_modal.geometry.connectivity import Connectivity
@@ -76,9 +76,7 @@ def checked_surface(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple
     return positions, mesh, found
 
 
-def checked_arrays(
-    keyframes: Any, faces: Any, min_keyframes: int = 1
-) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.int64]]:
+def checked_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, FloatArray, IntArray]:
     """Positions as they came and in float64, and faces: of the right shapes, finite, and indices of vertices.
 
     Raises:
@@ -115,7 +113,7 @@ def require_solid(vertices: Any, faces: Any) -> None:
         )
 
 
-def _check_shapes(positions: torch.Tensor, faces: NDArray[np.int64], min_keyframes: int) -> None:
+def _check_shapes(positions: torch.Tensor, faces: IntArray, min_keyframes: int) -> None:
     shape = tuple(positions.shape)
     if len(shape) == 2 and shape[1] == 3:
         raise MeshError(f"keyframes have shape {shape}, which is one shape; pass keyframes[None] for (K, V, 3)")
@@ -136,7 +134,7 @@ def _check_shapes(positions: torch.Tensor, faces: NDArray[np.int64], min_keyfram
         raise MeshError(f"faces have shape {faces.shape}; (F, 3) is needed, one for all key-frames")
 
 
-def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+def _check_values(shapes: FloatArray, faces: IntArray) -> None:
     finite = np.isfinite(shapes)
     if not finite.all():
         bad = ~finite.all(axis=2)
@@ -155,7 +153,7 @@ def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None
         )
 
 
-def _repaired(faces: NDArray[np.int64], n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
+def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
     """Drop faces that are none or are there twice, wind the rest consistently; say whether that went."""
     kept = np.arange(len(faces))
     for flaw, what in (
@@ -190,11 +188,11 @@ def _repaired(faces: NDArray[np.int64], n_vertices: int, note: Callable[[str], N
 
 
 def _check_sizes(
-    shapes: NDArray[np.float64],
+    shapes: FloatArray,
     mesh: Connectivity,
     dtype: torch.dtype,
     note: Callable[[str], None],
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Refuse sizes that cannot work; return the shapes around the origin, each with a diagonal of 1."""
     surface = shapes[:, mesh.used]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -234,7 +232,7 @@ def _check_sizes(
 
 
 def _check_surface(
-    scaled: NDArray[np.float64],
+    scaled: FloatArray,
     mesh: Connectivity,
     orientable: bool,
     resolution: float,
@@ -291,7 +289,7 @@ def _check_surface(
                 )
 
 
-def _seam_hint(vertices: NDArray[np.float64], boundary: NDArray[np.int64]) -> str:
+def _seam_hint(vertices: FloatArray, boundary: IntArray) -> str:
     """Files for rendering split vertices at texture seams; such cuts look closed and are open."""
     ends = np.unique(boundary)
     _, copies = np.unique(vertices[ends], axis=0, return_counts=True)

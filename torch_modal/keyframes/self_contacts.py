@@ -6,10 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import Search
-from torch_modal.geometry.crossings import Crossings, FloatArray, require_contact
+from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 

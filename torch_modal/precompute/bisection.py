@@ -5,11 +5,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 
 UNITS = 256
 """Whole numbers along the edge of a cube, so that edges may be halved eight times."""

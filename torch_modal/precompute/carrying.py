@@ -6,13 +6,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes, tet_volumes
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 FIT_WEIGHT = 1e4
 """Weight of the surface against the shape of the tetrahedra; both are made free of units."""

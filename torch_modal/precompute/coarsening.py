@@ -5,14 +5,12 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from torch_modal.geometry.connectivity import IntArray, connected_pieces, double_areas
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.connectivity import connected_pieces, double_areas
 from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
-
-FloatArray = NDArray[np.float64]
 
 # A triangle of less area than this part of its longest edge squared is a needle; an equilateral one has 0.43. If there
 # is one, other numbers of faces are tried.

@@ -5,13 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray
 from torch_modal.precompute.lanczos import lowest_spans
 from torch_modal.precompute.mass import Mass
 from torch_modal.precompute.parallel import one_blas_thread
-
-FloatArray = NDArray[np.float64]
 
 N_RIGID = 6
 GUARD = 4

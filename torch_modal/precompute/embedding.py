@@ -4,15 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 N_NEIGHBOURS = 12
 RINGS = 2

@@ -27,8 +27,6 @@ from torch_modal.precompute.tetrahedra import (
 )
 from torch_modal.precompute.tetwild import TetrahedraSettings, TetWild
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 MESHERS: dict[str, Callable[[TetrahedraSettings], Mesher]] = {"lattice": Lattice, "tetwild": TetWild}
 """By their names, made of how fine the tetrahedra are wanted."""
 

@@ -4,15 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.precompute.embedding import N_NEIGHBOURS, Neighbours, fit_weights
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra, is_small, kept_tetrahedra, loose_pieces
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 DEFORMS = 1e-6
 """Part of a motion that is not rigid on each piece of a surface, from which on it deforms that."""

@@ -5,14 +5,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.mass import Mass
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Pairs = tuple[FloatArray, FloatArray]
 """Eigenvalues ``(k,)`` and eigenvectors ``(n, k)``."""
 

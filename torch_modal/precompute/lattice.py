@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import halved
 from torch_modal.precompute.parallel import closest_in
@@ -28,10 +28,6 @@ from torch_modal.precompute.tetrahedra import (
     without_debris,
 )
 from torch_modal.precompute.tetwild import EDGE_RANGE, TetrahedraSettings
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 VERSION = "whole"
 """Tetrahedra that other versions of the package have stored are not those of this one."""

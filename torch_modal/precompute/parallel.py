@@ -8,9 +8,10 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from threadpoolctl import OpenBLASController, ThreadpoolController
+
+from torch_modal.arrays import FloatArray, IntArray
 
 Result = TypeVar("Result")
 
@@ -103,9 +104,7 @@ def one_blas_thread() -> Iterator[None]:
                 _Inside.limits.__exit__(None, None, None)
 
 
-def closest_in(
-    tree: cKDTree, points: NDArray[np.float64], k: int = 1, within: float = np.inf
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def closest_in(tree: cKDTree, points: FloatArray, k: int = 1, within: float = np.inf) -> tuple[FloatArray, IntArray]:
     """Distances and indices of what is nearest in a tree, by all processors where there are many points.
 
     *Shape:* ``(n, 3) -> (n,), (n,)``, or ``(n, k), (n, k)``. What is not within the distance has the index ``tree.n``.

@@ -3,16 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.sampling import SurfaceSamples, sampled
 from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 NEAR = 0.03
 """Gaps up to this width count as near, in bounding-box diagonals."""

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.io.cache import Cache
 from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, VolumeModes, lowest_modes
@@ -18,8 +19,6 @@ from torch_modal.precompute.parallel import Budget, run_all
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, loose_pieces
-
-FloatArray = NDArray[np.float64]
 
 VERTICES_AT_ONCE = 30_000
 """Tetrahedral vertices of all eigenproblems that are solved at the same time: about 2 GiB."""

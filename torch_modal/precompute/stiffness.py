@@ -6,9 +6,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
 
-FloatArray = NDArray[np.float64]
 HessianForm = Literal["edge", "element", "vertex"]
 HESSIAN_FORMS: tuple[HessianForm, ...] = ("edge", "element", "vertex")
 
@@ -153,7 +153,7 @@ def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     return sp.csc_matrix((k + k.T) / 2)
 
 
-def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[IntArray, IntArray, FloatArray]:
     """Every edge in both directions with its clamped cotangent weight ``c_ij = -Σ_t vol_t g_i · g_j``."""
     n = len(tetrahedra.vertices)
     g = hat_gradients(tetrahedra)

@@ -4,13 +4,10 @@ import threading
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.precompute.surface import CanonicalSurface
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 SMALL_VOLUME = 0.01
 """Of a small piece, as a fraction of the whole, and"""
@@ -113,7 +110,7 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     return kept_tetrahedra(tetrahedra, ~debris[piece])
 
 
-def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> NDArray[np.bool_]:
+def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> BoolArray:
     """Which pieces have little volume and are short; never the largest.
 
     Args:
@@ -154,7 +151,7 @@ def pieces_by_sides(tets: IntArray) -> IntArray:
     return connected_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
 
 
-def kept_tetrahedra(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:
+def kept_tetrahedra(tetrahedra: Tetrahedra, kept: BoolArray) -> Tetrahedra:
     """Some of the tetrahedra, with the vertices that they use."""
     used, compact = np.unique(tetrahedra.tets[kept], return_inverse=True)
     inside = None if tetrahedra.inside is None else tetrahedra.inside[kept]

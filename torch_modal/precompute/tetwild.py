@@ -14,18 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.io.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface, outward
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
 EDGES_PER_THICKNESS = 0.65

@@ -4,9 +4,9 @@ from functools import cached_property
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.registration.maps import FINE_FUNCTIONS, Map, nearest_rows, rate, zoom_out
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import FloatArray, IntArray
 
 N_SAMPLES = 40
 _KEPT = 0.12  # distances that differ by less, of a surface of area one, agree

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from torch_modal.arrays import FloatArray
 from torch_modal.geometry.connectivity import half_cotangents
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
-from torch_modal.registration.surface import FloatArray, MeshSurface
+from torch_modal.registration.surface import MeshSurface
 
 # Cotangent weights of obtuse triangles are negative, those of slivers huge.
 _WEIGHTS = (0.05, 10.0)

@@ -7,9 +7,10 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.registration.elastic import ElasticSurface, PointTargets
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import BoolArray, Closest, FloatArray, IntArray, MeshSurface
+from torch_modal.registration.surface import Closest, MeshSurface
 
 WORKING_DIAGONAL = 100.0
 """Of the target's bounding box: reaches below are in percent of it."""

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.registration.consistency import farthest_points
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import FloatArray, IntArray, referenced
+from torch_modal.registration.surface import referenced
 
 N_SUGGESTED = 14
 # A tip is a vertex that is farther from the rest, in the mean, than all within this distance; of a surface of area one.

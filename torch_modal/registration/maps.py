@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import FloatArray, IntArray
 
 COARSE_FUNCTIONS = 20
 FINE_FUNCTIONS = 50

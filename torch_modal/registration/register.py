@@ -9,6 +9,7 @@ import torch
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
@@ -29,7 +30,7 @@ from torch_modal.registration.maps import (
 )
 from torch_modal.registration.report import Quality, Registration, judge, measure
 from torch_modal.registration.spectrum import SpectralShape, main_part
-from torch_modal.registration.surface import FloatArray, IntArray, MeshSurface, outward, referenced
+from torch_modal.registration.surface import MeshSurface, outward, referenced
 
 VERSION = 4
 """Part of the key of kept results: raise it when the algorithm changes."""

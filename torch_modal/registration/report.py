@@ -7,10 +7,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
 from torch_modal.registration.fit import on_open_edge
-from torch_modal.registration.surface import BoolArray, FloatArray, MeshSurface, referenced
+from torch_modal.registration.surface import MeshSurface, referenced
 
 TRUSTED = 0.5
 """Confidence below which a result is doubtful."""

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.registration.landmarks import read_landmarks, vertices_named
 from torch_modal.registration.register import register
-from torch_modal.registration.surface import FloatArray, IntArray
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "

@@ -8,13 +8,11 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry import inspect
 from torch_modal.geometry.decimation import decimate
 from torch_modal.registration.libraries import require
 from torch_modal.registration.surface import (
-    BoolArray,
-    FloatArray,
-    IntArray,
     MeshSurface,
     largest_piece,
     referenced,
