@@ -14,7 +14,7 @@ import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
-from solids import box, surface
+from solids import box, lumped_mass, surface
 
 from torch_modal.io.cache import Cache
 from torch_modal.precompute import filling, tetwild
@@ -24,7 +24,7 @@ from torch_modal.precompute.filling import Filler
 from torch_modal.precompute.lattice import Lattice, is_too_fine, lattice
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.proximity import clearances
-from torch_modal.precompute.stiffness import arap_hessian, lumped_mass, mass_matrix
+from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
@@ -138,10 +138,9 @@ def test_thin_plates_are_filled(thickness: float) -> None:
 def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     """What fTetWild could still fill, the lattice fills with as many cubes as it may have."""
     ball = trimesh.creation.icosphere(subdivisions=2)
-    settings = TetrahedraSettings(edge_length_fac=0.012)
     whole = CanonicalSurface.of(ball.vertices, ball.faces)
     assert is_too_fine(whole, lattice_module.CUBE * 0.012)
-    filled = Filler(Lattice(settings), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    filled = Filler(Lattice(0.012), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
     assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
 
 

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import torch
 from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
-from solids import box, surface, together
+from solids import box, lumped_mass, surface, together
 
 from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
@@ -21,7 +21,7 @@ from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import ENOUGH, EXACT, ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.parallel import StoppedError
-from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, lumped_mass, mass_matrix
+from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
 
 Mesh = tuple[np.ndarray, np.ndarray]

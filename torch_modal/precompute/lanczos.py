@@ -23,10 +23,6 @@ FLOOR = 1e-14
 """Residual of the inverted problem, relative to its eigenvalue, where nothing is left to gain."""
 
 
-class NoConvergenceError(RuntimeError):
-    """The iteration has used up its steps."""
-
-
 def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, tolerance: float) -> Iterator[FloatArray]:
     """M-orthonormal bases of about the ``n_pairs`` lowest eigenvectors, each nearer to them than the one before.
 
@@ -48,7 +44,7 @@ def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, toler
         *Shape:* ``(3N, n_pairs)``.
 
     Raises:
-        NoConvergenceError: Lanczos did not find them.
+        RuntimeError: Lanczos has not converged.
     """
     graph = _vertex_graph(k)
     n_pieces, piece = connected_components(graph, directed=False)
@@ -166,9 +162,7 @@ def _block_lanczos(
             return
         check_at = stop + BLOCK
     if worst > tolerance:
-        raise NoConvergenceError(
-            f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns"
-        )
+        raise RuntimeError(f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns")
 
 
 def _vertex_graph(k: sp.csc_matrix) -> sp.csc_matrix:

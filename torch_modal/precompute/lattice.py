@@ -5,7 +5,7 @@ Deterministic, and never at a loss.
 
 import itertools
 import threading
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,12 +27,13 @@ from torch_modal.precompute.tetrahedra import (
     tet_volumes,
     without_debris,
 )
-from torch_modal.precompute.tetwild import EDGE_RANGE, TetrahedraSettings
 
 VERSION = "whole"
 """Tetrahedra that other versions of the package have stored are not those of this one."""
+EDGE = 0.04
+"""Default of the target edge length, in bounding-box diagonals."""
 CUBE = 0.75
-"""Edge of the lattice's cubes at the surface, over the largest edge of fTetWild."""
+"""Edge length of the cubes at the surface, relative to the target edge length."""
 COARSER = 1.1
 """Factor of that edge until there are not too many cubes."""
 TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
@@ -84,19 +85,21 @@ SPREAD = np.concatenate([np.eye(4) * 2 / 3 + 1 / 12, np.full((1, 4), 0.25)])
 class Lattice:
     """The mesher ``"lattice"``: :func:`lattice`, in another direction where that falls into pieces.
 
-    A thin wall that lies along the cubes' sides is in tetrahedra that hardly share any. Of the settings it takes
-    ``edge_length_fac``.
+    Tetrahedra around a thin wall along the faces of the cubes share hardly any faces with each other.
+
+    Attributes:
+        edge_length_fac: Target edge length as a fraction of the bounding-box diagonal; None takes the default.
     """
 
-    settings: TetrahedraSettings = field(default_factory=TetrahedraSettings)
+    edge_length_fac: float | None = None
 
     def key(self) -> dict[str, Any]:
-        """Settings, and a version."""
-        return {**asdict(self.settings), "lattice": VERSION, "mesher": "lattice"}
+        """The target edge length and the version."""
+        return {**asdict(self), "lattice": VERSION, "mesher": "lattice"}
 
     def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
         """Tetrahedra that fill the surface."""
-        cube = CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
+        cube = CUBE * (self.edge_length_fac or EDGE)
         while is_too_fine(surface, cube):
             cube *= COARSER
         found = lattice(surface, cube)

@@ -55,13 +55,6 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_m
     raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
 
 
-def lumped_mass(tetrahedra: Tetrahedra) -> FloatArray:
-    """Mass of each vertex: a quarter of the solid volumes around it, at a density of 1. *Shape:* ``(N,)``."""
-    volumes = solid_volumes(tetrahedra)
-    quarters = np.repeat(volumes / 4, 4)
-    return np.bincount(tetrahedra.tets.reshape(-1), quarters, len(tetrahedra.vertices)).astype(np.float64)
-
-
 def mass_matrix(tetrahedra: Tetrahedra) -> sp.csr_matrix:
     """Mass of linear displacements at a density of 1, half lumped: entries for vertices. *Shape:* ``(N, N)``.
 

@@ -119,7 +119,7 @@ def tetrahedralize(
     """Fill a closed surface with tetrahedra.
 
     fTetWild makes a new surface mesh within its tolerance, so the vertices of the surface are not among those
-    of the result: embed them with :func:`~torch_modal.precompute.embedding.embed_surface`. It is not
+    of the result: embed them with :func:`~torch_modal.precompute.embedding.fit_weights`. It is not
     deterministic either: two calls give two meshes. It runs in a child process, so a crash or a hang of it
     becomes an exception here, and threads and data-loader workers may call this function.
 

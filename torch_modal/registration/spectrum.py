@@ -8,10 +8,10 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
 
+from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry import inspect
 from torch_modal.geometry.decimation import decimate
-from torch_modal.registration.libraries import require
 from torch_modal.registration.surface import (
     MeshSurface,
     largest_piece,
@@ -54,7 +54,9 @@ class SpectralShape:
 
     @cached_property
     def _spectrum(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        laplacian, mass = require("robust_laplacian").mesh_laplacian(self.coarse.vertices, self.coarse.faces)
+        laplacian, mass = extras.require("robust_laplacian", "register", "registration").mesh_laplacian(
+            self.coarse.vertices, self.coarse.faces
+        )
         n = len(self)
         count = min(N_FUNCTIONS, n - 2)
         # Shifted by a little: the constant function makes the matrix singular.
@@ -87,7 +89,9 @@ class SpectralShape:
 
     @cached_property
     def _heat_solver(self) -> Any:
-        return require("potpourri3d").MeshHeatMethodDistanceSolver(self.coarse.vertices, self.coarse.faces)
+        return extras.require("potpourri3d", "register", "registration").MeshHeatMethodDistanceSolver(
+            self.coarse.vertices, self.coarse.faces
+        )
 
     def geodesics_from(self, sources: IntArray) -> FloatArray:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""

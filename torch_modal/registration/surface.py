@@ -7,11 +7,11 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.normals import vertex_normals
-from torch_modal.registration.libraries import require
 
 LEAN = 0.01
 """What a normal counts for beside a position, in diagonals: sheets closer than twice that are told apart."""
@@ -97,7 +97,7 @@ class MeshSurface:
 
     @cached_property
     def _tree(self) -> Any:
-        tree = require("igl").AABB()
+        tree = extras.require("igl", "register", "registration").AABB()
         tree.init(self.vertices, self.faces)
         return tree
 
