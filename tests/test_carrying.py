@@ -8,10 +8,10 @@ from solids import box, embed_surface, surface
 
 from torch_modal.io.cache import Cache
 from torch_modal.precompute import filling, modes, solving, tetwild
-from torch_modal.precompute.carrying import Carried, Carrier, vertex_rotations, nearest_rotations
+from torch_modal.precompute.carrying import Carried, Carrier, nearest_rotations, vertex_rotations
 from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
-from torch_modal.precompute.proximity import clearances, separation, self_proximity
+from torch_modal.precompute.proximity import clearances, self_proximity, separation
 from torch_modal.precompute.solving import Solved
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface

@@ -29,7 +29,7 @@ from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
-    pieces_by_sides,
+    face_connected_pieces,
     solid_volumes,
     tet_volumes,
 )
@@ -128,7 +128,7 @@ def test_thin_plates_are_filled(thickness: float) -> None:
     vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
     whole = CanonicalSurface.of(vertices, faces)
     filled = Filler(Lattice(), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
-    assert pieces_by_sides(filled.tets).max() == 0
+    assert face_connected_pieces(filled.tets).max() == 0
     assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
     basis = extract_modes(vertices, faces, 6, cache=False)
     across = (basis.modes[0, :, 2] ** 2).sum() / (basis.modes[0] ** 2).sum()
@@ -154,7 +154,7 @@ def test_thin_limbs_have_small_tetrahedra(name: str) -> None:
     """In a number that is bounded, in one piece, and with the volume that the body has."""
     whole = of_body(name)
     filled = lattice(whole, 0.03)
-    assert pieces_by_sides(filled.tets).max() == 0
+    assert face_connected_pieces(filled.tets).max() == 0
     assert len(filled.tets) < 1.2 * lattice_module.MOST_TETRAHEDRA
     exact = trimesh.Trimesh(whole.points, whole.faces)
     assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=0.15)

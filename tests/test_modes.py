@@ -204,7 +204,7 @@ def test_pieces_add_zero_modes() -> None:
 
 
 def test_more_modes_than_there_are() -> None:
-    with pytest.raises(ValueError, match="50 modes asked for, but 8 tetrahedral vertices have 18 elastic modes"):
+    with pytest.raises(ValueError, match="50 modes requested, but 8 tetrahedral vertices have 18 elastic modes"):
         solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 50)
     assert solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 18).modes.shape == (24, 18)
 

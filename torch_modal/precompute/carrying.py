@@ -130,7 +130,8 @@ class Carrier:
 def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
     """Rotation of the surface around each vertex from one pose to another.
 
-    The rotation nearest to the area-weighted mean of the rotations of the incident faces. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
+    The rotation nearest to the area-weighted mean of the rotations of the incident faces.
+    *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
     """
     frames = []
     for x in (before, after):
@@ -154,7 +155,7 @@ def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
     """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``.
 
     The orthogonal factor of the polar decomposition by Newton's iteration ``X <- (s X + X^-T / s) / 2``, scaled by
-    ``s = det(X)^(-1/3)`` (Higham 1986), in a quarter of the time of a singular value decomposition, which is used for
+    ``s = det(X)^(-1/3)`` (Higham 1986), in a quarter of the time of a singular value decomposition. The latter serves
     mirrored and singular matrices.
     """
     x = np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Edge-collapse coarsening shared by all key-frames, with cluster averages as restriction (section 3.2 of the paper)."""
+"""Edge-collapse coarsening shared by all key-frames, with cluster averages (section 3.2 of the paper)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

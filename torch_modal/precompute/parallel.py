@@ -105,7 +105,8 @@ def one_blas_thread() -> Iterator[None]:
 def closest_in(tree: cKDTree, points: FloatArray, k: int = 1, within: float = np.inf) -> tuple[FloatArray, IntArray]:
     """Distances and indices of the nearest points of a tree, in parallel for many queries.
 
-    *Shape:* ``(n, 3) -> (n,), (n,)``, or ``(n, k), (n, k)``. Queries without a neighbour within the distance have the index ``tree.n``.
+    *Shape:* ``(n, 3) -> (n,), (n,)``, or ``(n, k), (n, k)``.
+    Queries without a neighbour within the distance have the index ``tree.n``.
     """
     n_threads = n_cpus() if len(points) >= MANY else 1
     distance, index = tree.query(points, k=k, distance_upper_bound=within, workers=n_threads)

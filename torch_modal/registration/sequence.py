@@ -1,4 +1,4 @@
-"""Meshes of a sequence, each registered from its neighbour."""
+"""Registration of a sequence of meshes, each from its predecessor."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -27,13 +27,13 @@ def register_files(
     report: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> Keyframes:
-    """Read meshes and lay the first one's connectivity onto the others; see `load_keyframes`.
+    """Read meshes and register the first one's connectivity to the others; see `load_keyframes`.
 
     Args:
         paths: A file for each mesh.
-        landmarks: As `landmark_table` takes them.
-        report: Takes a line about each registration.
-        **options: What `register` takes besides.
+        landmarks: See `landmark_table`.
+        report: Called with a line about each registration.
+        **options: Further arguments of `register`.
 
     Raises:
         MeshError: A file cannot be read, landmarks do not fit the meshes, or a registration is doubtful.
@@ -67,7 +67,7 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray |
         shapes: Vertices of the K meshes.
 
     Raises:
-        MeshError: They do not fit the meshes.
+        MeshError: Landmarks do not match the meshes.
     """
     if landmarks is None:
         return None
@@ -85,7 +85,7 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray |
 
 
 def is_same_mesh(vertices: FloatArray, faces: IntArray, others: FloatArray, other_faces: IntArray) -> bool:
-    """Whether two meshes have one connectivity already."""
+    """Whether two meshes have the same connectivity."""
     try:
         require_same_mesh("", vertices, faces, "", others, other_faces)
     except MeshError:
