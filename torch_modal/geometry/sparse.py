@@ -46,8 +46,8 @@ def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> Super
 class SparseSolver:
     """The inverse of a sparse symmetric positive definite matrix, in float64.
 
-    Solves run on the device of the right-hand side, or on the CPU for GPUs other than the first, which ``cholespy`` does
-    not support. Backward is another solve. The matrix is factorised at the first use, and again after pickling.
+    Solves run on the device of the right-hand side, or on the CPU for GPUs other than the first, which ``cholespy``
+    does not support. Backward is another solve. The matrix is factorised at the first use, and again after pickling.
 
     Args:
         matrix: *Shape:* ``(V, V)``.
