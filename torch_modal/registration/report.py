@@ -227,7 +227,7 @@ def judge(
     )
     distance = max(quality.to_target.mean, quality.from_target.mean)
     signs = [
-        (_ramp(distance, 1.0, 0.3), f"the surfaces are {distance:.2f} % of the diagonal apart in the mean"),
+        (_ramp(distance, 1.0, 0.3), f"the mean distance of the surfaces is {distance:.2f} % of the diagonal"),
         (_ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
         (
             _ramp(quality.unsupported_area, 0.05, 0.02),
