@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from solids import box, surface
+from solids import box, lumped_mass, surface
 from threads import limit_threads
 
 from torch_modal.keyframes.check import Keyframes
@@ -22,7 +22,7 @@ from torch_modal.nn.settings import Objective, Solver
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases
-from torch_modal.precompute.stiffness import arap_hessian, lumped_mass
+from torch_modal.precompute.stiffness import arap_hessian
 from torch_modal.precompute.tetrahedra import Tetrahedra
 from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
 from torch_modal.registration.load import load_keyframes

@@ -3,7 +3,10 @@
 import itertools
 
 import numpy as np
+import scipy.sparse as sp
 
+from torch_modal.precompute.embedding import find_neighbours, fit_weights
+from torch_modal.precompute.stiffness import mass_matrix
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
 
@@ -32,6 +35,16 @@ def together(*solids: Tetrahedra) -> Tetrahedra:
         np.concatenate([solid.vertices for solid in solids]),
         np.concatenate([solid.tets + start for solid, start in zip(solids, starts, strict=False)]),
     )
+
+
+def embed_surface(points: np.ndarray, solid: Tetrahedra, normals: np.ndarray | None = None) -> sp.csr_matrix:
+    """Weights of the surface in the pose in which its neighbours are found. *Shape:* ``(V, N)``."""
+    return fit_weights(points, solid.vertices, find_neighbours(points, solid, normals))
+
+
+def lumped_mass(solid: Tetrahedra) -> np.ndarray:
+    """Row sums of the mass matrix. *Shape:* ``(N,)``."""
+    return np.asarray(mass_matrix(solid).sum(axis=1)).reshape(-1)
 
 
 def surface(solid: Tetrahedra) -> np.ndarray:

@@ -7,9 +7,9 @@ import pytest
 import scipy.linalg
 import scipy.sparse as sp
 import torch
-from solids import box, together
+from solids import box, lumped_mass, together
 
-from torch_modal.precompute.stiffness import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, lumped_mass, mass_matrix
+from torch_modal.precompute.stiffness import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, mass_matrix
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
 
 

@@ -54,7 +54,7 @@ def test_truncate(basis: ModalBasis) -> None:
     assert torch.equal(first.modes, basis.modes[:2])
     assert torch.equal(first.eigenvalues, basis.eigenvalues[:2])
     assert first.reference is basis.reference or torch.equal(first.reference, basis.reference)
-    with pytest.raises(ValueError, match="6 modes asked of a basis of 5"):
+    with pytest.raises(ValueError, match="6 modes requested from a basis of 5"):
         basis.truncate(6)
 
 

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 import torch
 from bodies import bend
-from solids import box, surface
+from solids import box, embed_surface, surface
 
 from torch_modal.io.cache import Cache
 from torch_modal.precompute import filling, modes, solving, tetwild
-from torch_modal.precompute.carrying import Carried, Carrier, local_rotations, nearest_rotations
+from torch_modal.precompute.carrying import Carried, Carrier, nearest_rotations, vertex_rotations
 from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
-from torch_modal.precompute.embedding import embed_surface
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
-from torch_modal.precompute.proximity import clearances, parting, self_proximity
+from torch_modal.precompute.proximity import clearances, self_proximity, separation
 from torch_modal.precompute.solving import Solved
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
@@ -88,7 +87,7 @@ def test_borders_of_the_checks(measures: tuple[float, float, float], good: bool)
 
 
 def test_local_rotations_of_a_turn() -> None:
-    turns = local_rotations(POINTS, POINTS @ TURN.T * 2.0 + 1.0, COMPACT)
+    turns = vertex_rotations(POINTS, POINTS @ TURN.T * 2.0 + 1.0, COMPACT)
     np.testing.assert_allclose(turns, np.broadcast_to(TURN, turns.shape), atol=1e-12)
 
 
@@ -107,7 +106,7 @@ def test_nearest_rotations_against_singular_values() -> None:
 
 def test_a_degenerate_face_does_no_harm() -> None:
     faces = np.concatenate([COMPACT, [[COMPACT[0, 0], COMPACT[0, 1], COMPACT[0, 1]]]])
-    assert np.isfinite(local_rotations(POINTS, POINTS @ TURN.T, faces)).all()
+    assert np.isfinite(vertex_rotations(POINTS, POINTS @ TURN.T, faces)).all()
 
 
 def test_clearances_of_a_plate_and_of_a_gap() -> None:
@@ -154,11 +153,11 @@ def test_parting_is_of_what_touched_and_came_apart() -> None:
     # Both ends, of 1 by 1 and of 66 in all, part by most of the length of 16, and half of that is counted for each.
     apart = np.linalg.norm(opened.points[0] - opened.points[-1]) * closed.scale / opened.scale
     expected = apart / 2 * np.sqrt(2 / 66) / 100
-    assert parting(closed, opened) == pytest.approx(expected, rel=0.4)
-    assert parting(closed, ajar) < 0.3 * parting(closed, opened)
-    assert parting(opened, closed) < 0.001
+    assert separation(closed, opened) == pytest.approx(expected, rel=0.4)
+    assert separation(closed, ajar) < 0.3 * separation(closed, opened)
+    assert separation(opened, closed) < 0.001
     turned = CanonicalSurface.of(horseshoe(1.995 * np.pi) @ TURN.T * 7.0 + 3.0, faces)
-    assert parting(closed, turned) < 1e-9
+    assert separation(closed, turned) < 1e-9
 
 
 # --------------------------------------------------------------------------------------- a set of key-frames

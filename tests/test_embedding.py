@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from solids import box, surface, together
+from solids import box, embed_surface, surface, together
 
-from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
+from torch_modal.precompute.embedding import closest_tetrahedra
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
 

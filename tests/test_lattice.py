@@ -14,7 +14,7 @@ import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
-from solids import box, surface
+from solids import box, lumped_mass, surface
 
 from torch_modal.io.cache import Cache
 from torch_modal.precompute import filling, tetwild
@@ -24,12 +24,12 @@ from torch_modal.precompute.filling import Filler
 from torch_modal.precompute.lattice import Lattice, is_too_fine, lattice
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.proximity import clearances
-from torch_modal.precompute.stiffness import arap_hessian, lumped_mass, mass_matrix
+from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
-    pieces_by_sides,
+    face_connected_pieces,
     solid_volumes,
     tet_volumes,
 )
@@ -128,7 +128,7 @@ def test_thin_plates_are_filled(thickness: float) -> None:
     vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
     whole = CanonicalSurface.of(vertices, faces)
     filled = Filler(Lattice(), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
-    assert pieces_by_sides(filled.tets).max() == 0
+    assert face_connected_pieces(filled.tets).max() == 0
     assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
     basis = extract_modes(vertices, faces, 6, cache=False)
     across = (basis.modes[0, :, 2] ** 2).sum() / (basis.modes[0] ** 2).sum()
@@ -138,10 +138,9 @@ def test_thin_plates_are_filled(thickness: float) -> None:
 def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     """What fTetWild could still fill, the lattice fills with as many cubes as it may have."""
     ball = trimesh.creation.icosphere(subdivisions=2)
-    settings = TetrahedraSettings(edge_length_fac=0.012)
     whole = CanonicalSurface.of(ball.vertices, ball.faces)
     assert is_too_fine(whole, lattice_module.CUBE * 0.012)
-    filled = Filler(Lattice(settings), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    filled = Filler(Lattice(0.012), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
     assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
 
 
@@ -155,7 +154,7 @@ def test_thin_limbs_have_small_tetrahedra(name: str) -> None:
     """In a number that is bounded, in one piece, and with the volume that the body has."""
     whole = of_body(name)
     filled = lattice(whole, 0.03)
-    assert pieces_by_sides(filled.tets).max() == 0
+    assert face_connected_pieces(filled.tets).max() == 0
     assert len(filled.tets) < 1.2 * lattice_module.MOST_TETRAHEDRA
     exact = trimesh.Trimesh(whole.points, whole.faces)
     assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=0.15)

@@ -124,17 +124,6 @@ def test_boundaries() -> None:
     assert {tuple(sorted(e)) for e in around_fins} == {tuple(e) for e in fins.boundary_edges.tolist()}
 
 
-def test_edge_index() -> None:
-    mesh = Connectivity(TETRAHEDRON + 5)  # vertices 0 to 4 belong to no face
-    order = np.random.default_rng(0).permutation(len(mesh.edges))
-    i, j = mesh.edges[order].T
-    assert mesh.edge_index(i, j).tolist() == order.tolist()
-    assert mesh.edge_index(j, i).tolist() == order.tolist()
-    for missing in ([5, 0], [7, 7], [8, 100]):
-        with pytest.raises(ValueError, match=f"between the vertices {missing[0]} and {missing[1]}"):
-            mesh.edge_index(np.array([5, missing[0]]), np.array([6, missing[1]]))
-
-
 def test_pieces() -> None:
     mesh = Connectivity(np.concatenate([TETRAHEDRON + 1, SQUARE + 6]), n_vertices=11)
     assert mesh.vertex_pieces.tolist() == [0, 1, 1, 1, 1, 2, 3, 3, 3, 3, 4]

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import torch
 from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
-from solids import box, surface, together
+from solids import box, lumped_mass, surface, together
 
 from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
@@ -21,7 +21,7 @@ from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import ENOUGH, EXACT, ModalAnalysisError, VolumeModes, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.parallel import StoppedError
-from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, lumped_mass, mass_matrix
+from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -204,7 +204,7 @@ def test_pieces_add_zero_modes() -> None:
 
 
 def test_more_modes_than_there_are() -> None:
-    with pytest.raises(ValueError, match="50 modes asked for, but 8 tetrahedral vertices have 18 elastic modes"):
+    with pytest.raises(ValueError, match="50 modes requested, but 8 tetrahedral vertices have 18 elastic modes"):
         solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 50)
     assert solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 18).modes.shape == (24, 18)
 

@@ -10,11 +10,11 @@ import trimesh
 import torch_modal as tm
 from torch_modal import extras
 from torch_modal.cli import main as cli
+from torch_modal.extras import require
 from torch_modal.io.frames import save_mesh
 from torch_modal.registration import register as register_module
 from torch_modal.registration.elastic import ElasticSurface, PointTargets
 from torch_modal.registration.landmarks import read_landmarks
-from torch_modal.registration.libraries import require
 from torch_modal.registration.maps import FINE_FUNCTIONS, nearest_rows, rate, zoom_out
 from torch_modal.registration.register import register
 from torch_modal.registration.report import measure
@@ -266,7 +266,7 @@ def test_bad_input_is_refused(pair: tuple[Mesh, Mesh, np.ndarray], monkeypatch: 
         register(np.full_like(rest, np.nan), faces, *target, progress=False)
     monkeypatch.setattr(extras.importlib, "import_module", lambda name: (_ for _ in ()).throw(ImportError(name)))
     with pytest.raises(ImportError, match=r"torch_modal\[register\]"):
-        require("igl")
+        require("igl", "register", "registration")
 
 
 # ------------------------------------------------------------------------------------------------------------- parts

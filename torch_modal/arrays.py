@@ -12,4 +12,5 @@ if TYPE_CHECKING:  # at run time torch stays out: a reader of PLY files does not
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 Array: TypeAlias = "torch.Tensor | NDArray[Any]"

@@ -1,12 +1,12 @@
-"""What the border raises and warns with."""
+"""Exceptions and warnings about input."""
 
 
 class MeshWarning(UserWarning):
-    """Input that works, but not in every respect as its owner may expect."""
+    """Usable input with possibly unexpected effects."""
 
 
 class MissingPackageError(ImportError):
-    """An optional package is not installed; the message says which, and how to get it."""
+    """An optional package is not installed; the message says how to install it."""
 
 
 class MeshError(ValueError):

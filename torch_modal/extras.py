@@ -1,4 +1,4 @@
-"""Packages that are imported when they are needed: some of them belong to an extra of this one."""
+"""Lazy imports of optional packages."""
 
 import gc
 import importlib
@@ -12,10 +12,10 @@ from torch_modal.errors import MissingPackageError
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """No search for garbage inside: imports leave next to none, and a search goes through all that torch is made of.
+    """Suspend garbage collection during an import, which creates hardly any garbage.
 
-    That is a tenth of a second for each, and large packages bring it about once or twice. What they have made counts as
-    old afterwards, or the next searches, of what is young, would go through all of it.
+    A collection traverses all objects of torch in a tenth of a second, once or twice per large import. New objects move
+    to the oldest generation, so that later collections of young objects skip them.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -23,7 +23,7 @@ def uncollected() -> Iterator[None]:
         yield
     finally:
         if was_on:
-            # Python 3.12 starts with a few hundred frozen. What others froze, which is all that they had, stays so.
+            # Python 3.12 starts with a few hundred frozen objects. More were frozen by others and stay frozen.
             if gc.get_freeze_count() < 1000:
                 gc.freeze()
                 gc.unfreeze()
@@ -34,12 +34,12 @@ def require(module: str, extra: str, what: str) -> Any:
     """Import an optional package.
 
     Args:
-        module: Its name.
-        extra: What brings it: ``pip install 'torch_modal[extra]'``.
-        what: What needs it, as the message begins.
+        module: Name of the module.
+        extra: The extra that installs it: ``pip install 'torch_modal[extra]'``.
+        what: The feature that needs it, for the message.
 
     Raises:
-        MissingPackageError: It is not installed; the message says how to install it.
+        MissingPackageError: The package is not installed; the message says how to install it.
     """
     try:
         return importlib.import_module(module)
@@ -48,10 +48,10 @@ def require(module: str, extra: str, what: str) -> Any:
 
 
 def require_installed(modules: Collection[str], extra: str, what: str) -> None:
-    """Refuse work that needs optional packages before any of it is done; nothing is imported.
+    """Raise before the work begins if optional packages are missing, without importing them.
 
     Raises:
-        MissingPackageError: It names those that are not installed.
+        MissingPackageError: Packages are not installed.
     """
     missing = [name for name in modules if importlib.util.find_spec(name) is None]
     if missing:

@@ -1,4 +1,4 @@
-"""What long work says while it goes on: a bar on a terminal, lines of the log elsewhere, or a callback."""
+"""Progress of long computations: a bar on a terminal, log lines elsewhere, or a callback."""
 
 import logging
 import sys
@@ -14,19 +14,19 @@ logger = logging.getLogger("torch_modal")
 
 Progress = bool | None | Callable[[int, int, str], object]
 """None: a bar on a terminal, and elsewhere a line of the log (level INFO) every few seconds. True: a bar. False:
-nothing. A function: called with what is done, the total, and what goes on; what it raises ends the work."""
+nothing. A function: called with the completed steps, the total and a description; its exceptions stop the work."""
 
 SECONDS_BETWEEN_LINES = 5.0
 
 
 class ProgressReport:
-    """Steps of long work, reported as the caller wants; from several threads if need be.
+    """Thread-safe progress reports.
 
     Args:
         total: Number of steps.
-        what: What goes on.
+        what: Description of the work.
         progress: See :data:`Progress`.
-        unit: What a step is, for the bar.
+        unit: Unit of the steps in the bar.
     """
 
     def __init__(self, total: int, what: str, progress: Progress = None, unit: str = "step") -> None:
@@ -35,11 +35,11 @@ class ProgressReport:
         wants_bar = progress is True or (progress is None and sys.stderr is not None and sys.stderr.isatty())
         self._bar: Any = tqdm(total=total, desc=what, unit=unit, leave=False) if wants_bar else None
         self._logs = progress is None and not wants_bar
-        self._said = time.monotonic()
+        self._reported_at = time.monotonic()
         self._lock = threading.Lock()
 
     def expect(self, steps: int) -> None:
-        """There are more steps than was known."""
+        """Increase the total."""
         with self._lock:
             self.total += steps
             if self._bar is not None:
@@ -47,26 +47,26 @@ class ProgressReport:
                 self._bar.refresh()
 
     def describe(self, what: str) -> None:
-        """Say what goes on now."""
+        """Change the description."""
         with self._lock:
             self.what = what
             if self._bar is not None:
                 self._bar.set_description(what)
-            self._tell()
+            self._report()
 
     def update(self, steps: int = 1) -> None:
-        """Some steps are done."""
+        """Report completed steps."""
         with self._lock:
             self.done += steps
             if self._bar is not None:
                 self._bar.update(steps)
-            self._tell()
+            self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         if self._callback is not None:
             self._callback(self.done, self.total, self.what)
-        elif self._logs and time.monotonic() - self._said >= SECONDS_BETWEEN_LINES:
-            self._said = time.monotonic()
+        elif self._logs and time.monotonic() - self._reported_at >= SECONDS_BETWEEN_LINES:
+            self._reported_at = time.monotonic()
             logger.info("%s (%d of %d)", self.what, self.done, self.total)
 
     def __enter__(self) -> "ProgressReport":

@@ -10,15 +10,16 @@ import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 from quadratic import at_points, quadratic_modes
+from solids import embed_surface, lumped_mass
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.embedding import closest_tetrahedra, embed_surface
+from torch_modal.precompute.embedding import closest_tetrahedra
 from torch_modal.precompute.lattice import USUAL_EDGE, lattice
 from torch_modal.precompute.modes import QUALITIES
-from torch_modal.precompute.stiffness import HessianForm, arap_hessian, hat_gradients, lumped_mass, mass_matrix
+from torch_modal.precompute.stiffness import HessianForm, arap_hessian, hat_gradients, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra
 from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize

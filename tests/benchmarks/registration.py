@@ -25,12 +25,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import torch_modal as tm
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.samples import sample_files
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import read_mesh
 from torch_modal.registration.consistency import farthest_points
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import FloatArray, IntArray, MeshSurface, referenced
+from torch_modal.registration.surface import MeshSurface, referenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from _animals import animal, held_out, tips

@@ -1,21 +1,21 @@
-"""A tree of the faces of a surface, for boxes around what lies together. NumPy only."""
+"""Order of faces in a bounding-box tree. NumPy only."""
 
 import numpy as np
 
-from torch_modal.geometry.crossings import FloatArray, IntArray
+from torch_modal.arrays import FloatArray, IntArray
 
 
 def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
-    """Faces as leaves of a binary tree: on each level halved across where their centres reach farthest.
+    """Faces as leaves of a binary tree, split on each level along the longest axis of their centres.
 
-    Node 1 is the root, node ``i`` has the nodes ``2 i`` and ``2 i + 1`` below it, and the last ``F`` are the leaves.
+    Node 1 is the root, node ``i`` has the children ``2 i`` and ``2 i + 1``, and the last ``F`` nodes are the leaves.
 
     Args:
         faces: *Shape:* ``(F, 3)``.
-        shapes: In all of which the faces of a node are to lie together. *Shape:* ``(K, V, 3)``.
+        shapes: Shapes in which the faces of a node should be close. *Shape:* ``(K, V, 3)``.
 
     Returns:
-        The faces of the leaves, in their order. *Shape:* ``(F,)``.
+        Face of each leaf. *Shape:* ``(F,)``.
     """
     points = np.concatenate(shapes[:, faces].mean(2), 1)
     n = len(points)
@@ -25,7 +25,7 @@ def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
         sizes[own] = sizes[2 * own] + sizes[2 * own + 1]
     order, nodes = np.arange(n), np.ones(n, np.int64)
     for start in _levels(n):
-        # What is a leaf already comes last.
+        # Finished leaves come last.
         own = np.arange(start, min(2 * start, n))
         size = sizes[own]
         firsts, m = np.cumsum(size) - size, int(size.sum())
@@ -43,5 +43,5 @@ def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
 
 
 def _levels(n: int) -> list[int]:
-    """The first node of each level with nodes below."""
+    """The first node of each inner level."""
     return [1 << k for k in range((n - 1).bit_length())]

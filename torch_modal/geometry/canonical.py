@@ -1,4 +1,4 @@
-"""Size, axes and order of a surface that follow from its shape: not from the caller's axes or the order of its faces.
+"""Size, axes and order of a surface, independent of the caller's axes and of the order of its faces.
 
 NumPy only.
 """
@@ -6,45 +6,43 @@ NumPy only.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import FloatArray, IntArray
 
 SIZE = 100.0
-"""The size of shapes as :func:`placed` gives them."""
+"""Size of canonical shapes (:func:`placed`)."""
 ROUNDING = 2.0**-20
-"""Their coordinates are multiples of this. Rounding errors of a turn or of a sum are far below, so they are lost."""
+"""Quantum of their coordinates, far above the rounding of rotations and sums, which it removes."""
 ALIKE = 1e-6
-"""Principal moments closer than this, over the largest, do not determine axes; smaller skewness determines no sign."""
+"""Relative difference of principal moments below which axes are undetermined; likewise skewness and signs."""
 GENERIC = np.array([1.0, 0.6180339887, 0.3247179572])
-"""No symmetry of a shape is likely to map points of a plane across this to each other."""
+"""A generic direction, which is unlikely to match a symmetry of a shape."""
 
 
 class Placed(NamedTuple):
-    """A shape in its own axes, about its centroid, at a size of 100."""
+    """A shape in its principal axes, centred, with a size of 100."""
 
     points: FloatArray
     """Coordinates along the axes, rounded. *Shape:* ``(V, 3)``."""
     axes: FloatArray
     """A rotation whose rows are the axes: ``points @ axes`` has the caller's axes. *Shape:* ``(3, 3)``."""
     centre: FloatArray
-    """In the caller's coordinates. *Shape:* ``(3,)``."""
+    """Centroid in the caller's coordinates. *Shape:* ``(3,)``."""
     scale: float
-    """Units here for each of the caller's."""
+    """Canonical units per unit of the caller."""
 
 
 def size(points: FloatArray, faces: IntArray) -> float:
     """``2 sqrt(3)`` times the radius of gyration of a surface: the length of a rod, the box diagonal of a sphere.
 
-    The diagonal of the bounding box itself changes with the axes, and with the tip of every limb.
+    The bounding-box diagonal depends on the axes and on the tips of limbs.
 
     Args:
         points: *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
 
     Returns:
-        In the units of the points; of a surface without area, the diagonal of its bounding box.
+        The size in the units of the points; for a surface without area, the bounding-box diagonal.
     """
     return _moments(points, faces)[2]
 
@@ -52,8 +50,8 @@ def size(points: FloatArray, faces: IntArray) -> float:
 def placed(points: FloatArray, faces: IntArray) -> Placed:
     """A shape in its principal axes.
 
-    The signs of the axes follow from the third moments. Where moments are equal, or vanish, as in symmetric shapes,
-    axes and signs close to the caller's are taken.
+    The signs of the axes follow from the third moments. Undetermined axes and signs, as in symmetric shapes, are close
+    to the caller's.
 
     Args:
         points: *Shape:* ``(V, 3)``.
@@ -62,9 +60,9 @@ def placed(points: FloatArray, faces: IntArray) -> Placed:
     second, centre, length, arms, areas = _moments(points, faces)
     axes = _principal_axes(second)
     skewness = areas @ (arms @ axes.T) ** 3
-    told = np.abs(skewness) > ALIKE * max(float(np.trace(second)), 0.0) ** 1.5
-    axes = axes * np.where(np.where(told, skewness, axes @ GENERIC) < 0, -1.0, 1.0)[:, None]
-    # The sign of the axis with the least skewness follows from the others: mirrored shapes are different shapes.
+    is_skewed = np.abs(skewness) > ALIKE * max(float(np.trace(second)), 0.0) ** 1.5
+    axes = axes * np.where(np.where(is_skewed, skewness, axes @ GENERIC) < 0, -1.0, 1.0)[:, None]
+    # The axis of least skewness completes a right-handed frame: mirrored shapes stay different.
     last = int(np.abs(skewness).argmin())
     axes[last] = np.cross(axes[last - 2], axes[last - 1])
     scale = SIZE / length
@@ -73,14 +71,14 @@ def placed(points: FloatArray, faces: IntArray) -> Placed:
 
 
 def vertex_order(points: FloatArray) -> IntArray:
-    """An order of points that follows from where they are; equal ones stay in theirs. *Shape:* ``(V, 3) -> (V,)``."""
-    # Coordinate by coordinate: a product of matrices need not round equal rows alike.
+    """Order of points by position; stable for equal ones. *Shape:* ``(V, 3) -> (V,)``."""
+    # By coordinate: a matrix product may round equal rows differently.
     key = points[:, 0] * GENERIC[0] + points[:, 1] * GENERIC[1] + points[:, 2] * GENERIC[2]
     return np.argsort(key, kind="stable")
 
 
 def ordered_faces(points: FloatArray, faces: IntArray) -> IntArray:
-    """The faces in an order, each from a corner, that follow from where the points are. *Shape:* ``(F, 3)``."""
+    """Faces in an order, and with a first corner, by position of the points. *Shape:* ``(F, 3)``."""
     order = vertex_order(points)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -91,9 +89,9 @@ def ordered_faces(points: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _moments(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
-    """Second moments over the surface, the centroid, the size, then centroids of faces and their parts of the area.
+    """Second moments over the surface, centroid, size, centroids of faces and their fractions of the area.
 
-    The first and the last two are relative to the box, whose unit may be far out of the range of squares.
+    The first and the last two are in units of the bounding box, against overflow of squares.
     """
     corners = points[faces]
     flat = corners.reshape(-1, 3)
@@ -116,7 +114,7 @@ def _moments(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArra
 
 
 def _principal_axes(second: FloatArray) -> FloatArray:
-    """Rows, by descending moments. *Shape:* ``(3, 3) -> (3, 3)``."""
+    """Principal axes in rows, by descending moments. *Shape:* ``(3, 3) -> (3, 3)``."""
     moments, vectors = np.linalg.eigh(second)
     moments, axes = moments[::-1], vectors.T[::-1].copy()
     start = 0
@@ -130,10 +128,10 @@ def _principal_axes(second: FloatArray) -> FloatArray:
 
 
 def _nearest_axes(span: FloatArray) -> FloatArray:
-    """Orthonormal vectors of the same span, close to the caller's axes. *Shape:* ``(n, 3) -> (n, 3)``."""
+    """Orthonormal basis of the same span, close to the caller's axes. *Shape:* ``(n, 3) -> (n, 3)``."""
     projector, found = span.T @ span, []
     for _ in range(len(span)):
-        # Uneven weights, so that rounding never chooses between equals.
+        # Uneven weights break ties.
         best = int((np.linalg.norm(projector, axis=0) * [1.0, 0.99, 0.98]).argmax())
         found.append(projector[:, best] / np.linalg.norm(projector[:, best]))
         projector = projector - np.outer(found[-1], found[-1] @ projector)

@@ -8,21 +8,20 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import FloatArray, IntArray
 
 
 class Connectivity:
-    """All that follows from the faces of a mesh, made when it is first asked for, from one sort of their sides.
+    """Connectivity of a triangle mesh, computed lazily from one sort of the half-edges, called sides here.
 
-    Made once for a mesh and handed on to all who need it. The arrays are shared, so they cannot be written to:
-    ``torch.tensor(...)`` makes a copy that can be.
+    The arrays are shared and read-only; ``torch.tensor(...)`` makes a writable copy.
 
-    A face has three sides. Side ``c F + f`` runs from corner ``c`` of face ``f`` to the next, so that an array of all
-    ``3F`` sides is three arrays of ``F``, one after the other.
+    Side ``c F + f`` runs from corner ``c`` of face ``f`` to the next, so arrays of all ``3F`` sides are three
+    concatenated arrays of ``F``.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_vertices: Number of vertices, V; by default those up to the last one that a face uses.
+        n_vertices: Number of vertices, V; by default the largest index plus one.
     """
 
     def __init__(self, faces: IntArray, n_vertices: int | None = None) -> None:
@@ -30,7 +29,7 @@ class Connectivity:
         self.n_vertices = int(self.faces.max(initial=-1)) + 1 if n_vertices is None else n_vertices
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """The faces alone are pickled: the rest is made faster than it is read."""
+        """Pickles the faces alone: the rest is faster to compute than to read."""
         return Connectivity, (self.faces, self.n_vertices)
 
     @cached_property
@@ -45,20 +44,20 @@ class Connectivity:
 
     @cached_property
     def opposite(self) -> IntArray:
-        """The corner across each side. *Shape:* ``(3F,)``."""
+        """The vertex opposite to each side. *Shape:* ``(3F,)``."""
         return _shared(self.faces[:, [2, 0, 1]].T.reshape(-1))
 
     @cached_property
     def used(self) -> IntArray:
-        """The vertices of all faces, ascending. *Shape:* ``(·,)``."""
+        """Referenced vertices, ascending. *Shape:* ``(·,)``."""
         return _shared(np.flatnonzero(np.bincount(self.faces.reshape(-1), minlength=self.n_vertices)))
 
     @cached_property
     def _runs(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Sides in the order of their edges, ``(3F,)``; where each edge starts there, and its packed ends, ``(E,)``."""
-        key = self._pack(self.start, self.end)
+        """Sides sorted by edge, ``(3F,)``; first position and packed end vertices of each edge, ``(E,)``."""
+        key = np.minimum(self.start, self.end) << self._bits | np.maximum(self.start, self.end)
         bits = len(key).bit_length()
-        if 2 * self._bits + bits < 64:  # ends and number in one integer: sorted three times as fast as by argsort
+        if 2 * self._bits + bits < 64:  # packed into one integer: three times as fast as argsort
             packed = np.sort(key << bits | np.arange(len(key)))
             order, key = packed & (1 << bits) - 1, packed >> bits
         else:
@@ -71,10 +70,6 @@ class Connectivity:
     def _bits(self) -> int:
         return max(self.n_vertices - 1, 0).bit_length()
 
-    def _pack(self, i: IntArray, j: IntArray) -> IntArray:
-        """One integer for two vertices, whichever comes first; its order is that of the edges."""
-        return np.minimum(i, j) << self._bits | np.maximum(i, j)
-
     @cached_property
     def edges(self) -> IntArray:
         """Each edge once, the smaller vertex first, sorted. *Shape:* ``(E, 2)``."""
@@ -83,20 +78,20 @@ class Connectivity:
 
     @cached_property
     def counts(self) -> IntArray:
-        """How many faces share each edge. *Shape:* ``(E,)``."""
+        """Number of faces at each edge. *Shape:* ``(E,)``."""
         order, first, _ = self._runs
         return _shared(np.diff(first, append=len(order)))
 
     @cached_property
     def sides(self) -> IntArray:
-        """The edge that each side runs along. *Shape:* ``(3F,)``."""
+        """Edge of each side. *Shape:* ``(3F,)``."""
         sides = np.empty(3 * len(self.faces), dtype=np.int64)
         sides[self._runs[0]] = np.repeat(np.arange(len(self.counts)), self.counts)
         return _shared(sides)
 
     @cached_property
-    def signs(self) -> NDArray[np.float64]:
-        """+1 for a side that runs along its edge from the smaller vertex to the larger, otherwise -1.
+    def signs(self) -> FloatArray:
+        """+1 for a side from the smaller vertex to the larger, otherwise -1.
 
         *Shape:* ``(3F,)``.
         """
@@ -104,7 +99,7 @@ class Connectivity:
 
     @cached_property
     def hinge_sides(self) -> IntArray:
-        """The two sides at each edge of exactly two faces, in the order of the edges. *Shape:* ``(H, 2)``."""
+        """The two sides of each interior edge, in the order of the edges. *Shape:* ``(H, 2)``."""
         order, first, _ = self._runs
         one = first[self.counts == 2]
         return _shared(np.stack([order[one], order[one + 1]], axis=1))
@@ -113,7 +108,7 @@ class Connectivity:
     def hinges(self) -> IntArray:
         """Interior edges with the two vertices opposite to them.
 
-        An edge of one face has no dihedral angle, an edge of three or more has no single one: neither gives a hinge.
+        Edges of one face or of three and more have no hinge.
         Rows are ``(i, j, k, l)``: the edge ``ij`` and the opposite vertices ``k`` and ``l`` of its two triangles. Where
         the winding is consistent, the triangles are ``(i, j, k)`` and ``(j, i, l)``. *Shape:* ``(H, 4)``.
         """
@@ -123,7 +118,7 @@ class Connectivity:
 
     @cached_property
     def face_neighbours(self) -> IntArray:
-        """Pairs of faces at one edge, the smaller first; where there are three or more, each with the next.
+        """Pairs of adjacent faces, the smaller first; at non-manifold edges each face with the next.
 
         *Shape:* ``(n, 2)``.
         """
@@ -138,10 +133,9 @@ class Connectivity:
 
     @cached_property
     def boundary_chain(self) -> IntArray:
-        """Directed edges that are left when opposite ones cancel: the boundary of an open surface.
+        """Boundary of the surface as a chain: the sum of all directed edges, with multiplicity.
 
-        Where the winding is consistent, these are the edges of one face, in its direction. An edge that two faces run
-        along in the same direction, or a third face shares, is left as often as it does not cancel.
+        With consistent winding these are the edges of one face, in its direction.
         *Shape:* ``(·, 2)``.
         """
         net = np.bincount(self.sides, self.signs, minlength=len(self.edges)).astype(np.int64)
@@ -150,22 +144,8 @@ class Connectivity:
 
     @cached_property
     def vertex_pieces(self) -> IntArray:
-        """Which connected piece each vertex belongs to; one of no face is a piece. *Shape:* ``(V,)``."""
+        """Connected component of each vertex, including unreferenced ones. *Shape:* ``(V,)``."""
         return _shared(connected_pieces(self.edges, self.n_vertices))
-
-    def edge_index(self, i: IntArray, j: IntArray) -> IntArray:
-        """Which of the edges joins ``i`` and ``j``. *Shape:* ``(n,), (n,) -> (n,)``.
-
-        Raises:
-            ValueError: None does.
-        """
-        known, wanted = self._runs[2], self._pack(i, j)
-        found = np.searchsorted(known, wanted)
-        missing = np.append(known, -1)[found] != wanted
-        if missing.any():
-            first = int(np.flatnonzero(missing)[0])
-            raise ValueError(f"no face has an edge between the vertices {i[first]} and {j[first]}")
-        return found.astype(np.int64)
 
 
 def _shared(array: NDArray[Any]) -> NDArray[Any]:
@@ -174,34 +154,34 @@ def _shared(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def connected_pieces(pairs: IntArray, n: int) -> IntArray:
-    """Which connected piece each of ``n`` nodes belongs to, numbered by their first nodes. *Shape:* ``(m, 2) -> (n,)``.
+    """Connected component of each of ``n`` nodes, numbered by first nodes. *Shape:* ``(m, 2) -> (n,)``.
 
-    A node without a pair is a piece.
+    A node without a pair is a component.
     """
     graph = sparse.coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tuple[IntArray, IntArray]:
-    """The cheapest connections that hold all together.
+def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArray, IntArray]:
+    """Minimum spanning forest of a graph.
 
     Args:
         n: Number of nodes.
-        pairs: Connections, the smaller node first. *Shape:* ``(m, 2)``.
-        costs: Above zero. *Shape:* ``(m,)``.
+        pairs: Edges, the smaller node first. *Shape:* ``(m, 2)``.
+        costs: Positive edge costs. *Shape:* ``(m,)``.
 
     Returns:
-        The parent of each node, its own for a root; the connected piece of each. *Shape:* ``(n,)`` each.
+        The parent of each node, itself for a root; its connected component. *Shape:* ``(n,)`` each.
     """
     graph = sparse.coo_matrix((costs, pairs.T), shape=(n, n)).tocsr()
-    if graph.nnz < len(pairs):  # two nodes that are connected twice: costs were added up
+    if graph.nnz < len(pairs):  # duplicate edges, whose costs were summed
         key = pairs[:, 0] * n + pairs[:, 1]
         order = np.lexsort((costs, key))
         order = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
         graph = sparse.coo_matrix((costs[order], pairs[order].T), shape=(n, n)).tocsr()
     tree = minimum_spanning_tree(graph).tocoo()
     piece = connected_components(tree, directed=False)[1].astype(np.int64)
-    # One more node above all roots: one walk then sees all pieces.
+    # An extra node above all roots: one traversal visits all components.
     roots = np.unique(piece, return_index=True)[1]
     ends = np.append(tree.row, np.full(len(roots), n)), np.append(tree.col, roots)
     whole = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
@@ -209,25 +189,25 @@ def spanning_forest(n: int, pairs: IntArray, costs: NDArray[np.float64]) -> tupl
     return np.where(parents == n, np.arange(n), parents).astype(np.int64), piece
 
 
-def half_cotangents(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
-    """Half the cotangent of the angle across each side, finite on slivers too. *Shape:* ``(3F,)``."""
+def half_cotangents(vertices: FloatArray, mesh: Connectivity) -> FloatArray:
+    """Half the cotangent of the angle opposite to each side, finite on slivers. *Shape:* ``(3F,)``."""
     tip = vertices[mesh.opposite]
     u, v = vertices[mesh.start] - tip, vertices[mesh.end] - tip
     twice_area = np.linalg.norm(np.cross(u, v), axis=1)
     least = 1e-12 * (u * u).sum(1) + np.finfo(np.float64).tiny
-    halves: NDArray[np.float64] = 0.5 * (u * v).sum(1) / np.maximum(twice_area, least)
+    halves: FloatArray = 0.5 * (u * v).sum(1) / np.maximum(twice_area, least)
     return halves
 
 
-def double_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
+def double_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Twice the area of each face. *Shape:* ``(F,)``."""
     a, b, c = (np.stack([x[corner] for x in vertices.T]) for corner in faces.T)
     (ux, uy, uz), (vx, vy, vz) = b - a, c - a
-    found: NDArray[np.float64] = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
+    found: FloatArray = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
     return found
 
 
-def vertex_areas(vertices: NDArray[np.float64], faces: IntArray) -> NDArray[np.float64]:
-    """A third of the area of the faces around each vertex. *Shape:* ``(V,)``."""
+def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """A third of the area of the incident faces of each vertex. *Shape:* ``(V,)``."""
     summed = np.bincount(faces.reshape(-1), np.repeat(double_areas(vertices, faces) / 6, 3), minlength=len(vertices))
-    return summed.astype(np.float64)  # of no face at all it is of integers
+    return summed.astype(np.float64)  # integers if there are no faces

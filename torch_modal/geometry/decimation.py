@@ -1,7 +1,6 @@
-"""Fewer faces by edge collapses: fast-simplification in the size that its thresholds are for, one call at a time.
+"""Edge-collapse decimation by fast-simplification, in canonical coordinates.
 
-It collapses in the order of the faces, so they are sorted first: the same shape gives the same collapses, however its
-faces are listed and its axes turned.
+Sorted faces make the collapses independent of the axes and of the order of the faces.
 """
 
 import threading
@@ -9,36 +8,33 @@ from typing import NamedTuple
 
 import fast_simplification
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.canonical import ordered_faces, placed, vertex_order
-from torch_modal.geometry.connectivity import IntArray
 
-FloatArray = NDArray[np.float64]
-
-# It keeps its mesh in static memory, and has absolute thresholds.
+# The library keeps its mesh in static memory.
 _NOT_THREAD_SAFE = threading.Lock()
 _AGGRESSIVENESS = 7.0
 
 
 class Decimation(NamedTuple):
-    """A mesh of fewer faces, and how it came about."""
+    """A decimated mesh and its edge collapses."""
 
     vertices: FloatArray
-    """Where the quadrics place them, not linear in the positions before. *Shape:* ``(V', 3)``."""
+    """Positions that minimise the quadrics, not linear in the input. *Shape:* ``(V', 3)``."""
     faces: IntArray
-    """Some may use a vertex twice, or be there twice. *Shape:* ``(F', 3)``."""
+    """Faces; may be degenerate or repeated. *Shape:* ``(F', 3)``."""
     collapses: IntArray
-    """In their order: which vertex stays, and which becomes part of it. *Shape:* ``(n, 2)``."""
+    """In order: the remaining vertex and the removed one. *Shape:* ``(n, 2)``."""
 
 
 def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> Decimation:
-    """Collapse edges until a number of faces is left.
+    """Collapse edges down to a number of faces.
 
     Args:
         vertices: In any units. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_faces: How many are wanted. There may remain more: some edges cannot be collapsed.
+        n_faces: Target number of faces; more remain if edges cannot be collapsed.
     """
     shape = placed(vertices, faces)
     order = vertex_order(shape.points)

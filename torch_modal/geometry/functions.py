@@ -1,4 +1,4 @@
-"""What torch does too, at less: functions with a derivative of their own where none is recorded, shapes together."""
+"""Helpers for autograd functions, cached tensors and broadcasting, with less overhead than in torch."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -13,23 +13,23 @@ Given = ParamSpec("Given")
 
 
 def traced(x: Tensor) -> bool:
-    """Whether a tensor has no numbers (torch.compile, export, fake and meta tensors), so that no kernel can have it."""
+    """Whether a tensor has no data (torch.compile, export, fake and meta tensors), so that no kernel can use it."""
     return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter) or x.is_meta
 
 
 def transformed(x: Tensor) -> bool:
-    """Whether a tensor stands for others in a transform of ``torch.func``."""
+    """Whether a tensor is a wrapper of a ``torch.func`` transform."""
     return torch.func.debug_unwrap(x, recurse=False) is not x
 
 
 def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
-    """The same function, whose new tensors serve later calls: no gradient is recorded, and none is an inference tensor.
+    """Decorate a function whose results are cached: no gradient is recorded, and no result is an inference tensor.
 
-    Autograd refuses inference tensors for good, so nothing that is kept may be made of ``torch.inference_mode()``.
+    Autograd rejects inference tensors, so cached tensors must not be created in ``torch.inference_mode()``.
     """
 
     @wraps(make)
-    def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:  # objects of typing would be guarded by Dynamo
+    def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:  # Dynamo would guard typing objects
         if not torch.is_inference_mode_enabled():
             with torch.no_grad():
                 return make(*args, **kwargs)
@@ -45,14 +45,14 @@ def outlasting(x: Tensor) -> Tensor:
 
 
 def made_outside(make: Callable[[], Made]) -> Made:
-    """What is made at its first use and kept: of numbers, whatever ``torch.compile`` or ``torch.func`` do around it."""
+    """Create a cached object outside of all transforms of ``torch.compile`` and ``torch.func``."""
     found: list[Made] = []
     _Outside.apply(lambda: found.append(make()), torch.empty(0))
     return found[0]
 
 
 class _Outside(torch.autograd.Function):
-    """Its ``forward`` is called below all transforms, which tensors that are made within them would not outlive."""
+    """``forward`` runs below all transforms, so its tensors outlive them."""
 
     @staticmethod
     def forward(work: Callable[[], None], nothing: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ class _Outside(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Nothing is remembered."""
+        """Saves nothing."""
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, None]:
@@ -77,8 +77,8 @@ class _Outside(torch.autograd.Function):
 def applied(function: Any, *given: Any) -> Any:
     """``function.apply`` of a :class:`torch.autograd.Function` with ``setup_context``.
 
-    Where nothing is recorded it goes straight to ``forward``: torch looks at its signature at every call, which takes
-    as long as a small kernel.
+    Without recording it calls ``forward`` directly: torch inspects the signature at every call, which takes as long as
+    a small kernel.
     """
     plain = not torch.is_grad_enabled() and not any(
         isinstance(value, Tensor) and (traced(value) or transformed(value)) for value in given
@@ -87,12 +87,12 @@ def applied(function: Any, *given: Any) -> Any:
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """``torch.broadcast_shapes``, which imports SymPy, a third of a second, when it is first called.
+    """``torch.broadcast_shapes`` without its import of SymPy, which takes a third of a second.
 
     Raises:
         RuntimeError: They do not broadcast.
     """
-    if torch.compiler.is_compiling():  # sizes need not be numbers
+    if torch.compiler.is_compiling():  # sizes may be symbolic
         return torch.broadcast_tensors(*(torch.empty((), device="meta").expand(shape) for shape in shapes))[0].shape
     found = []
     for sizes in zip_longest(*(reversed(shape) for shape in shapes), fillvalue=1):

@@ -1,28 +1,24 @@
-"""What can be wrong with triangles or with the shapes on them: findings and repairs. NumPy and SciPy only.
+"""Defects of meshes and repairs. NumPy and SciPy only.
 
-Nothing here raises or warns: `keyframes/check.py` decides what a finding means.
+Nothing here raises or warns; see `keyframes/check.py`.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 
 class Winding(NamedTuple):
-    """Faces with one winding per connected piece, where there is one."""
+    """Faces with consistent winding in each orientable component."""
 
     faces: IntArray
     flipped: IntArray
-    """Faces that were turned over."""
+    """Indices of flipped faces."""
     non_orientable: IntArray
-    """Faces of pieces without any consistent winding (a Moebius strip); they are left as they were."""
+    """Indices of the unchanged faces of non-orientable components (a Moebius strip)."""
 
 
 def degenerate_faces(faces: IntArray) -> BoolArray:
@@ -32,13 +28,13 @@ def degenerate_faces(faces: IntArray) -> BoolArray:
 
 
 def repeated_faces(faces: IntArray) -> BoolArray:
-    """Faces whose three vertices have been used by an earlier face, in any order. *Shape:* ``(F,)``."""
+    """Faces with the same vertices as an earlier face, in any order. *Shape:* ``(F,)``."""
     a, b, c = faces.T
     low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     middle = a + b + c - low - high
     repeated = np.zeros(len(faces), dtype=bool)
     n = int(high.max(initial=0)) + 1
-    if n < 2**21:  # as one integer each, which is sorted a hundred times as fast, and nearly always all that it takes
+    if n < 2**21:  # packed into integers: a hundred times as fast, and nearly always sufficient
         keys = np.sort((low * n + middle) * n + high)
         if (keys[1:] != keys[:-1]).all():
             return repeated
@@ -49,11 +45,11 @@ def repeated_faces(faces: IntArray) -> BoolArray:
 
 
 def consistent_winding(mesh: Connectivity) -> Winding:
-    """Turn the fewest faces over, so that the two faces of each edge run through it in opposite directions.
+    """Flip the fewest faces so that adjacent faces have opposite directions along their edge.
 
-    Every face stands in a graph twice, as it is and turned over. Neighbours that agree are joined like to
-    like, neighbours that disagree crosswise. A piece that can be oriented falls apart into two mirror copies
-    in this graph; one that cannot stays whole. Edges of three or more faces join nothing.
+    The graph has two nodes for each face, as it is and flipped. Edges join equal nodes of consistent neighbours and
+    different nodes of inconsistent ones. An orientable component gives two components of this graph, a non-orientable
+    one gives one. Edges of three or more faces are ignored.
     """
     faces, n_faces = mesh.faces, len(mesh.faces)
     one, two = mesh.hinge_sides.T % n_faces
@@ -67,7 +63,7 @@ def consistent_winding(mesh: Connectivity) -> Winding:
     as_is, turned = label[:n_faces], label[n_faces:]
     non_orientable = as_is == turned
 
-    # Of the two copies, keep the one with more faces as they were; on a tie, the one with the first face.
+    # Choose the copy with more unchanged faces; on a tie, the one with the first face.
     size = np.bincount(as_is, minlength=label.max() + 1)
     fewer, equal = size[as_is] < size[turned], size[as_is] == size[turned]
     flip = ~non_orientable & (fewer | (equal & (as_is > turned)))
@@ -76,16 +72,16 @@ def consistent_winding(mesh: Connectivity) -> Winding:
 
 
 def unreferenced_vertices(faces: IntArray, n_vertices: int) -> IntArray:
-    """Vertices of no face. *Shape:* ``(·,)``."""
+    """Unreferenced vertices. *Shape:* ``(·,)``."""
     return np.flatnonzero(np.bincount(faces.reshape(-1), minlength=n_vertices) == 0)
 
 
 def diagonals(keyframes: FloatArray) -> FloatArray:
     """Bounding-box diagonal of each shape. *Shape:* ``(K, V, 3)`` to ``(K,)``."""
-    rows = np.moveaxis(keyframes, 2, 0).copy()  # looked through ten times as fast where they lie together
+    rows = np.moveaxis(keyframes, 2, 0).copy()  # contiguous: ten times as fast
     extent = (rows.max(axis=2) - rows.min(axis=2)).T
     largest = extent.max(axis=1)
-    # The largest extent is taken out first, so that no square of it leaves the number range.
+    # Scaled by the largest extent, against overflow.
     return largest * np.linalg.norm(extent / np.where(largest > 0, largest, 1)[:, None], axis=1)
 
 
@@ -98,6 +94,6 @@ def flat_faces(vertices: FloatArray, faces: IntArray, tolerance: float) -> BoolA
 
 
 def signed_volume(vertices: FloatArray, faces: IntArray) -> float:
-    """Enclosed volume of a closed mesh, positive if its faces wind counterclockwise seen from outside."""
+    """Enclosed volume of a closed mesh, positive for outward normals."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)

@@ -2,25 +2,24 @@
 
 from typing import TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.vectors import cross, pick
 
-Array = TypeVar("Array", Tensor, NDArray[np.float64])
+Array = TypeVar("Array", Tensor, FloatArray)
 
 
-def vertex_normals(x: Array, faces: Tensor | NDArray[np.int64]) -> Array:
-    """Unit normals: means of those of the faces around each vertex, weighted by area.
+def vertex_normals(x: Array, faces: Tensor | IntArray) -> Array:
+    """Unit vertex normals: area-weighted means of the normals of incident faces.
 
     Args:
         x: Vertex positions, a tensor or an array. *Shape:* ``(..., V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
 
     Returns:
-        Zero where a vertex has no face, or its faces cancel; of the type of ``x``. *Shape:* ``(..., V, 3)``.
+        Zero for vertices without faces or with cancelling ones; of the type of ``x``. *Shape:* ``(..., V, 3)``.
     """
     if not isinstance(x, Tensor):
         return vertex_normals(torch.tensor(x), torch.tensor(faces)).numpy()
@@ -28,7 +27,7 @@ def vertex_normals(x: Array, faces: Tensor | NDArray[np.int64]) -> Array:
     rows = x.movedim(-1, 0).contiguous()
     a, b, c = (pick(rows, corner) for corner in faces.unbind(1))
     doubled = cross(b - a, c - a)
-    # Scaled, so that the squares of small shapes' areas do not vanish.
+    # Scaled against underflow of squared areas.
     largest = doubled.detach().abs().amax((0, -1), keepdim=True)
     doubled = doubled / torch.where(largest > 0, largest, 1)
     summed = torch.zeros_like(rows).index_add(-1, faces.T.flatten(), torch.cat([doubled] * 3, -1))

@@ -1,38 +1,36 @@
-"""Vertices from the edges or the sides that are asked for: a Poisson problem, factorised once for a connectivity."""
+"""Vertex positions from target edge vectors: Poisson problems, factorised once per connectivity."""
 
 from functools import cache, partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from torch_modal.geometry.connectivity import Connectivity, IntArray, half_cotangents, vertex_areas
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.connectivity import Connectivity, half_cotangents, vertex_areas
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
 from torch_modal.geometry.triangle_frames import Sides, edge_means
 from torch_modal.geometry.vectors import pick
 
-# Cotangents of slivers: a side counts neither for nothing nor for everything. Positive weights also make the matrix
-# definite whatever the triangles.
+# Bounds of cotangent weights, for slivers. Positive weights make the matrix positive definite.
 _WEIGHT_RANGE = (0.02, 20.0)
 
-# A piece that hangs loose follows this many of the nearest vertices of the largest piece.
+# Number of vertices of the largest piece that a loose piece follows.
 _N_ANCHORS = 16
 
 
 class Poisson(nn.Module):
-    r"""Vertices of :math:`\min_x \sum_e w_e |x_j - x_i - \bar e|^2`, each piece of the surface where it is told.
+    r"""Solves :math:`\min_x \sum_e w_e |x_j - x_i - \bar e|^2` with prescribed centres of the connected pieces.
 
-    The weights serve all shapes, so that one factorisation does
-    (:class:`~torch_modal.geometry.sparse.SparseSolver`). It is made at the first use, and again whenever
-    the weights are others than those that it was made of.
+    All shapes share the weights and one factorisation (:class:`~torch_modal.geometry.sparse.SparseSolver`), which is
+    made at the first use and again if the weights change.
 
     Args:
         mesh: The connectivity, of all vertices.
-        weights: One for each edge, above 0. *Shape:* ``(E,)``.
-        vertex_weights: Whose mean is a piece's centre, none below 0; by default all the same. *Shape:* ``(V,)``.
+        weights: Positive edge weights. *Shape:* ``(E,)``.
+        vertex_weights: Non-negative weights of the centres; uniform by default. *Shape:* ``(V,)``.
     """
 
     edges: Tensor
@@ -51,15 +49,15 @@ class Poisson(nn.Module):
         self.register_buffer("weights", weights.clone(), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.register_buffer("shares", (mass / total[piece]).to(weights), persistent=False)
-        # The equations fix each piece up to a translation: one vertex of each is held, and the piece placed afterwards.
-        held = np.unique(mesh.vertex_pieces, return_index=True)[1]
-        self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), held)), persistent=False)
-        self.n_pieces = len(held)
+        # The equations determine each piece up to a translation: one vertex of each is fixed at first.
+        fixed = np.unique(mesh.vertex_pieces, return_index=True)[1]
+        self.register_buffer("free", torch.from_numpy(np.setdiff1d(np.arange(len(piece)), fixed)), persistent=False)
+        self.n_pieces = len(fixed)
         self._made: tuple[Tensor, SparseSolver] | None = None
 
     @property
     def solver(self) -> SparseSolver:
-        """The Laplacian's inverse, of what the weights are now: others may stand in for them, as in functional_call."""
+        """Inverse of the Laplacian for the current weights, which ``functional_call`` may replace."""
         return self._solver_of(self.weights)
 
     def _solver_of(self, weights: Tensor) -> SparseSolver:
@@ -69,32 +67,30 @@ class Poisson(nn.Module):
         return self._made[1]
 
     def forward(self, wanted: Tensor, near: Tensor) -> Tensor:
-        """The shape whose edges come closest to those wanted.
+        """The shape that fits target edge vectors.
 
         Args:
-            wanted: Edge vectors, components first. *Shape:* ``(3, ..., E)``.
-            near: A shape whose pieces have their centres where those of the result are wanted. *Shape:*
-                ``(3, ..., V)``.
+            wanted: Target edge vectors, components first. *Shape:* ``(3, ..., E)``.
+            near: A shape with the centres of the pieces of the result. *Shape:* ``(3, ..., V)``.
 
         Returns:
-            Vertices that no face uses are pieces of their own, and stay where ``near`` has them. *Shape:*
-            ``(3, ..., V)``.
+            Positions; unreferenced vertices have those of ``near``. *Shape:* ``(3, ..., V)``.
         """
         pulls = wanted * self.weights.to(wanted)
         both = torch.cat([-pulls, pulls], -1)
         return self.placed(torch.zeros_like(near).index_add(-1, self.edges.T.flatten().to(near.device), both), near)
 
     def placed(self, right: Tensor, near: Tensor) -> Tensor:
-        """The same where the pulls on each vertex are known. *Shape:* ``(3, ..., V)`` each."""
-        # Once, of these weights: the backward solve may come when others are back in their place.
+        """The shape from the right-hand side of the normal equations. *Shape:* ``(3, ..., V)`` each."""
+        # Bound to the current weights: other weights may be in place during the backward solve.
         solver = cache(partial(self._solver_of, self.weights))
         x = solve_by(solver, right.movedim(0, -1)).movedim(-1, 0)
         return x + self.centres(near - x)
 
     def centres(self, x: Tensor) -> Tensor:
-        """The centre of the piece of each vertex. *Shape:* ``(3, ..., V) -> (3, ..., V)``, or all the same."""
+        """Centre of the piece of each vertex. *Shape:* ``(3, ..., V) -> (3, ..., V)``, or ``(3, ..., 1)``."""
         piece, shares = self.piece.to(x.device), self.shares.to(x.device)
-        # Thousands of float32 added one after the other would lose three digits.
+        # Sequential float32 sums over thousands of vertices lose three digits.
         weighted = x.double() * shares.double()
         if self.n_pieces == 1:
             return weighted.sum(-1, keepdim=True).to(x)
@@ -102,9 +98,9 @@ class Poisson(nn.Module):
 
 
 class Reconstruction(nn.Module):
-    r"""The shape whose sides come closest to those wanted, :math:`\min_x \sum w_{ij} |x_j - x_i - s_{ij}|^2`.
+    r"""The shape that fits target sides of the triangles, :math:`\min_x \sum w_{ij} |x_j - x_i - s_{ij}|^2`.
 
-    The weights are cotangents of a reference, so that one factorisation serves all shapes of the connectivity.
+    The weights are cotangents of a reference, so all shapes share one factorisation.
 
     Args:
         reference: A shape that gives the weights. *Shape:* ``(V, 3)``.
@@ -124,9 +120,9 @@ class Reconstruction(nn.Module):
         self.register_buffer("faces", faces.cpu().clone(), persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("signs", torch.tensor(mesh.signs), persistent=False)
-        #: Of the sides. *Shape:* ``(3F,)``.
+        #: Weights of the sides. *Shape:* ``(3F,)``.
         self.register_buffer("weights", torch.from_numpy(_side_weights(shape, mesh)), persistent=False)
-        #: Of the vertices. *Shape:* ``(V,)``.
+        #: Areas of the vertices. *Shape:* ``(V,)``.
         self.register_buffer("areas", torch.from_numpy(vertex_areas(shape, mesh.faces)), persistent=False)
         weights = torch.zeros(len(mesh.edges), dtype=torch.float64).index_add(0, self.sides, self.weights)
         self.poisson = Poisson(mesh, weights, self.areas)
@@ -143,21 +139,21 @@ class Reconstruction(nn.Module):
 
     @property
     def loose(self) -> list[tuple[Tensor, Tensor]]:
-        """The vertices of all pieces but the largest, and those of the largest that they follow."""
+        """Vertices of each piece except the largest, and vertices of the largest that it follows."""
         return [(getattr(self, f"piece_{i}"), getattr(self, f"anchors_{i}")) for i in range(self.n_loose)]
 
-    def _loose(self, shape: NDArray[np.float64], mesh: Connectivity) -> list[tuple[IntArray, IntArray]]:
+    def _loose(self, shape: FloatArray, mesh: Connectivity) -> list[tuple[IntArray, IntArray]]:
         labels, areas = mesh.vertex_pieces, self.areas.numpy()
         pieces = [np.flatnonzero(labels == label) for label in np.unique(labels[mesh.used])]
         pieces.sort(key=lambda piece: -float(areas[piece].sum()))
         return [(piece, pieces[0][_nearest(shape[pieces[0]], shape[piece])]) for piece in pieces[1:]]
 
     def forward(self, wanted: Sides, rest: Tensor) -> Tensor:
-        """The shape, its centroid where that of ``rest`` is. Vertices that no face uses stay.
+        """The shape with the centroid of ``rest``. Unreferenced vertices do not move.
 
         Args:
-            wanted: Sides of the triangles.
-            rest: The shape before, which loose pieces are placed by. *Shape:* ``(3, B, V)``.
+            wanted: Target sides of the triangles.
+            rest: The initial shape, which determines the positions of loose pieces. *Shape:* ``(3, B, V)``.
 
         Returns:
             *Shape:* ``(3, B, V)``.
@@ -177,13 +173,13 @@ def _equal(a: Tensor, b: Tensor) -> bool:
     return a is b or (a.dtype == b.dtype and a.device == b.device and torch.equal(a, b))
 
 
-def _side_weights(shape: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
-    """Half the cotangent of the angle across each side, within bounds. *Shape:* ``(3F,)``."""
+def _side_weights(shape: FloatArray, mesh: Connectivity) -> FloatArray:
+    """Half the cotangent of the angle opposite to each side, within bounds. *Shape:* ``(3F,)``."""
     return np.clip(half_cotangents(shape, mesh), *_WEIGHT_RANGE)
 
 
-def _nearest(points: NDArray[np.float64], piece: NDArray[np.float64]) -> IntArray:
-    """Which points are nearest to a piece, a few of them."""
+def _nearest(points: FloatArray, piece: FloatArray) -> IntArray:
+    """Indices of a few points nearest to a piece."""
     count = min(_N_ANCHORS, len(points))
     distances, found = KDTree(points).query(piece, k=min(count, 4))
     found, distances = np.asarray(found).reshape(-1), np.asarray(distances).reshape(-1)

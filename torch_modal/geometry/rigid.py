@@ -10,7 +10,7 @@ from torch_modal.geometry.rotations import exp, log
 
 
 class RigidMotion(NamedTuple):
-    """``x -> (x - source) rotation^T + target``: a rotation about a centroid, then a move of that centroid."""
+    """``x -> (x - source) rotation^T + target``: a rotation about a centroid and a translation of it."""
 
     rotation: Tensor
     """*Shape:* ``(..., 3, 3)``."""
@@ -24,14 +24,14 @@ class RigidMotion(NamedTuple):
         return (x - self.source[..., None, :]) @ self.rotation.mT + self.target[..., None, :]
 
     def inverse(self) -> "RigidMotion":
-        """The way back."""
+        """The inverse motion."""
         return RigidMotion(self.rotation.mT, self.target, self.source)
 
     def fraction(self, t: Tensor) -> "RigidMotion":
         """The motion at the time ``t`` of the geodesic from rest (0) to this motion (1).
 
-        The rotation turns at constant speed about its axis, the centroid moves on a straight line. At half a turn
-        either sense is a shortest way: :func:`~torch_modal.geometry.rotations.log` says which is taken.
+        The rotation has constant angular velocity, the centroid moves on a straight line. A half turn has two shortest
+        geodesics: :func:`~torch_modal.geometry.rotations.log` chooses one.
 
         Args:
             t: Time, broadcast against the motion's leading dimensions. *Shape:* ``(...,)``.
@@ -49,11 +49,9 @@ def centroid(x: Tensor, weights: Tensor) -> Tensor:
 def best_rotation(covariance: Tensor) -> Tensor:
     """The rotation ``R`` that maximises ``tr(R^T A)``, differentiable to second order.
 
-    The singular value decomposition gives the value alone (the largest eigenvector of the quaternions' 4 x 4 matrix by
-    repeated squaring is as exact for all shapes, and takes ten times as long). Its derivative divides by differences of
-    singular values and fails on symmetric shapes, where the rotation itself is smooth. The first derivative is written
-    out. Those after it come from two Newton steps that start at the solution, each of which makes them exact to a
-    higher order.
+    The value comes from the singular value decomposition. Its derivative divides by differences of singular values and
+    fails on symmetric shapes, where the rotation itself is smooth. The first derivative is therefore explicit; higher
+    ones come from two Newton steps at the solution, each of which makes them exact to a higher order.
 
     Args:
         covariance: ``A = sum_v w_v y_v x_v^T``. *Shape:* ``(..., 3, 3)``.
@@ -68,7 +66,7 @@ def best_rotation(covariance: Tensor) -> Tensor:
 
 
 def _by_singular_values(covariance: Tensor) -> Tensor:
-    """The value. *Shape:* ``(..., 3, 3)``."""
+    """The rotation without derivatives. *Shape:* ``(..., 3, 3)``."""
     u, _, vh = torch.linalg.svd(covariance.detach())
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)
@@ -76,24 +74,25 @@ def _by_singular_values(covariance: Tensor) -> Tensor:
 
 
 def _polished(covariance: Tensor, rotation: Tensor) -> Tensor:
-    """The same, with derivatives. *Shape:* ``(..., 3, 3)``."""
+    """The rotation with derivatives, by Newton steps. *Shape:* ``(..., 3, 3)``."""
     for _ in range(2):
         p = rotation.mT @ covariance
-        turn = torch.linalg.solve_ex(_stiffness(p), _torque(p)).result  # never singular: a GPU is not asked and runs on
+        # Never singular: `solve_ex` avoids a synchronisation of the GPU.
+        turn = torch.linalg.solve_ex(_stiffness(p), _torque(p)).result
         rotation = rotation @ exp(turn)
     return rotation
 
 
 def _torque(p: Tensor) -> Tensor:
-    """The inner product with infinitesimal rotations. *Shape:* ``(..., 3, 3) -> (..., 3)``."""
+    """Inner products with infinitesimal rotations. *Shape:* ``(..., 3, 3) -> (..., 3)``."""
     return torch.stack([p[..., 2, 1] - p[..., 1, 2], p[..., 0, 2] - p[..., 2, 0], p[..., 1, 0] - p[..., 0, 1]], -1)
 
 
 def _stiffness(p: Tensor) -> Tensor:
-    """What resists a further rotation. *Shape:* ``(..., 3, 3)``."""
+    """Hessian with respect to infinitesimal rotations. *Shape:* ``(..., 3, 3)``."""
     eye = torch.eye(3, dtype=p.dtype, device=p.device)
     trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    # Shapes on a line, in a point or turned inside out leave a rotation free: held still, well above rounding.
+    # Collinear, collapsed or inverted shapes leave a rotation undetermined: a floor above rounding fixes it.
     floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, 64 * torch.finfo(p.dtype).eps * trace.abs(), 1)
     return trace * eye - 0.5 * (p + p.mT) + floor.detach() * eye
 
@@ -106,13 +105,13 @@ def _skew(v: Tensor) -> Tensor:
 
 
 def _turned_on(rotation: Tensor, covariance: Tensor, change: Tensor) -> Tensor:
-    """The derivative, its own adjoint: where ``A`` changes, ``R`` turns on by ``w`` with ``stiffness w = torque``."""
+    """The self-adjoint derivative: a change of ``A`` turns ``R`` by ``w`` with ``stiffness w = torque``."""
     back = rotation.mT
     return rotation @ _skew(torch.linalg.solve_ex(_stiffness(back @ covariance), _torque(back @ change)).result)
 
 
 class _BestRotation(torch.autograd.Function):
-    """By singular values, with its first derivative written out."""
+    """Rotation by singular values with an explicit first derivative."""
 
     @staticmethod
     def forward(covariance: Tensor) -> Tensor:
@@ -129,7 +128,7 @@ class _BestRotation(torch.autograd.Function):
         if torch.is_grad_enabled():  # gradients of gradients
             (found,) = torch.func.vjp(lambda a: _polished(a, rotation.detach()), covariance)[1](grads[0])
             return found  # type: ignore[no-any-return]
-        with torch.autocast(rotation.device.type, enabled=False):  # backward may be called within it
+        with torch.autocast(rotation.device.type, enabled=False):  # backward may be called within autocast
             return _turned_on(rotation, covariance, grads[0])
 
     @staticmethod
@@ -143,7 +142,7 @@ class _BestRotation(torch.autograd.Function):
 
 
 def best_fit(x: Tensor, y: Tensor, weights: Tensor) -> RigidMotion:
-    """The rigid motion that carries ``x`` closest to ``y`` (weighted Kabsch).
+    """The rigid motion that best aligns ``x`` with ``y`` (weighted Kabsch).
 
     Args:
         x: Vertex positions. *Shape:* ``(..., V, 3)``.
@@ -157,7 +156,7 @@ def best_fit(x: Tensor, y: Tensor, weights: Tensor) -> RigidMotion:
 
 
 def blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
-    """Between two shapes: linear in the shape, along the geodesic in the rigid motion.
+    """Interpolate two shapes: linear in the shape, geodesic in the rigid motion.
 
     Args:
         x: Vertex positions at 0. *Shape:* ``(..., V, 3)``.

@@ -1,9 +1,9 @@
-"""Sparse symmetric positive definite systems. For tensors they are differentiable, and the same for every sample.
+"""Sparse symmetric positive definite systems, differentiable for tensors.
 
 :class:`SparseSolver` is CHOLMOD by ``cholespy``, on the CPU and on CUDA: nested dissection keeps its factors sparse on
-surfaces of any size. It has no wheels for Linux on ARM, where SciPy's SuperLU takes its place. :func:`factorize` is
+surfaces of any size. Without wheels for Linux on ARM, SciPy's SuperLU replaces it there. :func:`factorize` is
 SuperLU: on tetrahedra its supernodes take half the time of ``cholespy``, which has none (docs/precompute.md), and it
-does not hold Python's interpreter lock.
+releases the GIL.
 """
 
 import ctypes
@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.functions import applied
 
 try:
@@ -28,16 +28,16 @@ except ImportError:
 
 Solve = Callable[[Tensor], Tensor]
 
-# At once: more take no less time for each, on CUDA no more than 128 are possible, and CHOLMOD keeps memory for them.
+# Right-hand sides per solve: more are not faster and use more memory; CUDA allows at most 128.
 MOST_COLUMNS = 48
 
 
 def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> SuperLU:
-    """Sparse LU of a symmetric positive definite matrix: no pivoting, which would spoil the ordering.
+    """Sparse LU factorisation of a symmetric positive definite matrix, without pivoting.
 
     Args:
         matrix: *Shape:* ``(n, n)``.
-        ordering: SuperLU's name; ``"NATURAL"`` if the unknowns are in a good order already.
+        ordering: Column ordering of SuperLU; ``"NATURAL"`` keeps the order of the unknowns.
     """
     options = {"SymmetricMode": True}
     return splu(sparse.csc_matrix(matrix), permc_spec=ordering, diag_pivot_thresh=0.0, options=options)
@@ -46,15 +46,15 @@ def factorize(matrix: sparse.spmatrix, ordering: str = "MMD_AT_PLUS_A") -> Super
 class SparseSolver:
     """The inverse of a sparse symmetric positive definite matrix, in float64.
 
-    Solves run on the device of the right side; on other GPUs than the first, which ``cholespy`` does not know, on the
-    CPU. Backward solves once more. The matrix is factorised at the first use, and again after pickling.
+    Solves run on the device of the right-hand side, or on the CPU for GPUs other than the first, which ``cholespy``
+    does not support. Backward is another solve. The matrix is factorised at the first use, and again after pickling.
 
     Args:
         matrix: *Shape:* ``(V, V)``.
         free: Unknowns to solve for; the others are zero. Default: all.
     """
 
-    def __init__(self, matrix: sparse.spmatrix, free: NDArray[np.int64] | None = None) -> None:
+    def __init__(self, matrix: sparse.spmatrix, free: IntArray | None = None) -> None:
         self.n = matrix.shape[0]
         self.free = np.arange(self.n) if free is None else free
         self._inner = matrix.tocsr() if free is None else matrix.tocsr()[free][:, free]
@@ -65,19 +65,19 @@ class SparseSolver:
         return {**self.__dict__, "_solves": {}}
 
     def __call__(self, right: Tensor) -> Tensor:
-        """Solve for one or more columns. *Shape:* ``(..., V, m) -> (..., V, m)``.
+        """Solve for right-hand sides in columns. *Shape:* ``(..., V, m) -> (..., V, m)``.
 
         Raises:
             ValueError: The matrix is not positive definite.
         """
         return solve_by(lambda: self, right)
 
-    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same for arrays. *Shape:* ``(V, m) -> (V, m)``."""
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solve for an array. *Shape:* ``(V, m) -> (V, m)``."""
         return self.solved(torch.from_numpy(right)).numpy()
 
     def solved(self, right: Tensor) -> Tensor:
-        """The same without a gradient."""
+        """Solve without gradient."""
         device = right.device if _is_served(right.device) else torch.device("cpu")
         columns = right.detach().to(device, torch.float64).movedim(-2, 0)
         out = columns.new_zeros(columns.shape)
@@ -93,7 +93,7 @@ class SparseSolver:
 
 @cache
 def _is_served(device: torch.device) -> bool:
-    """Whether systems are solved there: cholespy knows the first GPU, if it finds the driver by its plain name."""
+    """Whether ``cholespy`` supports the device: the first GPU, if the driver library is found by its plain name."""
     if device.type != "cuda" or device.index or cholespy is None or torch.version.cuda is None:
         return device.type == "cpu"
     try:
@@ -111,7 +111,7 @@ def _superlu(matrix: sparse.csr_matrix) -> Solve:
 def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
     whole = [torch.from_numpy(part.astype(np.int32)) for part in (matrix.indptr, matrix.indices)]
     entries = [part.to(device) for part in (*whole, torch.from_numpy(matrix.data.astype(np.float64)))]
-    # By rows, which it copies: columns it would sort and free in place.
+    # CSR is copied; CSC would be sorted and freed in place.
     solver = cholespy.CholeskySolverD(matrix.shape[0], *entries, cholespy.MatrixType.CSR)
 
     def solve(right: Tensor) -> Tensor:
@@ -119,7 +119,7 @@ def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
         if device.type == "cpu":
             solver.solve(right, out)
             return out
-        # Its kernels run on the default stream, whatever the current one is.
+        # Its kernels always run on the default stream.
         current, default = torch.cuda.current_stream(device), torch.cuda.default_stream(device)
         default.wait_stream(current)
         solver.solve(right, out)
@@ -130,11 +130,11 @@ def _cholesky(matrix: sparse.csr_matrix, device: torch.device) -> Solve:
 
 
 def solve_by(solver: Callable[[], SparseSolver], right: Tensor) -> Tensor:
-    """Solve with what is made only then: inside ``torch.func`` transforms, no tensor can be read before.
+    """Solve with a lazily created solver: inside ``torch.func`` transforms, tensors cannot be read earlier.
 
     *Shape:* ``(..., V, m) -> (..., V, m)``.
     """
-    if torch.compiler.is_compiling():  # it would go on into SciPy
+    if torch.compiler.is_compiling():  # do not trace into SciPy
         return torch.compiler.disable(_Solve.apply)(solver, right)
     return applied(_Solve, solver, right)
 
@@ -159,7 +159,7 @@ class _Solve(torch.autograd.Function):
         return _Solve.apply(solver, right.movedim(in_dims[1], 0)), 0
 
 
-def graph_laplacian(edges: NDArray[np.int64], weights: NDArray[np.float64], n: int) -> sparse.csr_matrix:
+def graph_laplacian(edges: IntArray, weights: FloatArray, n: int) -> sparse.csr_matrix:
     """``sum_e w_e (x_i - x_j)^2`` as a matrix. *Shape:* ``(E, 2), (E,) -> (n, n)``."""
     half = sparse.coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
     adjacency = (half + half.T).tocsr()

@@ -1,6 +1,6 @@
-"""Rotations and stretches of triangles, and the sides that they ask for.
+"""Rotations and stretches of triangles, and the resulting sides.
 
-Components come first, ``(3, B, F)``, as in :mod:`~torch_modal.geometry.vectors`. ``B`` may be any leading dimensions.
+Components come first, ``(3, B, F)``, as in :mod:`~torch_modal.geometry.vectors`. ``B`` stands for any dimensions.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_modal.geometry.rotations import turned
 from torch_modal.geometry.vectors import cross, norm, pick, tiny
 
-# Below this part of the sides a height is rounding, and dividing by it would make noise into a gradient.
+# Smallest height relative to the sides; below, it is rounding, and the division amplifies noise.
 FLAT = 1e-6
 
 
@@ -30,7 +30,7 @@ class Frames(NamedTuple):
     e1: Tensor
     """Unit vector along the first side. *Shape:* ``(3, B, F)``."""
     e2: Tensor
-    """Unit vector in the plane, across it. *Shape:* ``(3, B, F)``."""
+    """Unit vector in the plane, orthogonal to it. *Shape:* ``(3, B, F)``."""
     normal: Tensor
     """Unit normal. *Shape:* ``(3, B, F)``."""
     length: Tensor
@@ -41,7 +41,7 @@ class Frames(NamedTuple):
     """*Shape:* ``(B, F)``, above 0."""
 
     def world(self, x: Tensor, y: Tensor) -> Tensor:
-        """The vector of given coordinates in the plane. *Shape:* ``(B, F), (B, F) -> (3, B, F)``."""
+        """The vector with coordinates in the plane. *Shape:* ``(B, F), (B, F) -> (3, B, F)``."""
         return x * self.e1 + y * self.e2
 
     @property
@@ -57,7 +57,7 @@ class Frames(NamedTuple):
 
 
 class Bend(NamedTuple):
-    """What a displacement does to each triangle, to first order."""
+    """Infinitesimal rotation and strain of each triangle."""
 
     turn: Tensor
     """Axis times angle, in the coordinates of the shape. *Shape:* ``(3, B, F)``."""
@@ -72,7 +72,7 @@ def sides(x: Tensor, faces: Tensor) -> Sides:
 
 
 def frames(given: Sides) -> Frames:
-    """The frame of each triangle; of one without area it is finite, and means nothing."""
+    """The frame of each triangle; finite but arbitrary for one without area."""
     first, second = given
     length = norm(first)
     e1 = first / length
@@ -84,14 +84,14 @@ def frames(given: Sides) -> Frames:
 
 
 def edge_means(wanted: Sides, weights: Tensor, edges: Tensor, signs: Tensor, n_edges: int) -> Tensor:
-    """Edge vectors from the sides that run along them, their weighted means.
+    """Edge vectors as weighted means of the sides along them.
 
     Args:
-        wanted: Of all triangles.
-        weights: Of the sides, none below 0. *Shape:* ``(3F,)`` or ``(B, 3F)``.
+        wanted: Sides of all triangles.
+        weights: Non-negative weights of the sides. *Shape:* ``(3F,)`` or ``(B, 3F)``.
         edges: The ``sides`` of a :class:`~torch_modal.geometry.connectivity.Connectivity`. *Shape:* ``(3F,)``.
         signs: Its ``signs``. *Shape:* ``(3F,)``.
-        n_edges: E.
+        n_edges: Number of edges, E.
 
     Returns:
         *Shape:* ``(3, B, E)``.
@@ -104,11 +104,11 @@ def edge_means(wanted: Sides, weights: Tensor, edges: Tensor, signs: Tensor, n_e
 
 
 def bend(displaced: Sides, reference: Frames) -> Bend:
-    """Infinitesimal rotation and strain of a displacement, its normal staying normal (Kirchhoff and Love).
+    """Infinitesimal rotation and strain of a displacement field (Kirchhoff-Love kinematics).
 
     Args:
         displaced: Sides of the displacement field.
-        reference: Frames of the shape that is displaced; of a batch of one they serve for all.
+        reference: Frames of the undeformed shape; a batch of one is broadcast.
     """
     axes = (reference.e1, reference.e2, reference.normal)
     d_x, d_y = ([_dot(side, axis) for axis in axes] for side in displaced)
@@ -121,7 +121,7 @@ def bend(displaced: Sides, reference: Frames) -> Bend:
 
 
 def convected(bending: Bend, own: Frames) -> Tensor:
-    """A bend in the coordinates of the triangles, which it keeps wherever they turn: turn, then strain.
+    """Rotation vector and strain in the frames of the triangles.
 
     *Shape:* ``(6, B, F)``.
     """
@@ -140,11 +140,11 @@ def stretched(
 def bent_sides(bending: Bend, own: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
-    The stretch is the exponential of the strain, so that a shear keeps the area, and no triangle turns over.
+    The stretch is the exponential of the strain: shear keeps the area, and no triangle inverts.
 
     Args:
         bending: Rotations in the coordinates of ``own``.
-        own: Frames of the shape whose sides are wanted.
+        own: Frames of the undeformed shape.
     """
     first, second = stretched(torch.stack(bending.strain), own.length, own.along, own.height)
     return Sides(turned(bending.turn, own.world(*first)), turned(bending.turn, own.world(*second)))
@@ -186,7 +186,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _exponential(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of symmetric 2 x 2 matrices, entry by entry."""
+    """Matrix exponential of symmetric 2 x 2 matrices, by entries."""
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     radius = (half**2 + xy**2).clamp_min(tiny(xx)).sqrt()
     scale = mean.exp()

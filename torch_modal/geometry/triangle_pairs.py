@@ -1,19 +1,16 @@
-"""Whether two triangles pass through each other: a test with a margin, and an exact one. NumPy and libigl."""
+"""Triangle-triangle intersection: a conservative test and an exact one. NumPy and libigl."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torch_modal import extras
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from torch_modal.arrays import BoolArray, FloatArray
 
 MARGIN = 1e-12
-"""Of the cube of the largest length in a determinant: more than its rounding error."""
+"""Relative to the cubed largest length in a determinant; above its rounding error."""
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """What ``np.cross`` is, which takes ten times as long for a few vectors. *Shape:* ``(n, 3)`` each."""
+    """Cross product, ten times as fast as ``np.cross`` for few vectors. *Shape:* ``(n, 3)`` each."""
     found = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         found[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
@@ -21,21 +18,21 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Inner products of vectors: sums along an axis of three take several times as long. *Shape:* ``(..., 3)``."""
+    """Inner products, faster than sums along an axis of length three. *Shape:* ``(..., 3)``."""
     found: FloatArray = np.einsum("...i,...i->...", a, b)
     return found
 
 
 def triangles_cross(one: FloatArray, other: FloatArray) -> BoolArray:
-    """Which triangles pass through each other, whatever the rounding.
+    """Exact intersection test of pairs of triangles.
 
-    Two triangles cross where each has vertices strictly on both sides of the other's plane, and the segments that the
-    planes cut out of them overlap in more than a point (Guigue and Devillers 2003). Those that only touch, at a vertex
-    or along an edge, or that lie in one plane, do not. Signs of determinants are those of exact arithmetic.
+    Two triangles intersect if each has vertices strictly on both sides of the other's plane, and their segments on the
+    line of the planes overlap in more than a point (Guigue and Devillers 2003). Touching and coplanar triangles do not.
+    Signs of determinants are exact.
 
     Args:
         one: Corners. *Shape:* ``(n, 3, 3)``.
-        other: Likewise.
+        other: Corners. *Shape:* ``(n, 3, 3)``.
 
     Returns:
         *Shape:* ``(n,)``.
@@ -50,7 +47,7 @@ def triangles_cross(one: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def pierce_nearly(edges_of: FloatArray, through: FloatArray) -> BoolArray:
-    """Whether an edge of each triangle passes through another one, or misses it by rounding only.
+    """Whether an edge of each triangle intersects another one within the margin.
 
     *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``.
     """
@@ -76,7 +73,7 @@ def _cross_exactly(one: FloatArray, other: FloatArray) -> BoolArray:
     some = np.flatnonzero(crossing)
     first, first_above = _lone_first(one[some], sides[0][some])
     second, second_above = _lone_first(other[some], sides[1][some])
-    # Each lone vertex is brought above the other's plane, by turning the other around.
+    # Flips the other triangle so that each lone vertex is above its plane.
     second[~first_above, 1:] = second[~first_above, :0:-1]
     first[~second_above, 1:] = first[~second_above, :0:-1]
     p, q, r = first.transpose(1, 0, 2)
@@ -86,7 +83,7 @@ def _cross_exactly(one: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def _sides(points: FloatArray, planes: FloatArray) -> FloatArray:
-    """On which side of a triangle's plane three points lie: 1 above, -1 below, 0 in it. *Shape:* ``(n, 3)``."""
+    """Side of a triangle's plane for three points: 1 above, -1 below, 0 in it. *Shape:* ``(n, 3)``."""
     a, b, c = (planes[:, i] for i in range(3))
     return np.stack([_above(a, b, c, points[:, i]) for i in range(3)], 1)
 
@@ -99,7 +96,7 @@ def _above(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatA
 
 
 def _lone_first(corners: FloatArray, side: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """The corners turned so that the one that is alone on its side comes first, and whether it is above."""
+    """Corners rotated so that the one alone on its side comes first, and whether it is above."""
     above = (side > 0).sum(1) == 1
     lone = np.where(above, (side > 0).argmax(1), (side < 0).argmax(1))
     turned = (lone[:, None] + np.arange(3)) % 3

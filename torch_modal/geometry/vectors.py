@@ -1,4 +1,4 @@
-"""Vectors of many elements at once, components first: elementwise operations then run over long contiguous rows."""
+"""Vector operations with components first, which gives long contiguous rows."""
 
 import torch
 from torch import Tensor
@@ -11,22 +11,22 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def pick(rows: Tensor, index: Tensor) -> Tensor:
-    """``rows[..., index]``, by the operation that is three times as fast on a CPU. *Shape:* ``(..., V), (m,)``."""
+    """``rows[..., index]`` by ``gather``, three times as fast on a CPU. *Shape:* ``(..., V), (m,)``."""
     return rows.gather(-1, index.expand(*rows.shape[:-1], -1))
 
 
 def norm(vectors: Tensor) -> Tensor:
-    """Euclidean length, with derivative 0 where there is none. *Shape:* ``(3, ...) -> (...)``."""
+    """Euclidean length, with derivative 0 at 0. *Shape:* ``(3, ...) -> (...)``."""
     squared = (vectors * vectors).sum(0)
-    # The root of a constant where there is no length: its derivative is 0 there, not NaN.
+    # The root of a constant has derivative 0 instead of NaN.
     return torch.where(squared > tiny(vectors), squared, tiny(vectors)).sqrt()
 
 
 def tiny(like: Tensor) -> float:
-    """What a squared length must exceed to have a direction; its inverse still has room to grow."""
+    """Smallest squared length with a direction; its inverse does not overflow."""
     return torch.finfo(like.dtype).tiny ** 0.5
 
 
 def inverse(x: Tensor, zero: Tensor) -> Tensor:
-    """``1 / x``, and 0 with all its derivatives where told."""
+    """``1 / x``, and 0 with zero derivatives where ``zero`` is true."""
     return torch.where(zero, 0, 1 / torch.where(zero, 1, x))

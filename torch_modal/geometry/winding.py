@@ -1,18 +1,18 @@
-"""Whether faces wind the other way round than those of another shape: mirror images."""
+"""Detection of mirrored shapes."""
 
 import torch
 from torch import Tensor
 
-# Of the mean cosine between normals, which a reflection must win. Between poses of one body, one of them mirrored, it
-# wins 0.44 and more; between poses of thin plates, 0.2 and less.
+# Required gain of a reflection, in mean cosine between normals: mirrored poses of one body have at least 0.44, poses of
+# thin plates at most 0.2.
 CLEARLY = 0.3
 
 
 def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
-    """Whether normals fit clearly better after a reflection than after a rotation.
+    """Whether normals agree clearly better after a reflection than after a rotation.
 
-    Of a body whose signed volume has changed its sign, this says whether it was mirrored; the volume of a thin plate
-    also changes its sign where both sheets pass through each other a little.
+    For bodies with signed volumes of different sign: the volume of a thin plate also changes its sign if its sheets
+    intersect slightly.
 
     Args:
         first: *Shape:* ``(B, V, 3)``.
@@ -28,8 +28,8 @@ def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
     centred = [c - (weights[..., None] * c).sum(1, keepdim=True) / total[:, None, None] for c in centres]
     covariance, alike = ((weights[..., None] * a).mT @ b for a, b in (centred, normals))
     u, _, vh = torch.linalg.svd(covariance)
-    # The best rotation and the best reflection differ in the sign of the last singular vectors alone. A reflection also
-    # turns the normals over, so that the cosines of both differ by twice the part that they have in common.
+    # The best rotation and reflection differ only in the sign of the last singular vector. A reflection also flips the
+    # normals, so the cosines differ by twice their common part.
     common = ((u[..., :2].mT @ alike) * vh[:, :2]).sum((1, 2))
     return -2 * common > CLEARLY * total
 

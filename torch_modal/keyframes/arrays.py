@@ -1,16 +1,16 @@
-"""Tensors from what callers hold: tensors, NumPy arrays, sequences."""
+"""Conversion of tensors, NumPy arrays and sequences to tensors."""
 
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from torch_modal.arrays import IntArray
 from torch_modal.errors import MeshError
 
 
 def as_positions(keyframes: Any) -> torch.Tensor:
-    """A float tensor of what came in, sharing memory where it can."""
+    """Convert positions to a float tensor, sharing memory where possible."""
     if isinstance(keyframes, (list, tuple)):
         if not keyframes:
             raise MeshError("keyframes is empty; it needs the shape (K, V, 3)")
@@ -34,10 +34,10 @@ def as_positions(keyframes: Any) -> torch.Tensor:
     return positions
 
 
-def as_faces(faces: Any) -> NDArray[np.int64]:
-    """An int64 array of what came in."""
+def as_faces(faces: Any) -> IntArray:
+    """Convert faces to an int64 array."""
     tensor = _as_tensor("faces", faces)
-    # An empty list becomes a float array; that there are no faces is said where shapes are checked.
+    # An empty list becomes a float array; `check_keyframes` reports missing faces.
     if tensor.numel() and (tensor.dtype == torch.bool or tensor.is_floating_point() or tensor.is_complex()):
         raise MeshError(
             f"faces have dtype {tensor.dtype}; they are vertex indices and must be integers: convert with .long()"
@@ -49,7 +49,7 @@ def as_faces(faces: Any) -> NDArray[np.int64]:
 
 
 def _as_tensor(name: str, value: Any) -> torch.Tensor:
-    """A dense tensor with values of a tensor, an array or nested lists."""
+    """Convert a tensor, an array or nested lists to a dense tensor."""
     if isinstance(value, torch.Tensor):
         if value.layout != torch.strided or value.device.type == "meta" or value.is_quantized:
             raise MeshError(

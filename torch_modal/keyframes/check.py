@@ -1,6 +1,6 @@
-"""The border: key-frames are checked. Everything that is wrong with the input is said here.
+"""Checks of key-frames: all errors and warnings about the input.
 
-``docs/input.md`` has a row for each condition. Messages count key-frames, vertices and faces from 0.
+``docs/input.md`` lists the conditions. Messages count key-frames, vertices and faces from 0.
 """
 
 import warnings
@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry import inspect
 from torch_modal.geometry.connectivity import Connectivity
@@ -19,13 +19,13 @@ from torch_modal.keyframes.arrays import as_faces, as_positions
 
 __all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_solid"]
 
-# What a length must exceed, relative to the coordinates it is the difference of, to be more than rounding.
+# Rounding of a length, relative to the coordinates.
 _RESOLUTION = {torch.float32: 1e-6, torch.float64: 1e-12}
-# Outside of this the factor that scales a diagonal to 100 leaves the number range.
+# Range of diagonals that can be scaled to 100 without overflow.
 _DIAGONAL_RANGE = {torch.float32: (1e-30, 1e30), torch.float64: (1e-250, 1e250)}
 _LARGEST_SIZE_RATIO = 100.0
 _FLATNESS = 1e-6
-# Rounding of the coordinates, relative to the diagonal, above which it shows in the shape.
+# Visible rounding of the coordinates, relative to the diagonal.
 _COARSE_ROUNDING = 1e-4
 
 
@@ -45,15 +45,15 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
         keyframes: Vertex positions in any units, float32 or float64, as a tensor, an array or a sequence of
             ``(V, 3)``. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices, of any integer type. *Shape:* ``(F, 3)``.
-        min_keyframes: How many key-frames the caller needs.
-        warn: Whether to warn; refusals are raised in any case.
+        min_keyframes: Required number of key-frames.
+        warn: Whether to warn; errors are raised in any case.
 
     Returns:
-        The positions as they came, with their dtype, device and graph; the repaired faces, int64, on the same
-        device. Repairs drop faces or turn them over; vertices are never dropped, added or reordered.
+        The unchanged positions, with their dtype, device and graph; the repaired faces, int64, on the same device.
+        Repairs drop or flip faces; vertices are never dropped, added or reordered.
 
     Raises:
-        MeshError: The input cannot work; the message says what arrived and what to do.
+        MeshError: The input cannot work; the message gives the reason and a remedy.
 
     Warns:
         MeshWarning: At most once per kind of flaw, with the number of places and the first one.
@@ -66,7 +66,7 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
 
 
 def checked_surface(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, Connectivity, list[str]]:
-    """The same for who goes on with the connectivity, and what there would be to warn of."""
+    """`check_keyframes` with the connectivity and the list of warnings."""
     found: list[str] = []
     note = found.append
     positions, shapes, indices = checked_arrays(keyframes, faces, min_keyframes)
@@ -76,13 +76,11 @@ def checked_surface(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple
     return positions, mesh, found
 
 
-def checked_arrays(
-    keyframes: Any, faces: Any, min_keyframes: int = 1
-) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.int64]]:
-    """Positions as they came and in float64, and faces: of the right shapes, finite, and indices of vertices.
+def checked_arrays(keyframes: Any, faces: Any, min_keyframes: int = 1) -> tuple[torch.Tensor, FloatArray, IntArray]:
+    """Check shapes and values of the arrays; return positions, unchanged and in float64, and faces.
 
     Raises:
-        MeshError: They are not.
+        MeshError: Wrong shapes, values that are not finite, or invalid indices.
     """
     positions, indices = as_positions(keyframes), as_faces(faces)
     _check_shapes(positions, indices, min_keyframes)
@@ -92,7 +90,7 @@ def checked_arrays(
 
 
 def require_solid(vertices: Any, faces: Any) -> None:
-    """Refuse a surface that lies in a plane: there is nothing inside it to fill with tetrahedra.
+    """Reject a planar surface, which has no interior.
 
     Args:
         vertices: Positions of one shape. *Shape:* ``(V, 3)``.
@@ -115,7 +113,7 @@ def require_solid(vertices: Any, faces: Any) -> None:
         )
 
 
-def _check_shapes(positions: torch.Tensor, faces: NDArray[np.int64], min_keyframes: int) -> None:
+def _check_shapes(positions: torch.Tensor, faces: IntArray, min_keyframes: int) -> None:
     shape = tuple(positions.shape)
     if len(shape) == 2 and shape[1] == 3:
         raise MeshError(f"keyframes have shape {shape}, which is one shape; pass keyframes[None] for (K, V, 3)")
@@ -136,7 +134,7 @@ def _check_shapes(positions: torch.Tensor, faces: NDArray[np.int64], min_keyfram
         raise MeshError(f"faces have shape {faces.shape}; (F, 3) is needed, one for all key-frames")
 
 
-def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+def _check_values(shapes: FloatArray, faces: IntArray) -> None:
     finite = np.isfinite(shapes)
     if not finite.all():
         bad = ~finite.all(axis=2)
@@ -155,8 +153,8 @@ def _check_values(shapes: NDArray[np.float64], faces: NDArray[np.int64]) -> None
         )
 
 
-def _repaired(faces: NDArray[np.int64], n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
-    """Drop faces that are none or are there twice, wind the rest consistently; say whether that went."""
+def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
+    """Drop degenerate and repeated faces, orient the others; return whether the mesh is orientable."""
     kept = np.arange(len(faces))
     for flaw, what in (
         (inspect.degenerate_faces, "use a vertex twice"),
@@ -190,12 +188,12 @@ def _repaired(faces: NDArray[np.int64], n_vertices: int, note: Callable[[str], N
 
 
 def _check_sizes(
-    shapes: NDArray[np.float64],
+    shapes: FloatArray,
     mesh: Connectivity,
     dtype: torch.dtype,
     note: Callable[[str], None],
-) -> NDArray[np.float64]:
-    """Refuse sizes that cannot work; return the shapes around the origin, each with a diagonal of 1."""
+) -> FloatArray:
+    """Reject unusable sizes; return centred shapes with a diagonal of 1."""
     surface = shapes[:, mesh.used]
     with np.errstate(over="ignore", invalid="ignore"):
         diagonals = inspect.diagonals(surface)
@@ -229,18 +227,18 @@ def _check_sizes(
             f"of {diagonals[small]:.3g}: more than {_LARGEST_SIZE_RATIO:.0f} times as large; they are "
             "probably in different units, so scale one of them"
         )
-    with np.errstate(over="ignore"):  # by a stray vertex of no face, which nothing below looks at
+    with np.errstate(over="ignore"):  # unreferenced vertices, which are not used below
         return (shapes - surface.mean(axis=1, keepdims=True)) / diagonals[:, None, None]
 
 
 def _check_surface(
-    scaled: NDArray[np.float64],
+    scaled: FloatArray,
     mesh: Connectivity,
     orientable: bool,
     resolution: float,
     note: Callable[[str], None],
 ) -> None:
-    """Note what the solver survives; refuse closed meshes that were turned inside out."""
+    """Report flaws that the solver tolerates; reject mirrored closed meshes."""
     faces, edges, counts = mesh.faces, mesh.edges, mesh.counts
     along = scaled[:, edges[:, 0]] - scaled[:, edges[:, 1]]
     vanishing = np.einsum("kei,kei->ke", along, along) <= resolution**2
@@ -291,8 +289,8 @@ def _check_surface(
                 )
 
 
-def _seam_hint(vertices: NDArray[np.float64], boundary: NDArray[np.int64]) -> str:
-    """Files for rendering split vertices at texture seams; such cuts look closed and are open."""
+def _seam_hint(vertices: FloatArray, boundary: IntArray) -> str:
+    """Hint at coincident boundary vertices, which rendering formats create at texture seams."""
     ends = np.unique(boundary)
     _, copies = np.unique(vertices[ends], axis=0, return_counts=True)
     split = int(copies[copies > 1].sum())

@@ -1,4 +1,4 @@
-"""Key-frames whose vertices were split at seams: one surface for the solve, and back."""
+"""Welding of vertices that were split at texture seams."""
 
 from typing import Any, NamedTuple
 
@@ -11,22 +11,22 @@ from torch_modal.keyframes.arrays import as_faces, as_positions
 
 
 class WeldedKeyframes(NamedTuple):
-    """Key-frames without the copies of vertices along seams."""
+    """Key-frames without duplicate vertices along seams."""
 
     keyframes: Tensor
     """*Shape:* ``(K, W, 3)``."""
     faces: Tensor
-    """Of the W vertices, int64. *Shape:* ``(F, 3)``."""
+    """Indices of the W vertices, int64. *Shape:* ``(F, 3)``."""
     vertex_of: Tensor
-    """Which of the W vertices each of the V is. *Shape:* ``(V,)``."""
+    """Welded vertex of each of the V vertices. *Shape:* ``(V,)``."""
 
     @property
     def n_merged(self) -> int:
-        """How many vertices were copies."""
+        """Number of removed vertices."""
         return len(self.vertex_of) - self.keyframes.shape[1]
 
     def scatter(self, shapes: Tensor) -> Tensor:
-        """All V vertices of shapes of the welded surface: copies lie exactly on each other.
+        """Positions of all V vertices; duplicates coincide exactly.
 
         *Shape:* ``(..., W, 3) -> (..., V, 3)``.
         """
@@ -36,24 +36,24 @@ class WeldedKeyframes(NamedTuple):
 def weld_seams(keyframes: Any, faces: Any) -> WeldedKeyframes:
     """Join the vertices that exporters split along seams of texture coordinates and normals.
 
-    A surface that is cut open there would tear. Vertices that are on a boundary, and at the same place in all
-    key-frames, become one; the first of them gives its positions. Faces that lose a corner by it are left out.
+    Otherwise the surface would tear there. Boundary vertices that coincide in all key-frames become one, with the
+    position of the first. Faces that become degenerate are removed.
 
     Args:
         keyframes: Vertex positions, as for :func:`torch_modal.check_keyframes`. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
 
     Returns:
-        The welded key-frames; where nothing was split, those that came.
+        The welded key-frames; unchanged if nothing was split.
 
     Raises:
-        MeshError: They are no arrays of numbers.
+        MeshError: The arguments are not numeric arrays.
     """
     positions = as_positions(keyframes)
     indices = as_faces(faces)
     n = positions.shape[1] if positions.dim() == 3 else 0
     fits = positions.dim() == 3 and indices.ndim == 2 and indices.shape[1:] == (3,) and len(indices)
-    # What is wrong with the mesh is said by `check_keyframes`, whichever comes first.
+    # `check_keyframes` reports errors of the mesh.
     if fits and indices.min() >= 0 and indices.max() < n and bool(torch.isfinite(positions).all()):
         vertex_of = merge_seams(positions.detach().cpu().double().numpy(), indices)
     else:

@@ -1,4 +1,4 @@
-"""The border of contact: what passes through itself in given shapes."""
+"""Public detection of self-intersections."""
 
 from typing import Any, NamedTuple
 
@@ -6,58 +6,60 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.contacts import Search
-from torch_modal.geometry.crossings import Crossings, FloatArray, require_contact
+from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 
 class SelfContacts(NamedTuple):
-    """Pairs of triangles that pass through each other, of all shapes one after the other."""
+    """Pairs of intersecting triangles of all shapes."""
 
     shape: Tensor
-    """Which shape each pair is of, counted through the leading dimensions. *Shape:* ``(P,)``."""
+    """Flat index of the shape of each pair. *Shape:* ``(P,)``."""
     pairs: Tensor
-    """Numbers of the two faces, the smaller first. *Shape:* ``(P, 2)``."""
+    """Face indices, the smaller first. *Shape:* ``(P, 2)``."""
     new: Tensor
-    """Whether the two cross in none of the shapes that were to be ignored. *Shape:* ``(P,)``."""
+    """Whether the pair intersects in none of the ignored shapes. *Shape:* ``(P,)``."""
     far: Tensor
-    """Whether two parts went through each other: new, two rings of faces or more from what crosses in a shape that was
-    to be ignored, and more than 6 % of the diagonal apart along the surface. The rest is a crossing that grew, or a
-    fold. *Shape:* ``(P,)``."""
+    """Whether two separate parts intersect: the pair is new, at least two rings of faces from the intersections of
+    ignored shapes, and its geodesic distance exceeds 6 % of the diagonal. Other pairs belong to a known intersection or
+    a fold. *Shape:* ``(P,)``."""
     depth: Tensor
-    """How deep each vertex lies in a part that it went through, in the unit of the shapes; 0 elsewhere, and where only
-    edges cross. *Shape:* ``(..., V)``."""
+    """Penetration depth of each vertex, in the unit of the shapes; 0 elsewhere, and where only edges cross.
+
+    *Shape:* ``(..., V)``."""
     number: Tensor
-    """Pairs of each shape. *Shape:* ``(...)``."""
+    """Number of pairs of each shape. *Shape:* ``(...)``."""
     n_new: Tensor
-    """Of these the new ones. *Shape:* ``(...)``."""
+    """Number of new pairs. *Shape:* ``(...)``."""
     n_far: Tensor
-    """And of these the far ones. *Shape:* ``(...)``."""
+    """Number of far pairs. *Shape:* ``(...)``."""
 
     def of(self, i: int) -> Tensor:
-        """The pairs of one shape. *Shape:* ``(n, 2)``."""
+        """Pairs of one shape. *Shape:* ``(n, 2)``."""
         return self.pairs[self.shape == i]
 
 
 def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
-    """Find where shapes pass through themselves.
+    """Find self-intersections of shapes.
 
-    Two triangles without a common vertex cross where their interiors do (broad phase of ``ipctk``, exact predicates of
-    ``libigl``). Those that only touch, or lie in one plane, do not. Depths come from winding numbers (``libigl``).
-    Nothing is differentiable here.
+    Two triangles without a common vertex intersect if their interiors do (broad phase of ``ipctk``, exact predicates of
+    ``libigl``); touching and coplanar triangles do not. Depths come from winding numbers (``libigl``).
+    Not differentiable.
 
     Args:
         x: Shapes. *Shape:* ``(..., V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        ignore: Shapes, such as key-frames, whose own crossings are known. *Shape:* ``(K, V, 3)``, or ``(V, 3)``.
+        ignore: Shapes, such as key-frames, whose intersections are ignored. *Shape:* ``(K, V, 3)``, or ``(V, 3)``.
 
     Returns:
-        On the device of ``x``.
+        Tensors on the device of ``x``.
 
     Raises:
-        MeshError: Arrays that are no shapes of these faces, or not finite.
+        MeshError: Shapes and faces do not match, or values are not finite.
         MissingPackageError: The extra ``contact`` is not installed.
     """
     require_contact()

@@ -1,4 +1,4 @@
-"""When the key-frames of a motion are."""
+"""Times of the key-frames of a motion."""
 
 from collections.abc import Sequence
 
@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 def checked_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor:
-    """The times of key-frames; if cyclic, with the time when the first comes again. *Shape:* ``(K,)`` or ``(K + 1,)``.
+    """Checked times of key-frames; if cyclic, with the end of the cycle. *Shape:* ``(K,)`` or ``(K + 1,)``.
 
     Raises:
-        ValueError: Another number of times, or times that do not ascend.
+        ValueError: The number of times is wrong, or they do not ascend.
     """
     n = n_keyframes + cyclic
     if times is None:

@@ -7,8 +7,7 @@ second.
 
 import sys
 
-# Running a script puts its folder first on the path, where this package's cache.py and others would shadow
-# modules that the libraries below import.
+# A script's folder comes first on the path, where modules of this package would shadow those of libraries.
 del sys.path[0]
 
 import ctypes  # noqa: E402
@@ -19,7 +18,7 @@ import types  # noqa: E402
 import numpy as np  # noqa: E402
 
 MESHER_RAISED = 3
-"""Exit code; tetrahedra.py, which this script cannot import, has the same."""
+"""Exit code; also in tetwild.py, which this script cannot import."""
 
 
 def main(job_path: str, result_path: str) -> None:
@@ -36,13 +35,12 @@ def main(job_path: str, result_path: str) -> None:
         max_surface_faces = int(job["max_surface_faces"])
 
     if hasattr(signal, "alarm"):
-        # The parent keeps the time. This is for the case that the parent itself is killed: the default action
-        # of SIGALRM ends the process even while pytetwild holds the GIL, so that no orphan computes for
-        # hours.
+        # The parent enforces the timeout. If the parent is killed, the default action of SIGALRM ends this process
+        # even while pytetwild holds the GIL.
         signal.alarm(min(int(timeout) + 10, 2**31 - 1))
 
     if sys.platform == "linux":
-        pr_set_pdeathsig = 1  # or at once, where the system can be told to
+        pr_set_pdeathsig = 1  # ends this process together with its parent
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
 
     # Imported after the alarm is set, and where needed.
@@ -65,17 +63,16 @@ def main(job_path: str, result_path: str) -> None:
             num_threads=1,  # more make it no faster
         )
     except (RuntimeError, ValueError) as error:
-        # Told apart from a missing library, too little memory or too many threads: the parent remembers it.
+        # The parent caches failures of the mesher, but not those of missing libraries, memory or threads.
         traceback.print_exc()
         sys.exit(1 if any(word in str(error) for word in ("alloc", "memory", "Resource")) else MESHER_RAISED)
     np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))
 
 
 def _pytetwild() -> types.ModuleType:
-    """The mesher without pyvista, which it imports for a plotting accessor only.
+    """Import pytetwild without pyvista, which it needs only for a plotting accessor.
 
-    That saves more than half of this process's start, and the libraries that VTK needs from a machine without a
-    display. Should pytetwild want more of pyvista one day, it gets the real one.
+    This halves the start-up time and avoids VTK's display libraries. If the import fails, the real pyvista is used.
     """
     sys.modules["pyvista"] = types.ModuleType("pyvista")
     try:

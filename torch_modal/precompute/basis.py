@@ -1,4 +1,4 @@
-"""The vibration modes of one key-frame, as tensors."""
+"""Vibration modes of one key-frame, as tensors."""
 
 import os
 from dataclasses import dataclass, fields, replace
@@ -19,8 +19,7 @@ VERSION = "1"
 class ModalBasis:
     """Lowest vibration modes of one shape, restricted to its surface.
 
-    The modes are constants of the autograd graph: they are precomputed outside of it, all tensors here are
-    detached, and no gradient flows to the key-frame through them.
+    The modes are constants of the autograd graph: all tensors are detached.
 
     Modes have unit mass (density 1) in the solid, not on the surface: ``phi`` scales as ``length^-3/2`` and
     eigenvalues as ``length^-2`` with the units of the shape. Signs are arbitrary but fixed.
@@ -28,12 +27,12 @@ class ModalBasis:
     Attributes:
         reference: The shape that the modes belong to, in the caller's coordinates. *Shape:* ``(V, 3)``.
         eigenvalues: Ascending, of the elastic modes. *Shape:* ``(k,)``.
-        modes: Elastic displacements; the rigid motions are kept apart. Zero at vertices that no face uses.
+        modes: Elastic displacements, without rigid motions; zero at unreferenced vertices.
             *Shape:* ``(k, V, 3)``.
-        rigid_eigenvalues: The six zero eigenvalues as they were computed, for checks. *Shape:* ``(6,)``.
+        rigid_eigenvalues: The six computed eigenvalues of rigid motions, zero up to rounding. *Shape:* ``(6,)``.
 
     Raises:
-        ValueError: Shapes, dtypes or devices do not fit each other.
+        ValueError: Shapes, dtypes or devices do not match.
     """
 
     reference: torch.Tensor
@@ -85,7 +84,7 @@ class ModalBasis:
         v = self.n_vertices
         axes = torch.eye(3, dtype=self.reference.dtype, device=self.reference.device)
         arms = self.reference - self.reference.mean(dim=0)
-        arms = arms / arms.abs().max()  # rotations are normalised anyway; this keeps any unit of length in range
+        arms = arms / arms.abs().max()  # avoids overflow; rotations are normalised below
         translations = axes[:, None].expand(3, v, 3) / v**0.5
         turned = torch.linalg.cross(axes[:, None].expand(3, v, 3), arms.expand(3, v, 3))
         rotations = torch.linalg.qr(turned.reshape(3, 3 * v).T).Q.T.reshape(3, v, 3)
@@ -98,7 +97,7 @@ class ModalBasis:
             ValueError: ``k`` is below 0 or above the number of modes.
         """
         if not 0 <= k <= self.n_modes:
-            raise ValueError(f"{k} modes asked of a basis of {self.n_modes}; extract more modes")
+            raise ValueError(f"{k} modes requested from a basis of {self.n_modes}; extract more modes")
         return replace(self, eigenvalues=self.eigenvalues[:k], modes=self.modes[:k])
 
     def to(self, *args: Any, **kwargs: Any) -> "ModalBasis":
@@ -106,7 +105,7 @@ class ModalBasis:
         return ModalBasis(**{name: tensor.to(*args, **kwargs) for name, tensor in self._tensors().items()})
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a safetensors file; it is whole or absent.
+        """Write a safetensors file atomically.
 
         Args:
             path: The file; its folder must exist.
@@ -129,7 +128,7 @@ class ModalBasis:
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: The file is damaged, holds something else, or has another format version.
+            ValueError: The file is damaged, has other content or another format version.
         """
         tensors, metadata = from_bytes(Path(path).read_bytes(), Path(path))
         if metadata.get("format") != FORMAT:

@@ -1,29 +1,26 @@
-"""Cubes cut into tetrahedra that are halved where they are too large, and stay conforming."""
+"""Conforming bisection of tetrahedra cut from cubes."""
 
 import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 
 UNITS = 256
-"""Whole numbers along the edge of a cube, so that edges may be halved eight times."""
+"""Integer coordinates along the edge of a cube, so that edges can be bisected eight times."""
 _EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 
 
-class Halved(NamedTuple):
-    """Tetrahedra of different sizes that share their sides.
+class BisectedMesh(NamedTuple):
+    """Conforming tetrahedra of different sizes.
 
     Attributes:
-        vertices: In cubes. *Shape:* ``(N, 3)``.
-        tets: With positive volumes. *Shape:* ``(T, 4)``.
-        sizes: Edge of the cube of which six such tetrahedra are as large, in cubes. *Shape:* ``(T,)``.
-        owner: The tetrahedron of each point. *Shape:* ``(P,)``.
+        vertices: Positions, in cube edges. *Shape:* ``(N, 3)``.
+        tets: Vertex indices, with positive volumes. *Shape:* ``(T, 4)``.
+        sizes: Edge length of the cube with six times the volume, in cube edges. *Shape:* ``(T,)``.
+        owner: Tetrahedron that contains each point. *Shape:* ``(P,)``.
     """
 
     vertices: FloatArray
@@ -32,22 +29,22 @@ class Halved(NamedTuple):
     owner: IntArray
 
 
-def halved(
+def bisected(
     cubes: IntArray, points: FloatArray, wanted: FloatArray, is_inside: Callable[[FloatArray], BoolArray], most: int
-) -> Halved:
-    """Cubes cut into tetrahedra, which are halved until none is larger than a point in it wants.
+) -> BisectedMesh:
+    """Cut cubes into tetrahedra and bisect them until none is larger than the target size at the points it contains.
 
     Each cube is cut into six tetrahedra, the paths along its edges from its lowest corner to its highest (Kuhn 1960).
-    A tetrahedron is halved across the edge that Maubach (1995) names, and so are all that share this edge, so that
-    sides always fit. All shapes that come up are those of the first three halvings.
+    A tetrahedron is bisected at the edge given by Maubach (1995), together with all that share this edge, so the mesh
+    stays conforming. The tetrahedra have only the shapes of the first three bisections.
 
     Args:
-        cubes: Lowest corners, none negative. *Shape:* ``(C, 3)``.
-        points: Samples of the surface, in any of the cubes. *Shape:* ``(P, 3)``.
-        wanted: The size of tetrahedra at each of them, in cubes. *Shape:* ``(P,)``.
-        is_inside: Whether points are inside. *Shape:* ``(n, 3) -> (n,)``. Tetrahedra with none of the samples are left
-            out where neither their corners nor their centroids are.
-        most: About so many tetrahedra: what is largest, compared to what is wanted, is halved first.
+        cubes: Non-negative integer coordinates of the lowest corners. *Shape:* ``(C, 3)``.
+        points: Surface samples inside the cubes. *Shape:* ``(P, 3)``.
+        wanted: Target size of tetrahedra at each sample, in cube edges. *Shape:* ``(P,)``.
+        is_inside: Whether points are inside. *Shape:* ``(n, 3) -> (n,)``. Tetrahedra without
+            samples are removed if neither their corners nor their centroids are inside.
+        most: Approximate limit of the number of tetrahedra; the largest relative to their target size come first.
     """
     mesh = _Mesh(cubes, points)
     while True:
@@ -57,7 +54,7 @@ def halved(
         chosen = ratio > 1.0
         if not chosen.any() or len(mesh.tets) >= most:
             break
-        # Halves have 0.79 of the size. The worst go first, so that the bound is shared fairly.
+        # Halves have 0.79 of the size. The largest come first, as the number is limited.
         mesh.halve(chosen & (ratio > 0.8 * ratio.max()))
     return mesh.result()
 
@@ -65,7 +62,7 @@ def halved(
 class _Mesh:
     """Tetrahedra as rows of vertex keys.
 
-    The key of a vertex is linear in its whole coordinates, so that the key between two is the mean of theirs.
+    Keys are linear in the integer coordinates, so the key of an edge's midpoint is the mean of the keys of its ends.
     """
 
     def __init__(self, cubes: IntArray, points: FloatArray) -> None:
@@ -76,7 +73,7 @@ class _Mesh:
         self.halvings = np.zeros(len(self.tets), dtype=np.int64)
         self.inner = np.zeros(len(self.tets), dtype=bool)
         self.vertices: IntArray = np.unique(self.tets)
-        # A point's path goes first along the axis of its largest coordinate within the cube.
+        # The tetrahedron of a point follows from the order of its coordinates within the cube.
         cube = points.astype(np.int64)
         order = np.argsort(-(points - cube), axis=1, kind="stable")
         within = np.take_along_axis(points - cube, order, axis=1)
@@ -89,7 +86,7 @@ class _Mesh:
         self.owner = place[tuple(cube.T)] * 6 + number[tuple(order.T)]
 
     def drop(self, is_inside: Callable[[FloatArray], BoolArray]) -> None:
-        """Leave out what is outside."""
+        """Remove tetrahedra outside."""
         touched = np.zeros(len(self.tets), dtype=bool)
         touched[self.owner] = True
         unsure = np.flatnonzero(~touched & ~self.inner)
@@ -102,7 +99,7 @@ class _Mesh:
         self.tets, self.halvings, self.inner = self.tets[kept], self.halvings[kept], self.inner[kept]
 
     def _coordinates(self, keys: IntArray) -> FloatArray:
-        """Of vertices, in cubes. *Shape:* ``(...) -> (..., 3)``."""
+        """Positions of vertices, in cube edges. *Shape:* ``(...) -> (..., 3)``."""
         x, rest = np.divmod(keys, self.stride[0])
         return np.stack([x, *np.divmod(rest, self.stride[1])], axis=-1) / UNITS
 
@@ -110,18 +107,18 @@ class _Mesh:
         return 2.0 ** (-self.halvings / 3)
 
     def halve(self, chosen: BoolArray) -> None:
-        """Halve some, and what must be with them."""
+        """Bisect the chosen tetrahedra and all that conformity requires."""
         while chosen.any():
             added = self._halve_alone(chosen)
             changed = np.concatenate([chosen, np.ones(int(chosen.sum()), dtype=bool)])
             chosen = np.zeros(len(self.tets), dtype=bool)
-            # What was left alone can only have got a vertex that is new.
+            # Unchanged tetrahedra can only have a hanging vertex that is new.
             chosen[~changed] = self._hanging(self.tets[~changed], added)
             chosen[changed] = self._hanging(self.tets[changed], self.vertices)
 
     @staticmethod
     def _hanging(tets: IntArray, vertices: IntArray) -> BoolArray:
-        """Whether one of the vertices lies on an edge."""
+        """Whether an edge has one of the vertices as its midpoint (a hanging vertex)."""
         if len(vertices) == 0:
             return np.zeros(len(tets), dtype=bool)
         middles = (tets[:, _EDGES[:, 0]] + tets[:, _EDGES[:, 1]]) // 2
@@ -129,7 +126,7 @@ class _Mesh:
         return (vertices[place] == middles).any(axis=1)
 
     def _halve_alone(self, chosen: BoolArray) -> IntArray:
-        """Halve some; the vertices that are new."""
+        """Bisect the chosen tetrahedra only; return the new vertices."""
         index = np.flatnonzero(chosen)
         old, tag = self.tets[index], 3 - self.halvings[index] % 3
         row = np.arange(len(index))
@@ -140,7 +137,7 @@ class _Mesh:
             own = tag == d
             second[own] = old[own][:, [*range(1, d + 1), d, *range(d + 1, 4)]]
         second[row, tag] = middle
-        # A point has barycentric coordinates: what one end has more than the other stays, the rest is the middle's.
+        # Barycentric coordinates in the half: the excess of one end stays, twice the smaller one goes to the midpoint.
         other = np.full(len(self.tets), -1)
         other[index] = len(self.tets) + row
         moved = np.flatnonzero(other[self.owner] >= 0)
@@ -167,20 +164,20 @@ class _Mesh:
         self.vertices = np.sort(np.concatenate([self.vertices, added]))
         return added
 
-    def result(self) -> Halved:
+    def result(self) -> BisectedMesh:
         used, tets = np.unique(self.tets, return_inverse=True)
         tets = tets.reshape(-1, 4)
         vertices = self._coordinates(used)
         corners = vertices[tets]
         mirrored = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
         tets[mirrored] = tets[mirrored][:, [1, 0, 2, 3]]
-        return Halved(vertices, tets, self.sizes(), self.owner)
+        return BisectedMesh(vertices, tets, self.sizes(), self.owner)
 
 
 def _paths() -> IntArray:
     """Corners of the six tetrahedra of a cube: each axis order is a path from its lowest to its highest corner.
 
-    Neighbouring cubes cut their common side alike. *Shape:* ``(6, 4, 3)``.
+    Adjacent cubes cut their common face in the same way. *Shape:* ``(6, 4, 3)``.
     """
     paths = np.zeros((6, 4, 3), dtype=np.int64)
     for path, order in zip(paths, itertools.permutations(range(3)), strict=True):

@@ -1,4 +1,4 @@
-"""The tetrahedra of one key-frame carried to the others, so that the mesher runs once for a whole set."""
+"""Deformation of the tetrahedra of one key-frame to other poses, so that each set is meshed once."""
 
 from typing import Any, NamedTuple
 
@@ -6,25 +6,23 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes, tet_volumes
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 FIT_WEIGHT = 1e4
-"""Weight of the surface against the shape of the tetrahedra; both are made free of units."""
+"""Weight of the surface term relative to the deformation energy; both are dimensionless."""
 N_STEPS = 5
-"""Local-global steps after the first solve. The energy hardly falls after that."""
+"""Local-global steps after the first solve; the energy has then nearly converged."""
 MAX_FIT_RMS = 5e-3
 MAX_FIT = 0.1
-"""Largest distances of the carried surface from the key-frame, in bounding-box diagonals."""
+"""Largest root mean square and maximum distances from the key-frame, in bounding-box diagonals."""
 MAX_INVERTED = 0.04
 """Largest fraction of inverted tetrahedra. Up to 2.5 % change neither modes nor mid-shapes."""
 FLAT = 1e-3
-"""Determinant, over the cubed norm, below which a matrix is as good as flat; a rotation has 0.19."""
+"""Determinant over the cubed norm, below which a matrix counts as singular; a rotation has 0.19."""
 MOST_POLAR_STEPS = 20
 
 
@@ -45,26 +43,26 @@ class Carried(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether modes of these tetrahedra can be trusted; if not, the key-frame needs its own."""
+        """Whether the tetrahedra are good enough for modes; otherwise the key-frame is meshed separately."""
         return self.fit_rms <= MAX_FIT_RMS and self.fit_max <= MAX_FIT and self.inverted <= MAX_INVERTED
 
 
 class Carrier:
-    """The tetrahedra of one key-frame, ready to be carried.
+    """As-rigid-as-possible deformation of the tetrahedra of one key-frame to other poses.
 
-    As-rigid-as-possible deformation of the tetrahedra that takes their surface to where it is known to go. The matrix
-    of all its linear solves is the same, for each step and each key-frame: it is factored here, once.
+    The embedded surface is pulled to its positions in the other pose. All steps and all key-frames share one system
+    matrix, which is factorised here.
 
     Args:
         tetrahedra: The mesh in the first pose.
         points: The surface in the first pose. *Shape:* ``(U, 3)``.
         faces: Its faces. *Shape:* ``(F, 3)``.
-        weights: How the surface hangs on the tetrahedra
-            (:func:`~torch_modal.precompute.embedding.embed_surface`). *Shape:* ``(U, N)``.
+        weights: Embedding of the surface in the tetrahedra
+            (:func:`~torch_modal.precompute.embedding.fit_weights`). *Shape:* ``(U, N)``.
 
     Raises:
-        RuntimeError: The matrix is singular, as where nothing of the surface hangs on a piece of the tetrahedra.
-        LinAlgError: A tetrahedron is flat.
+        RuntimeError: The matrix is singular, for example if no surface point is embedded in a piece.
+        LinAlgError: A tetrahedron is degenerate.
     """
 
     def __init__(self, tetrahedra: Tetrahedra, points: FloatArray, faces: IntArray, weights: sp.csr_matrix) -> None:
@@ -87,7 +85,7 @@ class Carrier:
         self._factors = factorize(laplacian.tocsc() + weights.T @ self._pull)
 
     def carry(self, points: FloatArray) -> Carried:
-        """The tetrahedra in the pose of another key-frame.
+        """Deform the tetrahedra to the pose of another key-frame.
 
         Args:
             points: The surface in the new pose. *Shape:* ``(U, 3)``.
@@ -96,11 +94,11 @@ class Carrier:
             LinAlgError: The result is not finite.
         """
         areas = vertex_areas(points, self._faces)
-        # The bounding box, and with it the unit here, changes with the pose; the size of the shape hardly does.
+        # The diagonal, the unit of length here, depends on the pose; the area hardly does.
         scale = np.sqrt(areas.sum() / self._area)
         target = points / scale
-        turns = local_rotations(self._points, target, self._faces)
-        # The smoothest field of matrices that is the turn of the surface on the surface.
+        turns = vertex_rotations(self._points, target, self._faces)
+        # Harmonic extension of the surface rotations to the volume.
         field = self._factors.solve(self._pull.T @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
         rotations = nearest_rotations(field[self._rest.tets].mean(axis=1))
         vertices = self._place(rotations, target)
@@ -129,18 +127,18 @@ class Carrier:
         return self._factors.solve(summed + self._pull.T @ points)
 
 
-def local_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
-    """How a surface turns around each of its vertices from one pose to another.
+def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
+    """Rotation of the surface around each vertex from one pose to another.
 
-    The rotation nearest to the mean of the deformation gradients of the faces around, each with its unit normal as
-    third direction. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
+    The rotation nearest to the area-weighted mean of the rotations of the incident faces.
+    *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
     """
     frames = []
     for x in (before, after):
         corners = x[faces]
         one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         normal = np.cross(one, two)
-        # As long as the edges are on average, so that flat and large faces count alike.
+        # Scaled like the edges, so that the gradient does not depend on the size of the face.
         area = np.linalg.norm(normal, axis=1)
         normal /= np.maximum(np.sqrt(area), 1e-300)[:, None]
         frames.append((np.stack([one, two, normal], axis=2), area))
@@ -157,8 +155,8 @@ def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
     """The rotations nearest to matrices. *Shape:* ``(·, 3, 3) -> (·, 3, 3)``.
 
     The orthogonal factor of the polar decomposition by Newton's iteration ``X <- (s X + X^-T / s) / 2``, scaled by
-    ``s = det(X)^(-1/3)`` (Higham 1986): a quarter of the time of singular values, which serve those that are mirrored
-    or flat.
+    ``s = det(X)^(-1/3)`` (Higham 1986), in a quarter of the time of a singular value decomposition. The latter serves
+    mirrored and singular matrices.
     """
     x = np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.float64)
     determinant = _cofactors(x)[1]

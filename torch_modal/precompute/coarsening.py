@@ -1,27 +1,25 @@
-"""One edge-collapse rule for all key-frames, and the cluster averages that it gives (section 3.2 of the paper)."""
+"""Edge-collapse coarsening shared by all key-frames, with cluster averages (section 3.2 of the paper)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from torch_modal.geometry.connectivity import IntArray, connected_pieces, double_areas
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.connectivity import connected_pieces, double_areas
 from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
 
-FloatArray = NDArray[np.float64]
-
-# A triangle of less area than this part of its longest edge squared is a needle; an equilateral one has 0.43. If there
-# is one, other numbers of faces are tried.
+# Ratio of area to squared longest edge below which a triangle is a needle; an equilateral one has 0.43. With needles,
+# other numbers of faces are tried.
 NEEDLE = 3e-3
 MORE_FACES = (1.0, 1.1, 1.25, 1.4, 1.6)
 
-# A closed piece with fewer faces bends without stretching, or vanishes, and then nothing keeps its shape.
+# Closed pieces with fewer faces vanish or bend without stretching.
 FACES_OF_PIECE = 20
-# Of more pieces than this only the largest are looked at.
+# Maximum number of pieces that are repaired, by area.
 MOST_PIECES = 100
 
 
@@ -30,12 +28,12 @@ class Coarsening:
     """A partition of the fine vertices into clusters, each a vertex of the coarse mesh.
 
     The restriction of positions and of modes is the same cluster average, so ``restrict(x + phi a)`` is exactly
-    ``restrict(x) + restrict(phi) a``. Positions that the simplification itself would place are never used: they solve
-    quadrics anew for every pose and are not linear in it.
+    ``restrict(x) + restrict(phi) a``. The positions from quadric simplification are not linear in the pose and are not
+    used.
     """
 
     clusters: IntArray
-    """Coarse vertex of each fine one, -1 for those that no face uses. *Shape:* ``(V,)``."""
+    """Coarse vertex of each fine vertex, -1 for unreferenced ones. *Shape:* ``(V,)``."""
     faces: IntArray
     """Faces of the coarse mesh. *Shape:* ``(F_coarse, 3)``."""
 
@@ -61,7 +59,7 @@ class Coarsening:
 
 
 class Collapses:
-    """Partitions by the edge collapses of single key-frames, each made once: pairs of key-frames share them.
+    """Cached partitions by the edge collapses of single key-frames, shared by pairs of key-frames.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
@@ -73,17 +71,17 @@ class Collapses:
         self._known: dict[tuple[int, int], Coarsening] = {}
 
     def __call__(self, keyframe: int, n_faces: int) -> Coarsening:
-        """The partition by one of them, to so many faces."""
+        """The partition by the collapses of one key-frame to a number of faces."""
         key = keyframe, n_faces
         if key not in self._known:
             self._known[key] = _collapse_once(self._poses[keyframe], self.faces, n_faces)
         return self._known[key]
 
     def of(self, places: Sequence[int], keyframes: FloatArray) -> Callable[[int, int], Coarsening]:
-        """The same of some key-frames, at these places among all. A key-frame keeps the pose in which it first came.
+        """A function of local indices of key-frames. The first pose passed for a key-frame is kept.
 
         Args:
-            places: One for each.
+            places: Global index of each key-frame.
             keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
         """
         for place, points in zip(places, keyframes, strict=True):
@@ -96,9 +94,9 @@ def _renumbered(collapses: Collapses, chosen: Sequence[int], keyframe: int, n_fa
 
 
 def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
-    """Partition by the edge collapses of one pose; pieces that nothing would be left of are collapsed alone."""
+    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately."""
     root = _roots(points, faces, n_faces)
-    coarse_faces = _left(root, faces)
+    coarse_faces = _coarse_faces(root, faces)
     piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))[faces[:, 0]]
     before = np.bincount(piece)
     if np.count_nonzero(before) > 1:
@@ -114,8 +112,8 @@ def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsen
                 compact = np.searchsorted(members, own)
                 few = before[i] <= FACES_OF_PIECE
                 root[members] = members if few else members[_roots(points[members], compact, FACES_OF_PIECE)]
-        coarse_faces = _left(root, faces)
-    # Roots that lost all their faces carry no energy: they are left out, as are vertices that never had one.
+        coarse_faces = _coarse_faces(root, faces)
+    # Clusters without faces carry no energy and are removed.
     used = np.unique(coarse_faces)
     index = np.full(len(points), -1)
     index[used] = np.arange(len(used))
@@ -123,7 +121,7 @@ def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsen
 
 
 def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
-    """The vertex that each becomes part of. *Shape:* ``(V,)``."""
+    """Representative vertex of each cluster. *Shape:* ``(V,)``."""
     collapses = decimate(points, faces, n_faces).collapses
     root = np.arange(len(points))
     root[collapses[:, 1]] = collapses[:, 0]
@@ -132,18 +130,18 @@ def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
     return root
 
 
-def _left(root: IntArray, faces: IntArray) -> IntArray:
-    """The faces that are left, in terms of the vertices that stay. *Shape:* ``(F_coarse, 3)``."""
+def _coarse_faces(root: IntArray, faces: IntArray) -> IntArray:
+    """Faces of the coarse mesh in terms of the representative vertices. *Shape:* ``(F_coarse, 3)``."""
     left = root[faces]
     left = left[~degenerate_faces(left)]
     return left[~repeated_faces(left)]
 
 
 def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, float]:
-    """How thin the coarse triangles get: area over longest edge squared, in the worst key-frame.
+    """Ratio of area to squared longest edge in the worst key-frame.
 
     Returns:
-        Of the thinnest triangle, and the 1st percentile.
+        Minimum and 1st percentile over the coarse triangles.
     """
     corners = coarsening.restrict(keyframes)[:, coarsening.faces]
     sides = corners - np.roll(corners, 1, axis=2)
@@ -161,15 +159,15 @@ def coarsen(
 ) -> Coarsening:
     """Partition the vertices of all key-frames by the edge collapses of one of them.
 
-    Every key-frame is tried as the one that the collapses are chosen on; the partition is kept whose triangles stay
-    fattest over all of them, as thin coarse triangles exaggerate bending and collapse on the way. Regular meshes of
-    flat sides can end in triangles whose corners lie on a line: then somewhat more faces are tried.
+    The collapses of each key-frame are candidates; the partition with the best triangle quality over all key-frames is
+    used, as thin coarse triangles exaggerate bending and collapse in between. Regular meshes with flat sides can lead
+    to degenerate triangles: then somewhat more faces are tried.
 
     Args:
         keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_faces: Faces of the coarse mesh; a mesh with no more than that is left as it is.
-        collapses: Partitions by the edge collapses of each key-frame to a number of faces, where they are shared.
+        n_faces: Faces of the coarse mesh; smaller meshes are not coarsened.
+        collapses: Shared partitions, from key-frame and number of faces (:meth:`Collapses.of`).
 
     Raises:
         ValueError: If ``n_faces`` is below 4.
@@ -188,7 +186,7 @@ def coarsen(
             break
         candidates = [collapses(i, n) for i in range(len(keyframes))]
         fatness = [_fatness(keyframes, candidate) for candidate in candidates]
-        # Those without needles first, then by the bulk of the triangles.
+        # Candidates without needles first, then by the 1st percentile.
         best = max(range(len(candidates)), key=lambda i: (min(fatness[i][0], NEEDLE), fatness[i][1]))
         found.append((fatness[best][0], candidates[best]))
         if fatness[best][0] >= NEEDLE:

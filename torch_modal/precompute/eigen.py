@@ -5,33 +5,31 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray
 from torch_modal.precompute.lanczos import lowest_spans
 from torch_modal.precompute.mass import Mass
 from torch_modal.precompute.parallel import one_blas_thread
 
-FloatArray = NDArray[np.float64]
-
 N_RIGID = 6
 GUARD = 4
-"""Pairs computed beyond those asked for: the last of a batch are the least settled."""
+"""Additional pairs: the last ones of a batch have converged least."""
 RIGID_TOLERANCE = 1e-5
-"""Largest eigenvalue of a rigid motion, beside the first elastic one: 1e-13 as a rule, 1e-7 in a wire that is 300 times
-longer than wide."""
+"""Largest eigenvalue of a rigid motion relative to the first elastic one: typically 1e-13, and 1e-7 for a wire with
+aspect ratio 300."""
 EXACT = 1e-6
-"""Residual at which modes are as good as exact."""
+"""Residual at which modes count as exact."""
 ENOUGH = 1e-3
-"""Residual that in-betweens do not notice. It is of the highest frequencies, which ``K`` magnifies, and there is next
-to none of it in the modes: they lie within 1e-4 of the space of the exact ones. It is accepted whatever was asked for
-where further steps do not help: of wires and of flat tetrahedra it is the rounding of ``K phi``."""
+"""Residual without effect on in-betweens. It consists of high frequencies, which ``K`` magnifies: the modes lie within
+1e-4 of the exact space. It is always accepted if further steps do not help: for wires and flat tetrahedra it is the
+rounding of ``K phi``."""
 INVERTED = 0.3
-"""Residual of the inverted problem, over that of the modes, from which on it is worth a look at these."""
+"""Residual of the inverted problem, relative to the tolerance, at which the residuals of the modes are checked."""
 SHIFT = 1.0
-"""Negative shift in units of 1 / (bounding-box diagonal)²; the lowest modes of slender bodies lie near it."""
+"""Negative shift, in 1 / (bounding-box diagonal)²; near the lowest modes of slender bodies."""
 ZERO = 1e-9
-"""Largest eigenvalue that counts as zero, in the same units: rounding leaves 1e-13 to 1e-12, and the first
-mode of a rod 10,000 times longer than wide is still near 1e-6."""
+"""Largest eigenvalue that counts as zero, in the same units: rounding is 1e-13 to 1e-12, and the first mode of a rod
+of aspect ratio 10,000 is near 1e-6."""
 
 
 class ModalAnalysisError(RuntimeError):
@@ -39,13 +37,13 @@ class ModalAnalysisError(RuntimeError):
 
 
 class VolumeModes(NamedTuple):
-    """Lowest modes of a tetrahedral mesh, the six rigid ones apart.
+    """Lowest elastic modes of a tetrahedral mesh.
 
     Attributes:
         eigenvalues: Ascending. *Shape:* ``(k,)``.
         modes: M-orthonormal and M-orthogonal to the rigid motions. *Shape:* ``(3N, k)``.
-        rigid_eigenvalues: As computed, zero up to rounding. *Shape:* ``(6,)``.
-        n_zero: How many eigenvalues are zero, the six included: six for each loose component.
+        rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
+        n_zero: Number of zero eigenvalues: six for each loose component.
         residual: Largest ``|K phi - lambda M phi| / (lambda |M phi|)``.
     """
 
@@ -66,7 +64,7 @@ def rigid_motions(positions: FloatArray, mass: Mass) -> FloatArray:
     n = len(positions)
     lumped = mass.lumped()
     centered = positions - np.average(positions, axis=0, weights=lumped)
-    # Of order 1 like the translations, so that the factorisation below is well conditioned.
+    # Scaled to order 1 like the translations, for a well-conditioned factorisation.
     centered = centered / np.sqrt(np.average((centered**2).sum(axis=1), weights=lumped))
     motions = np.zeros((n, 3, 6))
     motions[:, :, :3] = np.eye(3)
@@ -85,11 +83,10 @@ def lowest_modes(
 ) -> VolumeModes:
     """Lowest elastic modes of ``K phi = lambda M phi``.
 
-    Shift-invert block Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are
-    those of ``K`` itself, which a regularised ``K + eps M`` would not give for free. Then two steps of dense
-    clean-up: the span is made exactly M-orthogonal to the rigid motions, and ``K`` is diagonalised in it
-    (Rayleigh-Ritz). Lanczos goes on until the modes pass the check of their residuals. Small problems are solved
-    densely. Of each mode's largest components, the first is positive.
+    Shift-invert block Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are those of
+    ``K`` itself. The span is then made M-orthogonal to the rigid motions, and ``K`` is diagonalised in it
+    (Rayleigh-Ritz). Lanczos continues until the residuals of the modes are small enough. Small problems are solved
+    densely. The first of the largest components of each mode is positive.
 
     Args:
         k: Stiffness, symmetric positive semi-definite. *Shape:* ``(3N, 3N)``.
@@ -99,17 +96,17 @@ def lowest_modes(
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` at which Lanczos ends.
 
     Returns:
-        The modes. Zero modes beyond the six (loose components) stay in as the first of them.
+        The modes. Further zero modes, of loose components, come first.
 
     Raises:
         ValueError: More modes than the mesh has.
-        ModalAnalysisError: The six zero modes are missing, the stiffness is indefinite, nothing but zero
-            modes was found, or a residual is too large.
+        ModalAnalysisError: The six zero modes are missing, the stiffness is indefinite, all modes are zero modes, or a
+            residual is too large.
     """
     possible = 3 * len(positions) - N_RIGID
     if not 1 <= n_modes <= possible:
         raise ValueError(
-            f"{n_modes} modes asked for, but {len(positions)} tetrahedral vertices have {possible} elastic modes; "
+            f"{n_modes} modes requested, but {len(positions)} tetrahedral vertices have {possible} elastic modes; "
             f"give 1 to {possible}"
         )
     inertia = Mass.of(mass)
@@ -140,24 +137,23 @@ def _next_of(spans: Iterator[FloatArray]) -> FloatArray | None:
     """The next span, or None after the last."""
     try:
         return next(spans, None)
-    except (RuntimeError, np.linalg.LinAlgError) as error:  # of Lanczos, of SuperLU on a singular matrix, of LAPACK
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # Lanczos, SuperLU on a singular matrix, LAPACK
         raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
 
 
 def _modes_in_span(
     k: sp.csc_matrix, mass: Mass, positions: FloatArray, span: FloatArray, rigid: FloatArray, n_modes: int
 ) -> tuple[VolumeModes, float]:
-    """The lowest elastic modes that a span holds, and the first eigenvalue that is not zero."""
+    """Lowest elastic modes in a span, and the first non-zero eigenvalue."""
     rigid_eigenvalues = _rayleigh_ritz(span, k @ span)[0][:N_RIGID]
 
-    # The rigid part is taken out exactly: six directions of the span lose all their length, and are left
-    # behind.
+    # Remove the rigid part: six directions of the span become zero and are dropped.
     moved = mass @ rigid
     elastic = span - rigid @ (moved.T @ span)
     lengths, directions = np.linalg.eigh(elastic.T @ (mass @ elastic))
     elastic = elastic @ (directions / np.sqrt(np.maximum(lengths, np.finfo(np.float64).tiny)))[:, N_RIGID:]
     elastic -= rigid @ (moved.T @ elastic)
-    # Orthonormal but for the rounding of these two steps, so that this is as good as QR, at a fifth of its time.
+    # Nearly orthonormal already, so Cholesky is as accurate as QR, in a fifth of the time.
     elastic = elastic @ np.linalg.inv(np.linalg.cholesky(elastic.T @ (mass @ elastic))).T
     forces = k @ elastic
     eigenvalues, rotation = _rayleigh_ritz(elastic, forces)
@@ -166,7 +162,7 @@ def _modes_in_span(
     eigenvalues, rotation = eigenvalues[:n_modes], rotation[:, :n_modes]
     modes = elastic @ rotation
     residual = relative_residual(forces @ rotation, mass @ modes, eigenvalues, first_elastic)
-    # Zero modes of loose pieces come out as -1e-13 as well as 1e-13; nobody should meet the root of that.
+    # Zero eigenvalues of loose pieces may be -1e-13; their roots must exist.
     found = VolumeModes(np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, n_zero, residual)
     return found, first_elastic
 
@@ -174,20 +170,20 @@ def _modes_in_span(
 def relative_residual(forces: FloatArray, inertia: FloatArray, eigenvalues: FloatArray, smallest: float) -> float:
     """Largest ``|K phi - lambda M phi| / (lambda |M phi|)``, Euclidean norms.
 
-    A zero mode counts as if its eigenvalue were ``smallest``, the first that is not zero.
+    For zero modes, ``smallest`` replaces the eigenvalue.
 
     Args:
         forces: ``K phi`` of each mode. *Shape:* ``(3N, k)``.
         inertia: ``M phi``. *Shape:* ``(3N, k)``.
         eigenvalues: *Shape:* ``(k,)``.
-        smallest: Above zero.
+        smallest: The first non-zero eigenvalue.
     """
     difference = np.linalg.norm(forces - inertia * eigenvalues, axis=0)
     return float((difference / (np.maximum(eigenvalues, smallest) * np.linalg.norm(inertia, axis=0))).max())
 
 
 def _count_zeros(eigenvalues: FloatArray, positions: FloatArray) -> tuple[float, int]:
-    """The first eigenvalue that is not zero, and the number of those that are, the rigid ones included."""
+    """The first non-zero eigenvalue, and the number of zero ones, including the rigid ones."""
     zero = ZERO / _squared_diagonal(positions)
     if eigenvalues[0] < -zero:
         raise ModalAnalysisError(
@@ -198,7 +194,7 @@ def _count_zeros(eigenvalues: FloatArray, positions: FloatArray) -> tuple[float,
     if n_extra == len(eigenvalues):
         raise ModalAnalysisError(
             f"all of the lowest {n_extra} modes are motions without deformation: the mesh falls into loose "
-            "pieces, each of which moves in six ways of its own; join them, or ask for more modes than that"
+            "pieces, each of which has six rigid motions; join them, or request more modes"
         )
     return float(eigenvalues[n_extra]), N_RIGID + n_extra
 
@@ -206,8 +202,8 @@ def _count_zeros(eigenvalues: FloatArray, positions: FloatArray) -> tuple[float,
 def _signs(modes: FloatArray) -> FloatArray:
     """Signs that make the first of the largest components positive. *Shape:* ``(k,)``.
 
-    "Largest" up to a thousandth: symmetric shapes have components of equal magnitude and opposite sign, and
-    rounding must not choose among them.
+    Components within a thousandth of the largest count, so that rounding does not choose between equal magnitudes of
+    symmetric shapes.
     """
     magnitude = np.abs(modes)
     first = (magnitude >= 0.999 * magnitude.max(axis=0)).argmax(axis=0)

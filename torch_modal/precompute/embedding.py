@@ -1,72 +1,53 @@
-"""A surface carried by the tetrahedra around it: linear-precise moving least squares."""
+"""Surface points embedded in tetrahedra by moving least squares with linear precision."""
 
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 N_NEIGHBOURS = 12
 RINGS = 2
-"""Rings of tetrahedra vertices around the four of the closest tetrahedron."""
+"""Vertex rings around the closest tetrahedron from which neighbours are taken."""
 MAX_RINGS = 6
 PUSH = 0.005
-"""How far points are moved inward for the search of the closest tetrahedron, in bounding-box diagonals: more
-than the tolerance of the mesher (0.004), less than the thickness of a limb."""
+"""Inward offset of points for the search of the closest tetrahedron, in bounding-box diagonals: above the tolerance
+of the mesher (0.004), below the thickness of a limb."""
 MAX_AMPLIFICATION = 4.0
 """Largest sum of the magnitudes of a point's weights; 1 inside, larger where it extrapolates."""
 FLAT = 1e-7
-"""Determinant of the covariance of a point's neighbours, over its cubed trace, below which they lie in a plane."""
+"""Determinant of the neighbours' covariance over its cubed trace, below which they count as coplanar."""
 _CANDIDATES = (6, 32)
 _CHUNK = 4096
 
 
 class Neighbours(NamedTuple):
-    """The tetrahedra's vertices that each point hangs on, padded with kernels of zero.
+    """Tetrahedral vertices in the support of each point, padded with zero kernels.
 
     Attributes:
         vertex: *Shape:* ``(V, 12)``.
-        kernel: How much each of them counts; falls to zero with the distance. *Shape:* ``(V, 12)``.
+        kernel: Moving-least-squares kernel, which falls to zero with the distance. *Shape:* ``(V, 12)``.
     """
 
     vertex: IntArray
     kernel: FloatArray
 
 
-def embed_surface(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None) -> sp.csr_matrix:
-    """Weights that carry displacements of the tetrahedra's vertices to points on or near their surface.
-
-    Each point takes a moving-least-squares fit of a linear function to the (about 12) nearest vertices. Constant and
-    linear displacements are carried exactly (up to rounding), so rigid motions stay rigid; clamped barycentric
-    weights, the usual choice, make modes rough.
-
-    Args:
-        points: Positions on the surface. *Shape:* ``(V, 3)``.
-        tetrahedra: The mesh that carries them.
-        normals: Outward unit normals at the points; without them the points are searched for where they are.
-            *Shape:* ``(V, 3)``.
-
-    Returns:
-        Rows sum to one, and ``weights @ tetrahedra.vertices`` are the points. *Shape:* ``(V, N)``.
-    """
-    return fit_weights(points, tetrahedra.vertices, find_neighbours(points, tetrahedra, normals))
-
-
 def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: Neighbours) -> sp.csr_matrix:
-    """Linear-precise weights of known neighbours, in whatever pose both now are.
+    """Moving-least-squares weights that map displacements of the tetrahedra's vertices to surface points.
+
+    A linear function is fitted to the displacements of the neighbours of each point. Constant and linear displacements
+    are reproduced up to rounding, so rigid motions stay rigid. Clamped barycentric weights make modes rough.
 
     Args:
         points: Positions on the surface. *Shape:* ``(V, 3)``.
-        vertices: Positions of the tetrahedra's vertices. *Shape:* ``(N, 3)``.
-        neighbours: Those of each point, found in this pose or another.
+        vertices: Positions of the tetrahedra's vertices in the same pose. *Shape:* ``(N, 3)``.
+        neighbours: Neighbours of each point, from this pose or another.
 
     Returns:
         Rows sum to one, and ``weights @ vertices`` are the points. *Shape:* ``(V, N)``.
@@ -81,15 +62,14 @@ def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: Neighbours
 
 
 def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None) -> Neighbours:
-    """The nearest vertices that are only a few edges away from the closest tetrahedron of each point.
+    """Nearest vertices of each point within a few edges of its closest tetrahedron.
 
-    That tetrahedron is searched for slightly below the surface, so that limbs that touch do not mix.
+    The search for the closest tetrahedron starts slightly below the surface, so that touching limbs do not mix.
 
     Args:
         points: Positions on the surface. *Shape:* ``(V, 3)``.
-        tetrahedra: The mesh that carries them.
-        normals: Outward unit normals at the points; without them the points are searched for where they are.
-            *Shape:* ``(V, 3)``.
+        tetrahedra: The volume mesh.
+        normals: Outward unit normals at the points; without them the search starts at the points. *Shape:* ``(V, 3)``.
     """
     extent = np.ptp(tetrahedra.vertices, axis=0)
     below = points if normals is None else points - PUSH * np.linalg.norm(extent) * normals
@@ -120,10 +100,10 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
 
 
 def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
-    """The tetrahedron around each point, or about the closest one where there is none. *Shape:* ``(V,)``.
+    """Tetrahedron that contains each point, or approximately the closest one. *Shape:* ``(V,)``.
 
-    Among the tetrahedra with the nearest centroids, the one whose faces the point is least far outside of. A few are
-    enough for points that one of those few holds.
+    Among the tetrahedra with the nearest centroids, takes the one with the largest signed distance to its faces. Points
+    outside of all candidates are tested against more of them.
     """
     centroids = tetrahedra.vertices[tetrahedra.tets].mean(axis=1)
     gradients = hat_gradients(tetrahedra)
@@ -138,7 +118,7 @@ def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
             tets = closest_in(tree, points[chunk], n_candidates)[1].reshape(len(chunk), n_candidates)
             offset = points[chunk, None] - centroids[tets]
             barycentric = 0.25 + (gradients[tets] @ offset[..., None])[..., 0]
-            inside = (barycentric * heights[tets]).min(axis=2)  # signed distance to the face it is most outside of
+            inside = (barycentric * heights[tets]).min(axis=2)  # signed distance, positive inside
             closest[chunk] = np.take_along_axis(tets, inside.argmax(axis=1)[:, None], axis=1)[:, 0]
             outside.append(chunk[inside.max(axis=1) < 0])
         left = np.concatenate(outside)
@@ -146,12 +126,12 @@ def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
 
 
 def _chunks(indices: IntArray) -> list[IntArray]:
-    """Parts of at most 4096, so that the arrays of each stay small."""
+    """Chunks of at most 4096 indices, to bound memory."""
     return np.array_split(indices, max(1, -(-len(indices) // _CHUNK)))
 
 
 def _adjacency(tetrahedra: Tetrahedra) -> sp.csr_matrix:
-    """Which vertices share a tetrahedron, each with itself. *Shape:* ``(N, N)``."""
+    """Adjacency matrix of the vertices with a non-zero diagonal. *Shape:* ``(N, N)``."""
     n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
     incidence = sp.csr_matrix(
         (np.ones(4 * t, dtype=np.int32), tetrahedra.tets.reshape(-1), np.arange(0, 4 * t + 1, 4)),
@@ -163,7 +143,7 @@ def _adjacency(tetrahedra: Tetrahedra) -> sp.csr_matrix:
 def _nearest_reached(
     points: FloatArray, tetrahedra: Tetrahedra, closest: IntArray, reached: sp.csr_matrix
 ) -> tuple[Neighbours, IntArray]:
-    """The nearest vertices among those that ``reached`` connects with the closest tetrahedron's four; their number."""
+    """Nearest vertices among those that ``reached`` connects with the closest tetrahedron, and their number."""
     tets, row_of_point = np.unique(closest, return_inverse=True)
     seeds = sp.csr_matrix(
         (
@@ -191,8 +171,8 @@ def _nearest_reached(
     squared = np.sort(squared, axis=1)
 
     count = np.minimum(sizes[row_of_point.reshape(-1)], N_NEIGHBOURS)
-    # The kernel falls to zero at the first vertex that is not taken, so that weights change smoothly from one
-    # point to the next; where all are taken, somewhat beyond the last.
+    # The kernel vanishes at the first vertex outside of the support, so that weights vary smoothly over the surface;
+    # if there is none, somewhat beyond the last vertex.
     last = np.take_along_axis(squared, count[:, None] - 1, axis=1)
     radius = np.where(np.isfinite(squared[:, -1:]), squared[:, -1:], 1.2 * last)
     kernel = np.clip(1 - np.where(np.isfinite(squared), squared, np.inf) / np.maximum(radius, 1e-300), 0, None) ** 2
@@ -213,7 +193,7 @@ def _moving_least_squares(points: FloatArray, vertices: FloatArray, nearest: Nei
     inverse = _inverses(covariance)
     # Eliminating the constant leaves 3 x 3: the weights are θ (a + s · (d - mean)) with a sum a and a moment C s.
     weights = np.zeros_like(theta)
-    for _ in range(2):  # the second pass takes out the rounding of the first
+    for _ in range(2):  # the second pass corrects the rounding of the first
         sum_missing = 1 - weights.sum(axis=1)
         moment_missing = -(weights[:, None] @ offset)[:, 0]
         slope = (inverse @ (moment_missing - sum_missing[:, None] * mean)[..., None])[..., 0]
@@ -224,8 +204,8 @@ def _moving_least_squares(points: FloatArray, vertices: FloatArray, nearest: Nei
 def _inverses(covariance: FloatArray) -> FloatArray:
     """Inverses of symmetric positive semi-definite matrices. *Shape:* ``(·, 3, 3)``.
 
-    The pseudo-inverse of those that are nearly singular: neighbours in one plane fix no slope across it, and none is
-    taken then.
+    Nearly singular matrices have a pseudo-inverse: coplanar neighbours determine no slope across their plane, and zero
+    is used.
     """
     flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
     inverse = np.empty_like(covariance)

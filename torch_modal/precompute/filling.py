@@ -1,4 +1,4 @@
-"""Key-frames filled with tetrahedra: meshed once for the whole set where that works."""
+"""Tetrahedra of key-frames: meshed once per set where possible."""
 
 import threading
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
 from torch_modal.precompute.lattice import Lattice
-from torch_modal.precompute.proximity import parting, self_proximity
+from torch_modal.precompute.proximity import self_proximity, separation
 from torch_modal.precompute.stiffness import mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
@@ -27,23 +27,25 @@ from torch_modal.precompute.tetrahedra import (
 )
 from torch_modal.precompute.tetwild import TetrahedraSettings, TetWild
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-MESHERS: dict[str, Callable[[TetrahedraSettings], Mesher]] = {"lattice": Lattice, "tetwild": TetWild}
-"""By their names, made of how fine the tetrahedra are wanted."""
+MESHERS: dict[str, Callable[[TetrahedraSettings], Mesher]] = {
+    "lattice": lambda settings: Lattice(settings.edge_length_fac),
+    "tetwild": TetWild,
+}
+"""Constructors of meshers by name."""
 
-MOST_PARTING = 0.014
-"""Where parts that touch come further apart, carrying is not tried (:func:`~torch_modal.precompute.proximity.parting`).
-On all pairs of the samples and of five data sets tetrahedra survived up to 0.0105, and never from 0.0127 on."""
+MAX_SEPARATION = 0.014
+"""Largest separation of parts in contact at which carrying is tried
+(:func:`~torch_modal.precompute.proximity.separation`). On the samples and five data sets carrying worked up to 0.0105,
+never from 0.0127 on."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A key-frame with tetrahedra of its own.
+    """A key-frame with its own tetrahedra.
 
     Attributes:
         surface: The key-frame.
-        tetrahedra: In the units of the surface.
+        tetrahedra: The volume mesh, in the units of the surface.
     """
 
     surface: CanonicalSurface
@@ -52,13 +54,13 @@ class Body:
 
     @property
     def neighbours(self) -> Neighbours:
-        """What each point of the surface hangs on."""
+        """Embedding of the surface in the tetrahedra."""
         with self._lock:
             return self._neighbours
 
     @property
     def carrier(self) -> Carrier:
-        """What takes the tetrahedra to other key-frames."""
+        """Deformation of the tetrahedra to other key-frames."""
         with self._lock:
             return self._carrier
 
@@ -74,15 +76,15 @@ class Body:
 
 @dataclass(frozen=True)
 class Filling:
-    """Tetrahedra in the pose of a key-frame: its own, or those of another.
+    """Tetrahedra in the pose of a key-frame: its own, or carried from another.
 
-    Mass and neighbours are those of the pose that the tetrahedra were made in: there none is inverted, and no point
-    is nearer to another limb than to its own.
+    Mass and embedding come from the rest pose, in which no tetrahedron is inverted and no point is closer to another
+    limb than to its own.
 
     Attributes:
-        body: The key-frame that the tetrahedra were made for.
-        surface: The key-frame that they are in the pose of.
-        tetrahedra: In that pose, in the units of the surface.
+        body: The key-frame at rest.
+        surface: The key-frame in this pose.
+        tetrahedra: The volume mesh in this pose, in the units of the surface.
     """
 
     body: Body
@@ -95,11 +97,11 @@ class Filling:
         return mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
 
     def weights(self) -> sp.csr_matrix:
-        """How the surface hangs on the tetrahedra. *Shape:* ``(U, N)``."""
+        """Embedding of the surface in the tetrahedra. *Shape:* ``(U, N)``."""
         return fit_weights(self.surface.points, self.tetrahedra.vertices, self.body.neighbours)
 
     def content(self) -> Arrays:
-        """Everything that modes depend on, for the cache."""
+        """Cache inputs: everything that the modes depend on."""
         rest = {f"rest_{name}": array for name, array in _as_arrays(self.body.tetrahedra).items()}
         surfaces = {"points": self.surface.points, "faces": self.surface.faces, "rest_points": self.body.surface.points}
         return {**surfaces, **rest, "vertices": self.tetrahedra.vertices}
@@ -107,13 +109,13 @@ class Filling:
 
 @dataclass(frozen=True)
 class Filler:
-    """How surfaces are filled with tetrahedra; by several threads at once if need be.
+    """Fills surfaces with tetrahedra through the cache. Thread-safe.
 
     Attributes:
-        mesher: Fills them.
-        timeout: Seconds that it may take for one.
-        cache: Where tetrahedra are stored.
-        stop: Set when they are no longer wanted: child processes are killed then.
+        mesher: The mesher.
+        timeout: Time limit for one surface, in seconds.
+        cache: Storage of tetrahedra and failures.
+        stop: Event that cancels the work and kills child processes.
     """
 
     mesher: Mesher
@@ -122,17 +124,17 @@ class Filler:
     stop: threading.Event = field(default_factory=threading.Event)
 
     def body(self, surface: CanonicalSurface) -> Body:
-        """The surface with tetrahedra of its own.
+        """Mesh a surface.
 
         Raises:
-            TetrahedralizationError: No mesher could fill it.
+            TetrahedralizationError: The mesher failed.
         """
         key, inputs = self.mesher.key(), {"points": surface.points, "faces": surface.faces}
         stored = self.cache.get("tetrahedra", inputs, key, lambda: _as_arrays(self._made(surface, inputs, key)))
-        return _without_idle(Body(surface, Tetrahedra(**stored)))
+        return _without_unused_pieces(Body(surface, Tetrahedra(**stored)))
 
     def _made(self, surface: CanonicalSurface, inputs: Arrays, key: dict[str, Any]) -> Tetrahedra:
-        """Tetrahedra of the mesher, unless it is known to fail: nobody should wait for the same failure twice."""
+        """Run the mesher, unless a cached failure shows that it would fail again."""
         key = {name: value for name, value in key.items() if name != "mesher"}
         if (failure := self.cache.find("failure", inputs, key)) is not None:
             self._raise_known(failure)
@@ -146,7 +148,7 @@ class Filler:
             raise
 
     def _raise_known(self, failure: Arrays) -> None:
-        """Raise what an earlier run found, if the timeout is no longer than it was."""
+        """Raise a cached failure unless the timeout is longer than in the failed run."""
         fails_until = float(failure["fails_until"][0])
         if self.timeout > fails_until:
             return
@@ -158,12 +160,12 @@ class Filler:
         )
 
     def carried(self, body: Body, surface: CanonicalSurface) -> Filling | None:
-        """The body in the pose of another key-frame, or None if its tetrahedra do not survive that."""
+        """Carry the tetrahedra to the pose of another key-frame; None if the result is too distorted."""
 
         def compute() -> dict[str, NDArray[Any]]:
             try:
                 result = body.carrier.carry(surface.points)
-            except (RuntimeError, np.linalg.LinAlgError):  # of SuperLU, NumPy or SciPy: a matrix that is singular
+            except (RuntimeError, np.linalg.LinAlgError):  # a singular matrix, in SuperLU, NumPy or SciPy
                 return {"vertices": body.tetrahedra.vertices, "is_good": np.array([False])}
             return {"vertices": result.tetrahedra.vertices, "is_good": np.array([result.is_good])}
 
@@ -174,8 +176,8 @@ class Filler:
         return Filling(body, surface, body.tetrahedra._replace(vertices=kept["vertices"]))
 
 
-def _without_idle(body: Body) -> Body:
-    """The body without pieces of tetrahedra that nothing of its surface hangs on."""
+def _without_unused_pieces(body: Body) -> Body:
+    """Remove pieces of tetrahedra in which no surface point is embedded."""
     piece = loose_pieces(body.tetrahedra)
     if piece.max() == 0:
         return body
@@ -191,10 +193,10 @@ def _as_arrays(tetrahedra: Tetrahedra) -> dict[str, NDArray[Any]]:
 
 
 def meshing_order(surfaces: list[CanonicalSurface]) -> list[int]:
-    """Key-frames in the order in which they should be filled: the one that touches itself least comes first."""
+    """Indices of the key-frames by ascending self-proximity."""
     return [int(i) for i in np.argsort([self_proximity(surface) for surface in surfaces], kind="stable")]
 
 
-def is_torn(rest: CanonicalSurface, posed: CanonicalSurface) -> bool:
-    """Whether it is known beforehand that tetrahedra of one pose do not survive being carried to another."""
-    return parting(rest, posed) > MOST_PARTING
+def separates(rest: CanonicalSurface, posed: CanonicalSurface) -> bool:
+    """Whether parts in contact in one pose separate in another, so that carrying would fail."""
+    return separation(rest, posed) > MAX_SEPARATION

@@ -1,23 +1,20 @@
-"""Loose pieces of tetrahedra: small ones follow the body around them, and motions of whole ones are no modes."""
+"""Loose pieces of tetrahedra: small ones follow the body, rigid motions of large ones are removed from the modes."""
 
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.precompute.embedding import N_NEIGHBOURS, Neighbours, fit_weights
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra, is_small, kept_tetrahedra, loose_pieces
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 DEFORMS = 1e-6
-"""Part of a motion that is not rigid on each piece of a surface, from which on it deforms that."""
+"""Norm of the non-rigid part of a motion, relative to the motion, above which it is a deformation."""
 REACH = 2.0
-"""Size of the part of the body that a piece follows, over its distance from the body or its own size."""
+"""Radius of the region that a piece follows, relative to its distance from the body or its own size."""
 
 
 class Larger(NamedTuple):
@@ -25,8 +22,8 @@ class Larger(NamedTuple):
 
     Attributes:
         tetrahedra: The larger pieces.
-        vertices: Which vertices of all theirs are. *Shape:* ``(M,)``.
-        weights: How all vertices move with these; exact for linear displacements. *Shape:* ``(N, M)``.
+        vertices: Indices of their vertices in the whole mesh. *Shape:* ``(M,)``.
+        weights: Displacements of all vertices from these, exact for linear fields. *Shape:* ``(N, M)``.
     """
 
     tetrahedra: Tetrahedra
@@ -35,10 +32,10 @@ class Larger(NamedTuple):
 
 
 def larger_pieces(tetrahedra: Tetrahedra) -> Larger:
-    """The tetrahedra without small loose pieces, and how these follow the others.
+    """Remove small loose pieces and express their displacements by those of the others.
 
-    A small piece has little mass. Its six rigid motions would be modes of unit mass like all others, and so be larger
-    by orders of magnitude.
+    Small pieces have little mass, so their rigid motions of unit mass would be larger than other modes by orders of
+    magnitude.
     """
     n, piece = len(tetrahedra.vertices), loose_pieces(tetrahedra)
     of_tets = piece[tetrahedra.tets[:, 0]]
@@ -58,7 +55,7 @@ def larger_pieces(tetrahedra: Tetrahedra) -> Larger:
 
 
 def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArray:
-    """Vertices of one piece near some points, spread over a part of it that is as large as they are far away.
+    """Vertices of the nearest piece, spread by farthest-point sampling over a region as large as its distance.
 
     *Shape:* ``(n, 3), (N, 3), (N,) -> (12,)``.
     """
@@ -69,24 +66,24 @@ def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArr
     distance[piece != piece[nearest]] = np.inf
     near = np.argsort(distance, kind="stable")
     near = near[: max(int((distance <= reach).sum()), min(N_NEIGHBOURS, int(np.isfinite(distance).sum())))]
-    # Each next one is the furthest from those before.
-    found, apart = [0], distance[near]
+    # Farthest-point sampling.
+    found, to_found = [0], distance[near]
     while len(found) < N_NEIGHBOURS:
-        found.append(int(apart.argmax()))
-        apart = np.minimum(apart, np.linalg.norm(vertices[near] - vertices[near[found[-1]]], axis=1))
+        found.append(int(to_found.argmax()))
+        to_found = np.minimum(to_found, np.linalg.norm(vertices[near] - vertices[near[found[-1]]], axis=1))
     return near[found]
 
 
 def deforming(motions: FloatArray, surface: CanonicalSurface) -> FloatArray:
-    """Combinations of motions that deform a surface, without those that only move its pieces against each other.
+    """Linear combinations of motions that deform a surface, without rigid motions of its pieces.
 
-    Those have no energy at any size, so nothing would say how far in-betweens follow them. Interpolation of the
-    key-frames does. What is one piece of the surface but several of the tetrahedra is deformed by rigid motions of
-    these.
+    Relative rigid motions of pieces have no energy, so their amplitudes would be undetermined; the interpolation of the
+    key-frames determines them. A piece of the surface that spans several pieces of tetrahedra is deformed by their
+    rigid motions.
 
     Args:
-        motions: Orthonormal in the solid. *Shape:* ``(k, U, 3)``.
-        surface: Of ``U`` points.
+        motions: Displacements, M-orthonormal in the volume. *Shape:* ``(k, U, 3)``.
+        surface: The surface, with ``U`` points.
 
     Returns:
         *Shape:* ``(m, U, 3)`` with ``m <= k``.

@@ -1,65 +1,58 @@
-"""The lowest eigenvectors of ``K phi = lambda M phi`` by shift-invert block Lanczos, piece by piece."""
+"""Lowest eigenvectors of ``K phi = lambda M phi`` by shift-invert block Lanczos, separately for each component."""
 
 from collections.abc import Callable, Iterator
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.mass import Mass
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Pairs = tuple[FloatArray, FloatArray]
 """Eigenvalues ``(k,)`` and eigenvectors ``(n, k)``."""
 
 DENSE_BELOW = 600
-"""Number of unknowns under which LAPACK is as fast as a factorisation and Lanczos."""
+"""Number of unknowns below which LAPACK is as fast as Lanczos."""
 BLOCK = 8
-"""Vectors in one step. Solves for several at once are three times as fast, and an eigenvalue may have as many equal
-ones; a single starting vector meets only one of each (and the rest by rounding)."""
+"""Block size: solves for several right-hand sides are three times as fast, and a block finds eigenvalues of the same
+multiplicity; a single starting vector finds one of each."""
 FLOOR = 1e-14
-"""Residual of the inverted problem, relative to its eigenvalue, where nothing is left to gain."""
-
-
-class NoConvergenceError(RuntimeError):
-    """The iteration has used up its steps."""
+"""Relative residual of the inverted problem at the level of rounding."""
 
 
 def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, tolerance: float) -> Iterator[FloatArray]:
-    """M-orthonormal bases of about the ``n_pairs`` lowest eigenvectors, each nearer to them than the one before.
+    """M-orthonormal bases of approximately the ``n_pairs`` lowest eigenvectors, with decreasing errors.
 
-    The iteration sees residuals of the inverted problem. What they amount to in ``K phi - lambda M phi`` depends on the
-    worst tetrahedra, so the caller decides when they are small enough, and asks for the next basis until then.
+    The iteration controls residuals of the inverted problem. Their effect on ``K phi - lambda M phi`` depends on the
+    worst tetrahedra, so the caller checks each basis and requests the next one if needed.
 
-    Pieces that nothing connects are solved apart: their equal eigenvalues (six zeros each) would otherwise hide each
-    other.
+    Connected components are solved separately, because of their multiple eigenvalues (six zeros each).
 
     Args:
         k: Stiffness, symmetric positive semi-definite, three unknowns for each vertex. *Shape:* ``(3N, 3N)``.
         mass: M.
-        n_pairs: How many.
-        shift: Positive; ``K + shift M`` is factored, which is positive definite, where ``K`` is singular.
-        tolerance: Residual of the inverted problem, relative to its eigenvalue, at which the first is handed out.
+        n_pairs: Number of eigenvectors.
+        shift: Positive, so that ``K + shift M`` is positive definite.
+        tolerance: Relative residual of the inverted problem of the first basis.
 
     Yields:
-        In ascending order of the eigenvalues; none after the one that rounding lets no further step improve.
+        Bases by ascending eigenvalues, until rounding prevents further improvement.
         *Shape:* ``(3N, n_pairs)``.
 
     Raises:
-        NoConvergenceError: Lanczos did not find them.
+        RuntimeError: Lanczos has not converged.
     """
     graph = _vertex_graph(k)
     n_pieces, piece = connected_components(graph, directed=False)
     if n_pieces == 1:
-        yield from (vectors for _, vectors in _of_piece(k, graph, mass, n_pairs, shift, tolerance))
+        yield from (vectors for _, vectors in _component_pairs(k, graph, mass, n_pairs, shift, tolerance))
         return
-    owned = [_of_coordinates(np.flatnonzero(piece == index)) for index in range(n_pieces)]
+    owned = [_unknowns(np.flatnonzero(piece == index)) for index in range(n_pieces)]
     rounds = [
-        _of_piece(
+        _component_pairs(
             sp.csc_matrix(k[own][:, own]),
             sp.csc_matrix(graph[own[::3] // 3][:, own[::3] // 3]),
             mass.of_vertices(own[::3] // 3),
@@ -69,18 +62,18 @@ def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, toler
         )
         for own in owned
     ]
-    # A piece that has no better vectors keeps its last ones while others go on.
-    latest = [next(of_piece) for of_piece in rounds]
+    # A converged component keeps its vectors while others continue.
+    latest = [next(component) for component in rounds]
     improved = True
     while improved:
         yield _merged(latest, owned, k.shape[0], n_pairs)
-        better = [next(of_piece, None) for of_piece in rounds]
+        better = [next(component, None) for component in rounds]
         improved = any(found is not None for found in better)
         latest = [old if new is None else new for old, new in zip(latest, better, strict=True)]
 
 
 def _merged(found: list[Pairs], owned: list[IntArray], n: int, n_pairs: int) -> FloatArray:
-    """The lowest of the pairs of all pieces, as vectors of the whole. *Shape:* ``(n, n_pairs)``."""
+    """Lowest pairs of all components, as vectors of the whole mesh. *Shape:* ``(n, n_pairs)``."""
     whole = np.zeros((n, sum(len(values) for values, _ in found)))
     first = 0
     for (values, vectors), own in zip(found, owned, strict=True):
@@ -90,16 +83,16 @@ def _merged(found: list[Pairs], owned: list[IntArray], n: int, n_pairs: int) -> 
     return whole[:, order]
 
 
-def _of_piece(
+def _component_pairs(
     k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, tolerance: float
 ) -> Iterator[Pairs]:
-    """Ever better eigenvalues, ascending, and eigenvectors of a connected piece."""
+    """Iterates of the eigenvalues, ascending, and eigenvectors of a connected component."""
     n = k.shape[0]
     if n < DENSE_BELOW or 2 * n_pairs > n:
         yield scipy.linalg.eigh(k.toarray(), mass.for_coordinates().toarray(), subset_by_index=(0, n_pairs - 1))
         return
     vertices, solve = factored(k, graph, mass, shift)
-    order = _of_coordinates(vertices)
+    order = _unknowns(vertices)
     for inverse, vectors in _block_lanczos(solve, mass.of_vertices(vertices), n_pairs, tolerance):
         restored = np.empty_like(vectors)
         restored[order] = vectors
@@ -109,20 +102,20 @@ def _of_piece(
 def factored(
     k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, shift: float
 ) -> tuple[IntArray, Callable[[FloatArray], FloatArray]]:
-    """An order of the vertices, and the inverse of ``K + shift M`` in that order, for several columns at once.
+    """Elimination order of the vertices, and a solver for ``K + shift M`` in that order, for several columns.
 
-    An ordering of the vertices serves their three unknowns: a third less fill than one of the unknowns.
+    Ordering vertices instead of their three unknowns gives a third less fill.
     """
     vertices = _elimination_order(graph)
-    order = _of_coordinates(vertices)
-    # Symmetric, so it may be turned over: that sorts it, in a fraction of the time of sorting.
+    order = _unknowns(vertices)
+    # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
     permuted = k[order][:, order].tocsr().T
     factors = factorize(permuted + shift * mass.of_vertices(vertices).for_coordinates(), "NATURAL")
     return vertices, factors.solve
 
 
-def _of_coordinates(vertices: IntArray) -> IntArray:
-    """The unknowns of vertices. *Shape:* ``(N,) -> (3N,)``."""
+def _unknowns(vertices: IntArray) -> IntArray:
+    """Indices of the unknowns of vertices. *Shape:* ``(N,) -> (3N,)``."""
     return (3 * vertices[:, None] + np.arange(3)).reshape(-1)
 
 
@@ -137,14 +130,14 @@ def _block_lanczos(
     Args:
         solve: ``A⁻¹`` of several columns; ``A`` is symmetric positive definite.
         mass: M.
-        n_pairs: How many.
-        tolerance: Residual, relative to the eigenvalue, at which the first are handed out.
+        n_pairs: Number of eigenpairs.
+        tolerance: Relative residual of the first iterate.
     """
     n = 3 * mass.matrix.shape[0]
     most = min(n // BLOCK, 40 + n_pairs) * BLOCK
     basis, weighted = np.empty((n, most), order="F"), np.empty((n, most), order="F")
     projected = np.zeros((most, most))
-    # Fixed, so that equal input gives equal modes.
+    # A fixed seed makes modes reproducible.
     block = mass.orthonormal(np.random.default_rng(0).standard_normal((n, BLOCK)))[0]
     check_at, worst = 5 * n_pairs // 2, np.inf
     for start in range(0, most, BLOCK):
@@ -168,20 +161,18 @@ def _block_lanczos(
             return
         check_at = stop + BLOCK
     if worst > tolerance:
-        raise NoConvergenceError(
-            f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns"
-        )
+        raise RuntimeError(f"block Lanczos has not converged with {most} vectors for {n_pairs} pairs of {n} unknowns")
 
 
 def _vertex_graph(k: sp.csc_matrix) -> sp.csc_matrix:
-    """Which vertices ``K`` couples, from its three unknowns for each. *Shape:* ``(N, N)``."""
+    """Vertex adjacency from the block structure of ``K``. *Shape:* ``(N, N)``."""
     blocks = k.T.tobsr((3, 3))
     n = k.shape[0] // 3
     return sp.csc_matrix((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr), shape=(n, n))
 
 
 def _elimination_order(graph: sp.csc_matrix) -> IntArray:
-    """A minimum-degree ordering, which SciPy only gives along with a factorisation: of a small, tame matrix."""
+    """Minimum-degree ordering, from the factorisation of a well-conditioned matrix with the same pattern."""
     n = graph.shape[0]
     pattern = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
     factors = factorize(pattern + sp.identity(n) * (1.0 + np.diff(graph.indptr).max()))

@@ -1,20 +1,20 @@
-"""A surface filled with a graded lattice: cubes cut into tetrahedra, which are halved where the body is thin.
+"""Graded lattice of tetrahedra inside a surface: cubes cut into tetrahedra and bisected where the body is thin.
 
-Deterministic, and never at a loss.
+Deterministic; accepts every surface.
 """
 
 import itertools
 import threading
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-from torch_modal.precompute.bisection import halved
+from torch_modal.precompute.bisection import bisected
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.proximity import Clearance, clearances
 from torch_modal.precompute.sampling import SurfaceSamples, sampled
@@ -22,107 +22,105 @@ from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
-    pieces_by_sides,
+    face_connected_pieces,
     solid_volumes,
     tet_volumes,
     without_debris,
 )
-from torch_modal.precompute.tetwild import EDGE_RANGE, TetrahedraSettings
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 VERSION = "whole"
-"""Tetrahedra that other versions of the package have stored are not those of this one."""
+"""Part of the cache key: change it when the algorithm changes."""
+EDGE = 0.04
+"""Default of the target edge length, in bounding-box diagonals."""
 CUBE = 0.75
-"""Edge of the lattice's cubes at the surface, over the largest edge of fTetWild."""
+"""Edge length of the cubes at the surface, relative to the target edge length."""
 COARSER = 1.1
-"""Factor of that edge until there are not too many cubes."""
+"""Factor by which cubes grow until their number is within the limit."""
 TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
-"""A rotation after which no axis is along or across another."""
+"""Rotation that aligns no axis with another."""
 ROOT = 2.0
-"""Edge of the cubes that all tetrahedra come from by halving, over that of cubes at the surface."""
+"""Edge length of the root cubes, relative to the cubes at the surface."""
 ACROSS = 2.0
-"""Tetrahedra across what is thin."""
+"""Tetrahedra across the thickness."""
 ACROSS_GAP = 1.0
 """Tetrahedra across a gap."""
 SMALLEST = 1 / 12
-"""Size of the smallest tetrahedra, over the largest at the surface."""
+"""Smallest tetrahedron size, relative to the largest at the surface."""
 MOST_TETRAHEDRA = 12_000
-"""About; somewhat fewer are left once the outer vertices are on the surface. With finer cubes there may be more, as
-many as fit into the volume."""
+"""Approximate limit before the fit to the surface; it grows with the volume in units of finer cubes."""
 USUAL_EDGE = 0.03
-"""Of the cubes that this bound is for, in bounding-box diagonals."""
+"""Edge length of the cubes to which the limit applies, in bounding-box diagonals."""
 MOST_CUBES = 20_000
-"""Of those that all tetrahedra come from."""
+"""Limit of the number of root cubes."""
 SAMPLES_APART = 0.7
-"""Distance of the samples of the surface, over the size of tetrahedra there."""
+"""Spacing of the surface samples, relative to the local tetrahedron size."""
 FEWEST_SAMPLES = 5000
 GRID_SPACING = 0.5
-"""Of the grid on which the inside is found, over the smallest tetrahedra, unless it has too many points then."""
+"""Spacing of the indicator grid, relative to the smallest tetrahedra, unless the number of points is at its limit."""
 MOST_POINTS = 600_000
 SURELY_INSIDE = 0.9
-"""Values of the grid below are in doubt near the surface. Above, one closed part of it lies in another."""
+"""Indicator values below are corrected near the surface; values above occur where closed parts overlap."""
 NEARBY = 1.5
-"""How near that is, in spacings of the grid."""
+"""Range of the correction, in grid spacings."""
 RAMP = 0.25
-"""Over how much of the spacing the indicator falls there."""
+"""Width of the corrected transition, in grid spacings."""
 LEAST_INSIDE = 0.02
-"""Tetrahedra with less of them inside are left out, or count as this much where the surface runs through them."""
+"""Inside fraction below which tetrahedra are removed; lower bound for those that contain surface samples."""
 REACH = 0.7
-"""How far vertices are moved onto the surface, over the size of the smallest tetrahedron around."""
+"""Largest displacement onto the surface, relative to the smallest incident tetrahedron."""
 LEAST_VOLUME = 0.05
-"""Of a tetrahedron whose vertices were moved, in its volume before; else they go back."""
+"""Smallest volume ratio of moved tetrahedra; otherwise their vertices retreat."""
 MOST_RETREATS = 8
 FITTED_INSIDE = 0.4
-"""Tetrahedra with less of them inside are left out once vertices lie on the surface."""
+"""Inside fraction below which tetrahedra are removed after the fit to the surface."""
 MOST_BRIDGES = 4
 LEAST_KEPT = 0.8
-"""Of the volume: where more is lost on the way, the body is too thin for it."""
+"""Volume fraction that the fit must retain; otherwise the body is too thin for it."""
 SPREAD = np.concatenate([np.eye(4) * 2 / 3 + 1 / 12, np.full((1, 4), 0.25)])
-"""Points of a tetrahedron: from its corners a third of the way to the centroid, and the centroid."""
+"""Barycentric coordinates of the quadrature points of a tetrahedron."""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """The mesher ``"lattice"``: :func:`lattice`, in another direction where that falls into pieces.
+    """The mesher ``"lattice"``: :func:`lattice`, with a rotated grid if the result falls into pieces.
 
-    A thin wall that lies along the cubes' sides is in tetrahedra that hardly share any. Of the settings it takes
-    ``edge_length_fac``.
+    Tetrahedra around a thin wall along the faces of the cubes share hardly any faces with each other.
+
+    Attributes:
+        edge_length_fac: Target edge length as a fraction of the bounding-box diagonal; None takes the default.
     """
 
-    settings: TetrahedraSettings = field(default_factory=TetrahedraSettings)
+    edge_length_fac: float | None = None
 
     def key(self) -> dict[str, Any]:
-        """Settings, and a version."""
-        return {**asdict(self.settings), "lattice": VERSION, "mesher": "lattice"}
+        """The target edge length and the version."""
+        return {**asdict(self), "lattice": VERSION, "mesher": "lattice"}
 
     def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
-        """Tetrahedra that fill the surface."""
-        cube = CUBE * (self.settings.edge_length_fac or EDGE_RANGE[1])
+        """Fill the surface with tetrahedra."""
+        cube = CUBE * (self.edge_length_fac or EDGE)
         while is_too_fine(surface, cube):
             cube *= COARSER
         found = lattice(surface, cube)
         pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
         most = connected_pieces(pairs, len(surface.points)).max()
-        if pieces_by_sides(found.tets).max() <= most:
+        if face_connected_pieces(found.tets).max() <= most:
             return found
         turned = lattice(replace(surface, points=surface.points @ TURN.T), cube)
-        if pieces_by_sides(turned.tets).max() >= pieces_by_sides(found.tets).max():
+        if face_connected_pieces(turned.tets).max() >= face_connected_pieces(found.tets).max():
             return found
         return turned._replace(vertices=turned.vertices @ TURN)
 
 
 class Indicator(NamedTuple):
-    """One inside a surface, zero outside.
+    """Indicator function of the interior of a surface.
 
     Attributes:
-        values: On the points of a grid. *Shape:* ``(X, Y, Z)``.
-        low: Corner of the grid.
-        spacing: Of its points.
-        samples: Of the surface: which side of them a point is on tells more than the grid where that is in doubt.
-        has_sides: Whether that is so for each; not at the rim of an open surface. *Shape:* ``(P,)``.
+        values: Values at the grid points. *Shape:* ``(X, Y, Z)``.
+        low: Lowest corner of the grid.
+        spacing: Grid spacing.
+        samples: Surface samples; their tangent planes correct the indicator near the surface.
+        has_sides: Whether a sample is used for that; false at the boundary of an open surface. *Shape:* ``(P,)``.
     """
 
     values: FloatArray
@@ -132,16 +130,16 @@ class Indicator(NamedTuple):
     has_sides: BoolArray
 
     def inside(self, corners: FloatArray) -> FloatArray:
-        """Which part of tetrahedra is inside. *Shape:* ``(T, 4, 3) -> (T,)``."""
+        """Inside fraction of tetrahedra. *Shape:* ``(T, 4, 3) -> (T,)``."""
         values = self.at(np.einsum("qa,tai->tqi", SPREAD, corners).reshape(-1, 3))
         return values.reshape(len(corners), -1).mean(axis=1)
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Linear between the points of the grid, and sharper near the surface. *Shape:* ``(P, 3) -> (P,)``."""
+        """Trilinear interpolation, with a sharper transition near the surface. *Shape:* ``(P, 3) -> (P,)``."""
         values = self._by_grid(points)
         doubtful = np.flatnonzero(values < SURELY_INSIDE)
         distance, nearest = closest_in(self.samples.tree, points[doubtful], within=NEARBY * self.spacing)
-        # Beyond the rim of an open surface there are no sides.
+        # Beyond the boundary of an open surface there is no tangent plane.
         near = np.isfinite(distance) & np.append(self.has_sides, False)[nearest]
         doubtful, nearest = doubtful[near], nearest[near]
         offset = points[doubtful] - self.samples.points[nearest]
@@ -168,21 +166,19 @@ class Indicator(NamedTuple):
 
 
 def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Clearance | None = None) -> Tetrahedra:
-    """Cubes around a surface, cut into tetrahedra, with the outer vertices moved onto it where that is near.
+    """Fill a surface with a graded lattice of tetrahedra, with the outer vertices moved onto the surface.
 
-    Where the body is thin, or another part of it is near, tetrahedra are halved until they are small enough.
-    Tetrahedra count with the fraction of them that is inside. Needs no closed surface and no consistent one: what is
-    inside follows from the normals of all faces together. Parts closer together than a tetrahedron are fused. The same
-    surface always gives the same tetrahedra.
+    Tetrahedra are bisected where the body or a gap is thin. Each has the fraction of its volume that is inside. The
+    surface need not be closed or consistent: the interior follows from the normals of all faces. Parts closer together
+    than a tetrahedron are fused. Deterministic.
 
     Args:
-        surface: What to fill.
-        edge_length_fac: Edge of the cubes that are cut at the surface, where nothing is thin, as a fraction of the
-            bounding-box diagonal.
-        clearance: Of the surface, if it is known.
+        surface: The surface.
+        edge_length_fac: Edge length of the cubes at the surface where nothing is thin, in bounding-box diagonals.
+        clearance: Thickness and gap of the surface, if known.
 
     Raises:
-        TetrahedralizationError: The lattice would be too fine, or nothing is inside.
+        TetrahedralizationError: The lattice would be too fine.
     """
     largest = edge_length_fac * DIAGONAL
     root = ROOT * largest
@@ -214,7 +210,7 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Cleara
         return indicator.at(low + root * places) >= 0.5
 
     most = int(MOST_TETRAHEDRA * max(1.0, USUAL_EDGE / edge_length_fac) ** 3)
-    mesh = halved(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    mesh = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
     vertices = low + root * mesh.vertices
     inside = indicator.inside(vertices[mesh.tets])
     kept = inside >= LEAST_INSIDE
@@ -226,28 +222,27 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Cleara
 
 
 def _sizes_at_vertices(tetrahedra: Tetrahedra) -> FloatArray:
-    """Of the smallest tetrahedron around each: the edge of the cube of which six are as large. *Shape:* ``(N,)``."""
+    """Edge length of the cube with six times the volume of the smallest incident tetrahedron. *Shape:* ``(N,)``."""
     sizes = np.full(len(tetrahedra.vertices), np.inf)
     np.minimum.at(sizes, tetrahedra.tets.reshape(-1), np.repeat(np.cbrt(6 * tet_volumes(tetrahedra)), 4))
     return sizes
 
 
 def is_too_fine(surface: CanonicalSurface, edge_length_fac: float) -> bool:
-    """Whether a lattice with such cubes would have too many of them."""
+    """Whether a lattice would have too many root cubes."""
     return bool(_box(surface, ROOT * edge_length_fac * DIAGONAL)[1].prod() > MOST_CUBES)
 
 
 def _box(surface: CanonicalSurface, cell: float) -> tuple[FloatArray, IntArray]:
-    """Lowest corner of the cubes, and their numbers along the axes."""
+    """Lowest corner of the lattice, and the number of cubes along each axis."""
     low = surface.points.min(axis=0) - 1.5 * cell
     return low, np.ceil((surface.points.max(axis=0) + 1.5 * cell - low) / cell).astype(np.int64)
 
 
 def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
-    """The outer vertices moved onto the surface, along its normals, and without what is outside then.
+    """Move the outer vertices onto the surface along its normals and remove the tetrahedra outside.
 
-    Modes are then those of tetrahedra that follow the surface. What is thinner than a tetrahedron may fall into pieces
-    or get lost: then everything stays as it was.
+    If the fit splits the mesh, loses volume or uncovers the surface, the tetrahedra stay as they were.
     """
     samples = indicator.samples
     volumes, sizes = tet_volumes(filled), _sizes_at_vertices(filled)
@@ -261,7 +256,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     retreated = np.zeros(len(vertices), dtype=bool)
     for retreat in range(MOST_RETREATS):
         bad = np.unique(filled.tets[tet_volumes(Tetrahedra(vertices, filled.tets)) < LEAST_VOLUME * volumes])
-        # Half the way back at first; as no vertex is out of its cube's reach then, all the way is always right.
+        # Half the way back at first, then all the way, which restores the original position.
         part = 1.0 if retreat >= MOST_RETREATS // 2 else 0.5
         vertices[bad] += part * (filled.vertices[bad] - vertices[bad])
         retreated[bad] = True
@@ -269,14 +264,14 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     retreated &= ~placed
     inside = indicator.inside(vertices[filled.tets])
     kept = inside >= FITTED_INSIDE
-    # The indicator rises over a cube's fraction. Of a tetrahedron with no corner outside, all is inside.
+    # A tetrahedron with no corner outside is inside, although the indicator has a transition.
     placed[rim[(vertices[rim] != filled.vertices[rim]).any(axis=1)]] = True
     placed[retreated] = False
     inside[placed[filled.tets].all(axis=1)] = 1.0
     kept = _bridged(filled.tets, kept, inside > 0)
     used, compact = np.unique(filled.tets[kept], return_inverse=True)
     fitted = without_debris(Tetrahedra(vertices[used], compact.reshape(-1, 4), np.maximum(inside[kept], LEAST_INSIDE)))
-    if len(fitted.tets) == 0 or pieces_by_sides(fitted.tets).max() != pieces_by_sides(filled.tets).max():
+    if len(fitted.tets) == 0 or face_connected_pieces(fitted.tets).max() != face_connected_pieces(filled.tets).max():
         return filled
     if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():
         return filled
@@ -286,13 +281,13 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
 
 
 def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
-    """The kept ones, and others that join pieces of them which hang on each other by an edge or a vertex only.
+    """Keep further tetrahedra that join pieces which share only an edge or a vertex.
 
     *Shape:* ``(T, 4), (T,), (T,) -> (T,)``.
     """
     kept = kept.copy()
     for _ in range(MOST_BRIDGES):
-        piece = pieces_by_sides(tets[kept])
+        piece = face_connected_pieces(tets[kept])
         lowest, highest = np.full(tets.max() + 1, len(tets)), np.full(tets.max() + 1, -1)
         np.minimum.at(lowest, tets[kept].reshape(-1), np.repeat(piece, 4))
         np.maximum.at(highest, tets[kept].reshape(-1), np.repeat(piece, 4))
@@ -304,10 +299,10 @@ def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
 
 
 def _indicator(samples: SurfaceSamples, low: FloatArray, spacing: float, counts: IntArray) -> FloatArray:
-    """One inside, zero outside, on the points of a grid.
+    """Indicator function on the grid points, from the normals of the samples (Poisson reconstruction).
 
-    Its gradient is minus the normal on the surface, so it solves a Poisson equation with the divergence of the
-    normals: in trilinear finite elements, by Fourier transform, once. On an open surface it closes the holes smoothly.
+    Its gradient is the inward normal on the surface, so it solves a Poisson equation with the divergence of the
+    normals: in trilinear finite elements, by one Fourier transform. Holes of open surfaces are closed smoothly.
     """
     places = (samples.points - low) / spacing
     base = np.floor(places).astype(np.int64)

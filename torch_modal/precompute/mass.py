@@ -1,39 +1,37 @@
-"""The mass matrix, and what M-orthogonality needs."""
+"""Mass matrix and M-orthonormalisation."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from torch_modal.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
 class Mass:
-    """The matrix M of a tetrahedral mesh; it acts alike on the three coordinates of each vertex.
+    """Mass matrix of a tetrahedral mesh, the same for the three coordinates.
 
     Attributes:
-        matrix: Its entries for vertices, symmetric positive definite; diagonal if lumped. *Shape:* ``(N, N)``.
+        matrix: Entries for vertices, symmetric positive definite; diagonal if lumped. *Shape:* ``(N, N)``.
     """
 
     matrix: sp.csr_matrix
 
     @classmethod
     def of(cls, mass: "FloatArray | sp.spmatrix | Mass") -> "Mass":
-        """From the mass of each vertex ``(N,)``, or a matrix ``(N, N)``."""
+        """From vertex masses ``(N,)`` or a matrix ``(N, N)``."""
         if isinstance(mass, Mass):
             return mass
         return cls(sp.csr_matrix(mass if sp.issparse(mass) else sp.diags(mass)))
 
     def lumped(self) -> FloatArray:
-        """Mass of each vertex: the sums of the rows. *Shape:* ``(N,)``."""
+        """Row sums: the mass of each vertex. *Shape:* ``(N,)``."""
         return np.asarray(self.matrix.sum(axis=1)).reshape(-1)
 
     def of_vertices(self, vertices: IntArray) -> "Mass":
-        """That of some of the vertices, which nothing connects with the others."""
+        """Submatrix of some vertices."""
         return Mass(sp.csr_matrix(self.matrix[vertices][:, vertices]))
 
     def for_coordinates(self) -> sp.csc_matrix:
@@ -46,16 +44,16 @@ class Mass:
         return (self.matrix @ np.ascontiguousarray(columns).reshape(n, 3 * k)).reshape(3 * n, k)
 
     def orthonormal(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``columns = q r`` with ``qᵀ M q = 1`` and an upper triangular ``r``, as QR is for ``M = 1``.
+        """QR factorisation in the M inner product: ``columns = q r`` with ``qᵀ M q = 1`` and upper triangular ``r``.
 
-        Also where columns depend on each other: ``q`` is orthonormal nevertheless.
+        Linearly dependent columns also give an orthonormal ``q``.
 
         Args:
-            columns: No more than rows. *Shape:* ``(3N, k)``.
+            columns: At most as many as rows. *Shape:* ``(3N, k)``.
         """
         root = np.sqrt(np.repeat(self.lumped(), 3))[:, None]
         q, r = np.linalg.qr(root * columns)
         q /= root
-        # In units of the lumped masses M is between 1/5 and 1, so this product is far from singular.
+        # Scaled by the lumped masses, the spectrum of M is within [1/5, 1]: the product is well conditioned.
         upper = scipy.linalg.cholesky(q.T @ (self @ q))
         return scipy.linalg.solve_triangular(upper, q.T, trans="T").T, upper @ r

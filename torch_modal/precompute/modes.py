@@ -1,4 +1,4 @@
-"""From key-frames to modal bases: the calls that users make, what they check and what they warn about."""
+"""Public functions that compute modal bases of key-frames."""
 
 import warnings
 from collections.abc import Callable
@@ -24,10 +24,10 @@ QUALITIES = {
     "fast": TetrahedraSettings(),
     "fine": TetrahedraSettings(edge_length_fac=0.02, epsilon=1e-3, stop_energy=10.0, max_surface_faces=10_000),
 }
-"""Named settings; ``docs/precompute.md`` says what each costs and gives."""
+"""Named settings (``docs/precompute.md``)."""
 
 TIMEOUT = 600.0
-"""Seconds that fTetWild may take for a key-frame."""
+"""Time limit of fTetWild for a key-frame, in seconds."""
 
 
 def extract_modes(
@@ -43,21 +43,18 @@ def extract_modes(
     cache_dir: str | None = None,
     cache: bool = True,
 ) -> ModalBasis:
-    """Lowest vibration modes of one shape: `extract_bases` for a single key-frame.
+    """Lowest vibration modes of one shape: `extract_bases` for a single key-frame, with the same options.
 
     Args:
         vertices: Positions, tensor or array, any units. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes, k.
-        form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
-        settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
-        mesher: What fills the surface: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts
-            every surface; ``"tetwild"``, fTetWild in a child process; or a
-            :class:`~torch_modal.precompute.tetrahedra.Mesher`, which has settings of its own.
-        tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
-            more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
-        timeout: Seconds that the child process of fTetWild may take.
-        cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
+        form: Form of the Hessian.
+        settings: ``"fast"``, ``"fine"``, or numbers.
+        mesher: ``"lattice"``, ``"tetwild"``, or an object.
+        tolerance: Largest relative residual of a mode.
+        timeout: Time limit of fTetWild, in seconds.
+        cache_dir: Folder of the cache.
         cache: Whether results are kept on disk and found there.
 
     Returns:
@@ -101,11 +98,11 @@ def extract_bases(
 ) -> list[ModalBasis]:
     """Lowest vibration modes of each key-frame.
 
-    The key-frame that touches itself least is filled with tetrahedra, which are carried to the others. The
+    The key-frame of least self-proximity is filled with tetrahedra, which are carried to the others. The
     as-rigid-as-possible stiffness and a mass of density 1 give ``K phi = lambda M phi``, and the lowest elastic modes
-    are restricted to the surface. Small loose pieces follow the body beside them. Modes do not move larger ones against
-    each other: such motions have no energy, and in-betweens take them from the interpolation of the key-frames.
-    Constants of the autograd graph: nothing here is differentiated.
+    are restricted to the surface. Small loose pieces follow the nearest part of the body. Modes contain no relative
+    rigid motions of larger pieces: these have no energy, and in-betweens take them from the interpolation of the
+    key-frames. Nothing is differentiated.
 
     Args:
         keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
@@ -118,8 +115,8 @@ def extract_bases(
             :class:`~torch_modal.precompute.tetrahedra.Mesher`, which has settings of its own.
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode, unless rounding leaves
             more. At 1e-3 modes lie within 1e-4 of the space of the exact ones, at 1e-6 each is one of these.
-        carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each has its own.
-        timeout: Seconds that the child process of fTetWild may take for a key-frame.
+        carry: Whether the tetrahedra of one key-frame are carried to the others. Otherwise each is meshed.
+        timeout: Time limit of fTetWild for a key-frame, in seconds.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
         progress: Whether a bar shows key-frame and stage; by default on terminals, with lines of the log elsewhere. Or
@@ -135,7 +132,7 @@ def extract_bases(
         ModalAnalysisError: The modes failed a check.
 
     Warns:
-        MeshWarning: What `check_keyframes` warns about; a shape of several loose pieces.
+        MeshWarning: The warnings of `check_keyframes`; a shape of several loose pieces.
     """
     if form not in HESSIAN_FORMS:
         raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
@@ -160,18 +157,9 @@ def bases_of_checked(
     progress: Progress = None,
     meanwhile: Callable[[], object] | None = None,
 ) -> list[ModalBasis]:
-    """`extract_bases` for key-frames that :func:`~torch_modal.keyframes.check.check_keyframes` has seen.
+    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`.
 
-    Args:
-        keyframes: *Shape:* ``(K, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        n_modes: As there, like the others that are not named here.
-        filler: Gives them tetrahedra. Default: as there.
-        form: As there.
-        tolerance: As there.
-        carry: As there.
-        progress: As there.
-        meanwhile: Called while this goes on, by a processor that has nothing else to do, if there is one.
+    ``filler`` has the mesher and the cache; ``meanwhile`` is a background task for an idle processor.
     """
     filler = filler or Filler(_mesher("lattice", "fast"), TIMEOUT, Cache.at(None))
     shapes = keyframes.detach().cpu().double().numpy()
@@ -222,13 +210,13 @@ def _check_n_modes(n_modes: int, n_used: int) -> None:
     possible = 3 * n_used - N_RIGID
     if n_modes > possible:
         raise ValueError(
-            f"{n_modes} modes asked for, but a surface of {n_used} vertices has at most {possible} ways to "
+            f"{n_modes} modes requested, but a surface of {n_used} vertices has at most {possible} ways to "
             f"deform; give 1 to {possible}"
         )
 
 
 def _warn_of_pieces(solved: list[Solved]) -> None:
-    """Say once if a set has loose pieces, when all threads have ended."""
+    """Warn once if a set has loose pieces."""
     loose = [one for one in solved if one.n_zero > N_RIGID]
     if loose:
         n_pieces = max(one.n_pieces for one in loose)

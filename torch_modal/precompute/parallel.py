@@ -1,4 +1,4 @@
-"""Several key-frames at once, in threads: the mesher has processes of its own, and SuperLU and BLAS free the GIL."""
+"""Threads for several key-frames: the mesher runs in child processes, and SuperLU and BLAS release the GIL."""
 
 import os
 import threading
@@ -8,22 +8,23 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from threadpoolctl import OpenBLASController, ThreadpoolController
+
+from torch_modal.arrays import FloatArray, IntArray
 
 Result = TypeVar("Result")
 
 MANY = 500
-"""Points from which on a search of a tree is worth threads."""
+"""Number of points above which a nearest-neighbour search uses threads."""
 
 
 class StoppedError(Exception):
-    """What a thread ends with when another has failed, or on Ctrl-C. No caller of the package ever meets it."""
+    """Raised in threads that are cancelled by another failure or Ctrl-C; never reaches the caller of the package."""
 
 
 def n_cpus() -> int:
-    """Processors that this process may use."""
+    """Number of processors available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -32,18 +33,16 @@ def n_cpus() -> int:
 def run_all(
     work: Callable[[int], Result], n: int, stop: threading.Event, meanwhile: Callable[[], object] | None = None
 ) -> list[Result]:
-    """The results of ``work(0)`` to ``work(n - 1)``, as many at a time as there are processors.
+    """Results of ``work(0)`` to ``work(n - 1)``, computed in one thread per processor.
 
-    The first error ends everything: ``stop`` is set, what has not begun is not begun, and the error is raised once the
-    running calls have returned. So it is with Ctrl-C, which only the calling thread is told of. BLAS has one thread in
-    each of them.
+    On the first error or Ctrl-C, ``stop`` is set, pending calls are cancelled, and the error is raised after the
+    running calls have returned. BLAS has one thread in each call.
 
     Args:
-        work: Looks at ``stop`` from time to time if it takes long, and then raises `StoppedError`.
-        n: How many.
-        stop: Set when the results are no longer wanted.
-        meanwhile: What the first processor does that has nothing else to do while others are at work; left out where
-            there is but one, or one result.
+        work: The function; long calls check ``stop`` and raise `StoppedError`.
+        n: Number of calls.
+        stop: Cancels the work.
+        meanwhile: Background task for the first idle thread; skipped if only one thread is used.
     """
 
     def alone(index: int) -> Result:
@@ -56,7 +55,7 @@ def run_all(
     with one_blas_thread(), ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
         futures: list[Future[Any]] = []
         try:
-            # Ctrl-C may come before all are told: the first are at work by then.
+            # Inside the try block: Ctrl-C may come between submissions.
             for index in range(n):
                 futures.append(pool.submit(alone, index))
             if meanwhile is not None:
@@ -72,7 +71,7 @@ def run_all(
 
 
 class _Inside:
-    """How many calls are inside `one_blas_thread` now, and what is undone when the last one leaves."""
+    """Number of active `one_blas_thread` contexts, and the limits that the last one restores."""
 
     lock = threading.Lock()
     count = 0
@@ -81,11 +80,11 @@ class _Inside:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Inside, BLAS has one thread; a decorator too.
+    """Limit BLAS to one thread; context manager and decorator.
 
-    The products here are small, and BLAS threads that wait for each other in a loop cost ten times the work, the more
-    so where several key-frames are solved at once. With most builds of BLAS the number belongs to the process, so the
-    last that leaves puts it back; with some, to each thread, so every thread comes in.
+    The matrix products here are small, and busy-waiting BLAS threads cost ten times the work. In most BLAS builds the
+    limit belongs to the process, so the last context restores it; in some it belongs to the thread, so every thread
+    enters one.
     """
     with _Inside.lock:
         limits = ThreadpoolController().select(user_api="blas").limit(limits=1)
@@ -98,17 +97,16 @@ def one_blas_thread() -> Iterator[None]:
         with _Inside.lock:
             _Inside.count -= 1
             if _Inside.count == 0:
-                # Later versions of threadpoolctl obey the thread alone that came first, unless it is told off.
+                # Later versions of threadpoolctl accept the limit from its first thread only, unless that is cleared.
                 getattr(OpenBLASController, "clear_controlling_thread", lambda **_: None)(force=True)
                 _Inside.limits.__exit__(None, None, None)
 
 
-def closest_in(
-    tree: cKDTree, points: NDArray[np.float64], k: int = 1, within: float = np.inf
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Distances and indices of what is nearest in a tree, by all processors where there are many points.
+def closest_in(tree: cKDTree, points: FloatArray, k: int = 1, within: float = np.inf) -> tuple[FloatArray, IntArray]:
+    """Distances and indices of the nearest points of a tree, in parallel for many queries.
 
-    *Shape:* ``(n, 3) -> (n,), (n,)``, or ``(n, k), (n, k)``. What is not within the distance has the index ``tree.n``.
+    *Shape:* ``(n, 3) -> (n,), (n,)``, or ``(n, k), (n, k)``.
+    Queries without a neighbour within the distance have the index ``tree.n``.
     """
     n_threads = n_cpus() if len(points) >= MANY else 1
     distance, index = tree.query(points, k=k, distance_upper_bound=within, workers=n_threads)
@@ -116,10 +114,10 @@ def closest_in(
 
 
 class Budget:
-    """A quantity, of memory say, that threads share: they wait for their part of it.
+    """A shared resource such as memory; threads block until enough of it is free.
 
     Args:
-        total: How much there is. Who wants more than that gets all of it, alone.
+        total: The amount. Larger requests get all of it exclusively.
     """
 
     def __init__(self, total: int) -> None:
@@ -128,7 +126,7 @@ class Budget:
 
     @contextmanager
     def part(self, amount: int) -> Iterator[None]:
-        """Hold some of it."""
+        """Reserve an amount."""
         amount = min(amount, self._total)
         with self._changed:
             self._changed.wait_for(lambda: self._left >= amount)

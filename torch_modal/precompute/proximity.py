@@ -1,61 +1,59 @@
-"""Where a surface comes near to itself: outside, where limbs touch, and inside, where it is thin."""
+"""Self-proximity of a surface: gaps between parts in front of it, thickness behind it."""
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.sampling import SurfaceSamples, sampled
 from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 NEAR = 0.03
-"""Gaps up to this width count as near, in bounding-box diagonals."""
+"""Largest gap that counts as proximity, in bounding-box diagonals."""
 OPPOSED = -0.3
-"""Cosine between the normals of a point and of the one across, up to which that is another side."""
+"""Largest cosine between the normals of opposing points."""
 SEEN_POINTS = 2000
-"""About as many points of the surface are looked at, of larger ones every second, third and so on."""
+"""Approximate number of points tested for proximity; larger surfaces are subsampled."""
 MOST = 0.06
-"""Thicknesses and gaps above are not told apart, in bounding-box diagonals."""
+"""Largest measured thickness or gap, in bounding-box diagonals."""
 N_SAMPLES = 5000
-"""At least, where these are measured, and of as many as"""
+"""Minimum number of samples for thickness and gap."""
 SEEN_SAMPLES = 10_000
+"""Approximate number of samples at which they are measured."""
 MOST_SHRINKINGS = 10
 TOUCHING = 0.015
-"""How far apart points of a surface touch each other, for tetrahedra, in bounding-box diagonals."""
+"""Distance below which points are in contact, in bounding-box diagonals."""
 CELL = 0.005
-"""Of so large cells one point is looked at for that."""
+"""Cell size of the subsampling for contact, in bounding-box diagonals."""
 
 
 def self_proximity(surface: CanonicalSurface) -> float:
-    """Fraction of the area that has an opposing part of the surface near in front of it.
+    """Fraction of the area with an opposing part of the surface close in front of it.
 
-    From such a pose tetrahedra cannot be carried well: they fuse what touches.
+    Tetrahedra fuse parts in contact, so such a pose is a poor rest pose.
     """
-    # Half-way to the opposing side that side becomes nearer than the own one.
+    # Beyond half the gap, the opposing side is nearer than the point itself.
     return _opposed_part(surface, np.array([1 / 16, 1 / 8, 1 / 4, 1 / 2]) * NEAR * DIAGONAL)
 
 
-def parting(rest: CanonicalSurface, posed: CanonicalSurface) -> float:
-    """How far parts of a surface that touch in one pose are from each other in another, in bounding-box diagonals.
+def separation(rest: CanonicalSurface, posed: CanonicalSurface) -> float:
+    """Separation in one pose of parts in contact in another, in bounding-box diagonals.
 
-    Root mean square over the surface of half of what the distance of a point to those near it grows by, at most.
-    Tetrahedra of the first pose hang on both parts, and cannot follow either.
+    Root mean square over the surface of half the largest growth of a point's distance to its neighbours in space.
+    Tetrahedra of the first pose join both parts, so they cannot follow a separation.
 
     Args:
         rest: The surface in the first pose.
-        posed: In the other.
+        posed: The surface in the other pose.
     """
     cells = np.floor(rest.points / (CELL * DIAGONAL)).astype(np.int64)
     cells -= cells.min(axis=0)
     _, chosen, cell = np.unique(np.ravel_multi_index(tuple(cells.T), cells.max(axis=0) + 1), True, True)
     areas = np.bincount(cell.reshape(-1), vertex_areas(rest.points, rest.faces))
-    # The bounding box, which is the unit here, changes with the pose; the size of the shape hardly does.
+    # The diagonal, the unit of length here, depends on the pose; the area hardly does.
     before, after = rest.points[chosen], posed.points[chosen] * np.sqrt(rest.area / posed.area)
     one, other = cKDTree(before).query_pairs(TOUCHING * DIAGONAL, output_type="ndarray").T
     growth = np.linalg.norm(after[one] - after[other], axis=1) - np.linalg.norm(before[one] - before[other], axis=1)
@@ -66,11 +64,11 @@ def parting(rest: CanonicalSurface, posed: CanonicalSurface) -> float:
 
 
 class Clearance(NamedTuple):
-    """How near other parts of a surface are, at each face; infinite where they are further than `MOST`.
+    """Thickness and gap at each face; infinite above `MOST`.
 
     Attributes:
-        thickness: Of the body below. *Shape:* ``(F,)``.
-        gap: In front. *Shape:* ``(F,)``.
+        thickness: Thickness of the body behind the face. *Shape:* ``(F,)``.
+        gap: Distance to the opposing part in front of the face. *Shape:* ``(F,)``.
     """
 
     thickness: FloatArray
@@ -78,7 +76,7 @@ class Clearance(NamedTuple):
 
 
 def clearances(surface: CanonicalSurface) -> Clearance:
-    """Diameters of the balls that touch a surface at samples and at an opposing part of it."""
+    """Diameters of the largest empty balls tangent to the surface at samples (shrinking balls)."""
     spacing = np.sqrt(surface.area / N_SAMPLES)
     samples = sampled(surface, np.full(len(surface.faces), spacing))
     seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))
@@ -92,7 +90,7 @@ def clearances(surface: CanonicalSurface) -> Clearance:
 
 
 def _opposed_part(surface: CanonicalSurface, distances: FloatArray) -> float:
-    """Fraction of the area from which a way along the normal leads to where another side is nearer."""
+    """Fraction of the area whose offset points along the normal are nearest to an opposing side."""
     step = max(len(surface.points) // SEEN_POINTS, 1)
     points, normals = surface.points[::step], surface.normals[::step]
     tree = cKDTree(points)
@@ -105,15 +103,15 @@ def _opposed_part(surface: CanonicalSurface, distances: FloatArray) -> float:
 
 
 def _opposed_radius(samples: SurfaceSamples, side: float, seen: IntArray, most: float) -> FloatArray:
-    """Radii of the balls that touch at samples and at another side.
+    """Radii of the balls tangent to the surface at samples and at an opposing side.
 
-    They shrink until they are empty (Ma, Bae and Choi 2012), or touch something that is no other side, as in a corner.
+    Balls shrink until they are empty (Ma, Bae and Choi 2012) or touch a side that is not opposing, as in a corner.
 
     Args:
-        samples: Of a surface.
-        side: 1 in front of it, -1 behind.
-        seen: Where radii are wanted. *Shape:* ``(S,)``.
-        most: Larger ones are infinite.
+        samples: Samples of a surface.
+        side: 1 in front of the surface, -1 behind it.
+        seen: Indices of the queried samples. *Shape:* ``(S,)``.
+        most: Largest radius; larger ones are infinite.
 
     Returns:
         *Shape:* ``(S,)``.

@@ -1,30 +1,27 @@
-"""Points all over a surface."""
+"""Surface samples."""
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.precompute.surface import CanonicalSurface
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MOST_SAMPLES = 60_000
 LEAF = 32
-"""Points that a search compares one by one; twice SciPy's, which takes a third off searches a little off a surface."""
+"""Leaf size of the tree: twice SciPy's, which is a third faster for queries near the surface."""
 
 
 class SurfaceSamples(NamedTuple):
-    """Points all over a surface.
+    """Samples of a surface.
 
     Attributes:
         points: *Shape:* ``(P, 3)``.
         normals: Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``.
-        areas: What each stands for. *Shape:* ``(P,)``.
-        faces: Where each is. *Shape:* ``(P,)``.
-        tree: Of the points.
+        areas: Area of each sample. *Shape:* ``(P,)``.
+        faces: Face of each sample. *Shape:* ``(P,)``.
+        tree: Search tree of the points.
     """
 
     points: FloatArray
@@ -35,11 +32,11 @@ class SurfaceSamples(NamedTuple):
 
 
 def sampled(surface: CanonicalSurface, spacing: FloatArray) -> SurfaceSamples:
-    """Points over all faces, about so far apart in each, and one in each at least.
+    """Sample all faces at a given spacing, with at least one sample per face.
 
     Args:
         surface: The surface.
-        spacing: *Shape:* ``(F,)``.
+        spacing: Distance of the samples in each face. *Shape:* ``(F,)``.
     """
     corners = surface.points[surface.faces]
     sides = corners - np.roll(corners, 1, axis=1)

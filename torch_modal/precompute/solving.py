@@ -1,4 +1,4 @@
-"""The way of each key-frame of a set to its modes, several of them at once."""
+"""Modes of all key-frames of a set, computed in parallel threads."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -9,32 +9,31 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.io.cache import Cache
 from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, VolumeModes, lowest_modes
-from torch_modal.precompute.filling import Filler, Filling, is_torn, meshing_order
+from torch_modal.precompute.filling import Filler, Filling, meshing_order, separates
 from torch_modal.precompute.following import deforming, larger_pieces
 from torch_modal.precompute.parallel import Budget, run_all
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, loose_pieces
 
-FloatArray = NDArray[np.float64]
-
 VERTICES_AT_ONCE = 30_000
-"""Tetrahedral vertices of all eigenproblems that are solved at the same time: about 2 GiB."""
+"""Total size of concurrent eigenproblems, in tetrahedral vertices: about 2 GiB."""
 
 
 class Solved(NamedTuple):
-    """A key-frame's modes in the caller's units, and how they came about.
+    """Modes of a key-frame in the caller's units.
 
     Attributes:
         eigenvalues: Ascending. *Shape:* ``(k,)``.
-        modes: At the vertices of the key-frame, zero at those that no face uses. *Shape:* ``(k, V, 3)``.
+        modes: Displacements of all vertices, zero at unreferenced ones. *Shape:* ``(k, V, 3)``.
         rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
-        filling: The tetrahedra that they are the modes of.
-        n_zero: How many eigenvalues are zero, the six rigid ones included.
-        n_pieces: How many loose pieces the tetrahedra have, small ones left out.
+        filling: The tetrahedra.
+        n_zero: Number of zero eigenvalues, including the six rigid ones.
+        n_pieces: Number of loose pieces of the tetrahedra, without small ones.
     """
 
     eigenvalues: FloatArray
@@ -47,18 +46,18 @@ class Solved(NamedTuple):
 
 @dataclass(frozen=True)
 class KeyframeSet:
-    """Key-frames to be solved.
+    """Key-frames whose modes are computed.
 
     Attributes:
-        surfaces: As the pre-computation sees them.
-        n_vertices: Of each, those included that no face uses.
-        filler: Gives them tetrahedra.
+        surfaces: Canonical surfaces.
+        n_vertices: Number of vertices of each, including unreferenced ones.
+        filler: Mesher and cache.
         n_modes: Number of elastic modes of each.
         form: Form of the Hessian.
         tolerance: Residual of the modes.
-        report: Called with the index of a key-frame and the stage that it enters.
-        done: Called twice for each key-frame: when it has its tetrahedra, and when it has its modes.
-        meanwhile: Called by a thread that has nothing else to do, see :func:`~torch_modal.precompute.parallel.run_all`.
+        report: Called with the index of a key-frame and its next stage.
+        done: Called twice for each key-frame: after meshing and after the modes.
+        meanwhile: Background task, see :func:`~torch_modal.precompute.parallel.run_all`.
     """
 
     surfaces: list[CanonicalSurface]
@@ -73,14 +72,14 @@ class KeyframeSet:
     _memory: Budget = field(default_factory=lambda: Budget(VERTICES_AT_ONCE))
 
     def solve_each(self) -> list[Solved]:
-        """With tetrahedra of its own for each."""
+        """Solve with separate tetrahedra for each key-frame."""
         return self._all(lambda index: self._solved(index, self._own(index)))
 
     def solve_carried(self) -> list[Solved]:
-        """With the tetrahedra of the one that touches itself least, carried to those where they survive that."""
+        """Solve with the tetrahedra of the key-frame of least self-proximity, carried to the others where possible."""
         first, *others = meshing_order(self.surfaces)
-        # Those that are known to need their own do not wait until carrying has failed.
-        alone = [first, *(index for index in others if is_torn(self.surfaces[first], self.surfaces[index]))]
+        # Key-frames with separating contacts are meshed in parallel with the first one.
+        alone = [first, *(index for index in others if separates(self.surfaces[first], self.surfaces[index]))]
         made = run_all(lambda i: self._own(alone[i]), len(alone), self.filler.stop)
         own = dict(zip(alone, made, strict=True))
 
@@ -88,7 +87,7 @@ class KeyframeSet:
             if index in own:
                 return self._solved(index, own[index])
             if (carried := self._carried(own[first], index)) is not None:
-                with contextlib.suppress(ModalAnalysisError):  # they are distorted: others may do
+                with contextlib.suppress(ModalAnalysisError):  # too distorted: mesh separately
                     return self._solved(index, carried)
             return self._solved(index, self._own(index, counted=carried is None))
 
@@ -98,7 +97,7 @@ class KeyframeSet:
         return run_all(solve, len(self.surfaces), self.filler.stop, self.meanwhile)
 
     def _own(self, index: int, counted: bool = True) -> Filling:
-        """A key-frame with tetrahedra of its own; not counted as done if it has had others."""
+        """Mesh a key-frame; counted as done unless carried tetrahedra were counted before."""
         surface = self.surfaces[index]
         with self._naming(index):
             self.report(index, "tetrahedra")
@@ -108,7 +107,7 @@ class KeyframeSet:
         return Filling(body, surface, body.tetrahedra)
 
     def _carried(self, other: Filling, index: int) -> Filling | None:
-        """A key-frame with those of another, or None if they do not survive that."""
+        """Carry tetrahedra to a key-frame; None if the result is too distorted."""
         with self._naming(index):
             self.report(index, "carrying tetrahedra")
             filling = self.filler.carried(other.body, self.surfaces[index])
@@ -130,7 +129,7 @@ class KeyframeSet:
 
 @contextlib.contextmanager
 def naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
-    """Say in an error which of several key-frames it is about."""
+    """Prefix error messages with the index of the key-frame if there are several."""
     try:
         yield
     except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
@@ -143,12 +142,12 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
     """Modes of the tetrahedra, restricted to the surface, in the caller's units.
 
     Args:
-        n_vertices: Of the key-frame, those included that no face uses.
-        filling: Its tetrahedra.
+        n_vertices: Number of vertices of the key-frame, including unreferenced ones.
+        filling: The tetrahedra.
         n_modes: Number of elastic modes.
         form: Form of the Hessian.
         tolerance: Residual of the modes, see :func:`~torch_modal.precompute.eigen.lowest_modes`.
-        cache: Where modes are kept.
+        cache: Storage of modes.
 
     Raises:
         ModalAnalysisError: The modes failed a check.
@@ -168,7 +167,7 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
             if len(modes) < n_modes:
                 raise ModalAnalysisError(
                     f"only {len(modes)} modes deform the {n_pieces} loose pieces of the tetrahedra, {n_modes} are "
-                    "asked for; ask for fewer, or give a smaller edge_length_fac"
+                    "requested; request fewer, or give a smaller edge_length_fac"
                 )
             eigenvalues = solid.eigenvalues[len(solid.eigenvalues) - len(modes) :]
         except ModalAnalysisError:

@@ -1,4 +1,4 @@
-"""Stiffness and mass of as-rigid-as-possible deformation on tetrahedra."""
+"""Stiffness and mass matrices of as-rigid-as-possible deformation on tetrahedra."""
 
 from typing import Literal
 
@@ -6,9 +6,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
 
-FloatArray = NDArray[np.float64]
 HessianForm = Literal["edge", "element", "vertex"]
 HESSIAN_FORMS: tuple[HessianForm, ...] = ("edge", "element", "vertex")
 
@@ -25,26 +25,25 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_m
 
     - ``"edge"``: ``sum_e vol_e |sym ∇u_e|²``, where ``∇u_e`` is the mean of ``∇u`` over the tetrahedra around an edge
       and ``vol_e`` a sixth of their volume (edge-based smoothed finite elements; Cazes and Meschke 2013 for
-      tetrahedra). Linear tetrahedra are too stiff in bending, by half or more where one or two span a limb; the mean
-      takes nearly all of that away. It is at most the element form and at least about a fifth of it, whatever the
-      mesh, so no mode is spurious. Couples vertices whose tetrahedra share an edge.
+      tetrahedra). Linear tetrahedra are too stiff in bending, by half or more with one or two across a limb; smoothing
+      removes most of this error. It is bounded by the element form and about a fifth of it, so no mode is spurious.
+      Couples vertices whose tetrahedra share an edge.
     - ``"element"``: ``sum_t vol_t |sym ∇u|²``. Couples vertices that share a tetrahedron.
     - ``"vertex"`` (Huang, Wicke, Adams and Guibas 2009): ``½ sum_i sum_{j in N(i)} c_ij |u_i - u_j - w_i ×
       (x_i - x_j)|²`` with the rotations ``w_i`` eliminated, ``K = L ⊗ I - Bᵀ C⁻¹ B``. Couples vertices two
       edges apart. The weights ``c_ij`` are the cotangent weights of the tetrahedra, **clamped from below** to
-      a small positive number: on the meshes of fTetWild the raw ones are negative on many edges, ``K`` is
-      then indefinite, and its lowest modes are spurious. The floor is not zero, so that no vertex loses its
-      neighbours.
+      a small positive number: on meshes of fTetWild many raw weights are negative, so that ``K`` is indefinite and
+      its lowest modes are spurious. A positive floor keeps all vertices connected.
 
     Args:
-        tetrahedra: The mesh at rest. Inverted tetrahedra count with the magnitude of their volume.
-        form: Which of the two.
+        tetrahedra: The mesh at rest. Inverted tetrahedra have the magnitude of their volume.
+        form: Form of the Hessian.
 
     Returns:
         Symmetric matrix; row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
 
     Raises:
-        ValueError: ``form`` is none of these.
+        ValueError: ``form`` is unknown.
     """
     if form == "edge":
         return _edge_hessian(tetrahedra)
@@ -55,19 +54,11 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_m
     raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
 
 
-def lumped_mass(tetrahedra: Tetrahedra) -> FloatArray:
-    """Mass of each vertex: a quarter of the solid volumes around it, at a density of 1. *Shape:* ``(N,)``."""
-    volumes = solid_volumes(tetrahedra)
-    quarters = np.repeat(volumes / 4, 4)
-    return np.bincount(tetrahedra.tets.reshape(-1), quarters, len(tetrahedra.vertices)).astype(np.float64)
-
-
 def mass_matrix(tetrahedra: Tetrahedra) -> sp.csr_matrix:
     """Mass of linear displacements at a density of 1, half lumped: entries for vertices. *Shape:* ``(N, N)``.
 
-    The mean of the consistent mass ``∫ h_i h_j``, with which vibrations are too fast on coarse tetrahedra, and of the
-    lumped one, with which they are too slow, in bulky parts above all. Most of both errors cancel. Rows sum to the
-    lumped masses.
+    The mean of the consistent mass ``∫ h_i h_j``, which overestimates frequencies on coarse tetrahedra, and the lumped
+    mass, which underestimates them. Most of both errors cancel. Row sums are the lumped masses.
     """
     n = len(tetrahedra.vertices)
     # For each tetrahedron: (1 + δ) / 20 if consistent, δ / 4 if lumped.
@@ -106,7 +97,7 @@ _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     """Blocks ``K_ab = sum_e vol_e ((g_a · g_b) I + g_b g_aᵀ)`` with the mean gradients ``g`` around each edge.
 
-    As in the element form; all ``g_a g_bᵀ`` at once are a product of a sparse matrix with itself.
+    As in the element form; one sparse matrix product gives all ``g_a g_bᵀ``.
     """
     n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
     columns = 3 * tetrahedra.tets[:, :, None] + np.arange(3)
@@ -117,19 +108,19 @@ def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     edge = np.unique(ends[:, 0] * n + ends[:, 1], return_inverse=True)[1].reshape(-1)
     shares = np.tile(solid_volumes(tetrahedra) / 6, 6)
     volumes = np.bincount(edge, shares)
-    # Scaled by the root of the edge's volume, so that the product below needs no further weights.
+    # Scaled by the root of the edge's volume, which weights the product below.
     means = sp.csr_matrix((shares / np.sqrt(volumes[edge]), (edge, np.tile(np.arange(t), 6))), shape=(len(volumes), t))
     averaged = means @ gradients
-    averaged.sort_indices()  # so that sums have one order, and the product is symmetric to the last bit
+    averaged.sort_indices()  # fixes the order of summation: the product is exactly symmetric
     products = (averaged.T @ averaged).tobsr((3, 3))
     blocks = products.data.transpose(0, 2, 1) + np.trace(products.data, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     k = sp.bsr_matrix((blocks, products.indices, products.indptr), shape=products.shape).tocsr()
     k.sort_indices()
-    return k.T  # as columns, which it is equal to
+    return k.T  # the symmetric matrix in column format
 
 
 def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
-    """``K = 2 L ⊗ I - Bᵀ C⁻¹ B`` (each edge is seen from both its ends, hence the 2)."""
+    """``K = 2 L ⊗ I - Bᵀ C⁻¹ B`` (each edge occurs in both directions, hence the 2)."""
     n = len(tetrahedra.vertices)
     tail, head, weights = _directed_cotangents(tetrahedra)
     edges = tetrahedra.vertices[tail] - tetrahedra.vertices[head]
@@ -153,7 +144,7 @@ def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     return sp.csc_matrix((k + k.T) / 2)
 
 
-def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[IntArray, IntArray, FloatArray]:
     """Every edge in both directions with its clamped cotangent weight ``c_ij = -Σ_t vol_t g_i · g_j``."""
     n = len(tetrahedra.vertices)
     g = hat_gradients(tetrahedra)

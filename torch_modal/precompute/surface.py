@@ -1,37 +1,34 @@
-"""A key-frame as the pre-computation sees it."""
+"""Key-frames in canonical coordinates, as the pre-computation uses them."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import SIZE, ordered_faces, placed
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.normals import vertex_normals
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 DIAGONAL = SIZE
-"""Size in which the pre-computation works (:func:`~torch_modal.geometry.canonical.size`)."""
+"""Size of canonical surfaces (:func:`~torch_modal.geometry.canonical.size`)."""
 _DIAGONAL_RANGE = (1e-90, 1e90)
 
 
 @dataclass(frozen=True)
 class CanonicalSurface:
-    """A shape with its used vertices only, in its principal axes, centred, with a size of 100.
+    """Referenced vertices of a shape in its principal axes, centred, with a size of 100.
 
-    So all that follows from it is the same however the caller's axes are turned and the faces are listed.
+    Results do not depend on the caller's axes or on the order of the faces.
 
     Attributes:
         points: *Shape:* ``(U, 3)``.
         faces: Indices into ``points``, wound counterclockwise seen from outside, sorted. *Shape:* ``(F, 3)``.
-        used: Which vertices of the shape the points are. *Shape:* ``(U,)``.
-        scale: Units here per unit of the caller.
-        axes: Vectors here times this have the caller's axes. *Shape:* ``(3, 3)``.
+        used: Vertex indices of the points in the shape. *Shape:* ``(U,)``.
+        scale: Canonical units per unit of the caller.
+        axes: ``points @ axes`` has the caller's axes. *Shape:* ``(3, 3)``.
     """
 
     points: FloatArray
@@ -42,14 +39,14 @@ class CanonicalSurface:
 
     @classmethod
     def of(cls, shape: FloatArray, faces: IntArray) -> "CanonicalSurface":
-        """The surface of a checked shape.
+        """Canonical surface of a checked shape.
 
         Args:
             shape: Positions in any units. *Shape:* ``(V, 3)``.
             faces: Vertex indices. *Shape:* ``(F, 3)``.
 
         Raises:
-            MeshError: It is so large or small that eigenvalues leave the range of float64.
+            MeshError: The size is so large or small that eigenvalues leave the range of float64.
         """
         used, compact = np.unique(faces, return_inverse=True)
         points = shape[used]
@@ -65,7 +62,7 @@ class CanonicalSurface:
 
     @cached_property
     def area(self) -> float:
-        """Of all faces."""
+        """Surface area."""
         return float(vertex_areas(self.points, self.faces).sum())
 
     @cached_property
@@ -75,9 +72,9 @@ class CanonicalSurface:
 
 
 def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
-    """The faces, all turned over if they wind clockwise seen from outside. *Shape:* ``(F, 3)``.
+    """Faces with counterclockwise winding seen from outside. *Shape:* ``(F, 3)``.
 
-    fTetWild keeps what the faces wind around, which is nothing for a mesh that is inside out.
+    fTetWild keeps the volume with positive winding number, which is empty for an inverted mesh.
     """
     inside_out = signed_volume(vertices - vertices.mean(axis=0), faces) < 0
     return np.ascontiguousarray(faces[:, ::-1]) if inside_out else faces

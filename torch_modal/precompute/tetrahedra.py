@@ -1,23 +1,20 @@
-"""Tetrahedral meshes, and what makes them of surfaces."""
+"""Tetrahedral meshes and the protocol of meshers."""
 
 import threading
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.precompute.surface import CanonicalSurface
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 SMALL_VOLUME = 0.01
-"""Of a small piece, as a fraction of the whole, and"""
+"""Largest volume of a small piece, as a fraction of the whole."""
 SMALL_SIZE = 0.1
-"""its extent, as a fraction of the bounding-box diagonal; a long piece is a limb or a wire, however thin."""
+"""Largest extent of a small piece, as a fraction of the diagonal; longer thin pieces are limbs or wires."""
 MOST_DEBRIS = 0.2
-"""Of the volume: where more hangs on other pieces, the body itself is in pieces."""
+"""Largest volume fraction of debris; with more, the body itself consists of pieces."""
 
 
 class Tetrahedra(NamedTuple):
@@ -25,8 +22,8 @@ class Tetrahedra(NamedTuple):
 
     Attributes:
         vertices: Positions. *Shape:* ``(N, 3)``.
-        tets: Vertex indices; as they are made, volumes are positive. *Shape:* ``(T, 4)``.
-        inside: Fraction of each tetrahedron that is inside the surface; None if all of them are. *Shape:* ``(T,)``.
+        tets: Vertex indices; meshers give positive volumes. *Shape:* ``(T, 4)``.
+        inside: Fraction of each tetrahedron inside the surface; None for 1. *Shape:* ``(T,)``.
     """
 
     vertices: FloatArray
@@ -35,37 +32,37 @@ class Tetrahedra(NamedTuple):
 
 
 class TetrahedralizationError(RuntimeError):
-    """No usable tetrahedra came out; the message says for which mesh, why, and what to do.
+    """The mesher failed; the message names the mesh, the reason and a remedy.
 
     Attributes:
-        fails_until: The same call fails again with any timeout up to this, in seconds: infinity where the mesher
-            cannot do it, zero where it was not its fault.
+        fails_until: Timeout in seconds up to which the same call fails again: infinity if the surface is the cause,
+            zero if another attempt may succeed.
     """
 
     fails_until: float = 0.0
 
 
 class Mesher(Protocol):
-    """Fills surfaces with tetrahedra. Its attributes are its settings.
+    """Fills surfaces with tetrahedra. Its attributes are the settings.
 
     A mesher is one file; an entry in :data:`~torch_modal.precompute.filling.MESHERS` gives it a name.
     """
 
     def key(self) -> dict[str, Any]:
-        """What the tetrahedra depend on besides the surface: name, settings, versions. Numbers, strings or None."""
+        """Cache key besides the surface: name, settings and versions, as numbers, strings or None."""
         ...
 
     def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
-        """Tetrahedra in the units of the surface.
+        """Fill a surface with tetrahedra, in its units.
 
         Args:
             surface: A closed surface, or one that is nearly closed.
-            timeout: Seconds that it may take; one that is quick need not look.
-            stop: Set when the tetrahedra are no longer wanted.
+            timeout: Time limit in seconds; a fast mesher may ignore it.
+            stop: Event that cancels the work.
 
         Raises:
-            TetrahedralizationError: There are none.
-            StoppedError: Somebody set ``stop``.
+            TetrahedralizationError: The mesher failed.
+            StoppedError: ``stop`` was set.
         """
         ...
 
@@ -78,31 +75,31 @@ def tet_volumes(tetrahedra: Tetrahedra) -> FloatArray:
 
 
 def solid_volumes(tetrahedra: Tetrahedra) -> FloatArray:
-    """Volume of the part of each tetrahedron that is solid; inverted ones count like others. *Shape:* ``(T,)``."""
+    """Absolute volume of each tetrahedron times its inside fraction. *Shape:* ``(T,)``."""
     volumes = np.abs(tet_volumes(tetrahedra))
     return volumes if tetrahedra.inside is None else volumes * tetrahedra.inside
 
 
 def oriented(tetrahedra: Tetrahedra) -> Tetrahedra:
-    """The same mesh with positive volumes, without flat tetrahedra and unused vertices."""
+    """Orient tetrahedra to positive volumes; remove degenerate ones and unused vertices."""
     volumes = tet_volumes(tetrahedra)
     tets = tetrahedra.tets.copy()
     tets[volumes < 0] = tets[volumes < 0][:, [1, 0, 2, 3]]
     edges = tetrahedra.vertices[tets[:, 1:]] - tetrahedra.vertices[tets[:, :1]]
-    # A volume below rounding in units of the tetrahedron's own size has no usable gradients.
+    # Volumes at the level of rounding give no usable gradients.
     flat = np.abs(volumes) <= 1e-12 * np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0) ** 3
     return kept_tetrahedra(Tetrahedra(tetrahedra.vertices, tets, tetrahedra.inside), ~flat)
 
 
 def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
-    """The same mesh without small pieces that hang on others by a vertex or an edge only.
+    """Remove small pieces that share only a vertex or an edge with others.
 
-    fTetWild leaves them along the rims of open surfaces. They swing freely, and each adds zero modes.
+    fTetWild creates them along the boundary of open surfaces. Each adds zero modes.
     """
     tets = tetrahedra.tets
     if len(tets) == 0:
         return tetrahedra
-    piece = pieces_by_sides(tets)
+    piece = face_connected_pieces(tets)
     n = piece.max() + 1
     vertex, user = np.divmod(np.unique(tets.reshape(-1) * n + np.repeat(piece, 4)), n)
     hinge = np.bincount(vertex)[vertex] > 1  # a vertex of two pieces or more
@@ -113,12 +110,12 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     return kept_tetrahedra(tetrahedra, ~debris[piece])
 
 
-def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> NDArray[np.bool_]:
-    """Which pieces have little volume and are short; never the largest.
+def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> BoolArray:
+    """Whether pieces have little volume and extent; false for the largest.
 
     Args:
-        tetrahedra: Of ``P`` pieces.
-        piece: The piece of each tetrahedron. *Shape:* ``(T,)``.
+        tetrahedra: Mesh of ``P`` pieces.
+        piece: Piece index of each tetrahedron. *Shape:* ``(T,)``.
 
     Returns:
         *Shape:* ``(P,)``.
@@ -137,16 +134,16 @@ def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> NDArray[np.bool_]:
 
 
 def loose_pieces(tetrahedra: Tetrahedra) -> IntArray:
-    """Which piece each vertex belongs to; pieces share no vertex. *Shape:* ``(N,)``."""
+    """Connected component of each vertex. *Shape:* ``(N,)``."""
     pairs = np.stack([np.repeat(tetrahedra.tets[:, 0], 3), tetrahedra.tets[:, 1:].reshape(-1)], axis=1)
     return connected_pieces(pairs, len(tetrahedra.vertices))
 
 
-def pieces_by_sides(tets: IntArray) -> IntArray:
-    """Which piece each tetrahedron belongs to; those that share a side are in one. *Shape:* ``(T, 4) -> (T,)``."""
+def face_connected_pieces(tets: IntArray) -> IntArray:
+    """Face-connected component of each tetrahedron. *Shape:* ``(T, 4) -> (T,)``."""
     a, b, c, d = np.sort(tets, axis=1).T
     n = tets.max(initial=0) + 1
-    # Three vertices as one number, which two million of them do not overflow.
+    # Packs three vertices into one integer; safe up to two million vertices.
     sides = np.concatenate([(p * n + q) * n + r for p, q, r in ((b, c, d), (a, c, d), (a, b, d), (a, b, c))])
     order = np.argsort(sides)
     shared = np.diff(sides[order]) == 0
@@ -154,8 +151,8 @@ def pieces_by_sides(tets: IntArray) -> IntArray:
     return connected_pieces(np.stack([owner[:-1][shared], owner[1:][shared]], axis=1), len(tets))
 
 
-def kept_tetrahedra(tetrahedra: Tetrahedra, kept: NDArray[np.bool_]) -> Tetrahedra:
-    """Some of the tetrahedra, with the vertices that they use."""
+def kept_tetrahedra(tetrahedra: Tetrahedra, kept: BoolArray) -> Tetrahedra:
+    """Submesh of some tetrahedra with their vertices."""
     used, compact = np.unique(tetrahedra.tets[kept], return_inverse=True)
     inside = None if tetrahedra.inside is None else tetrahedra.inside[kept]
     return Tetrahedra(tetrahedra.vertices[used], compact.reshape(-1, 4), inside)

@@ -1,4 +1,4 @@
-"""fTetWild: a surface filled with tetrahedra that conform to it, in a process of its own."""
+"""fTetWild in a child process: conforming tetrahedra inside a surface."""
 
 import contextlib
 import signal
@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.io.processes import describe_exit, end_process, last_line
@@ -24,19 +24,16 @@ from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface, outward
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
 EDGES_PER_THICKNESS = 0.65
 EDGE_RANGE = (0.018, 0.04)
-"""Slender shapes need finer tetrahedra: with one across a limb it is far too stiff. Bulky ones would get too many."""
+"""Range of default edge lengths: one tetrahedron across a limb is far too stiff, bulky bodies need no finer ones."""
 
 MESHER_RAISED = 3
-"""Exit code of the worker when the mesher itself raised, and not, say, its import."""
+"""Exit code of the worker if the mesher itself raised an exception."""
 _OWN_FAILURES = {MESHER_RAISED, *(-getattr(signal, name, 0) for name in ("SIGSEGV", "SIGFPE"))}
-"""Ends that the surface brings about. Others may not come again: SIGKILL is sent from outside, and SIGABRT is how C++
-ends where memory or threads run out."""
+"""Exit codes that the surface causes. Others may not recur: SIGKILL comes from outside, and C++ raises SIGABRT when
+memory or threads run out."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +43,8 @@ class TetrahedraSettings:
     Attributes:
         edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two
             thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04. The lattice has cubes of
-            three quarters of it, or of the largest of these; larger ones where there would be too many.
-        epsilon: How far the tetrahedra may leave the surface, as a fraction of the bounding-box diagonal.
+            three quarters of it (default 0.04); larger ones if there would be too many.
+        epsilon: Largest distance of the tetrahedra's surface from the input, as a fraction of the diagonal.
         stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is
             10).
         max_surface_faces: The surface is decimated to about this many faces first.
@@ -73,7 +70,7 @@ class TetrahedraSettings:
                 raise ValueError(f"{name} is {value}; give a number from {low:g} to {high:g}")
 
     def edge_length(self, points: FloatArray, faces: IntArray) -> float:
-        """The edge length for a surface, as a fraction of its bounding-box diagonal.
+        """Edge length for a surface, as a fraction of its bounding-box diagonal.
 
         Args:
             points: *Shape:* ``(V, 3)``.
@@ -108,7 +105,7 @@ class TetWild:
 def _installed(name: str) -> str | None:
     with contextlib.suppress(PackageNotFoundError):
         return version(name)
-    return None  # the worker will say so
+    return None  # the worker reports it
 
 
 def tetrahedralize(
@@ -121,18 +118,18 @@ def tetrahedralize(
 ) -> Tetrahedra:
     """Fill a closed surface with tetrahedra.
 
-    fTetWild makes a new surface mesh within its tolerance, so the vertices of the surface are not among those
-    of the result: embed them with :func:`~torch_modal.precompute.embedding.embed_surface`. It is not
-    deterministic either: two calls give two meshes. It runs in a child process, so a crash or a hang of it
-    becomes an exception here, and threads and data-loader workers may call this function.
+    fTetWild remeshes the surface within its tolerance, so the vertices of the surface are not among those
+    of the result: embed them with :func:`~torch_modal.precompute.embedding.fit_weights`. It is not
+    deterministic. It runs in a child process: crashes and hangs become exceptions, and threads and data-loader workers
+    may call this function.
 
     Args:
         vertices: Positions, any units. *Shape:* ``(V, 3)``.
-        faces: Vertex indices of a closed surface; vertices outside all faces are left out. *Shape:*
+        faces: Vertex indices of a closed surface; unreferenced vertices are ignored. *Shape:*
             ``(F, 3)``.
         settings: How fine the tetrahedra are.
         timeout: Seconds after which the child process is killed.
-        stop: It is killed as soon as somebody sets this, too.
+        stop: Event that kills it.
 
     Returns:
         Tetrahedra in the units of ``vertices``: positive volumes, every vertex used.
@@ -140,7 +137,7 @@ def tetrahedralize(
     Raises:
         TetrahedralizationError: The child process crashed, took longer than ``timeout``, or gave no
             tetrahedra or ones that do not fill the surface.
-        StoppedError: Somebody set ``stop``.
+        StoppedError: ``stop`` was set.
     """
     settings = settings or TetrahedraSettings()
     used, compact = np.unique(faces, return_inverse=True)
@@ -159,7 +156,7 @@ def tetrahedralize(
 
 
 class _Failure(NamedTuple):
-    """The mesh that an error message speaks about."""
+    """The mesh in error messages."""
 
     n_vertices: int
     n_faces: int
@@ -179,7 +176,7 @@ def _run_worker(
     stop: threading.Event,
     failure: _Failure,
 ) -> Tetrahedra:
-    """Hand the surface to the worker process, wait for it, read what it wrote."""
+    """Run the worker process on the surface and read its result."""
     if not sys.executable:
         raise failure.error(
             "sys.executable is empty, so no worker process can be started", "Run in a normal interpreter", 0.0
@@ -188,7 +185,7 @@ def _run_worker(
         job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
         np.savez(job, vertices=surface, faces=faces, timeout=timeout, **asdict(settings))
         command = [sys.executable, str(WORKER), str(job), str(result)]
-        # Output goes to a file: a pipe that nobody empties would block the child.
+        # Output goes to a file: a full pipe would block the child.
         with log.open("wb") as output:
             process = subprocess.Popen(
                 command,
@@ -196,7 +193,7 @@ def _run_worker(
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 cwd=folder,  # fTetWild leaves a __tracked_surface.stl where it runs
-                # Its own process group: it is killed as a whole, and Ctrl-C reaches only this process.
+                # A separate process group can be killed as a whole, and Ctrl-C reaches only this process.
                 start_new_session=True,
             )
         try:
@@ -226,7 +223,7 @@ def _run_worker(
 def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Event) -> int | None:
     """The exit code, or None after ``timeout`` seconds.
 
-    Polled: for ``stop``, and as a wait in one piece cannot be interrupted by Ctrl-C on every platform.
+    Polls for ``stop``, and because Ctrl-C cannot interrupt a single wait on every platform.
     """
     end = time.monotonic() + timeout
     while True:
@@ -240,7 +237,7 @@ def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Even
 
 
 def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: TetrahedraSettings, failure: _Failure) -> None:
-    """Refuse a mesh that is empty, not finite, or does not reach all of the surface (diagonal 100)."""
+    """Reject a mesh that is empty, not finite, or does not cover the surface (diagonal 100)."""
     advice = (
         "Check that the surface is closed, its winding consistent, and no part thinner than "
         f"{100 * settings.epsilon:g} % of the diagonal, or give a smaller epsilon"

@@ -1,20 +1,20 @@
-"""Whether a map keeps distances along the surface: two legs that were exchanged below the knee do not."""
+"""Consistency of geodesic distances under a map, which detects exchanged limbs."""
 
 from functools import cached_property
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.registration.maps import FINE_FUNCTIONS, Map, nearest_rows, rate, zoom_out
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import FloatArray, IntArray
 
 N_SAMPLES = 40
-_KEPT = 0.12  # distances that differ by less, of a surface of area one, agree
-_FEWEST = 8  # samples that must agree before a map is made from them
+_KEPT = 0.12  # largest error of a consistent distance, for a surface of unit area
+_FEWEST = 8  # minimum number of consistent samples for a repair
 
 
 class Consistency:
-    """Distances on the first shape to samples that are spread over it, beside those of their images.
+    """Compares geodesic distances to samples of the first shape with those to their images.
 
     Args:
         first: The first shape.
@@ -26,17 +26,17 @@ class Consistency:
 
     @cached_property
     def _samples(self) -> tuple[IntArray, FloatArray]:
-        """Vertices, each as far as possible from those before, and distances to them. *Shape:* ``(m,), (n, m)``."""
+        """Farthest-point samples and the distances to them. *Shape:* ``(m,), (n, m)``."""
         return farthest_points(self.first, N_SAMPLES)
 
     def distortion(self, vertices: IntArray) -> float:
-        """Mean over the vertices of the worst error of their distances to the samples. *Shape:* ``(n_first,)``."""
+        """Mean over the vertices of the largest distance error to a sample. *Shape:* ``(n_first,)``."""
         samples, here = self._samples
         there = self.second.geodesics_from(vertices[samples])[vertices]
         return float(np.abs(here - there).max(1).mean())
 
-    def mended(self, found: Map) -> Map | None:
-        """The map that those samples give which agree with each other; None if they are few.
+    def repaired(self, found: Map) -> Map | None:
+        """A map from the mutually consistent samples; None if they are few.
 
         Args:
             found: A map that may be wrong in parts.
@@ -60,12 +60,12 @@ class Consistency:
 
 
 def farthest_points(shape: SpectralShape, n: int, start: IntArray | None = None) -> tuple[IntArray, FloatArray]:
-    """Vertices that are each as far as possible from those before; their distances. *Shape:* ``(m,), (n, m)``.
+    """Farthest-point samples and the distances to them. *Shape:* ``(m,), (n, m)``.
 
     Args:
         shape: The shape.
-        n: How many; fewer on a shape with fewer vertices.
-        start: The first ones; by default the vertex farthest from the first vertex.
+        n: Number of samples; fewer on a shape with fewer vertices.
+        start: The first samples; by default the vertex farthest from the first vertex.
     """
     if start is None:
         start = shape.geodesics_from(np.zeros(1, dtype=np.int64)).argmax(0)

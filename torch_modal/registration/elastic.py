@@ -1,19 +1,20 @@
-"""An elastic surface that keeps its shape locally and follows targets: as rigid as possible, or as similar."""
+"""As-rigid-as-possible or as-similar-as-possible deformation of a surface towards target positions."""
 
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
+from torch_modal.arrays import FloatArray
 from torch_modal.geometry.connectivity import half_cotangents
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
-from torch_modal.registration.surface import FloatArray, MeshSurface
+from torch_modal.registration.surface import MeshSurface
 
 # Cotangent weights of obtuse triangles are negative, those of slivers huge.
 _WEIGHTS = (0.05, 10.0)
-# Rotations are mixed with their neighbours': this is what resists bending (Levi and Gotsman 2015).
+# Smoothing of rotations over neighbours resists bending (Levi and Gotsman 2015).
 _SMOOTHING, _SMOOTHING_ROUNDS = 0.5, 2
-# The same for local scales, over many more neighbours, and how far they may go.
+# Smoothing rounds and bounds of local scales.
 _SCALE_ROUNDS, _SCALES = 30, (0.3, 3.0)
 
 
@@ -29,13 +30,13 @@ class PointTargets(NamedTuple):
 
 
 class ElasticSurface:
-    r"""Minimises :math:`\sum_{ij} w_{ij} |x_i - x_j - \bar R_{ij} (r_i - r_j)|^2` plus pulls, by alternation.
+    r"""Minimises :math:`\sum_{ij} w_{ij} |x_i - x_j - \bar R_{ij} (r_i - r_j)|^2` plus pulls, by local-global steps.
 
-    Sorkine and Alexa 2007, with rotations that are smoothed over neighbours.
+    As-rigid-as-possible surface modeling (Sorkine and Alexa 2007) with smoothed rotations.
 
     Args:
-        rest: The shape that it keeps.
-        stretchable: Whether parts may also grow and shrink, smoothly.
+        rest: The rest shape.
+        stretchable: Whether smooth local scaling is allowed.
     """
 
     def __init__(self, rest: MeshSurface, *, stretchable: bool = False) -> None:
@@ -48,7 +49,7 @@ class ElasticSurface:
         self._sides = rest.vertices[self._i] - rest.vertices[self._j]
         around = np.bincount(self._i, self._weights, minlength=n)
         self.stiffness = float(around.mean())
-        """Mean weight around a vertex: what a pull of weight one is measured by."""
+        """Mean weight around a vertex, the unit of the weights of pulls."""
         adjacency = sparse.csr_matrix((self._weights, (self._i, self._j)), shape=(n, n))
         self._mean = sparse.diags(1 / np.maximum(around, 1e-12)) @ adjacency
         self._gather = sparse.csr_matrix(
@@ -56,7 +57,7 @@ class ElasticSurface:
         )
 
     def local_frames(self, x: FloatArray) -> FloatArray:
-        """Rotation, times scale if stretchable, from rest to ``x`` around each vertex. *Shape:* ``(V, 3, 3)``."""
+        """Local rotation, with scale if stretchable, from rest to ``x``. *Shape:* ``(V, 3, 3)``."""
         now = x[self._i] - x[self._j]
         products = self._weights[:, None, None] * now[:, :, None] * self._sides[:, None, :]
         covariance = self._gather @ products.reshape(-1, 9)
@@ -70,7 +71,7 @@ class ElasticSurface:
         return rotations * self._scales(now)[:, None, None]
 
     def _scales(self, now: FloatArray) -> FloatArray:
-        """Lengths over lengths at rest, without rotations: what collapsed counts as small. *Shape:* ``(V,)``."""
+        """Smoothed ratios of edge lengths to rest lengths. *Shape:* ``(V,)``."""
         squares = [self._weights * (sides**2).sum(1) for sides in (now, self._sides)]
         both = np.stack([np.bincount(self._i, s, minlength=len(self.rest.vertices)) for s in squares], axis=1)
         for _ in range(_SCALE_ROUNDS):
@@ -78,7 +79,7 @@ class ElasticSurface:
         return np.clip(np.sqrt(both[:, 0] / np.maximum(both[:, 1], 1e-30)), *_SCALES)
 
     def follow(self, x: FloatArray, pulls: list[PointTargets], rounds: int = 2) -> FloatArray:
-        """Some rounds of: rotations for fixed positions, positions for fixed rotations. *Shape:* ``(V, 3)``."""
+        """Alternate local steps (rotations) and global steps (positions). *Shape:* ``(V, 3)``."""
         matrix, pulled = self.laplacian, np.zeros_like(x)
         for pull in pulls:
             weighted = pull.points.T @ sparse.diags(pull.weights)

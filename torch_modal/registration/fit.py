@@ -1,4 +1,4 @@
-"""Laying a template onto a target, from a rough map to the surface itself."""
+"""As-rigid-as-possible fit of a template to a target."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -7,43 +7,44 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.registration.elastic import ElasticSurface, PointTargets
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import BoolArray, Closest, FloatArray, IntArray, MeshSurface
+from torch_modal.registration.surface import Closest, MeshSurface
 
 WORKING_DIAGONAL = 100.0
-"""Of the target's bounding box: reaches below are in percent of it."""
+"""Diagonal of the target; the reaches below are percentages of it."""
 
 
 class Stage(NamedTuple):
-    """Some steps with the same weight."""
+    """Steps with constant parameters."""
 
     weight: float
-    """Of closest points against stiffness."""
+    """Weight of closest points relative to the stiffness."""
     reach: float
-    """Closest points further away do not count, in percent of the diagonal."""
+    """Largest distance of closest points, in percent of the diagonal."""
     steps: int
 
 
 COARSE_STAGES = (Stage(0.05, 6, 4), Stage(0.2, 5, 6), Stage(0.5, 4, 6), Stage(2.0, 3, 4))
 FINE_STAGES = (Stage(0.3, 4, 3), Stage(1.0, 3, 3), Stage(3.0, 3, 3))
 
-_ALIKE = 0.4  # cosine between the normals of closest points
+_ALIKE = 0.4  # smallest cosine between the normals of closest points
 _LANDMARK_WEIGHT = 5.0
 MAP_WEIGHTS = (0.02, 0.1)
 _MAP_ROUNDS = 40
-_MAP_SHARE = 0.05  # of the weight of closest points, while a map is followed
-_RELEASED, _CAUGHT = Stage(0.3, 5, 4), Stage(0.5, 5, 3)  # without what is turned, then with it
-_REST = 1e-5  # holds what nothing else does: a piece without a counterpart
+_MAP_SHARE = 0.05  # weight of the map relative to closest points
+_RELEASED, _CAUGHT = Stage(0.3, 5, 4), Stage(0.5, 5, 3)  # without flipped faces, then with them
+_REST = 1e-5  # fixes pieces without a counterpart
 _ON_EDGE = 1e-6
 
 
 class Gate:
-    """Keeps closest points near the image of a map: two fingers that touch are far apart along the surface.
+    """Accepts closest points near the image of a map, by geodesic distance: touching fingers do not mix.
 
     Args:
         target: The target's coarse shape.
-        radius: Of a surface of area one.
+        radius: Largest geodesic distance, for a surface of unit area.
     """
 
     def __init__(self, target: SpectralShape, radius: float = 0.12) -> None:
@@ -51,24 +52,24 @@ class Gate:
         self._tree = cKDTree(target.positions)
 
     def coarse(self, points: FloatArray) -> IntArray:
-        """The coarse vertex next to points on the target. *Shape:* ``(n, 3) -> (n,)``."""
+        """Nearest coarse vertices of points on the target. *Shape:* ``(n, 3) -> (n,)``."""
         return self._tree.query(points)[1].astype(np.int64)
 
     def open(self, images: IntArray, coarse: IntArray) -> BoolArray:
-        """Whether coarse vertices are neighbours. *Shape:* ``(n,), (n,) -> (n,)``."""
+        """Whether pairs of coarse vertices are within the radius. *Shape:* ``(n,), (n,) -> (n,)``."""
         return self._near[images, coarse]
 
 
 class TemplateFit:
-    """A template on its way to a target.
+    """Iterative fit of a template to a target.
 
     Args:
         template: The rest shape, in the target's scale.
-        target: With a diagonal of 100.
-        back: Some form of the target whose vertices look for closest points on the template.
-        gate: Says which points may meet.
+        target: The target, with a diagonal of 100.
+        back: The target or a coarse copy, whose vertices are matched to the template.
+        gate: Accepts or rejects closest points.
         images: Coarse vertex of the target for each template vertex. *Shape:* ``(V,)``.
-        landmarks: Points of the template and where they belong.
+        landmarks: Points of the template and their target positions.
         stretchable: Whether parts may grow and shrink.
         tick: Called after each step.
     """
@@ -100,7 +101,7 @@ class TemplateFit:
         return PointTargets(points, places, self.elastic.stiffness * weights)
 
     def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
-        """Towards the places that a map gives, softly; and from then on a little. *Shape:* ``(V, 3), (V, 3)``."""
+        """Fit to the positions of a map, which keep a small weight in later steps. *Shape:* ``(V, 3), (V, 3)``."""
         everywhere, ones = sparse.identity(len(x), format="csr"), np.ones(len(x))
         for weight in MAP_WEIGHTS:
             x = self.elastic.follow(x, [self._pull(everywhere, places, weight * ones), *self._fixed], _MAP_ROUNDS)
@@ -109,14 +110,14 @@ class TemplateFit:
         return x
 
     def run(self, x: FloatArray, stages: Sequence[Stage], releases: int) -> FloatArray:
-        """All stages, then some releases of what lies the wrong way round. *Shape:* ``(V, 3)``."""
+        """Run all stages, then release flipped regions several times. *Shape:* ``(V, 3)``."""
         for stage in stages:
             x = self._steps(x, stage)
         self._map = []
         for _ in range(releases):
-            turned = self._turned(x)
-            if turned.any():
-                x = self._steps(self._steps(x, _RELEASED, turned), _CAUGHT)
+            flipped = self._flipped(x)
+            if flipped.any():
+                x = self._steps(self._steps(x, _RELEASED, flipped), _CAUGHT)
         return x
 
     def _steps(self, x: FloatArray, stage: Stage, released: BoolArray | None = None) -> FloatArray:
@@ -131,12 +132,12 @@ class TemplateFit:
         return x
 
     def _forth(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
-        """Template vertices to their closest points on the target."""
+        """Pull template vertices to closest points on the target."""
         closest = self.target.closest(shape.vertices)
         places, normals = closest.points.copy(), self.target.face_normals[closest.faces]
         used = np.einsum("vi,vi->v", shape.vertex_normals, normals) > _ALIKE
         used &= self._gate.open(self._images, self._gate.coarse(places))
-        # Where another sheet lies in the way, a vertex of the right one will do.
+        # If another sheet is closer, take the nearest vertex with a similar normal.
         hidden = np.flatnonzero(~used)
         beside = self.target.nearest_alike(shape.vertices[hidden], shape.vertex_normals[hidden])
         places[hidden] = self.target.vertices[beside]
@@ -151,7 +152,7 @@ class TemplateFit:
         return self._pull(points, places[kept], stage.weight * self._share[kept])
 
     def _and_back(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
-        """The template's points next to the target's vertices, pulled to these."""
+        """Pull the closest points on the template to the target's vertices."""
         closest = shape.closest(self.back.vertices)
         corners = shape.faces[closest.faces]
         used = np.einsum("vi,vi->v", self.back.vertex_normals, shape.face_normals[closest.faces]) > _ALIKE
@@ -164,8 +165,8 @@ class TemplateFit:
         points = shape.rows(closest)[kept]
         return self._pull(points, self.back.vertices[kept], stage.weight * self._back_share[kept])
 
-    def _turned(self, x: FloatArray) -> BoolArray:
-        """Vertices of faces that look against the target, and their neighbours."""
+    def _flipped(self, x: FloatArray) -> BoolArray:
+        """Vertices of flipped faces and their neighbours."""
         shape = self.template.moved(x)
         bad = np.zeros(len(x), dtype=bool)
         bad[shape.faces[self.target.looks_away(x[shape.faces].mean(1), shape.face_normals)]] = True
@@ -176,7 +177,7 @@ class TemplateFit:
 
 
 def on_open_edge(surface: MeshSurface, closest: Closest) -> BoolArray:
-    """Closest points on the boundary: what is really next to them may be missing. *Shape:* ``(n,)``."""
+    """Whether closest points are on the boundary, where the true counterpart may be missing. *Shape:* ``(n,)``."""
     if not surface.open_sides.any():
         return np.zeros(len(closest.faces), dtype=bool)
     return np.logical_or.reduce((surface.barycentric(closest) < _ON_EDGE) & surface.open_sides[closest.faces], axis=1)

@@ -1,4 +1,4 @@
-"""Landmarks: points that belong together; their files, and suggestions where to put them."""
+"""Landmarks: corresponding points, their files, and suggestions."""
 
 import os
 from collections.abc import Sequence
@@ -9,26 +9,27 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.registration.consistency import farthest_points
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import FloatArray, IntArray, referenced
+from torch_modal.registration.surface import referenced
 
 N_SUGGESTED = 14
-# A tip is a vertex that is farther from the rest, in the mean, than all within this distance; of a surface of area one.
+# A tip has the largest mean geodesic distance within this radius, for a surface of unit area.
 _TIP_RADIUS = 0.12
 
 
 class LandmarkPoints(NamedTuple):
-    """Places on both meshes, each in its own coordinates. *Shape of each:* ``(n, 3)``."""
+    """Positions on both meshes, each in its own coordinates. *Shape of each:* ``(n, 3)``."""
 
     template: FloatArray
     target: FloatArray
 
 
 def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) -> LandmarkPoints:
-    """What `register` is given, as points.
+    """Landmarks of `register` as points.
 
     Args:
         landmarks: None, pairs of vertex indices ``(n, 2)``, or two arrays of points ``(n, 3)``.
@@ -62,10 +63,10 @@ def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) ->
 
 
 def vertices_named(numbers: IntArray, vertices: FloatArray, mesh: str) -> FloatArray:
-    """The vertices of these numbers. *Shape:* ``(n,), (V, 3) -> (n, 3)``.
+    """Positions of numbered vertices. *Shape:* ``(n,), (V, 3) -> (n, 3)``.
 
     Raises:
-        MeshError: ``mesh``, as the message calls it, has no such vertex.
+        MeshError: A vertex does not exist; ``mesh`` is the name in the message.
     """
     wrong = np.flatnonzero((numbers < 0) | (numbers >= len(vertices)))
     if len(wrong):
@@ -127,7 +128,7 @@ def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | Fl
 
 
 def landmark_vertices(path: str | os.PathLike[str], shapes: Sequence[FloatArray]) -> IntArray:
-    """The landmarks of a file as vertices of the meshes: of points, the nearest ones. *Shape:* ``(n, K)``.
+    """Landmarks of a file as vertex indices; points give the nearest vertices. *Shape:* ``(n, K)``.
 
     Args:
         path: As for `read_landmarks`.
@@ -146,14 +147,14 @@ def landmark_vertices(path: str | os.PathLike[str], shapes: Sequence[FloatArray]
 
 
 def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArray:
-    """Vertices that are easily found again on another mesh of the same kind: tips first, then points spread between.
+    """Suggest vertices that are easy to identify on another mesh: tips first, then farthest points.
 
-    Tips are local maxima of the mean geodesic distance to everything else: the ends of limbs, ears, noses.
+    Tips are local maxima of the mean geodesic distance: the ends of limbs, ears, noses.
 
     Args:
         vertices: Vertex positions. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n: How many.
+        n: Number of landmarks.
 
     Returns:
         Vertex indices. *Shape:* ``(n,)``, fewer on a mesh with fewer vertices.

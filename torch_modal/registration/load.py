@@ -26,12 +26,11 @@ def load_keyframes(
 ) -> Keyframes:
     """Read key-frames from OBJ, PLY, OFF, GLB or GLTF files.
 
-    Vertices keep the order and number in which they stand in the files. Faces may differ between the files in
-    their order, first corner and winding; those of the first file are used. What may be wrong with the
-    meshes themselves is said by `check_keyframes`, which everything that takes key-frames calls.
+    Vertices keep their order. Faces may differ between the files in order, first corner and winding; those of the first
+    file are used. `check_keyframes` reports flaws of the meshes.
 
-    With ``register``, the meshes may have any connectivity: the first one's is laid onto each, from the one before it.
-    A mesh with the vertices and faces of the first is taken as it is.
+    With ``register``, the meshes may have any connectivity: the first one is registered to each, from its predecessor.
+    A mesh with the connectivity of the first is not registered.
 
     Args:
         paths: One file per key-frame, in the order of the sequence.
@@ -42,7 +41,7 @@ def load_keyframes(
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether registrations are kept on disk and found there.
         progress: Of the registration, see :data:`torch_modal.progress.Progress`.
-        report: Takes a line about each registration.
+        report: Called with a line about each registration.
 
     Returns:
         Positions, float64, *shape* ``(K, V, 3)``, in the files' units; faces, int64, *shape* ``(F, 3)``.

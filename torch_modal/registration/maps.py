@@ -1,7 +1,7 @@
 """Maps between two coarse shapes, from their spectra or from landmarks.
 
-A map gives each vertex of the first shape one of the second, ``(n_first,)``. Rows of eigenfunctions are compared:
-near-isometric shapes have the same ones up to a small orthogonal matrix, the functional map (Ovsjanikov et al. 2012).
+A map gives each vertex of the first shape a vertex of the second, ``(n_first,)``. It follows from rows of
+eigenfunctions: those of near-isometric shapes agree up to the functional map (Ovsjanikov et al. 2012).
 """
 
 import itertools
@@ -10,32 +10,32 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import FloatArray, IntArray
 
 COARSE_FUNCTIONS = 20
 FINE_FUNCTIONS = 50
 N_OTHER_STARTS = 6
-"""Beside the patterns of signs."""
+"""Number of initial maps besides the sign patterns."""
 _STEP = 3
 
-# How much an error of the way there and back, in lengths of a surface of area one, weighs against right area.
+# Weight of the round-trip error, for a surface of unit area, relative to the oriented area.
 _ROUND_TRIP = 3.0
-# A triangle whose image is longer than so many times its own length, and a bit, is torn.
+# Relative and absolute stretch above which a triangle counts as torn.
 _TORN = (2.5, 0.03)
-# At least so much of the area counts, even if more than the rest of it falls together.
+# Smallest fraction of the area that is the denominator of the score, if many triangles collapse.
 _LEAST_COUNTED = 0.3
 
 
 class Map(NamedTuple):
-    """A map and how good it looks."""
+    """A map and its score."""
 
     vertices: IntArray
     """*Shape:* ``(n_first,)``."""
     score: float
-    """Right maps of one subject reach 0.7 and more, wrong ones hardly; see `rate`."""
+    """See `rate`; correct maps of one subject have 0.7 or more."""
     mirrored_score: float = -np.inf
-    """The same if the target were mirrored; known of those that `spectral_maps` finds."""
+    """Score for the mirrored target, from `spectral_maps`."""
 
 
 def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
@@ -48,14 +48,14 @@ def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
 
 
 def zoom_out(first: SpectralShape, second: SpectralShape, vertices: IntArray, start: int, stop: int) -> IntArray:
-    """Refine a map by more and more eigenfunctions (ZoomOut, Melzi et al. 2019).
+    """Refine a map with an increasing number of eigenfunctions (ZoomOut, Melzi et al. 2019).
 
     Args:
         first: *n_first vertices.*
         second: *n_second vertices.*
         vertices: The map. *Shape:* ``(n_first,)``.
-        start: Eigenfunctions at first.
-        stop: And at last.
+        start: Initial number of eigenfunctions.
+        stop: Final number of eigenfunctions.
     """
     stop = min(stop, first.functions.shape[1], second.functions.shape[1])
     for k in [*range(min(start, stop), stop, _STEP), stop]:
@@ -65,20 +65,20 @@ def zoom_out(first: SpectralShape, second: SpectralShape, vertices: IntArray, st
 
 
 def functional_map(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int) -> FloatArray:
-    """Functions on the second, pulled back to the first, in both bases. *Shape:* ``(k, k)``."""
+    """Matrix of the pull-back of functions from the second shape to the first. *Shape:* ``(k, k)``."""
     return first.functions[:, :k].T @ (first.mass[:, None] * second.functions[vertices, :k])
 
 
 def rate(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int) -> float:
-    """Area that keeps its orientation, of the worse direction, minus thrice the mean error of the way there and back.
+    """Score: oriented area of the worse direction minus three times the mean round-trip error.
 
-    Mirrored maps turn all area over, and so lose.
+    Mirrored maps have negative oriented area.
     """
     return rates(first, second, vertices, k)[0]
 
 
 def rates(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int) -> tuple[float, float]:
-    """The same, and what it would be if the second shape were mirrored."""
+    """Scores for the second shape and its mirror image."""
     k = min(k, first.functions.shape[1], second.functions.shape[1])
     functional = functional_map(first, second, vertices, k)
     back = nearest_rows(second.functions[:, :k] @ functional.T, first.functions[:, :k])
@@ -88,7 +88,7 @@ def rates(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: in
 
 
 def _oriented_area(first: SpectralShape, second: SpectralShape, vertices: IntArray) -> float:
-    """Part of the first's area whose image is whole and looks outwards, minus what looks inwards."""
+    """Fraction of the first shape's area with an untorn, outward image minus that with an inward image."""
     faces = first.coarse.faces
     image = second.coarse.vertices[vertices][faces]
     area_vectors = np.cross(image[:, 1] - image[:, 0], image[:, 2] - image[:, 0])
@@ -97,14 +97,14 @@ def _oriented_area(first: SpectralShape, second: SpectralShape, vertices: IntArr
     before, after = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1) for x in (own, image))
     whole = after < _TORN[0] * before + _TORN[1]
     sign = np.sign(np.einsum("fi,fi->f", area_vectors, normals))
-    # Where the other mesh is coarser, faces fall together into points and edges, which says nothing.
+    # Faces that collapse, because the other mesh is coarser, do not count.
     counted = first.coarse.face_areas[sign != 0].sum()
     total = max(counted, _LEAST_COUNTED * first.coarse.area)
     return float((first.coarse.face_areas * whole * sign).sum() / total)
 
 
 def landmark_map(first: SpectralShape, second: SpectralShape, pairs: IntArray) -> Map:
-    """The map that geodesic distances to landmarks give, refined.
+    """Refined map from geodesic distances to landmarks.
 
     Args:
         first: The first shape.
@@ -127,17 +127,17 @@ def spectral_maps(
     keep: int = 4,
     tick: Callable[[], None] = lambda: None,
 ) -> list[Map]:
-    """The best maps that spectra alone give, best first; the last is the best one of the mirrored target.
+    """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
-    Eigenfunctions have no sign: all patterns of signs of the lowest are starts, beside wave kernel signatures and the
-    rigid placements by principal axes. Each is refined a little, and the best to the end.
+    The initial maps are all sign patterns of the lowest eigenfunctions, wave kernel signatures and rigid alignments of
+    principal axes. All are refined with few eigenfunctions, the best with all.
 
     Args:
         first: The first shape.
         second: The second.
-        n_signs: How many eigenfunctions have their signs tried: ``2**n_signs`` starts.
-        keep: How many are refined to the end.
-        tick: Called after each start.
+        n_signs: Number of eigenfunctions with both signs: ``2**n_signs`` initial maps.
+        keep: Number of fully refined maps.
+        tick: Called after each initial map.
     """
     coarse = []
     for vertices, k in _starts(first, second, n_signs):
@@ -153,7 +153,7 @@ def spectral_maps(
 
 
 def _starts(first: SpectralShape, second: SpectralShape, n_signs: int) -> Iterator[tuple[IntArray, int]]:
-    """Rough maps, and how many eigenfunctions they are good for."""
+    """Initial maps, and the number of eigenfunctions for their refinement."""
     k = n_signs + 1
     for signs in itertools.product([1.0, -1.0], repeat=n_signs):
         yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
@@ -164,7 +164,7 @@ def _starts(first: SpectralShape, second: SpectralShape, n_signs: int) -> Iterat
 
 
 def _placements(first: SpectralShape, second: SpectralShape) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """The first shape about its centroid, as it lies and turned by its principal axes; positions and normals."""
+    """Centred positions and normals of the first shape, unrotated and aligned by principal axes."""
     points, normals = first.coarse.vertices - _centroid(first), first.coarse.vertex_normals
     yield points, normals
     axes = []

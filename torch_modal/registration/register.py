@@ -1,4 +1,4 @@
-"""One mesh laid onto another: the whole path, from two meshes to a report."""
+"""Registration of one mesh to another."""
 
 import os
 from functools import cached_property
@@ -9,6 +9,7 @@ import torch
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
@@ -29,23 +30,23 @@ from torch_modal.registration.maps import (
 )
 from torch_modal.registration.report import Quality, Registration, judge, measure
 from torch_modal.registration.spectrum import SpectralShape, main_part
-from torch_modal.registration.surface import FloatArray, IntArray, MeshSurface, outward, referenced
+from torch_modal.registration.surface import MeshSurface, outward, referenced
 
 VERSION = 4
-"""Part of the key of kept results: raise it when the algorithm changes."""
-FEWEST_ACROSS = 5
-"""Landmarks that two different subjects need: their spectra do not tell which map is right."""
-_SURE_SCORE = 0.62  # of a spectral map; below it, more starts are tried
+"""Part of the cache key: raise it when the algorithm changes."""
+MIN_LANDMARKS = 5
+"""Minimum number of landmarks between different subjects, whose spectra do not determine the map."""
+_SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
 _SIGNS, _MORE_SIGNS = 4, 6
-_SCORE_SHARE = 0.5  # of a map's score against the stretch of its fit
-_NEAR_LANDMARK = 0.1  # of a surface of area one: spectral maps further off are left out
-_RIVALS = 3  # maps that are fitted before one is chosen
-_RIVAL_SCORE = 0.15  # behind the best, in score minus distortion
-_SAME = 0.1  # maps that differ by less at all but 2 % of the vertices, of a surface of area one, count as one
-_REFINEMENTS = (True, True, False, False)  # whether the map of each is refined by spectra first
-_AT_REST = 0.3  # mean way of the vertices in one of them, in percent of the diagonal, that is none
-_WORSE = 0.05  # of a candidate's cost, which does not know the truth that well
-_RESCALED = 0.02  # change of scale of the whole, as a logarithm, that is worth another fit
+_SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
+_NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
+_RIVALS = 3  # maximum number of maps that are fitted
+_RIVAL_SCORE = 0.15  # largest difference to the best map, in score minus distortion
+_SAME = 0.1  # 98th percentile of the distance of maps that count as equal, for a surface of unit area
+_REFINEMENTS = (True, True, False, False)  # whether each map is first refined by spectra
+_CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
+_WORSE = 0.05  # accepted increase of a candidate's cost
+_RESCALED = 0.02  # logarithm of the global scale above which the fit is repeated
 
 
 class _Candidate(NamedTuple):
@@ -58,7 +59,7 @@ class _Candidate(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """What candidates are compared by: a good map, laid on without stretch."""
+        """Cost of a candidate: fit and distortion minus the score of the map."""
         return self.quality.cost + self.distortion - _SCORE_SHARE * self.found.score
 
 
@@ -74,27 +75,26 @@ def register(
     cache: bool = True,
     progress: Progress = None,
 ) -> Registration:
-    """Lay a template onto a target of any other connectivity.
+    """Register a template to a target of any connectivity.
 
-    Both are decimated and compared by their Laplacian spectra, or by geodesic distances to the landmarks; the map is
-    refined, and an elastic copy of the template follows it onto the target.
+    Laplacian spectra of decimated copies, or geodesic distances to landmarks, give a map. The map is refined, and an
+    as-rigid-as-possible fit moves the template along it onto the target.
 
     Args:
-        template: Vertex positions, float32 or float64, in any units and any place. *Shape:* ``(V, 3)``.
+        template: Vertex positions, float32 or float64, in any units. *Shape:* ``(V, 3)``.
         template_faces: Vertex indices. *Shape:* ``(F, 3)``.
         target: Vertex positions. *Shape:* ``(V_target, 3)``.
         target_faces: Vertex indices. *Shape:* ``(F_target, 3)``.
         landmarks: Pairs of vertices, template first, *shape* ``(n, 2)``; or two arrays of points ``(n, 3)``, in the
             coordinates of the template and of the target.
-        same_subject: Whether both are poses of one body, nearly without stretch. Two different bodies need five
-            landmarks or more.
+        same_subject: Whether both are nearly isometric poses of one body. Different bodies need five landmarks.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
-        cache: Whether the result is kept on disk, by the content of meshes and landmarks, and found there.
-        progress: See :data:`torch_modal.progress.Progress`; the total grows as it is learnt.
+        cache: Whether results are kept on disk and found there.
+        progress: See :data:`torch_modal.progress.Progress`; the total grows during the work.
 
     Returns:
-        Places of the template's vertices on the target, and a report. A doubtful result is returned too, with a
-        confidence below 0.5 and warnings.
+        Positions of the template's vertices on the target, and a report. Doubtful results have a confidence below 0.5
+        and warnings.
 
     Raises:
         MeshError: A mesh or the landmarks cannot work.
@@ -104,19 +104,19 @@ def register(
     goal = check_keyframes([target], target_faces, warn=False)
     shapes = [mesh.keyframes[0].detach().cpu().double().numpy() for mesh in (checked, goal)]
     points = landmark_points(landmarks, *shapes)
-    # Along seams of texture coordinates, the surface is not cut open.
+    # Texture seams must not cut the surface open.
     welded, welded_goal = (
         weld_seams(x[None], mesh.faces.cpu()) for x, mesh in zip(shapes, (checked, goal), strict=True)
     )
-    if not same_subject and len(points.template) < FEWEST_ACROSS:
+    if not same_subject and len(points.template) < MIN_LANDMARKS:
         raise MeshError(
-            f"two different subjects need {FEWEST_ACROSS} landmarks or more, got {len(points.template)}: without them "
-            "nothing tells which map is right; give pairs of vertices, template first"
+            f"two different subjects need {MIN_LANDMARKS} landmarks or more, got {len(points.template)}: spectra alone "
+            "do not determine the map; give pairs of vertices, template first"
         )
     own, other = ((one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal))
 
     def compute() -> dict[str, Any]:
-        # The matrices are small: on a busy machine, threads of BLAS would mostly wait for each other.
+        # The matrices are too small for BLAS threads.
         with ProgressReport(0, "register", progress) as report, threadpool_limits(1):
             return _RegistrationProblem(own, other, points, same_subject, report).solve().arrays()
 
@@ -135,7 +135,7 @@ def register(
 
 
 class _RegistrationProblem:
-    """Two meshes in working units: the target around the origin with a diagonal of 100, the template of its area."""
+    """Both meshes in working units: the target centred with a diagonal of 100, the template with equal area."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class _RegistrationProblem:
         self.same_subject, self.progress = same_subject, progress
         rest = template[0]
         goal, self.target_vertices = referenced(target[0], outward(*target))
-        # Neither size is that of pieces beside the body, such as a stray sphere.
+        # Sizes are those of the main body, without stray pieces.
         body = main_part(goal)
         self.unit, self.origin = body.diagonal / WORKING_DIAGONAL, body.vertices.mean(0)
         self.target = goal.moved((goal.vertices - self.origin) / self.unit)
@@ -196,23 +196,23 @@ class _RegistrationProblem:
         return np.stack([shape.nearest(at, _normals(surface, at)) for shape, surface, at in both], axis=1)
 
     def _agrees(self, found: Map) -> bool:
-        """Whether a map sends all landmarks near their places."""
+        """Whether a map agrees with all landmarks."""
         places = self.second.coarse.vertices
-        apart = np.linalg.norm(places[found.vertices[self._pairs[:, 0]]] - places[self._pairs[:, 1]], axis=1)
-        return bool((apart < _NEAR_LANDMARK).all())
+        errors = np.linalg.norm(places[found.vertices[self._pairs[:, 0]]] - places[self._pairs[:, 1]], axis=1)
+        return bool((errors < _NEAR_LANDMARK).all())
 
     def _rivals(self, maps: list[Map]) -> list[tuple[Map, float]]:
-        """The maps that are worth a fit, and their distortions: those found, and those mended, which differ."""
-        mended = [self.consistency.mended(found) for found in maps] if self.same_subject else []
-        everything = [*maps, *(found for found in mended if found is not None and self._agrees(found))]
+        """Different maps that will be fitted, found and repaired ones, with their distortions."""
+        repaired = [self.consistency.repaired(found) for found in maps] if self.same_subject else []
+        everything = [*maps, *(found for found in repaired if found is not None and self._agrees(found))]
         rated = [(found, self.consistency.distortion(found.vertices)) for found in everything]
         rated.sort(key=lambda pair: pair[1] - pair[0].score)
         places = self.second.coarse.vertices
         kept = rated[:1]
         for found, distortion in rated[1:]:
-            apart = min(_apart(places[found.vertices], places[one.vertices]) for one, _ in kept)
+            difference = min(_difference(places[found.vertices], places[one.vertices]) for one, _ in kept)
             lead = (found.score - distortion) - (rated[0][0].score - rated[0][1])
-            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and apart > _SAME:
+            if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and difference > _SAME:
                 kept.append((found, distortion))
         return kept
 
@@ -245,9 +245,9 @@ class _RegistrationProblem:
         )
 
     def _refined(self, candidate: _Candidate) -> _Candidate:
-        """Fitted again from the start along the map that it makes itself, until nothing moves any more.
+        """Repeat the fit from the start with the map of its result, until convergence.
 
-        An elastic fit drags along what slid on the way; its map, at first refined by all functions, does not.
+        An elastic fit accumulates sliding; its map, first refined by all eigenfunctions, does not.
         """
         if not self.same_subject:
             return candidate
@@ -261,13 +261,13 @@ class _RegistrationProblem:
             again = self._coarse(found, self.consistency.distortion(vertices))
             if again.cost > most:
                 break
-            if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _AT_REST:
+            if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _CONVERGED:
                 return min(candidate, again, key=lambda one: one.cost)
             candidate = again
         return candidate
 
     def _rescaled(self, candidate: _Candidate) -> _Candidate:
-        """Fitted again with the scale that it has on the target: areas mislead where parts are missing."""
+        """Repeat the fit with its scale on the target: the ratio of areas is wrong if parts are missing."""
         template = candidate.fit.template
         i, j = template.edges.T
         now, rest = (np.linalg.norm(p[i] - p[j], axis=1) for p in (candidate.x, template.vertices))
@@ -278,7 +278,7 @@ class _RegistrationProblem:
         return again if again.quality.cost <= candidate.quality.cost else candidate
 
     def _fine(self, candidate: _Candidate) -> tuple[FloatArray, FloatArray]:
-        """Of the used vertices after the last stages; and of all, so that vertices of no face come along."""
+        """Positions after the last stages of the referenced vertices, and of all vertices."""
         coarse, x = candidate.fit.template, candidate.x
         template = self.template.moved(self.template.vertices * candidate.scale)
         frames = candidate.fit.elastic.local_frames(x)
@@ -297,7 +297,7 @@ class _RegistrationProblem:
         coarse = best.fit.template.moved(best.x)
         images = self.second.nearest(coarse.vertices, coarse.vertex_normals)
         score = rate(self.first, self.second, images, FINE_FUNCTIONS)
-        # Where sheets touch, the image of a sample may fall on the wrong one; the map itself has no such places.
+        # Where sheets touch, the image of a sample may lie on the wrong one; the map has no such errors.
         distortion = min(best.distortion, self.consistency.distortion(images))
         errors = np.zeros(0)
         if len(self.marks):
@@ -314,12 +314,7 @@ class _RegistrationProblem:
             confidence=confidence,
             map_score=score,
             distortion=distortion,
-            to_target=quality.to_target,
-            from_target=quality.from_target,
-            stretch=quality.stretch,
-            flipped_area=quality.flipped_area,
-            folds=quality.folds,
-            unsupported_area=quality.unsupported_area,
+            **quality._asdict(),
             mirrored_lead=lead,
             landmark_errors=torch.from_numpy(errors),
             target_faces=torch.from_numpy(closest.faces),
@@ -329,7 +324,7 @@ class _RegistrationProblem:
         )
 
 
-def _apart(places: FloatArray, others: FloatArray) -> float:
+def _difference(places: FloatArray, others: FloatArray) -> float:
     return float(np.percentile(np.linalg.norm(places - others, axis=1), 98))
 
 
@@ -338,16 +333,16 @@ def _normals(surface: MeshSurface, points: FloatArray) -> FloatArray:
 
 
 def _placed(x: FloatArray, places: FloatArray, weights: FloatArray) -> FloatArray:
-    """Moved rigidly onto places, as well as it goes. *Shape:* ``(n, 3), (n, 3), (n,)``."""
+    """Best rigid alignment to target positions. *Shape:* ``(n, 3), (n, 3), (n,)``."""
     here, there, shares = (torch.from_numpy(array) for array in (x, places, weights))
     with torch.no_grad():
         return best_fit(here, there, shares).apply(here).numpy()
 
 
 def _carried(points: FloatArray, coarse: MeshSurface, x: FloatArray, frames: FloatArray) -> FloatArray:
-    """Points beside a coarse surface at rest, moved along with it. *Shape:* ``(n, 3)``."""
+    """Deformation of points near a coarse surface at rest. *Shape:* ``(n, 3)``."""
     rows: sparse.csr_matrix = coarse.rows(coarse.closest(points))
-    # Each corner carries the point as its own frame says; the mean by barycentric weights.
+    # Barycentric mean of the affine maps of the corners.
     offsets = np.einsum("vij,vj->vi", frames, coarse.vertices)
     turn = (rows @ frames.reshape(len(frames), 9)).reshape(-1, 3, 3)
     return rows @ (x - offsets) + np.einsum("nij,nj->ni", turn, points)

@@ -1,4 +1,4 @@
-"""What came out of a registration, and how far it can be trusted."""
+"""Result and confidence of a registration."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -7,24 +7,25 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
 from torch_modal.registration.fit import on_open_edge
-from torch_modal.registration.surface import BoolArray, FloatArray, MeshSurface, referenced
+from torch_modal.registration.surface import MeshSurface, referenced
 
 TRUSTED = 0.5
 """Confidence below which a result is doubtful."""
 
-_FAR = 0.01  # from the target, in diagonals, is without it
-_SHRUNK = 0.2  # of the median change of area: what is missing collapses
-_APART = 0.03  # pieces of the target that are further from the template, in its diagonals, belong to something else
+_FAR = 0.01  # distance from the target above which a face is unsupported, in diagonals
+_SHRUNK = 0.2  # area change relative to the median below which a face is unsupported: missing parts collapse
+_STRAY = 0.03  # distance from the template above which a piece of the target is ignored, in diagonals
 
 
 class Distances(NamedTuple):
-    """From the vertices of one surface to the other, in percent of the target's bounding-box diagonal."""
+    """Distances from vertices to the other surface, in percent of the target's bounding-box diagonal."""
 
     mean: float
-    """By area."""
+    """Area-weighted mean."""
     percentile_95: float
     """Of the vertices."""
     max: float
@@ -39,27 +40,27 @@ class Distances(NamedTuple):
 
 
 class Quality(NamedTuple):
-    """How a laid-on template looks; nothing here knows the truth."""
+    """Quality measures of a fitted template, without ground truth."""
 
     to_target: Distances
     from_target: Distances
     stretch: float
-    """Root mean square of ``log(length / length at rest)`` over the edges, after the best scale of the whole."""
+    """Root mean square of ``log(length / rest length)`` over the edges, relative to its median."""
     flipped_area: float
-    """Part of the template's area that looks against the target."""
+    """Fraction of the template's area with normals opposed to the target."""
     folds: int
-    """Edges at which two faces that were at most at right angles now lie nearly back to back."""
+    """Edges at which the angle between the normals grew from below 90 to above 120 degrees."""
     unsupported_area: float
-    """Part of the template's area without target beside it: its place is extrapolated."""
+    """Fraction of the template's area without a counterpart on the target."""
 
     @property
     def cost(self) -> float:
-        """What candidates are compared by: lower is better."""
+        """Cost for comparing candidates."""
         return self.stretch + 0.1 * (self.to_target.mean + self.from_target.mean) + self.flipped_area
 
 
 def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> Quality:
-    """The quality of a shape of the template against the target."""
+    """Measure the quality of a fitted template."""
     shape = template.moved(x)
     target = _without_strays(target, shape)
     i, j = shape.edges.T
@@ -82,18 +83,18 @@ def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> Qualit
 
 
 def _without_strays(target: MeshSurface, shape: MeshSurface) -> MeshSurface:
-    """The target without its pieces that lie apart from the laid-on template; all of it, if all do."""
+    """Remove pieces of the target far from the fitted template, unless all are far."""
     pieces = target.connectivity.vertex_pieces
     if pieces.max() == 0:
         return target
     nearest = np.full(pieces.max() + 1, np.inf)
     np.minimum.at(nearest, pieces, shape.closest(target.vertices).distances)
-    kept = (nearest <= _APART * shape.diagonal)[pieces[target.faces[:, 0]]]
+    kept = (nearest <= _STRAY * shape.diagonal)[pieces[target.faces[:, 0]]]
     return referenced(target.vertices, target.faces[kept])[0] if kept.any() else target
 
 
 def _unsupported(template: MeshSurface, shape: MeshSurface, target: MeshSurface) -> BoolArray:
-    """Faces far from the target, beside a hole of it, or squeezed to nearly nothing. *Shape:* ``(F,)``."""
+    """Whether faces are far from the target, at one of its holes, or collapsed. *Shape:* ``(F,)``."""
     closest = target.closest(shape.vertices[shape.faces].mean(1))
     open_there = on_open_edge(target, closest) & ~shape.on_boundary[shape.faces].any(1)
     change = shape.face_areas / np.maximum(template.face_areas, 1e-30)
@@ -103,57 +104,57 @@ def _unsupported(template: MeshSurface, shape: MeshSurface, target: MeshSurface)
 
 
 class Registration(NamedTuple):
-    """A template laid onto a target. Lengths are in percent of the target's bounding-box diagonal."""
+    """A template registered to a target. Lengths are in percent of the target's bounding-box diagonal."""
 
     positions: torch.Tensor
-    """Places of the template's vertices on the target, in its coordinates and the template's dtype.
+    """Positions of the template's vertices on the target, in its coordinates and the template's dtype.
 
     *Shape:* ``(V, 3)``.
     """
     confidence: float
-    """From 0 to 1; below 0.5 the result is doubtful, and ``warnings`` says why."""
+    """From 0 to 1; below 0.5 the result is doubtful, and ``warnings`` gives the reasons."""
     map_score: float
-    """Area that keeps its orientation minus thrice the round-trip error, of the coarse map; 1 is perfect."""
+    """Oriented area minus three times the round-trip error of the coarse map; at most 1."""
     distortion: float
-    """Error of distances along the surface, of each vertex to its worst sample, in roots of the area."""
+    """Mean over the vertices of the largest geodesic distance error, in square roots of the area."""
     to_target: Distances
     """From the template's vertices to the target."""
     from_target: Distances
     """From the target's vertices to the template."""
     stretch: float
-    """Root mean square of the edges' logarithmic change of length, after the best scale of the whole."""
+    """Root mean square of the edges' logarithmic change of length, relative to its median."""
     flipped_area: float
-    """Part of the template's area that looks against the target."""
+    """Fraction of the template's area with normals opposed to the target."""
     folds: int
     """Edges at which the template is folded over itself."""
     unsupported_area: float
-    """Part of the template's area without target beside it, such as a limb that is missing there."""
+    """Fraction of the template's area without a counterpart, such as a limb missing on the target."""
     mirrored_lead: float
-    """By how much a mirrored map beats this one, in score minus distortion; minus infinity where none was sought."""
+    """Advantage of a mirrored map, in score minus distortion; minus infinity if none was computed."""
     landmark_errors: torch.Tensor
-    """From each landmark to its place. *Shape:* ``(n,)``."""
+    """Distance of each landmark from its target. *Shape:* ``(n,)``."""
     target_faces: torch.Tensor
-    """The face of the target below each vertex. *Shape:* ``(V,)``."""
+    """Closest face of the target for each vertex. *Shape:* ``(V,)``."""
     barycentric: torch.Tensor
-    """Weights of that face's corners. *Shape:* ``(V, 3)``."""
+    """Barycentric coordinates in that face. *Shape:* ``(V, 3)``."""
     target_corners: torch.Tensor
     """Vertices of the target at those corners. *Shape:* ``(V, 3)``."""
     warnings: tuple[str, ...]
-    """What makes the result doubtful, and what to do."""
+    """Reasons for a low confidence, with remedies."""
 
     @property
     def doubtful(self) -> bool:
-        """Whether the result should not be used without a look at it."""
+        """Whether the confidence is below 0.5."""
         return self.confidence < TRUSTED
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The same as arrays, which a file can hold."""
+        """Arrays for a file."""
         arrays = {name: to_numpy(value) for name, value in self._asdict().items() if name != "warnings"}
         return arrays | {"warnings": np.frombuffer("\n".join(self.warnings).encode(), dtype=np.uint8)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Registration":
-        """What `arrays` was made from."""
+        """Inverse of `arrays`."""
         fields: dict[str, Any] = {}
         for name, array in arrays.items():
             if name == "warnings":
@@ -167,10 +168,10 @@ class Registration(NamedTuple):
         return cls(**fields)
 
     def sample(self, values: Any) -> torch.Tensor:
-        """Attributes of the target's vertices, at the template's vertices.
+        """Transfer attributes from the target's vertices to the template's vertices.
 
-        Floats (colours, texture coordinates) are interpolated in the face below each vertex; whole numbers and
-        booleans (labels) are taken from the nearest of its corners.
+        Floats (colours, texture coordinates) are interpolated in the closest face; integers and booleans (labels) come
+        from the nearest of its corners.
 
         Args:
             values: One row for each vertex of the target. *Shape:* ``(V_target, ...)``.
@@ -195,7 +196,7 @@ class Registration(NamedTuple):
         return (weights * rows[corners]).sum(1)
 
     def summary(self) -> str:
-        """The report in one line."""
+        """One-line report."""
         marks = f", landmarks within {float(self.landmark_errors.max()):.2f} %" if len(self.landmark_errors) else ""
         return (
             f"confidence {self.confidence:.2f}, distance {self.to_target.mean:.3f} % there and "
@@ -206,7 +207,7 @@ class Registration(NamedTuple):
 
 
 def _ramp(value: float, bad: float, good: float) -> float:
-    """0 at ``bad``, 1 at ``good``, linear between."""
+    """Linear ramp from 0 at ``bad`` to 1 at ``good``."""
     return float(np.clip((value - bad) / (good - bad), 0, 1))
 
 
@@ -220,13 +221,13 @@ def judge(
     same_subject: bool,
     landmarks: bool,
 ) -> tuple[float, tuple[str, ...]]:
-    """Confidence, the least of several signs, and a sentence for each that is bad."""
+    """Confidence, the minimum of several criteria, and a message for each criterion that fails."""
     advice = "look at the result, and give landmarks (five or more) on both meshes" + (
         ", or more of them" if landmarks else ""
     )
     distance = max(quality.to_target.mean, quality.from_target.mean)
     signs = [
-        (_ramp(distance, 1.0, 0.3), f"the surfaces are {distance:.2f} % of the diagonal apart in the mean"),
+        (_ramp(distance, 1.0, 0.3), f"the mean distance of the surfaces is {distance:.2f} % of the diagonal"),
         (_ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
         (
             _ramp(quality.unsupported_area, 0.05, 0.02),

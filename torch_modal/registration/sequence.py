@@ -1,4 +1,4 @@
-"""Meshes of a sequence, each registered from its neighbour."""
+"""Registration of a sequence of meshes, each from its predecessor."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.registration.landmarks import read_landmarks, vertices_named
 from torch_modal.registration.register import register
-from torch_modal.registration.surface import FloatArray, IntArray
 
 ADVICE = (
     "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
@@ -27,13 +27,13 @@ def register_files(
     report: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> Keyframes:
-    """Read meshes and lay the first one's connectivity onto the others; see `load_keyframes`.
+    """Read meshes and register the first one's connectivity to the others; see `load_keyframes`.
 
     Args:
         paths: A file for each mesh.
-        landmarks: As `landmark_table` takes them.
-        report: Takes a line about each registration.
-        **options: What `register` takes besides.
+        landmarks: See `landmark_table`.
+        report: Called with a line about each registration.
+        **options: Further arguments of `register`.
 
     Raises:
         MeshError: A file cannot be read, landmarks do not fit the meshes, or a registration is doubtful.
@@ -67,7 +67,7 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray |
         shapes: Vertices of the K meshes.
 
     Raises:
-        MeshError: They do not fit the meshes.
+        MeshError: Landmarks do not match the meshes.
     """
     if landmarks is None:
         return None
@@ -85,7 +85,7 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray |
 
 
 def is_same_mesh(vertices: FloatArray, faces: IntArray, others: FloatArray, other_faces: IntArray) -> bool:
-    """Whether two meshes have one connectivity already."""
+    """Whether two meshes have the same connectivity."""
     try:
         require_same_mesh("", vertices, faces, "", others, other_faces)
     except MeshError:

@@ -1,4 +1,4 @@
-"""A coarse copy of a surface with its Laplacian eigenfunctions and geodesic distances: what maps are made from."""
+"""Laplacian eigenfunctions and geodesic distances on a coarse copy of a surface."""
 
 from functools import cached_property
 from typing import Any
@@ -8,13 +8,11 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
 
+from torch_modal import extras
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry import inspect
 from torch_modal.geometry.decimation import decimate
-from torch_modal.registration.libraries import require
 from torch_modal.registration.surface import (
-    BoolArray,
-    FloatArray,
-    IntArray,
     MeshSurface,
     largest_piece,
     referenced,
@@ -25,24 +23,24 @@ from torch_modal.registration.surface import (
 N_COARSE = 2000
 """Vertices of the coarse copies."""
 CUT = 0.04
-"""The widest cut through a surface that is sewn up again, in diagonals."""
+"""Widest cut through a surface that is closed, in diagonals."""
 N_FUNCTIONS = 60
-"""Eigenfunctions, the constant one among them."""
+"""Number of eigenfunctions, including the constant one."""
 
 
 class SpectralShape:
-    """The largest piece of a surface, decimated and scaled to area one.
+    """The largest piece of a surface, decimated and scaled to unit area.
 
     Args:
         surface: The fine surface.
-        n_vertices: About as many are kept.
+        n_vertices: Approximate number of coarse vertices.
     """
 
     def __init__(self, surface: MeshSurface, n_vertices: int = N_COARSE) -> None:
         self.fine = surface
         coarse = decimated(surface, n_vertices)
         self.scale = np.sqrt(coarse.area)
-        """Length of the fine surface's units that is one here."""
+        """Unit of length of the coarse copy, in units of the fine surface."""
         self.coarse = MeshSurface(coarse.vertices / self.scale, coarse.faces)
 
     def __len__(self) -> int:
@@ -56,10 +54,12 @@ class SpectralShape:
 
     @cached_property
     def _spectrum(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        laplacian, mass = require("robust_laplacian").mesh_laplacian(self.coarse.vertices, self.coarse.faces)
+        laplacian, mass = extras.require("robust_laplacian", "register", "registration").mesh_laplacian(
+            self.coarse.vertices, self.coarse.faces
+        )
         n = len(self)
         count = min(N_FUNCTIONS, n - 2)
-        # Shifted by a little: the constant function makes the matrix singular.
+        # A small shift: the constant function makes the matrix singular.
         values, functions = eigsh(laplacian.tocsc(), count, mass.tocsc(), sigma=-0.01, v0=np.ones(n) + np.arange(n) / n)
         return values, functions, mass.diagonal()
 
@@ -75,11 +75,11 @@ class SpectralShape:
 
     @property
     def mass(self) -> FloatArray:
-        """Area of each vertex, as the Laplacian has it. *Shape:* ``(n,)``."""
+        """Lumped mass of the Laplacian. *Shape:* ``(n,)``."""
         return self._spectrum[2]
 
     def wave_kernel_signatures(self, n_energies: int = 40) -> FloatArray:
-        """Aubry, Schlickewei and Cremers 2011. *Shape:* ``(n, n_energies)``, columns of length one."""
+        """Wave kernel signatures (Aubry et al. 2011) in unit columns. *Shape:* ``(n, n_energies)``."""
         logs = np.log(np.maximum(self.eigenvalues[1:], 1e-9))
         energies = np.linspace(logs[0], logs[-1] / 1.02, n_energies)
         width = max(7 * (logs[-1] - logs[0]) / n_energies, 1e-9)
@@ -89,14 +89,16 @@ class SpectralShape:
 
     @cached_property
     def _heat_solver(self) -> Any:
-        return require("potpourri3d").MeshHeatMethodDistanceSolver(self.coarse.vertices, self.coarse.faces)
+        return extras.require("potpourri3d", "register", "registration").MeshHeatMethodDistanceSolver(
+            self.coarse.vertices, self.coarse.faces
+        )
 
     def geodesics_from(self, sources: IntArray) -> FloatArray:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
         return np.stack([self._heat_solver.compute_distance(int(source)) for source in sources], axis=1)
 
     def neighbourhoods(self, radius: float) -> BoolArray:
-        """Where two vertices lie within a distance along edges. *Shape:* ``(n, n)``."""
+        """Whether two vertices are within a distance along edges. *Shape:* ``(n, n)``."""
         i, j = self.coarse.edges.T
         lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
         graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
@@ -104,7 +106,7 @@ class SpectralShape:
         return near
 
     def nearest(self, points: FloatArray, normals: FloatArray) -> IntArray:
-        """The coarse vertex next to points of the fine surface, on the same side of thin parts. *Shape:* ``(m,)``."""
+        """Nearest coarse vertices of points of the fine surface, on the same side of thin parts. *Shape:* ``(m,)``."""
         return self.placed.nearest_alike(points, normals)
 
     @cached_property
@@ -114,9 +116,9 @@ class SpectralShape:
 
 
 def decimated(surface: MeshSurface, n_vertices: int) -> MeshSurface:
-    """The largest piece, and those that a cut has parted from it, with fewer vertices.
+    """Decimate the main part of a surface.
 
-    With no more than a fifth above, all are kept.
+    A surface with at most a fifth more vertices is not decimated.
     """
     surface = without_dust(surface)
     if len(surface.vertices) <= 1.2 * n_vertices:
@@ -129,5 +131,5 @@ def decimated(surface: MeshSurface, n_vertices: int) -> MeshSurface:
 
 
 def main_part(surface: MeshSurface) -> MeshSurface:
-    """The largest piece, and those that a cut has parted from it."""
+    """The largest piece, with those separated from it by a cut."""
     return largest_piece(sewn(without_dust(surface), CUT))

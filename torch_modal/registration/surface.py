@@ -4,40 +4,36 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from torch_modal import extras
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.normals import vertex_normals
-from torch_modal.registration.libraries import require
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 LEAN = 0.01
-"""What a normal counts for beside a position, in diagonals: sheets closer than twice that are told apart."""
+"""Weight of normals relative to positions, in diagonals; distinguishes sheets closer than twice this distance."""
 
 
 class Closest(NamedTuple):
-    """The point of a surface next to each query."""
+    """Closest points on a surface."""
 
     distances: FloatArray
     """*Shape:* ``(n,)``."""
     faces: IntArray
-    """The face that it lies on. *Shape:* ``(n,)``."""
+    """Face of each point. *Shape:* ``(n,)``."""
     points: FloatArray
     """*Shape:* ``(n, 3)``."""
 
 
 class MeshSurface:
-    """A triangle mesh with what is derived from it once.
+    """A triangle mesh with cached derived quantities.
 
     Args:
         vertices: *Shape:* ``(V, 3)``.
-        faces: *Shape:* ``(F, 3)``, or what was made from them for another shape.
+        faces: *Shape:* ``(F, 3)``, or their connectivity.
     """
 
     def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
@@ -47,7 +43,7 @@ class MeshSurface:
 
     @cached_property
     def area_vectors(self) -> FloatArray:
-        """Normals as long as the faces are large. *Shape:* ``(F, 3)``."""
+        """Face normals scaled by area. *Shape:* ``(F, 3)``."""
         a, b, c = (self.vertices[corner] for corner in self.faces.T)
         return 0.5 * np.cross(b - a, c - a)
 
@@ -63,12 +59,12 @@ class MeshSurface:
 
     @cached_property
     def vertex_normals(self) -> FloatArray:
-        """Means over the faces around a vertex, by area. *Shape:* ``(V, 3)``."""
+        """Area-weighted means of the normals of incident faces. *Shape:* ``(V, 3)``."""
         return vertex_normals(self.vertices, self.faces)
 
     @cached_property
     def vertex_areas(self) -> FloatArray:
-        """A third of the faces around each vertex. *Shape:* ``(V,)``."""
+        """A third of the area of incident faces. *Shape:* ``(V,)``."""
         return vertex_areas(self.vertices, self.faces)
 
     @property
@@ -78,30 +74,30 @@ class MeshSurface:
 
     @cached_property
     def open_sides(self) -> BoolArray:
-        """Whether the side opposite to each corner belongs to one face only. *Shape:* ``(F, 3)``."""
+        """Whether the edge opposite to each corner is a boundary edge. *Shape:* ``(F, 3)``."""
         is_open = (self.connectivity.counts == 1)[self.connectivity.sides].reshape(3, -1).T
-        return np.roll(is_open, -1, axis=1)  # the side opposite to a corner starts at the next one
+        return np.roll(is_open, -1, axis=1)  # the edge opposite to a corner starts at the next one
 
     @cached_property
     def on_boundary(self) -> BoolArray:
-        """Vertices of such sides. *Shape:* ``(V,)``."""
+        """Whether vertices are on the boundary. *Shape:* ``(V,)``."""
         found = np.zeros(len(self.vertices), dtype=bool)
         found[self.connectivity.boundary_edges] = True
         return found
 
     @property
     def diagonal(self) -> float:
-        """Of the bounding box."""
+        """Diagonal of the bounding box."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
     @property
     def area(self) -> float:
-        """Of all faces."""
+        """Total area."""
         return float(self.face_areas.sum())
 
     @cached_property
     def _tree(self) -> Any:
-        tree = require("igl").AABB()
+        tree = extras.require("igl", "register", "registration").AABB()
         tree.init(self.vertices, self.faces)
         return tree
 
@@ -118,14 +114,14 @@ class MeshSurface:
         return cKDTree(np.hstack([self.vertices, LEAN * self.diagonal * self.vertex_normals]))
 
     def nearest_alike(self, points: FloatArray, normals: FloatArray) -> IntArray:
-        """The vertex next to each query whose normal is not far off: of two sheets that touch, the right one.
+        """The nearest vertex in position and normal, which distinguishes touching sheets.
 
         *Shape:* ``(n, 3), (n, 3) -> (n,)``.
         """
         return self._sides_tree.query(np.hstack([points, LEAN * self.diagonal * normals]))[1].astype(np.int64)
 
     def looks_away(self, points: FloatArray, normals: FloatArray) -> BoolArray:
-        """Whether surface elements look against the closest point, and no sheet beside it looks their way.
+        """Whether normals oppose those of the closest point and of the nearest sheet with a similar normal.
 
         *Shape:* ``(n, 3), (n, 3) -> (n,)``.
         """
@@ -136,7 +132,7 @@ class MeshSurface:
         return away
 
     def barycentric(self, closest: Closest) -> FloatArray:
-        """Weights of the corners of each closest point's face, none negative. *Shape:* ``(n, 3)``."""
+        """Non-negative barycentric coordinates of closest points. *Shape:* ``(n, 3)``."""
         a, b, c = (self.vertices[self.faces[closest.faces, corner]] for corner in range(3))
         normal = np.cross(b - a, c - a)
         squared = np.einsum("ni,ni->n", normal, normal)
@@ -154,37 +150,37 @@ class MeshSurface:
         return weights / weights.sum(1, keepdims=True)
 
     def rows(self, closest: Closest) -> sparse.csr_matrix:
-        """Closest points as combinations of the vertices. *Shape:* ``(n, V)``."""
+        """Interpolation matrix from vertices to closest points. *Shape:* ``(n, V)``."""
         n = len(closest.faces)
         where = (np.repeat(np.arange(n), 3), self.faces[closest.faces].reshape(-1))
         return sparse.csr_matrix((self.barycentric(closest).reshape(-1), where), shape=(n, len(self.vertices)))
 
     def moved(self, vertices: FloatArray) -> "MeshSurface":
-        """The same connectivity in another shape."""
+        """The same connectivity with other positions."""
         return MeshSurface(vertices, self.connectivity)
 
 
 def unit(vectors: FloatArray) -> FloatArray:
-    """Vectors of length one; zero stays zero. *Shape:* ``(n, 3)``."""
+    """Unit vectors; zero for zero. *Shape:* ``(n, 3)``."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0, length, 1)
 
 
 def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Faces wound outwards if the surface is closed, else as they are. *Shape:* ``(F, 3)``."""
+    """Faces with outward winding if the surface is closed, otherwise unchanged. *Shape:* ``(F, 3)``."""
     closed = not len(Connectivity(faces).boundary_edges)
     centred = vertices - vertices[faces].mean((0, 1))
     return faces[:, ::-1].copy() if closed and signed_volume(centred, faces) < 0 else faces
 
 
 def referenced(vertices: FloatArray, faces: IntArray) -> tuple[MeshSurface, IntArray]:
-    """Without the vertices of no face; and which vertices are left. *Shape of the second:* ``(V',)``."""
+    """Remove unreferenced vertices; returns the indices of the others, too. *Shape of the second:* ``(V',)``."""
     used, renumbered = np.unique(faces, return_inverse=True)
     return MeshSurface(vertices[used], renumbered.reshape(-1, 3)), used
 
 
 def without_dust(surface: MeshSurface, share: float = 0.01) -> MeshSurface:
-    """The connected pieces with so much of the area, or the largest if none has."""
+    """The connected pieces with a minimum share of the area; at least the largest."""
     pieces = surface.connectivity.vertex_pieces
     if pieces.max() == 0:
         return surface
@@ -194,11 +190,11 @@ def without_dust(surface: MeshSurface, share: float = 0.01) -> MeshSurface:
 
 
 def sewn(surface: MeshSurface, reach: float) -> MeshSurface:
-    """Pieces whose edges lie side by side, as a cut leaves them, joined by strips of triangles.
+    """Join the boundaries of adjacent pieces by strips of triangles, to close cuts.
 
     Args:
-        surface: Of several pieces.
-        reach: The widest gap that is closed, in diagonals.
+        surface: A surface of several pieces.
+        reach: Widest closed gap, in diagonals.
     """
     mesh = surface.connectivity
     pieces = mesh.vertex_pieces
