@@ -9,7 +9,7 @@ from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, S
 from torch_modal.data.space import KeyframeReference, ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import Bend, bend, bent_sides, frames, sides
+from torch_modal.geometry.triangle_frames import bend, bent_sides, frames, sides
 from torch_modal.geometry.vectors import pick
 
 # A draw beyond the bound is scaled to this part of it; its largest strain is nearly linear in the scale.
@@ -147,7 +147,7 @@ def deform(x: Tensor, amplitudes: Tensor, reference: KeyframeReference, reconstr
     pose = best_fit(reference.shape.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
     rest = x.movedim(-1, 0).contiguous()
-    wanted = bent_sides(Bend(turn, strain), frames(sides(rest, faces)))
+    wanted = bent_sides(BentTriangles(turn, strain), frames(sides(rest, faces)))
     bent = reconstruction(wanted, rest).movedim(0, -1)
     return best_fit(bent, x, weights).apply(bent)
 

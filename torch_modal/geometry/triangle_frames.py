@@ -56,7 +56,7 @@ class Frames(NamedTuple):
         return self.doubled_areas / torch.stack([x * x + y * y for x, y in ends]).amax(0)
 
 
-class Bend(NamedTuple):
+class BentTriangles(NamedTuple):
     """Infinitesimal rotation and strain of each triangle."""
 
     turn: Tensor
@@ -103,7 +103,7 @@ def edge_means(wanted: Sides, weights: Tensor, edges: Tensor, signs: Tensor, n_e
     return summed / total.clamp_min(torch.finfo(total.dtype).tiny)
 
 
-def bend(displaced: Sides, reference: Frames) -> Bend:
+def bend(displaced: Sides, reference: Frames) -> BentTriangles:
     """Infinitesimal rotation and strain of a displacement field (Kirchhoff-Love kinematics).
 
     Args:
@@ -117,10 +117,10 @@ def bend(displaced: Sides, reference: Frames) -> Bend:
         (d - along * reference.along) / reference.height for d, along in zip(d_y, (x_x, y_x, n_x), strict=True)
     )
     spin = 0.5 * (y_x - x_y)
-    return Bend(n_y * axes[0] - n_x * axes[1] + spin * axes[2], (x_x, 0.5 * (x_y + y_x), y_y))
+    return BentTriangles(n_y * axes[0] - n_x * axes[1] + spin * axes[2], (x_x, 0.5 * (x_y + y_x), y_y))
 
 
-def convected(bending: Bend, own: Frames) -> Tensor:
+def convected(bending: BentTriangles, own: Frames) -> Tensor:
     """Rotation vector and strain in the frames of the triangles.
 
     *Shape:* ``(6, B, F)``.
@@ -137,7 +137,7 @@ def stretched(
     return (xx * length, xy * length), (xx * along + xy * height, xy * along + yy * height)
 
 
-def bent_sides(bending: Bend, own: Frames) -> Sides:
+def bent_sides(bending: BentTriangles, own: Frames) -> Sides:
     """Sides after a bend: stretched in their plane, then turned by the finite rotation of the same axis and angle.
 
     The stretch is the exponential of the strain: shear keeps the area, and no triangle inverts.

@@ -45,27 +45,24 @@ PAGES = (".html", ".htm")
 
 
 class Animation(NamedTuple):
-    """A sequence to write, as :func:`torch_modal.save_animation` passes it to a format.
-
-    Attributes:
-        shapes: *Shape:* ``(N, V, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-        timing: Times of the frames in seconds, and samples at a fixed rate.
-        name: Of the file, for messages.
-        keyframes: Frame numbers of the key-frames.
-        asset: The mesh file that the frames come from.
-        max_targets: Most morph targets of a GLB.
-        progress: See :data:`torch_modal.progress.Progress`.
-    """
+    """A sequence to write, as :func:`torch_modal.save_animation` passes it to a format."""
 
     shapes: FloatArray
+    """*Shape:* ``(N, V, 3)``."""
     faces: IntArray
+    """*Shape:* ``(F, 3)``."""
     timing: Timing
+    """Times of the frames in seconds, and samples at a fixed rate."""
     name: str
+    """Of the file, for messages."""
     keyframes: list[int]
+    """Frame numbers of the key-frames."""
     asset: Asset | None
+    """The mesh file that the frames come from."""
     max_targets: int
+    """Most morph targets of a GLB."""
     progress: Progress
+    """See :data:`torch_modal.progress.Progress`."""
 
 
 def mesh_format(*suffixes: str, holds: Collection[str] = ()) -> Callable[[Writer], Writer]:
