@@ -9,7 +9,7 @@ from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, S
 from torch_modal.data.space import KeyframeReference, ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import bend, bent_sides, frames, sides
+from torch_modal.geometry.triangle_frames import BentTriangles, bend, bent_sides, frames, sides
 from torch_modal.geometry.vectors import pick
 
 # A draw beyond the bound is scaled to this part of it; its largest strain is nearly linear in the scale.

@@ -137,7 +137,8 @@ class _Mesh:
             own = tag == d
             second[own] = old[own][:, [*range(1, d + 1), d, *range(d + 1, 4)]]
         second[row, tag] = middle
-        # Barycentric coordinates in the half: the difference of both stays at one end, twice the smaller one goes to the midpoint.
+        # Barycentric coordinates in the half: the difference of both stays at one end, twice the smaller one goes
+        # to the midpoint.
         other = np.full(len(self.tets), -1)
         other[index] = len(self.tets) + row
         moved = np.flatnonzero(other[self.owner] >= 0)
