@@ -6,8 +6,10 @@ SuperLU: on tetrahedra its supernodes take half the time of ``cholespy``, which 
 releases the GIL.
 """
 
+import atexit
 import ctypes
 import sys
+import weakref
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -83,12 +85,23 @@ class SparseSolver:
         out = columns.new_zeros(columns.shape)
         if len(self.free) and out.numel():
             if device not in self._solves:
+                _SOLVERS.add(self)
                 self._solves[device] = _superlu(self._inner) if cholespy is None else _cholesky(self._inner, device)
             free = torch.from_numpy(self.free).to(device)
             parts = columns.index_select(0, free).flatten(1).split(MOST_COLUMNS, 1)
             solved = [self._solves[device](part.contiguous()) for part in parts]
             out.flatten(1).index_copy_(0, free, solved[0] if len(solved) == 1 else torch.cat(solved, 1))
         return out.movedim(0, -2).to(right).contiguous()
+
+
+_SOLVERS: weakref.WeakSet[SparseSolver] = weakref.WeakSet()
+
+
+@atexit.register
+def _free_factors() -> None:
+    """Free all factors before the interpreter ends: ``cholespy`` prints warnings about those that are left."""
+    for solver in list(_SOLVERS):
+        solver._solves.clear()
 
 
 @cache
