@@ -13,7 +13,7 @@ from torch_modal.nn import trees
 from torch_modal.nn.between import Between, fine_chunk
 from torch_modal.nn.contact import Contacts
 from torch_modal.nn.frame import Pair
-from torch_modal.nn.fused_relax import AtOther
+from torch_modal.nn.fused_relax import FurtherDerivatives
 from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import Samples
 
@@ -43,7 +43,7 @@ class ActiveContacts:
         """Of each shape. *Shape:* ``(T, V, 3) -> (T,)``."""
         return self._summed(self.weights * self._missing(_flat(x))[1] ** 2)
 
-    def at(self, x: Tensor) -> AtOther:
+    def at(self, x: Tensor) -> FurtherDerivatives:
         """Of the vertices that are too near. *Shape:* ``(T, V, 3)``."""
         edge_vectors, missing = self._missing(_flat(x))
         near = torch.nonzero(missing).flatten()
@@ -61,7 +61,7 @@ class ActiveContacts:
             _flat(out).index_add_(1, corners, stiffness * rate.repeat(4) * on_corners)
             return out
 
-        return AtOther(self._summed(self.weights * missing**2), gradient, diagonal, product)
+        return FurtherDerivatives(self._summed(self.weights * missing**2), gradient, diagonal, product)
 
     def _summed(self, each: Tensor) -> Tensor:
         """*Shape:* ``(N,) -> (T,)``."""
@@ -90,11 +90,11 @@ class Pull(NamedTuple):
         """Of each shape. *Shape:* ``(T, V, 3) -> (T,)``."""
         return (self.weights * ((x - self.to) ** 2).sum(-1)).sum(-1)
 
-    def at(self, x: Tensor) -> AtOther:
+    def at(self, x: Tensor) -> FurtherDerivatives:
         """*Shape:* ``(T, V, 3)``."""
         twice = 2 * self.weights[:, None]
         diagonal = twice * twice.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
-        return AtOther(self.value(x), twice * (x - self.to), diagonal, lambda field: twice * field)
+        return FurtherDerivatives(self.value(x), twice * (x - self.to), diagonal, lambda field: twice * field)
 
 
 @torch.no_grad()

@@ -21,7 +21,7 @@ from torch_modal.nn.blend import Blends
 from torch_modal.nn.comparison import SLACK, SLACK_OF_PATHS, Distortion, no_worse
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
 from torch_modal.nn.fused_crossings import FusedPairs
-from torch_modal.nn.fused_relax import FusedRelax, Other, Terms
+from torch_modal.nn.fused_relax import FurtherEnergy, FurtherTerms, FusedRelax
 from torch_modal.nn.fused_shell import ShellReference
 from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.joint import JointSpace
@@ -314,7 +314,7 @@ class Between(nn.Module):
         return self.fused is not None and not (recorded or traced(x) or transformed(x))
 
     def descend(
-        self, x: Tensor, batch: Batch, stages: Sequence[tuple[int, int]], contacts: Sequence[Other] = ()
+        self, x: Tensor, batch: Batch, stages: Sequence[tuple[int, int]], contacts: Sequence[FurtherEnergy] = ()
     ) -> Tensor:
         """Steps of all vertices by kernels, with further terms and contacts.
 
@@ -335,7 +335,7 @@ class Between(nn.Module):
 
     def fused_chunks(
         self, samples: Samples, pair: Pair, anchors: Tensor | None
-    ) -> Iterator[tuple[slice, ShellReference, list[Other]]]:
+    ) -> Iterator[tuple[slice, ShellReference, list[FurtherEnergy]]]:
         """Chunks of samples for the kernels, with their references and further terms."""
         fused = self.fused
         assert fused is not None
@@ -347,11 +347,11 @@ class Between(nn.Module):
             own = slice(i, i + chunk)
             given = trees.rows((first, second, samples.t, samples.stiffness, anchors), own)
             a, b, t, stiffness, fixed = trees.mapped(given, lambda value: value.double().contiguous())
-            others: list[Other] = []
+            others: list[FurtherEnergy] = []
             if self.further is not None:
                 one, other = (self.further.rest(self.further.extend(x.movedim(-1, 0).contiguous())) for x in (a, b))
                 reference = self.further.between(one, other, t, stiffness[N_SHELL_TERMS:])
-                others.append(Terms(self.further, reference, fixed))
+                others.append(FurtherTerms(self.further, reference, fixed))
             yield own, fused.reference(a, b, t, *stiffness[:N_SHELL_TERMS]), others
 
     def fine_chunks(self, batch: Batch) -> Iterator[tuple[slice, Reference, Tensor | None]]:

@@ -69,7 +69,7 @@ class FusedRelax(FusedShell):
     # -------------------------------------------------------------------------------------------------------- the steps
     @torch.no_grad()
     def descend(
-        self, x: Tensor, to: ShellReference, others: Sequence["Other"], n_steps: int, n_products: int
+        self, x: Tensor, to: ShellReference, others: Sequence["FurtherEnergy"], n_steps: int, n_products: int
     ) -> Tensor:
         """Steps of all vertices with other energies beside Eq. 5, never uphill; they have no gradient.
 
@@ -94,7 +94,7 @@ class FusedRelax(FusedShell):
                 at.gradient.add_(one.gradient)
                 at.diagonal.add_(one.diagonal)
 
-            def beyond(direction: Tensor, product: Tensor, form: Tensor, more: list[AtOther] = more) -> None:
+            def beyond(direction: Tensor, product: Tensor, form: Tensor, more: list[FurtherDerivatives] = more) -> None:
                 for one in more:
                     pushed = one.product(direction)
                     product.add_(pushed)
@@ -282,7 +282,7 @@ class FusedRelax(FusedShell):
         return to_x
 
 
-class AtOther(NamedTuple):
+class FurtherDerivatives(NamedTuple):
     """An energy beside Eq. 5 at given shapes."""
 
     value: Tensor
@@ -295,17 +295,17 @@ class AtOther(NamedTuple):
     """With the convex Hessian. *Shape:* ``(B, V, 3) -> (B, V, 3)``."""
 
 
-class Other(Protocol):
+class FurtherEnergy(Protocol):
     """An energy that steps of all vertices take beside Eq. 5."""
 
     def value(self, x: Tensor) -> Tensor:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
 
-    def at(self, x: Tensor) -> AtOther:
+    def at(self, x: Tensor) -> FurtherDerivatives:
         """*Shape:* ``(B, V, 3)``."""
 
 
-class Terms:
+class FurtherTerms:
     """Terms in torch as such an energy.
 
     Args:
@@ -325,7 +325,7 @@ class Terms:
         """*Shape:* ``(B, V, 3) -> (B,)``."""
         return self.energy.value(self._extended(x), self.reference)
 
-    def at(self, x: Tensor) -> AtOther:
+    def at(self, x: Tensor) -> FurtherDerivatives:
         """*Shape:* ``(B, V, 3)``."""
         energy, n = self.energy, x.shape[1]
         at = energy.linearise(self._extended(x), self.reference)
@@ -337,7 +337,7 @@ class Terms:
             return energy.fold(hessian(rows)).movedim(0, -1)
 
         gradient = energy.fold(energy.gradient(at)).movedim(0, -1)
-        return AtOther(energy.value_at(at, self.reference), gradient, packed, product)
+        return FurtherDerivatives(energy.value_at(at, self.reference), gradient, packed, product)
 
 
 class _Iterations(NamedTuple):
