@@ -18,7 +18,7 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.sparse import SparseSolver, factorize, graph_laplacian
 from torch_modal.geometry.triangle_frames import (
-    Bend,
+    BentTriangles,
     Sides,
     bend,
     bent_sides,
@@ -74,11 +74,11 @@ def test_turns_become_finite_rotations(bars: Shapes) -> None:
     zero = torch.zeros_like(own.length)
     for omega in ([0.0, 0.0, 0.0], [2.0, -1.0, 0.7], [1e-9, 0.0, 0.0]):
         turn = torch.tensor(omega, dtype=F64)[:, None, None].expand_as(own.e1)
-        found = bent_sides(Bend(turn, (zero, zero, zero)), own)
+        found = bent_sides(BentTriangles(turn, (zero, zero, zero)), own)
         rotation = exp(torch.tensor(omega, dtype=F64))
         for mine, its in zip(found, sides(x, faces), strict=True):
             torch.testing.assert_close(mine[:, 0], rotation @ its[:, 0])
-    stretched = bent_sides(Bend(torch.zeros_like(own.e1), (zero + 0.5, zero, zero + 0.5)), own)
+    stretched = bent_sides(BentTriangles(torch.zeros_like(own.e1), (zero + 0.5, zero, zero + 0.5)), own)
     for mine, its in zip(stretched, sides(x, faces), strict=True):
         torch.testing.assert_close(mine, np.exp(0.5) * its)
 
@@ -89,7 +89,7 @@ def test_the_stretch_is_the_exponential_of_the_strain() -> None:
     for strain in ([[0.3, 0.2], [0.2, -0.1]], [[0.0, 0.4], [0.4, 0.0]], [[-3.0, 0.0], [0.0, -3.0]]):
         given = torch.tensor(strain, dtype=F64)
         entries = (given[0, 0].reshape(1, 1), given[0, 1].reshape(1, 1), given[1, 1].reshape(1, 1))
-        found = bent_sides(Bend(torch.zeros(3, 1, 1, dtype=F64), entries), own)
+        found = bent_sides(BentTriangles(torch.zeros(3, 1, 1, dtype=F64), entries), own)
         expected = torch.linalg.matrix_exp(given)
         torch.testing.assert_close(found.first[:2, 0, 0], expected[:, 0])
         torch.testing.assert_close(found.second[:2, 0, 0], expected[:, 1])

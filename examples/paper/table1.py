@@ -17,8 +17,8 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.io.cache import Cache
 from torch_modal.precompute.filling import Filler
-from torch_modal.precompute.modes import QUALITIES
-from torch_modal.precompute.surface import Surface
+from torch_modal.precompute.lattice import Lattice
+from torch_modal.precompute.surface import CanonicalSurface
 
 N_MODES = 50
 PAPER = {
@@ -49,8 +49,8 @@ def main(out: Path, overwrite: bool = True, names: Sequence[str] = tuple(PAPER))
     lines = [head, "|---" * 7 + "|"]
     for name in names:
         x, faces = key_poses(name)
-        surface = Surface.of(x[0].numpy(), faces.numpy())
-        filler = Filler(QUALITIES["fast"], "lattice", 600.0, Cache.at(None, enabled=False))
+        surface = CanonicalSurface.of(x[0].numpy(), faces.numpy())
+        filler = Filler(Lattice(), 600.0, Cache.at(None, enabled=False))
         n = len(filler.body(surface).tetrahedra.vertices)
         start = time.process_time()
         bases = tm.extract_bases(x, faces, N_MODES, mesher="lattice", cache=False, progress=False)

@@ -80,6 +80,8 @@ class SparseSolver:
 
     def solved(self, right: Tensor) -> Tensor:
         """Solve without gradient."""
+        if right.is_meta:
+            return torch.empty_like(right)
         device = right.device if _is_served(right.device) else torch.device("cpu")
         columns = right.detach().to(device, torch.float64).movedim(-2, 0)
         out = columns.new_zeros(columns.shape)

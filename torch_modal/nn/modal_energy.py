@@ -159,18 +159,16 @@ class ModalEnergy(nn.Module):
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-
-        def total(a: Tensor) -> tuple[Tensor, Tensor]:
-            value = self.value(a, placement)
-            return value.sum(), value
-
-        if traced(a) or any(transformed(x) for x in (a, *trees.leaves(placement))):
-            gradient, value = torch.func.grad(total, has_aux=True)(a)
-            return value, gradient
-        with torch.enable_grad():  # the same, in half of the time
+        # Autograd computes the gradient in half of the time that the derivatives of all elements take.
+        given = a, *trees.leaves(placement)
+        if torch.is_inference_mode_enabled() or traced(a) or any(transformed(x) or x.is_inference() for x in given):
+            at = self.energy.linearise(self.rows(a, placement), placement.reference)
+            gradient = along_columns(self.energy.gradient(at).transpose(0, 1), self.columns, placement.extra)
+            return self.energy.value_at(at, placement.reference), gradient
+        with torch.enable_grad():
             leaf = a.detach().requires_grad_()
-            whole, value = total(leaf)
-            (gradient,) = torch.autograd.grad(whole, leaf)
+            value = self.value(leaf, placement)
+            (gradient,) = torch.autograd.grad(value.sum(), leaf)
         return value.detach(), gradient
 
     def second_order(self, a: Tensor, placement: Placement) -> Tensor:
