@@ -191,6 +191,10 @@ class Energy(nn.Module):
             weights.append(part.term.weights(edge_vectors, found))
         return Rest(tuple(measures), tuple(weights))
 
+    def rest_of(self, x: Tensor) -> Rest:
+        """The same of vertices alone. *Shape:* ``(B, V, 3)``."""
+        return self.rest(self.extend(x.movedim(-1, 0).contiguous()))
+
     def between(self, first: Rest, second: Rest, t: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
         r"""Both as the reference: :math:`(1-t) \sum w_a (q - q_a)^2 + t \sum w_b (q - q_b)^2`.
 

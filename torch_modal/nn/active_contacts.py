@@ -13,7 +13,7 @@ from torch_modal.nn import trees
 from torch_modal.nn.between import Between, fine_chunk
 from torch_modal.nn.contact import Contacts
 from torch_modal.nn.frame import Pair
-from torch_modal.nn.fused_relax import FurtherDerivatives
+from torch_modal.nn.further import FurtherDerivatives
 from torch_modal.nn.relax import relax
 from torch_modal.nn.samples import Samples
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import Energy, Reference, Rest
+from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
 from torch_modal.errors import MeshWarning
@@ -20,8 +20,9 @@ from torch_modal.nn.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.nn.blend import Blends
 from torch_modal.nn.comparison import SLACK, SLACK_OF_PATHS, Distortion, no_worse
 from torch_modal.nn.frame import Alignment, Collapsing, Frame, Pair, mean_areas, shared_collapses
+from torch_modal.nn.further import FurtherEnergy, FurtherTerms
 from torch_modal.nn.fused_crossings import FusedPairs
-from torch_modal.nn.fused_relax import FurtherEnergy, FurtherTerms, FusedRelax
+from torch_modal.nn.fused_relax import FusedRelax
 from torch_modal.nn.fused_shell import ShellReference
 from torch_modal.nn.gauss_newton import GaussNewtonStep
 from torch_modal.nn.joint import JointSpace
@@ -259,9 +260,9 @@ class Between(nn.Module):
         """The reference of Eq. 5 on the fine mesh."""
         if pair.around is not None:
             return Energy.against(
-                self._fine_rest(self.space.on_trajectory(pair, samples.which, samples.t)[0]), samples.stiffness
+                self.fine.rest_of(self.space.on_trajectory(pair, samples.which, samples.t)[0]), samples.stiffness
             )
-        first, second = trees.picked([self._fine_rest(end) for end in (pair.first, pair.second)], samples.which)
+        first, second = trees.picked([self.fine.rest_of(end) for end in (pair.first, pair.second)], samples.which)
         return self.fine.between(first, second, samples.t, samples.stiffness)
 
     def coarse_reference(self, samples: Samples, pair: Pair) -> Any:
@@ -349,7 +350,7 @@ class Between(nn.Module):
             a, b, t, stiffness, fixed = trees.mapped(given, lambda value: value.double().contiguous())
             others: list[FurtherEnergy] = []
             if self.further is not None:
-                one, other = (self.further.rest(self.further.extend(x.movedim(-1, 0).contiguous())) for x in (a, b))
+                one, other = (self.further.rest_of(x) for x in (a, b))
                 reference = self.further.between(one, other, t, stiffness[N_SHELL_TERMS:])
                 others.append(FurtherTerms(self.further, reference, fixed))
             yield own, fused.reference(a, b, t, *stiffness[:N_SHELL_TERMS]), others
@@ -358,24 +359,20 @@ class Between(nn.Module):
         """Chunks of samples, with their references on the fine mesh and their anchors."""
         pair, samples = batch.pair, batch.samples
         ends = pair.first, pair.second
-        known = None if samples.which is None else [self._fine_rest(end) for end in ends]
+        known = None if samples.which is None else [self.fine.rest_of(end) for end in ends]
         chunk = fine_chunk(self.mesh.n_vertices, samples.t.device)
         for i in range(0, len(samples.t), chunk):
             own = slice(i, i + chunk)
             t, stiffness, fixed = trees.rows((samples.t, samples.stiffness, batch.anchors), own)
             if pair.around is not None:
-                reference = Energy.against(self._fine_rest(batch.problem.base[own]), stiffness)
+                reference = Energy.against(self.fine.rest_of(batch.problem.base[own]), stiffness)
             else:
                 if known is None or samples.which is None:
-                    first, second = (self._fine_rest(end[own]) for end in ends)
+                    first, second = (self.fine.rest_of(end[own]) for end in ends)
                 else:
                     first, second = trees.rows(known, samples.which[own])
                 reference = self.fine.between(first, second, t, stiffness)
             yield own, reference, fixed
-
-    def _fine_rest(self, x: Tensor) -> Rest:
-        """Shapes as rest shapes on the fine mesh. *Shape:* ``(B, V, 3)``."""
-        return self.fine.rest(self.fine.extend(x.movedim(-1, 0).contiguous()))
 
     def _levelled(self, stiffness: list[Tensor]) -> Stiffness:
         """Stiffnesses of the elements of the fine mesh, on those of each level."""

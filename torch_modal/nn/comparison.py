@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import Energy, Rest
+from torch_modal.energy.energy import Energy
 from torch_modal.energy.measures import collapsed, dihedral_angle, wrap_angle
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import N_SHELL_TERMS, Mesh
@@ -109,7 +109,7 @@ class Distortion(nn.Module):
         both = self._by_kernels if kernels_serve else self._by_torch
         total = both(shapes, ends, which, t, stiffness)
         if self.further is not None:
-            rests = trees.picked([_rest(self.further, end) for end in ends], which)
+            rests = trees.picked([self.further.rest_of(end) for end in ends], which)
             reference = self.further.between(rests[0], rests[1], t, stiffness[N_SHELL_TERMS:])
             fixed = None if anchors is None else anchors.movedim(-1, 0)
             each = [self.further.extend(x.movedim(-1, 0).contiguous(), fixed) for x in shapes]
@@ -209,8 +209,3 @@ def _weights(edge_vectors: Tensor) -> Tensor:
     n1, n2 = cross(e, a), cross(b, e)
     weight = 2 * (e * e).sum(0) * inverse(norm(n1) + norm(n2), collapsed(e, n1) | collapsed(e, n2))
     return weight.clamp_max(LARGEST_WEIGHT)
-
-
-def _rest(energy: Energy, x: Tensor) -> Rest:
-    """A rest shape. *Shape:* ``(B, V, 3)``."""
-    return energy.rest(energy.extend(x.movedim(-1, 0).contiguous()))

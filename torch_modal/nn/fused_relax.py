@@ -2,17 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_modal.energy.energy import Energy, Reference
 from torch_modal.geometry.functions import applied, traced
 from torch_modal.nn.adjoint import flattened
+from torch_modal.nn.further import FurtherDerivatives, FurtherEnergy
 from torch_modal.nn.fused_shell import FusedShell, ShellPoint, ShellReference
 from torch_modal.nn.launch import kernels, launch
-from torch_modal.nn.relax import STEP_LENGTHS, ConvexHessian, relax
+from torch_modal.nn.relax import STEP_LENGTHS, relax
 
 
 class FusedRelax(FusedShell):
@@ -63,7 +63,7 @@ class FusedRelax(FusedShell):
     def oracle(self, n_steps: int, n_products: int, x: Tensor, first: Tensor, second: Tensor, *rest: Tensor) -> Tensor:
         """The same by torch."""
         t, *stiffness = rest
-        one, other = (self.energy.rest(self.energy.extend(x.movedim(-1, 0).contiguous())) for x in (first, second))
+        one, other = (self.energy.rest_of(x) for x in (first, second))
         return relax(self.energy, x, self.energy.between(one, other, t, stiffness), n_steps, n_products)
 
     # -------------------------------------------------------------------------------------------------------- the steps
@@ -101,12 +101,10 @@ class FusedRelax(FusedShell):
                     form.add_((pushed * direction).sum((1, 2)))
 
             solution = self.solved(x, at, to, n_products, beyond=beyond).solution
-            length = torch.zeros_like(before)
-            for shorter in STEP_LENGTHS:
-                downhill = (length == 0) & (value(x + shorter * solution) < before)
-                length = torch.where(downhill, shorter, length)
-                if bool((length > 0).all()):
-                    break
+            down = value(x + solution) < before
+            length = down.to(x)
+            if not bool(down.all()):
+                length = _shortened(x, solution, before, length, value)
             x = x + length[:, None, None] * solution
         return x
 
@@ -139,20 +137,12 @@ class FusedRelax(FusedShell):
                 there, energy = None, self.value(reached, to)
             down = energy < at.energy
             if not bool(down.all()):
-                length = lengths[k] = self._shortened(x, solution, at.energy, down.to(x), to)
+                length = lengths[k] = _shortened(x, solution, at.energy, down.to(x), partial(self.value, to=to))
                 reached = x + length[:, None, None] * solution
                 there = self.at(reached, to) if k < n_steps - 1 else None
             x = reached
             at = at if there is None else there
         return x, lengths
-
-    def _shortened(self, x: Tensor, solution: Tensor, before: Tensor, length: Tensor, to: ShellReference) -> Tensor:
-        for shorter in STEP_LENGTHS[1:]:
-            downhill = (length == 0) & (self.value(x + shorter * solution, to) < before)
-            length = torch.where(downhill, shorter, length)
-            if bool(length.all()):
-                break
-        return length
 
     def solved(
         self,
@@ -282,62 +272,16 @@ class FusedRelax(FusedShell):
         return to_x
 
 
-class FurtherDerivatives(NamedTuple):
-    """An energy beside Eq. 5 at given shapes."""
-
-    value: Tensor
-    """*Shape:* ``(B,)``."""
-    gradient: Tensor
-    """*Shape:* ``(B, V, 3)``."""
-    diagonal: Tensor
-    """The blocks of its convex Hessian's diagonal, packed. *Shape:* ``(B, V, 6)``."""
-    product: Callable[[Tensor], Tensor]
-    """With the convex Hessian. *Shape:* ``(B, V, 3) -> (B, V, 3)``."""
-
-
-class FurtherEnergy(Protocol):
-    """An energy that steps of all vertices take beside Eq. 5."""
-
-    def value(self, x: Tensor) -> Tensor:
-        """*Shape:* ``(B, V, 3) -> (B,)``."""
-
-    def at(self, x: Tensor) -> FurtherDerivatives:
-        """*Shape:* ``(B, V, 3)``."""
-
-
-class FurtherTerms:
-    """Terms in torch as such an energy.
-
-    Args:
-        energy: Of these terms.
-        reference: What shapes are compared with.
-        anchors: Of the terms, where there are some. *Shape:* ``(B, P, 3)``.
-    """
-
-    def __init__(self, energy: Energy, reference: Reference, anchors: Tensor | None) -> None:
-        self.energy, self.reference = energy, reference
-        self.anchors = None if anchors is None else anchors.movedim(-1, 0)
-
-    def _extended(self, x: Tensor) -> Tensor:
-        return self.energy.extend(x.movedim(-1, 0).contiguous(), self.anchors)
-
-    def value(self, x: Tensor) -> Tensor:
-        """*Shape:* ``(B, V, 3) -> (B,)``."""
-        return self.energy.value(self._extended(x), self.reference)
-
-    def at(self, x: Tensor) -> FurtherDerivatives:
-        """*Shape:* ``(B, V, 3)``."""
-        energy, n = self.energy, x.shape[1]
-        at = energy.linearise(self._extended(x), self.reference)
-        hessian = ConvexHessian(energy, at)
-        packed = hessian.diagonal().flatten(0, 1)[[0, 1, 2, 4, 5, 8], ..., :n].movedim(0, -1)
-
-        def product(field: Tensor) -> Tensor:
-            rows = energy.extend(field.movedim(-1, 0).contiguous())
-            return energy.fold(hessian(rows)).movedim(0, -1)
-
-        gradient = energy.fold(energy.gradient(at)).movedim(0, -1)
-        return FurtherDerivatives(energy.value_at(at, self.reference), gradient, packed, product)
+def _shortened(
+    x: Tensor, solution: Tensor, before: Tensor, length: Tensor, value: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """The first of the shorter steps that goes downhill, where the length is still 0. *Shape:* ``(B,)``."""
+    for shorter in STEP_LENGTHS[1:]:
+        downhill = (length == 0) & (value(x + shorter * solution) < before)
+        length = torch.where(downhill, shorter, length)
+        if bool(length.all()):
+            break
+    return length
 
 
 class _Iterations(NamedTuple):

@@ -153,7 +153,7 @@ class FusedShell(nn.Module):
 
     def reference_by_torch(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
         """The same by torch."""
-        one, other = (self.energy.rest(self.energy.extend(x.movedim(-1, 0).contiguous())) for x in (first, second))
+        one, other = (self.energy.rest_of(x) for x in (first, second))
         return self.packed(self.energy.between(one, other, t, stiffness))
 
     def packed(self, reference: Reference) -> ShellReference:

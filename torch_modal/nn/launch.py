@@ -92,10 +92,11 @@ def load_kernels(backend: Backend) -> None:
     if has_kernels(backend):
         import warp as wp
 
-        modules = [importlib.import_module(f"{PACKAGE}.{name}") for name in IN_BETWEENS]
+        for name in IN_BETWEENS:
+            importlib.import_module(f"{PACKAGE}.{name}")
         _load(wp, PACKAGE)
-        for module in modules:
-            kernels(module.__name__.rsplit(".", 1)[-1])  # type: ignore[arg-type]
+        for name in IN_BETWEENS:
+            kernels(name)
 
 
 class _Commands(threading.local):

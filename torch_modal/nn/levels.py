@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.energy import Energy, OnMesh, Reference, Rest
+from torch_modal.energy.energy import Energy, OnMesh, Reference
 from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
 from torch_modal.nn import trees
 from torch_modal.nn.columns import Columns
@@ -92,13 +92,13 @@ class Levels(nn.Module):
             if self.shell is not None and not found:
                 found.append(fused_reference(self.shell, *trees.picked((a, b), index), t, *own))
             else:
-                found.append(energy.between(*trees.picked((_rest(energy, a), _rest(energy, b)), index), t, own))
+                found.append(energy.between(*trees.picked((energy.rest_of(a), energy.rest_of(b)), index), t, own))
         return found
 
     def against(self, x: Tensor, coarse: Tensor, stiffness: Stiffness) -> list[Reference]:
         """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
         parts = zip(self.energies, self.seen(x, coarse), stiffness.levels, strict=True)
-        return [Energy.against(_rest(energy, own), factors) for energy, own, factors in parts]
+        return [Energy.against(energy.rest_of(own), factors) for energy, own, factors in parts]
 
     def place(
         self,
@@ -120,11 +120,6 @@ class Levels(nn.Module):
             return None
         each = anchors.split(self.n_anchors, 1)
         return torch.cat([each[i] for i in members], 1) if members else None
-
-
-def _rest(energy: Energy, x: Tensor) -> Rest:
-    """A shape at rest. *Shape:* ``(B, V, 3)``."""
-    return energy.rest(energy.extend(x.movedim(-1, 0).contiguous()))
 
 
 def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor) -> Tensor:
