@@ -97,7 +97,7 @@ def test_two_keyframes_make_two_seconds(tmp_path):
 
 
 def test_unknown_suffix_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match=r"\.glb, \.mp4, .*\.npz.*, got 'a\.avi'"):
+    with pytest.raises(ValueError, match=r"\.glb, \.mp4, .* or \.npz, got 'a\.avi'"):
         tm.save_animation(FRAMES, FACES, tmp_path / "a.avi")
     assert not list(tmp_path.iterdir())
 

@@ -7,6 +7,7 @@ that is not run says so, and why, in the line before it: ``*Not run by the tests
 
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, co
 from test_examples import load_example
 
 from torch_modal.cli import main as cli
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
 QUICK = {"layer", "viewing"}
 """Pages that are tried in the default run; what others cost is not known beforehand."""
@@ -24,6 +26,16 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("meshes")
     load_example("write_meshes").main(folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def formats() -> Iterator[None]:
+    """Formats that a page registers are gone after it."""
+    before = {id(table): set(table) for table in (MESH_FORMATS, ANIMATION_FORMATS)}
+    yield
+    for table in (MESH_FORMATS, ANIMATION_FORMATS):
+        for suffix in set(table) - before[id(table)]:
+            del table[suffix]
 
 
 def pages_with(*languages: str) -> list[object]:
