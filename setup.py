@@ -77,7 +77,7 @@ setup(
     ],
     python_requires=">=3.10",
     packages=find_packages(include=["torch_modal", "torch_modal.*"]),
-    package_data={"torch_modal": ["py.typed", "*.pyi", "nn/*.pyi", "samples/*/*.ply", "view/page_assets/*"]},
+    package_data={"torch_modal": ["py.typed", "*.pyi", "samples/*/*.ply", "view/page_assets/*"]},
     install_requires=[
         "torch>=2.8",  # earlier ones lack what tells transforms of torch.func apart, or cannot gather by int32 in them
         "numpy>=1.24",
@@ -95,8 +95,8 @@ setup(
         "pillow>=10",
         "tqdm>=4.65",
         "lazy_loader>=0.4",
-        # Kernels, where there are wheels. nn/launch.py writes arguments into commands that Warp has recorded, whose
-        # layout is not documented.
+        # Kernels, where there are wheels. backends/warp/launch.py writes arguments into commands that Warp has
+        # recorded, whose layout is not documented.
         f"warp-lang>=1.19,<1.20 ; {HAS_WARP}",
     ],
     extras_require={

@@ -14,11 +14,11 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, lumped_mass, surface
 from threads import limit_threads
 
+from torch_modal.backends.torch.alignment import Pair
+from torch_modal.inbetween.samples import Samples
+from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.nn.frame import Pair
-from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.samples import Samples
-from torch_modal.nn.settings import Objective, Solver
+from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases

@@ -10,12 +10,12 @@ from conftest import Shapes
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.backends.warp.launch import has_kernels
 from torch_modal.energy.terms import Mesh
-from torch_modal.nn.adjoint import ConvergenceWarning
-from torch_modal.nn.comparison import Distortion, _weights, no_worse
-from torch_modal.nn.launch import has_kernels
-from torch_modal.nn.settings import PRESETS
-from torch_modal.nn.solver import Status
+from torch_modal.inbetween.comparison import Distortion, _weights, no_worse
+from torch_modal.inbetween.settings import PRESETS
+from torch_modal.solve.adjoint import ConvergenceWarning
+from torch_modal.solve.solver import Status
 
 BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not has_kernels("auto"), reason="no Warp")), "torch"]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.codec.modes import _clusters, reproducible_modes
 from torch_modal.codec.selection import FrameSequence, IntervalErrors, select_keyframes
-from torch_modal.nn import modal_decoder
+from torch_modal.layers import modal_decoder
 
 
 @pytest.fixture(scope="module")

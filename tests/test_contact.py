@@ -11,26 +11,28 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal import trees
+from torch_modal.backends.torch.alignment import Pair
 from torch_modal.cli import main as cli
+from torch_modal.contact import rounds as contact_rounds
+from torch_modal.contact import together
+from torch_modal.contact import trajectory as contact
+from torch_modal.contact.acceleration import AccelerationLimit
+from torch_modal.contact.active import ActiveContacts, Pull, settled
+from torch_modal.contact.detect import Search, _nearest_faces
+from torch_modal.contact.rounds import ContactRounds
+from torch_modal.contact.search import Contacts, ContactSearch
+from torch_modal.contact.splines import splines, through
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.contact import Contact
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.position import Position
 from torch_modal.energy.terms import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.contacts import Search, _nearest_faces
 from torch_modal.geometry.crossings import Crossings
-from torch_modal.nn import contact_rounds, trees
-from torch_modal.nn.active_contacts import ActiveContacts, Pull, settled
-from torch_modal.nn.between import Between
-from torch_modal.nn.contact import Contacts, ContactSearch
-from torch_modal.nn.contact_rounds import ContactRounds
-from torch_modal.nn.frame import Pair
-from torch_modal.nn.samples import Samples
-from torch_modal.sequence import contact, together
-from torch_modal.sequence import path as path_module
-from torch_modal.sequence.acceleration import AccelerationLimit
-from torch_modal.sequence.splines import splines, through
+from torch_modal.inbetween.between import Between
+from torch_modal.inbetween.samples import Samples
+from torch_modal.motion import path as path_module
 
 pytest.importorskip("ipctk")
 DOUBLE = torch.float64

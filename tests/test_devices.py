@@ -18,14 +18,14 @@ from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.overrides import TorchFunctionMode
 
 import torch_modal as tm
+from torch_modal.backends.torch.alignment import Pair
+from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
+from torch_modal.contact.search import Contacts
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.rigid import RigidMotion
-from torch_modal.nn.contact import Contacts
-from torch_modal.nn.frame import Pair
-from torch_modal.nn.relax import ConvexHessian, _solved
-from torch_modal.nn.samples import Samples
-from torch_modal.nn.settings import PRESETS
+from torch_modal.inbetween.samples import Samples
+from torch_modal.inbetween.settings import PRESETS
 
 DOUBLE = torch.float64
 ELEMENTS = torch.tensor([[0, 1, 2, 9], [3, 4, 5, 8]])

@@ -6,10 +6,11 @@ import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
 
+from torch_modal.backends.torch.alignment import Pair
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.canonical import size
-from torch_modal.nn.columns import Directions
-from torch_modal.nn.frame import Frame, Pair
+from torch_modal.inbetween.columns import Directions
+from torch_modal.inbetween.frame import Frame
 from torch_modal.precompute.coarsening import coarsen
 
 

@@ -17,6 +17,15 @@ from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
 import torch_modal as tm
+from torch_modal import trees
+from torch_modal.backends.torch.modal_energy import ModalEnergy, Placement
+from torch_modal.backends.warp import alignment as fused_alignment
+from torch_modal.backends.warp import launch
+from torch_modal.backends.warp import modal_energy as fused_modal
+from torch_modal.backends.warp.fine_steps import FusedRelax
+from torch_modal.backends.warp.modal_energy import FusedModalEnergy, fused_reference
+from torch_modal.backends.warp.rotations import FusedRotations
+from torch_modal.backends.warp.shell import FusedShell
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
@@ -24,14 +33,8 @@ from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.rotations import exp
-from torch_modal.nn import fused_alignment, fused_modal, launch, trees
-from torch_modal.nn.frame import Frame
-from torch_modal.nn.fused_modal import FusedModalEnergy, fused_reference
-from torch_modal.nn.fused_relax import FusedRelax
-from torch_modal.nn.fused_rotations import FusedRotations
-from torch_modal.nn.fused_shell import FusedShell
-from torch_modal.nn.modal_energy import ModalEnergy, Placement
-from torch_modal.nn.settings import PRESETS
+from torch_modal.inbetween.frame import Frame
+from torch_modal.inbetween.settings import PRESETS
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
@@ -428,7 +431,9 @@ def test_the_first_of_a_thread_may_have_nothing_to_do(bars: Shapes, monkeypatch:
     assert shell is not None
     none = bars.keyframes[:0]
     given: list[tuple[Any, ...]] = []
-    monkeypatch.setattr("torch_modal.nn.fused_shell.launch", lambda *call: given.append(call) or launch.launch(*call))
+    monkeypatch.setattr(
+        "torch_modal.backends.warp.shell.launch", lambda *call: given.append(call) or launch.launch(*call)
+    )
     launch._COMMANDS.known.clear()
     assert shell.volumes(none, none).shape == (0, 2)
     assert given and not launch._COMMANDS.known
@@ -469,8 +474,9 @@ class TestBackend:
 
     def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
         code = (
-            "import sys; from torch_modal.nn.launch import kernels; kernels('rotations'); "
-            "sys.exit(any(f'torch_modal.nn.kernels.{name}' in sys.modules for name in ('shell', 'modal', 'steps')))"
+            "import sys; from torch_modal.backends.warp.launch import kernels; kernels('rotations'); "
+            "sys.exit(any(f'torch_modal.backends.warp.kernels.{name}' in sys.modules "
+            "for name in ('shell', 'modal', 'steps')))"
         )
         folder = Path(tm.__file__).parents[1]
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
@@ -480,7 +486,7 @@ class TestBackend:
         assert said == []
 
     def test_import_does_not_load_warp(self) -> None:
-        code = "import sys, torch_modal.nn.in_between; sys.exit('warp' in sys.modules)"
+        code = "import sys, torch_modal.layers.in_between; sys.exit('warp' in sys.modules)"
         folder = Path(tm.__file__).parents[1]
         assert subprocess.run([sys.executable, "-c", code], timeout=120, cwd=folder).returncode == 0
 

@@ -10,12 +10,12 @@ from scipy.optimize import least_squares
 from torch import Tensor
 from torch.func import jacfwd
 
+from torch_modal.backends.torch.modal_energy import Derivatives, Placement
 from torch_modal.energy.shell import ShellEnergy
-from torch_modal.nn.gauss_newton import GaussNewtonStep
-from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.modal_energy import Derivatives, Placement
-from torch_modal.nn.samples import ConvergenceError, report
-from torch_modal.nn.solver import Solution, Status, minimise
+from torch_modal.inbetween.samples import ConvergenceError, report
+from torch_modal.layers.mid_shape import MidShape
+from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.solver import Solution, Status, minimise
 
 
 class LeastSquares:

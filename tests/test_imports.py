@@ -16,14 +16,20 @@ FLOORS = [
     "errors",
     "extras",
     "progress",
+    "autograd",
+    "trees",
     "geometry",
     "io",
     "keyframes",
     "precompute",
     "energy",
-    "nn",
+    "backends",
+    "solve",
+    "inbetween",
+    "contact",
+    "layers",
+    "motion",
     "registration",
-    "sequence",
     "codec",
     "data",
     "view",
@@ -35,6 +41,7 @@ MODULES = sorted(
     str(path.relative_to(PACKAGE).with_suffix("")).replace("/", ".").removesuffix("__init__").removesuffix(".")
     for path in PACKAGE.rglob("*.py")
 )
+LAYERS = {"backends", "solve", "inbetween", "layers"}
 FOREIGN_TO_LAYERS = set("numpy scipy fast_simplification trimesh pytetwild tqdm pyvista matplotlib pygltflib".split())
 
 
@@ -70,8 +77,10 @@ def floor(module: str) -> int:
 
 def test_every_module_has_its_floor() -> None:
     assert {module.split(".")[0] for module in MODULES} == set(FLOORS)
-    assert "precompute.modes" in own("sequence.subdivide"), "imports are not seen"
-    assert "geometry.connectivity" in own("nn.frame"), "from torch_modal.geometry import connectivity is not seen"
+    assert "precompute.modes" in own("motion.subdivide"), "imports are not seen"
+    assert "geometry.connectivity" in own("inbetween.frame"), (
+        "from torch_modal.geometry import connectivity is not seen"
+    )
 
 
 def test_imports_go_down() -> None:
@@ -100,12 +109,13 @@ def test_precompute_is_without_torch() -> None:
 
 def test_layers_are_torch_only() -> None:
     """Bases are what comes in; only the frame and its coarse mesh, made once, use more of the pre-computation."""
-    allowed = {"nn.frame": {"numpy", "precompute.coarsening"}, "nn.congruence": {"numpy"}}
-    allowed["nn.resolution"] = {"precompute.coarsening"}
+    allowed = {"inbetween.frame": {"numpy", "precompute.coarsening"}}
+    allowed["inbetween.resolution"] = {"precompute.coarsening"}
+    allowed["backends.torch.congruence"] = {"numpy"}
     foreign = {
         (module, name)
         for module in MODULES
-        if module.startswith("nn.")
+        if module.split(".")[0] in LAYERS
         for name in {found if found in MODULES else found.split(".")[0] for found in imported(module)}
         if name in FOREIGN_TO_LAYERS or (name.startswith("precompute.") and name != "precompute.basis")
         if name not in allowed.get(module, ())
@@ -132,7 +142,7 @@ def test_import_loads_nothing_heavy() -> None:
     heavy += ["scipy.interpolate", "sympy"]
     code = (
         "import sys, torch_modal; torch_modal.extract_bases, torch_modal.subdivide, torch_modal.InBetween; "
-        "from torch_modal.geometry.functions import broadcast_shapes; "
+        "from torch_modal.autograd import broadcast_shapes; "
         "assert broadcast_shapes((2, 1), [3], ()) == (2, 3); "
         f"print([name for name in {heavy} if name in sys.modules])"
     )

@@ -17,16 +17,16 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
 
+from torch_modal import trees
+from torch_modal.backends.torch.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
-from torch_modal.nn import trees
-from torch_modal.nn.gauss_newton import GaussNewtonStep
-from torch_modal.nn.in_between import InBetween
-from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.modal_energy import Derivatives, SumOfEnergies
-from torch_modal.nn.samples import ConvergenceError, ConvergenceWarning, Samples
-from torch_modal.nn.settings import Solver
-from torch_modal.nn.solver import Status
+from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning, Samples
+from torch_modal.inbetween.settings import Solver
+from torch_modal.layers.in_between import InBetween
+from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
+from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.solver import Status
 
 DOUBLE = torch.float64
 

@@ -6,9 +6,10 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
+from torch_modal import trees
+from torch_modal.backends.torch import congruence
+from torch_modal.backends.torch.modal_energy import Derivatives, ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
-from torch_modal.nn import congruence, trees
-from torch_modal.nn.modal_energy import Derivatives, ModalEnergy
 
 N, BATCH = 5, 3
 MOEBIUS = [[i, (i + 1) % 7, (i + 2) % 7] if i % 2 == 0 else [(i + 1) % 7, i, (i + 2) % 7] for i in range(7)]

@@ -6,17 +6,18 @@ from conftest import Shapes, modal
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev
 
+from torch_modal.backends.torch.alignment import Pair
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.nn.frame import Frame, Pair
-from torch_modal.nn.gauss_newton import GaussNewtonStep
-from torch_modal.nn.in_between import InBetween
-from torch_modal.nn.levels import Levels, Stiffness
-from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.paired import PairedPlacement, PairedProblem, PairedSpace
-from torch_modal.nn.solver import minimise
+from torch_modal.inbetween.frame import Frame
+from torch_modal.inbetween.levels import Levels, Stiffness
+from torch_modal.inbetween.paired import PairedPlacement, PairedProblem, PairedSpace
+from torch_modal.layers.in_between import InBetween
+from torch_modal.layers.mid_shape import MidShape
+from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.solver import minimise
 
 MU = 0.3
 

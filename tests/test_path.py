@@ -15,7 +15,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry import hermite
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.sequence.path import Path
+from torch_modal.motion.path import Path
 
 DOUBLE = torch.float64
 

@@ -9,11 +9,11 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd, vmap
 
+from torch_modal.backends.torch.fine_steps import RIDGE, STEP_LENGTHS, ConvexHessian, _downhill, relax
 from torch_modal.energy.energy import Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry.vectors import norm
-from torch_modal.nn.between import fine_chunk
-from torch_modal.nn.relax import RIDGE, STEP_LENGTHS, ConvexHessian, _downhill, relax
+from torch_modal.inbetween.between import fine_chunk
 
 BATCH = 2
 

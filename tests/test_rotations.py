@@ -7,11 +7,11 @@ import torch
 from conftest import Shapes, modal, problem_of
 from torch import Tensor
 
+from torch_modal.backends.warp.rotations import FusedRotations
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
-from torch_modal.nn.blend import Blends, RotationBlend
-from torch_modal.nn.fused_rotations import FusedRotations
-from torch_modal.nn.mid_shape import MidShape
+from torch_modal.inbetween.blend import Blends, RotationBlend
+from torch_modal.layers.mid_shape import MidShape
 
 T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
 

@@ -13,9 +13,9 @@ from conftest import random_rotation
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
+from torch_modal.contact.detect import nearest_on_triangles
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.contacts import nearest_on_triangles
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.geometry.triangle_pairs import pierce_nearly, triangles_cross
 
@@ -116,7 +116,7 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
     kernels = None
     if search == "warp":
         pytest.importorskip("warp")
-        from torch_modal.nn.fused_crossings import FusedPairs
+        from torch_modal.backends.warp.crossings import FusedPairs
 
         kernels = FusedPairs(mesh, points[None])
     assert len(Crossings(mesh, points[None], search=kernels).pairs(points)) == 0
@@ -134,7 +134,7 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
 @pytest.mark.parametrize("n_faces", [1, 2, 3, 20, 500])
 def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Generator) -> None:
     pytest.importorskip("warp")
-    from torch_modal.nn import fused_crossings
+    from torch_modal.backends.warp import crossings as fused_crossings
 
     corners = torch.stack([torch.randperm(n_faces + 3, generator=generator)[:3] for _ in range(n_faces)]).numpy()
     mesh = Connectivity(corners, n_faces + 3)
@@ -153,7 +153,7 @@ def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Ge
 
 def test_searches_agree_whoever_searches() -> None:
     pytest.importorskip("warp")
-    from torch_modal.nn.fused_crossings import FusedPairs
+    from torch_modal.backends.warp.crossings import FusedPairs
 
     sample = load_sample("hand")
     mesh, x = Connectivity(sample.faces.numpy(), sample.keyframes.shape[1]), sample.keyframes.numpy()

@@ -12,10 +12,10 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.nn.mid_shape import MidShape
-from torch_modal.nn.settings import Objective, Solver
-from torch_modal.sequence import subdivide as sequence
-from torch_modal.sequence.subdivide import keyframe_places, linear_sequence, subdivide
+from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.layers.mid_shape import MidShape
+from torch_modal.motion import subdivide as sequence
+from torch_modal.motion.subdivide import keyframe_places, linear_sequence, subdivide
 
 COARSE: dict[str, Any] = {"objective": Objective(coarse_faces=200)}
 PAIRED: dict[str, Any] = {"objective": Objective(space="paired", coarse_faces=200), "solver": Solver(local_steps=0)}

@@ -28,10 +28,10 @@ from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.contact.trajectory import ROUNDS
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
-from torch_modal.sequence.contact import ROUNDS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LEVELS = 5
@@ -241,7 +241,7 @@ def draws() -> None:
 
 def gradients() -> None:
     """Of a weighted sum of the sample hand's vertices at t = 7/8, against central differences."""
-    from torch_modal.nn.contact_rounds import ContactRounds
+    from torch_modal.contact.rounds import ContactRounds
 
     case = sample_hand()
     layer = tm.InBetween(tm.extract_bases(case.keyframes, case.faces, 20, progress=False), case.faces, contact=True)

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch_modal.geometry import hermite
 from torch_modal.geometry.rigid import best_fit
 
-USERS = ("torch_modal.geometry.local_rotations", "torch_modal.nn.frame", "torch_modal.nn.joint")
+USERS = ("torch_modal.geometry.local_rotations", "torch_modal.inbetween.frame", "torch_modal.inbetween.joint")
 CHOICES = "| motion | choice | distance over ours | edge error over ours | worst corner | folds | overshoot % |"
 
 

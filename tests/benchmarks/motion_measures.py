@@ -15,7 +15,7 @@ from timing import timed
 from torch import Tensor
 
 from torch_modal.energy.measures import wrap_angle
-from torch_modal.sequence.path import Path
+from torch_modal.motion.path import Path
 
 COLLAPSED = 0.05  # of the smaller area in both key-frames
 MOVES = 1e-3  # of the diagonal: vertices that move less have no direction

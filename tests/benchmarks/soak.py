@@ -31,10 +31,10 @@ from wild import FELL_BACK, WORSE, straight
 import torch_modal as tm
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.errors import MeshError
-from torch_modal.nn.settings import PRESETS
-from torch_modal.nn.solver import Status
+from torch_modal.inbetween.settings import PRESETS
 from torch_modal.precompute.coarsening import coarsen
 from torch_modal.precompute.filling import MESHERS
+from torch_modal.solve.solver import Status
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -60,7 +60,7 @@ from wild_making import BODIES, WildBody
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.nn.solver import Status
+from torch_modal.solve.solver import Status
 
 N_MODES = 30
 PRESETS = ("accurate", "fast", "paper")

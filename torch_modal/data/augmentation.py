@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import lasting
 from torch_modal.data.space import ShapeSpace
-from torch_modal.geometry.functions import lasting
 
 Parameters = dict[str, Tensor]
 

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import Any
 
-from torch_modal.geometry.functions import lasting
+from torch_modal.autograd import lasting
 
 
 class Recent:

@@ -8,9 +8,9 @@ from kornia.geometry.conversions import quaternion_to_axis_angle
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torch_modal.autograd import lasting
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
 from torch_modal.data.space import ShapeSpace
-from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.rigid import RigidMotion
 from torch_modal.geometry.rotations import exp
 

@@ -10,26 +10,26 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_modal.autograd import lasting
 from torch_modal.data.motion import Motion, Span
 from torch_modal.data.recent import Recent
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
 from torch_modal.geometry.crossings import require_contact
-from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
 from torch_modal.geometry.vectors import norm, pick
+from torch_modal.inbetween.samples import InBetweenResult
+from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.io.cache import CacheWarning
 from torch_modal.io.content import ContentError, code_digest, content_digest
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.nn.adjoint import ConvergenceWarning
-from torch_modal.nn.in_between import InBetween
-from torch_modal.nn.samples import InBetweenResult
-from torch_modal.nn.settings import Objective, Preset, Solver, settings
-from torch_modal.nn.solver import Status
+from torch_modal.layers.in_between import InBetween
+from torch_modal.motion.path import Path as MotionPath
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.sequence.path import Path as MotionPath
+from torch_modal.solve.adjoint import ConvergenceWarning
+from torch_modal.solve.solver import Status
 from torch_modal.version import __version__
 
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.

@@ -24,8 +24,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_modal.autograd import lasting
 from torch_modal.data.motion import Motion
-from torch_modal.geometry.functions import lasting
 from torch_modal.io.tensors import opened, to_bytes
 from torch_modal.precompute.basis import FORMAT as BASIS_FORMAT
 from torch_modal.precompute.basis import VERSION as BASIS_VERSION

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import lasting
 from torch_modal.energy.terms import Mesh, Term
-from torch_modal.geometry.functions import lasting
 from torch_modal.geometry.vectors import inverse, pick
 
 

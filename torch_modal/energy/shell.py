@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import broadcast_shapes, lasting
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Term, Volume
-from torch_modal.geometry.functions import broadcast_shapes, lasting
 from torch_modal.keyframes.arrays import as_faces
 
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.functions import applied, traced
+from torch_modal.autograd import applied, traced
 from torch_modal.geometry.rotations import exp, log
 
 

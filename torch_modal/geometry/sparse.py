@@ -21,7 +21,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.functions import applied
+from torch_modal.autograd import applied
 
 try:
     import cholespy

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from torch_modal.geometry.functions import lasting, outlasting
+from torch_modal.autograd import lasting, outlasting
 from torch_modal.io.files import write_atomically
 from torch_modal.io.tensors import from_bytes, to_bytes
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_modal.nn.in_between import InBetween
-from torch_modal.nn.settings import PRESETS, Preset
+from torch_modal.inbetween.settings import PRESETS, Preset
+from torch_modal.layers.in_between import InBetween
 from torch_modal.precompute.basis import ModalBasis
 
 # Part of the mean compliance by which handles may be missed, so that close handles do not conflict.

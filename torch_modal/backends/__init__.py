@@ -1,0 +1,1 @@
+"""What an in-between is computed with: torch, the reference, and kernels of NVIDIA Warp, the fast path."""

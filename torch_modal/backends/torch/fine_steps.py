@@ -1,0 +1,213 @@
+"""An energy with every vertex free: a convex Hessian that is applied without being assembled, and steps with it."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_modal import trees
+from torch_modal.autograd import flattened
+from torch_modal.energy.energy import Energy, Linearised, Reference
+
+# Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
+RIDGE = 1e-6
+
+# The whole step, and what is tried where it goes uphill. Contacts that a step activates need the shortest ones.
+STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.003, 0.001)
+
+
+class ConvexHessian:
+    """Gauss-Newton's Hessian and the second-order term of stretched edges: never negative.
+
+    Args:
+        energy: The energy.
+        at: Where it is linearised.
+    """
+
+    def __init__(self, energy: Energy, at: Sequence[Linearised]) -> None:
+        self.energy, self.at = energy, at
+        #: Stiffness across each element of two vertices; along it, there is the curvature. *Shape:* ``(B, M)``.
+        self.tensions = [
+            part.term.tension(one.edge_vectors, one.slope, one.curvature)
+            for part, one in zip(energy.parts, at, strict=True)
+        ]
+
+    def __call__(self, field: Tensor) -> Tensor:
+        """The product with displacements. *Shape:* ``(3, B, V)``, extended."""
+        received = []
+        for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
+            if part.term.total:
+                received.append(one.curvature * (one.gradients * field).sum((0, -1))[:, None])
+                continue
+            edge_vectors = part.edge_vectors(field)
+            rate = (one.gradients * edge_vectors).sum((0, 1))
+            if tension is None:
+                received.append(one.curvature * rate * one.gradients)
+            else:
+                received.append(tension * edge_vectors + (one.curvature - tension) * rate * one.gradients)
+        return self.energy.scatter(self.at, received)
+
+    def diagonal(self) -> Tensor:
+        """The 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
+        on_corners = []
+        for part, one, tension in zip(self.energy.parts, self.at, self.tensions, strict=True):
+            if part.term.total:
+                continue  # of rank one: it couples all vertices, and adds little to each
+            ends = part.to_corners(one.gradients)
+            n = len(part.corners)
+            along = one.curvature if tension is None else one.curvature - tension
+            blocks = (along.repeat(1, n) * ends)[:, None] * ends
+            if tension is not None:
+                eye = torch.eye(3, dtype=ends.dtype, device=ends.device)[..., None, None]
+                blocks = blocks + eye * tension.repeat(1, n)
+            on_corners.append(blocks)
+        blocks = torch.cat(on_corners, -1)
+        summed = blocks.new_zeros(*blocks.shape[:-1], self.energy.n_extended)
+        return summed.index_add(-1, self.energy.corners, blocks)
+
+    def inverse_diagonal(self) -> Tensor:
+        """Inverses of the 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
+        return inverse_of_symmetric(self.diagonal())
+
+
+def inverse_of_symmetric(blocks: Tensor) -> Tensor:
+    """Inverse by cofactors, with a ridge. *Shape:* ``(3, 3, ...)``."""
+    trace = blocks[0, 0] + blocks[1, 1] + blocks[2, 2]
+    # Vertices that no face uses have no stiffness at all, and no gradient either.
+    trace = torch.where(trace > 0, trace, 1)
+    scaled = blocks / trace
+    a, d, f = (scaled[i, i] + RIDGE for i in range(3))
+    b, c, e = scaled[0, 1], scaled[0, 2], scaled[1, 2]
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * aa + b * bb + c * cc
+    cofactors = torch.stack([aa, bb, cc, bb, a * f - c * c, b * c - a * e, cc, b * c - a * e, a * d - b * b])
+    return (cofactors / (determinant * trace)).unflatten(0, (3, 3))
+
+
+def relax(
+    energy: Energy, x: Tensor, reference: Reference, n_steps: int, n_products: int, anchors: Tensor | None = None
+) -> Tensor:
+    """Steps of a truncated Newton method on all vertices, never uphill.
+
+    Each step solves with :class:`ConvexHessian` by conjugate gradients, preconditioned by its diagonal blocks and cut
+    short: what a modal space leaves to be done is local, and a few iterations see far enough. Every sample takes the
+    same number of both, so that the result is differentiable like any other expression.
+
+    Args:
+        energy: The energy.
+        x: Where to start. *Shape:* ``(B, V, 3)``.
+        reference: What is compared with.
+        n_steps: Newton steps.
+        n_products: Iterations of conjugate gradients in each.
+        anchors: Of the energy's terms, where there are some. *Shape:* ``(B, P, 3)``.
+
+    Returns:
+        *Shape:* ``(B, V, 3)``.
+    """
+    fixed = None if anchors is None else anchors.movedim(-1, 0)
+    rows = x.movedim(-1, 0).contiguous()
+    for _ in range(n_steps):
+        extended = energy.extend(rows, fixed)
+        at = energy.linearise(extended, reference)
+        right = -energy.fold(energy.gradient(at))
+        direction = _solved(energy, ConvexHessian(energy, at), right, n_products)
+        moves = energy.extend(direction)
+        before = energy.value_at(at, reference)
+        length = _downhill(energy, before, extended, moves, reference)
+        rows = rows + length[:, None] * direction
+    return rows.movedim(0, -1)
+
+
+def _solved(energy: Energy, hessian: ConvexHessian, right: Tensor, n_products: int) -> Tensor:
+    """An approximate solution. *Shape:* ``(3, B, V)``."""
+    inverse = hessian.inverse_diagonal()[..., : right.shape[-1]]
+
+    def product(field: Tensor) -> Tensor:
+        return energy.fold(hessian(energy.extend(field)))
+
+    def precondition(residual: Tensor) -> Tensor:
+        return (inverse * residual).sum(1)
+
+    def dot(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum((0, -1))[:, None]
+
+    return conjugate_gradients(product, precondition, dot, right, n_products)
+
+
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    dot: Callable[[Tensor, Tensor], Tensor],
+    right: Tensor,
+    n_products: int,
+) -> Tensor:
+    """An approximate solution, preconditioned, of one or more systems.
+
+    Args:
+        product: With the matrix, symmetric and never negative.
+        precondition: With an approximate inverse.
+        dot: Inner products of two such fields, one of each system, that broadcast against them.
+        right: The right side.
+        n_products: How many.
+    """
+
+    def quotient(a: Tensor, b: Tensor) -> Tensor:
+        # A system that is solved exactly has nothing left: 0 / 0.
+        return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0)
+
+    solution = torch.zeros_like(right)
+    residual = right
+    direction = preconditioned = precondition(residual)
+    size = dot(residual, preconditioned)
+    for k in range(n_products):
+        along = product(direction)
+        length = quotient(size, dot(direction, along))
+        solution = solution + length * direction
+        if k == n_products - 1:
+            break
+        residual = residual - length * along
+        preconditioned = precondition(residual)
+        previous, size = size, dot(residual, preconditioned)
+        direction = preconditioned + quotient(size, previous) * direction
+    return solution
+
+
+def _downhill(energy: Energy, before: Tensor, rows: Tensor, moves: Tensor, reference: Reference) -> Tensor:
+    """The longest of the steps that goes downhill. *Shape:* ``(B,), (3, B, V), (3, B, V) -> (B,)``."""
+    batched = (before, rows.transpose(0, 1), moves.transpose(0, 1), *trees.leaves(reference))
+    if torch.compiler.is_compiling():
+        # It looks at numbers: a graph ends here, and another begins. No decorator: that takes a second to import.
+        return torch.compiler.disable(_Length.apply)(energy, trees.skeleton(reference), *batched)
+    return _Length.apply(energy, trees.skeleton(reference), *batched)
+
+
+class _Length(torch.autograd.Function):
+    """The longest of the steps that goes downhill, of each sample; 0 where none does. It has no gradient."""
+
+    @staticmethod
+    def forward(energy: Energy, tree: Any, before: Tensor, x: Tensor, moves: Tensor, *inputs: Tensor) -> Tensor:
+        rows, direction, reference = x.transpose(0, 1), moves.transpose(0, 1), trees.filled(tree, inputs)
+        chosen = torch.zeros_like(before)
+        searching = torch.ones_like(before, dtype=torch.bool)
+        for length in STEP_LENGTHS:
+            downhill = searching & (energy.value(rows + length * direction, reference) < before)
+            chosen = torch.where(downhill, length, chosen)
+            searching = searching & ~downhill
+            if not bool(searching.any()):
+                break
+        return chosen
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+        ctx.n_inputs = len(inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
+        return (None,) * ctx.n_inputs
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], energy: Energy, tree: Any, *tensors: Tensor) -> tuple[Tensor, int]:
+        flat = flattened(info.batch_size, in_dims[-len(tensors) :], tensors)
+        return _Length.apply(energy, tree, *flat).unflatten(0, (info.batch_size, -1)), 0

@@ -1,0 +1,307 @@
+"""Eq. 5 in the amplitudes of a modal space by kernels of NVIDIA Warp, where that is installed."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal import trees
+from torch_modal.autograd import applied, flattened, made_outside, traced, transformed
+from torch_modal.backends.torch.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
+from torch_modal.backends.warp.launch import kernels, launch
+from torch_modal.backends.warp.shell import FusedShell, ShellReference
+from torch_modal.energy.terms import Mesh
+
+# Columns that a kernel takes at a time.
+_BLOCK = 8
+
+# Columns of a product with itself that are multiplied at a time.
+_BLOCKS_OF_PRODUCTS = 16
+
+MOST_NUMBERS = 2**27
+"""Of an array that all samples of a batch have at a time (1 GiB): kernels index with 32 bits, and memory is finite."""
+
+
+def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
+    """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
+    given = [value.double() for value in (first, second, t, *stiffness)]
+    return shell.reference_by_torch(*given) if traced(t) else ShellReference(*applied(_Referred, shell, *given))
+
+
+class _Referred(torch.autograd.Function):
+    @staticmethod
+    def forward(shell: FusedShell, *given: Tensor) -> tuple[Tensor, ...]:
+        return tuple(shell.reference(*(value.detach().contiguous() for value in given)))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.shell, *given = inputs
+        ctx.mark_non_differentiable(output[-1])
+        ctx.save_for_backward(*given)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        given = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            return (None, *torch.func.vjp(lambda *given: tuple(ctx.shell.reference_by_torch(*given)), *given)[1](grads))
+        received = ShellReference(*(grad.contiguous() for grad in grads))
+        return (None, *ctx.shell.from_reference(received, *(value.detach().contiguous() for value in given)))
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], shell: FusedShell, *given: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        found = _Referred.apply(shell, *flattened(info.batch_size, in_dims[1:], given))
+        return tuple(value.unflatten(0, (info.batch_size, -1)) for value in found), (0,) * len(found)
+
+
+class FusedModalEnergy(ModalEnergy):
+    """:class:`ModalEnergy` whose values and derivatives come from kernels, in float64.
+
+    It does so for placements with a :class:`ShellReference`, which shapes are not extended for; others, and what is
+    differentiated once more, are torch's.
+
+    Args:
+        shell: The energy on the mesh that the columns live on.
+        mesh: That mesh.
+        columns: Directions of the space. *Shape:* ``(n, V, 3)``.
+    """
+
+    flat: Tensor
+    blocks: Tensor
+    pairs: Tensor
+    slots: Tensor
+    face_slots: Tensor
+
+    def __init__(self, shell: FusedShell, mesh: Mesh, columns: Tensor) -> None:
+        super().__init__(shell.energy, columns)
+        self._shell = (shell,)
+        places = self.curvature.places.int()
+        n_edges, n_hinges = len(shell.record), len(shell.interior)
+        slots = places.new_zeros(n_edges, 6)
+        slots[:, 0] = places[:n_edges]
+        slots[shell.interior, 1:] = places[n_edges : n_edges + 5 * n_hinges].unflatten(0, (5, -1)).T
+        self.register_buffer("slots", slots, persistent=False)
+        capped_faces = places[n_edges + 5 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
+        self.register_buffer("face_slots", capped_faces, persistent=False)
+        self.register_buffer("pairs", self.curvature.pairs.int(), persistent=False)
+        self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
+        rows = self.columns.permute(2, 1, 0).flatten(0, 1)
+        blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()
+        #: Columns of each component of each vertex and of the centre, with room for two more, and zeros.
+        self.register_buffer("blocks", blocks, persistent=False)
+
+    def _prepare(self) -> None:
+        """Do nothing: kernels have their own tables, and torch's are built on first use."""
+        self._kept: tuple[Tensor, Any] | None = None
+
+    @property
+    def tables(self) -> Any:
+        """As in the base class, for the present columns, which functional_call may have replaced."""
+        if self._kept is None or self._kept[0] is not self.columns:
+            self._kept = self.columns, made_outside(self._made_tables)
+        return self._kept[1]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "FusedModalEnergy":
+        """Nothing is made in a lower precision, or on another device, than the columns came in."""
+        after = fn(self.columns)
+        if (after.dtype, after.device) == (self.columns.dtype, self.columns.device):
+            return super()._apply(fn, recurse)
+        tables = self.tables
+        super()._apply(fn, recurse)
+        self._kept = self.columns, tables._apply(fn)
+        return self
+
+    @property
+    def shell(self) -> FusedShell:
+        """The kernels."""
+        return self._shell[0]
+
+    def place(
+        self, base: Tensor, reference: Any, extra: Tensor | None = None, anchors: Tensor | None = None
+    ) -> Placement:
+        """As in the base class."""
+        if not isinstance(reference, ShellReference):
+            return super().place(base, reference, extra, anchors)
+        return Placement(base.double(), None if extra is None else extra.double(), reference)  # type: ignore[arg-type]
+
+    def _plain(self, placement: Placement) -> Placement | None:
+        """The placement for torch; None where it is for kernels."""
+        if not isinstance(placement.reference, ShellReference):
+            return placement
+        values = placement.base, placement.extra, *placement.reference
+        if torch.is_grad_enabled() or any(x is not None and (traced(x) or transformed(x)) for x in values):
+            base, extra, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
+            return super().place(base, self.shell.unpacked(reference), extra)
+        return None
+
+    # ------------------------------------------------------------------------------------------------------- the shapes
+    def _shapes(self, a: Tensor, base: Tensor, extra: Tensor | None) -> Tensor:
+        """*Shape:* ``(..., B, n) -> (D * B, V, 3)``."""
+        n = len(self.columns)
+        a, flat = a.double(), self.flat.double()
+        if a.dim() == 2:
+            x = torch.addmm(base.flatten(1), a[:, :n], flat).view_as(base)
+        else:
+            x = (a[..., :n] @ flat).unflatten(-1, (-1, 3)) + base
+        if extra is not None:
+            x = torch.addcmul(x, a[..., n, None, None], extra)
+        return x.flatten(0, -3)
+
+    def rows(self, a: Tensor, placement: Placement) -> Tensor:
+        """As in the base class."""
+        if not isinstance(placement.reference, ShellReference):
+            return super().rows(a, placement)
+        x = self._shapes(a, placement.base, placement.extra).unflatten(0, a.shape[:-1])
+        return self.energy.extend(x.movedim(-1, 0))
+
+    def value(self, a: Tensor, placement: Placement) -> Tensor:
+        """As in the base class."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().value(a.to(plain.base), plain).to(placement.base)
+        to: Any = placement.reference
+        found = self.shell.value(self._shapes(a, placement.base, placement.extra), to)
+        return found.unflatten(0, a.shape[:-1]) + to.constant
+
+    def base_value(self, placement: Placement) -> Tensor:
+        """As in the base class."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().base_value(plain).to(placement.base)
+        to: Any = placement.reference
+        found = self.shell.value(placement.base.flatten(0, -3), to)
+        return found.unflatten(0, placement.base.shape[:-2]) + to.constant
+
+    def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
+        """As in the base class."""
+        plain = self._plain(placement)
+        if plain is not None:
+            found = super().derivatives(a.to(plain.base), plain, second_order)
+            return trees.mapped(found, lambda value: value.to(placement.base))
+        chunks = self._chunks(a, placement)
+        parts = [self._derivatives(*chunk, second_order) for chunk in chunks]
+        if len(parts) == 1:
+            return parts[0]
+        joined = [None if each[0] is None else torch.cat(each) for each in zip(*parts, strict=True)]
+        return Derivatives(*joined)  # type: ignore[arg-type]
+
+    def _chunks(self, a: Tensor, placement: Placement) -> list[tuple[Tensor, Placement]]:
+        """Samples whose derivatives are taken at a time."""
+        shell, width = self.shell, self.blocks.shape[1]
+        rows = len(shell.record) + len(shell.interior) + 1, len(self.blocks)
+        most = max(1, MOST_NUMBERS // max(width * max(rows), 18 * len(self.pairs)))
+        if len(a) <= most:
+            return [(a, placement)]
+        every = [slice(i, i + most) for i in range(0, len(a), most)]
+        return [(a[own], trees.rows(placement, own)) for own in every]
+
+    def _derivatives(self, a: Tensor, placement: Placement, second_order: bool) -> Derivatives:
+        to: Any = placement.reference
+        x, extra, shell = self._shapes(a, placement.base, placement.extra), placement.extra, self.shell
+        (b, n), blocks = (len(x), len(self.columns)), self.blocks.double()
+        n_all, n_measures = n + (extra is not None), len(shell.record) + len(shell.interior)
+        # One row for each measure, the last for the volume; the residuals are a column like the others.
+        jacobian, stiffness = x.new_empty(b, n_measures + 1, blocks.shape[1]), to.stiffness.clone()
+        given = [x, shell.record, shell.hinge, to.stretch, to.bend, blocks, extra, shell.n_vertices, n]
+        given += [blocks.shape[1] // _BLOCK, n_measures + 1, jacobian, jacobian, stiffness]
+        launch(kernels("modal").jacobian, (b, len(shell.record)), given)
+        volume, normal = shell.volume(x)
+        root, off, last = to.stiffness.sqrt()[:, None], volume - to.volume, jacobian[:, -1]
+        last[:, :n_all] = along_columns(normal, self.flat.double(), extra)
+        last[:, n_all] = off
+        last *= root
+        last[:, n_all + 1 :] = 0
+        products = gram(jacobian)
+        gradient, inner = products[:, :n_all, n_all], products[:, :n_all, :n_all]
+        stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
+        rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
+        curved = self._second(x, to.stiffness * off, placement) if second_order else None
+        return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
+
+    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
+        """As in the base class."""
+        plain = self._plain(placement)
+        if plain is not None:
+            value, gradient = super().value_and_gradient(a.to(plain.base), plain)
+            return value.to(placement.base), gradient.to(placement.base)
+        to: Any = placement.reference
+        value, x = self.shell.value_and_gradient(self._shapes(a, placement.base, placement.extra), to)
+        return value + to.constant, along_columns(x, self.flat.double(), placement.extra)
+
+    def second_order(self, a: Tensor, placement: Placement) -> Tensor:
+        """As in the base class."""
+        plain = self._plain(placement)
+        if plain is not None:
+            return super().second_order(a.to(plain.base), plain).to(placement.base)
+        found = []
+        for own, there in self._chunks(a, placement):
+            x, to = self._shapes(own, there.base, there.extra), there.reference
+            volume, _ = self.shell.volume(x)
+            found.append(self._second(x, to.stiffness * (volume - to.volume), there))  # type: ignore[attr-defined]
+        return found[0] if len(found) == 1 else torch.cat(found)
+
+    def _second(self, x: Tensor, moment: Tensor, placement: Placement) -> Tensor:
+        to: Any = placement.reference
+        shell, n_pairs = self.shell, len(self.curvature.pairs)
+        found = x.new_zeros(len(x), 2 * n_pairs, 3, 3)
+        given = [x, shell.record, to.stretch, to.bend, self.slots, shell.n_vertices, 2 * n_pairs, found]
+        launch(kernels("modal").curved_edges, (len(x), len(shell.record)), given)
+        given = [x, shell.centre(x), shell.capped_faces, moment, self.face_slots, shell.n_vertices, 2 * n_pairs, found]
+        launch(kernels("modal").curved_faces, (len(x), len(shell.capped_faces)), given)
+        extra, columns, n = placement.extra, self.blocks.double(), len(self.columns)
+        if extra is not None:
+            extra = torch.cat([extra, shell.mean(extra)[:, None]], 1)
+        pushed = x.new_zeros(len(x), *columns.shape)
+        given = [self.pairs, found, columns, extra, len(columns) // 3, n, columns.shape[1] // _BLOCK, pushed, pushed]
+        launch(kernels("modal").curved_columns, (len(x), n_pairs), given)
+        n_all = n + (extra is not None)
+        curved = (columns.mT @ pushed)[:, :n_all, :n_all]
+        if extra is not None:  # a column of zeros so far on the left side
+            curved[:, n, :n] = curved[:, :n, n]
+            curved[:, n, n] = (extra.flatten(1) * pushed[..., n]).sum(-1)
+        return curved
+
+    def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
+        """As in the base class."""
+        to: Any = placement.reference
+        if not isinstance(to, ShellReference):
+            return super().pull_back(a, direction, placement)
+        plain = self._plain(placement)
+        if plain is not None:
+            pulled = super().pull_back(a.to(plain.base), direction.to(plain.base), plain)
+            return self._repacked(pulled, placement)
+        base, extra, shell = placement.base, placement.extra, self.shell
+        x, moved = self._shapes(a, base, extra), self._shapes(direction, torch.zeros_like(base), extra)
+        at = shell.at(x, to)
+        to_base, to_reference = torch.zeros_like(x), ShellReference(*(torch.zeros_like(value) for value in to))
+        shell.from_point(x, at, to, moved, to_base, to_reference)
+        to_extra = None
+        if extra is not None:
+            own = torch.addcmul(at.gradient, at.moment[:, None, None], at.normal)
+            to_extra = a[:, -1, None, None] * to_base + direction[:, -1, None, None] * own
+        return Placement(to_base, to_extra, to_reference)  # type: ignore[arg-type]
+
+    def _repacked(self, found: Placement, placement: Placement) -> Placement:
+        """Gradients in a placement for torch as those in the one for kernels that it was made of."""
+        given, skeleton = trees.leaves(placement), trees.skeleton(placement)
+
+        def run(*values: Tensor) -> tuple[Tensor, ...]:
+            return tuple(trees.leaves(self._plain(trees.filled(skeleton, values))))
+
+        pulled = torch.func.vjp(run, *given)[1](tuple(trees.leaves(found)))
+        return trees.filled(skeleton, pulled)  # type: ignore[no-any-return]
+
+
+def gram(x: Tensor) -> Tensor:
+    """``x^T x``; on a CPU in rows of blocks, from the diagonal on. *Shape:* ``(B, m, n) -> (B, n, n)``."""
+    n = x.shape[-1]
+    if x.device.type != "cpu":
+        return x.mT @ x
+    found = x.new_empty(len(x), n, n)
+    for i in range(0, n, _BLOCKS_OF_PRODUCTS):
+        own = slice(i, i + _BLOCKS_OF_PRODUCTS)
+        right = torch.bmm(x[..., own].mT, x[..., i:])
+        found[:, i:, own], found[:, own, i:] = right.mT, right
+    return found

@@ -1,0 +1,1 @@
+"""Keeping the parts of a surface from passing through each other."""

@@ -1,0 +1,1 @@
+"""In-betweens of pairs of key-frames, for flat batches."""

@@ -1,0 +1,145 @@
+"""Where the terms of an in-between's energy are evaluated: on the coarse mesh, or at the vertices that they name."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal import trees
+from torch_modal.backends.torch.modal_energy import ModalEnergy, Placement, SumOfEnergies
+from torch_modal.backends.warp.launch import Backend
+from torch_modal.backends.warp.modal_energy import FusedModalEnergy, fused_reference
+from torch_modal.backends.warp.shell import FusedShell
+from torch_modal.energy.energy import Energy, OnMesh, Reference
+from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
+from torch_modal.inbetween.columns import Columns
+from torch_modal.inbetween.frame import Frame
+
+
+class Stiffness(NamedTuple):
+    """Stiffnesses of each sample, with those of the elements of either mesh."""
+
+    fine: list[Tensor]
+    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    levels: list[list[Tensor]]
+    """Of the terms of each level. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+
+
+class Levels(nn.Module):
+    """The energies of the modal solve: most terms on the coarse mesh, and those that name vertices at these.
+
+    Args:
+        frame: The frame of both bases.
+        fine: The caller's mesh.
+        terms: All terms.
+        backend: Whether kernels may take the coarse level.
+    """
+
+    def __init__(self, frame: Frame, fine: Mesh, terms: Sequence[Term], backend: Backend = "torch") -> None:
+        super().__init__()
+        self.mesh = Mesh.of(frame.coarse.faces, frame.coarse.n_vertices)
+        kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
+        members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
+        #: Which terms each level has: those of Eq. 5, others on the coarse mesh, others at vertices of the fine mesh.
+        self.members = [own for own in members if own]
+        self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
+        own_terms = [[terms[i] for i in own] for own in self.members]
+        energies = [Energy(fine, own, True) if own[0].sampled else Energy(self.mesh, own) for own in own_terms]
+        self.energies: Any = nn.ModuleList(energies)
+        #: Whether any are.
+        self.sampled = bool(members[2])
+        #: The kernels of Eq. 5, where there are some.
+        self.shell = FusedShell(energies[0], self.mesh) if FusedShell.serves(energies[0], backend) else None
+
+    def modal(self, columns: Columns) -> SumOfEnergies:
+        """All of them in the amplitudes of a space."""
+        parts = []
+        for i, energy in enumerate(self.energies):
+            if i or self.shell is None:
+                own = columns.at(energy.vertices) if energy.sampled else columns.coarse
+                parts.append(ModalEnergy(energy, own))
+            else:
+                parts.append(FusedModalEnergy(self.shell, self.mesh, columns.coarse))
+        return SumOfEnergies(*parts)
+
+    def seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
+        """A fine shape and its coarse one as each energy sees them. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
+        return [x[..., energy.vertices, :] if energy.sampled else coarse for energy in self.energies]
+
+    def between(
+        self,
+        first: Sequence[Tensor],
+        second: Sequence[Tensor],
+        index: Tensor | None,
+        t: Tensor,
+        stiffness: Stiffness,
+    ) -> list[Any]:
+        """References of in-betweens at the times ``t``, of the pairs ``index`` (each its own where None).
+
+        Args:
+            first: Rest shapes as each energy sees them, of the weight ``1 - t``. *Shape of each:* ``(P, V, 3)``.
+            second: Of the weight ``t``. *Shape of each:* ``(P, V, 3)``.
+            index: *Shape:* ``(B,)``.
+            t: *Shape:* ``(B,)``.
+            stiffness: Of each sample.
+
+        Returns:
+            A :class:`Reference` of each energy, or a :class:`ShellReference` for kernels.
+        """
+        found: list[Any] = []
+        for energy, a, b, own in zip(self.energies, first, second, stiffness.levels, strict=True):
+            if self.shell is not None and not found:
+                found.append(fused_reference(self.shell, *trees.picked((a, b), index), t, *own))
+            else:
+                found.append(energy.between(*trees.picked((energy.rest_of(a), energy.rest_of(b)), index), t, own))
+        return found
+
+    def against(self, x: Tensor, coarse: Tensor, stiffness: Stiffness) -> list[Reference]:
+        """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
+        parts = zip(self.energies, self.seen(x, coarse), stiffness.levels, strict=True)
+        return [Energy.against(energy.rest_of(own), factors) for energy, own, factors in parts]
+
+    def place(
+        self,
+        modal: SumOfEnergies,
+        bases: Sequence[Tensor],
+        references: Sequence[Reference],
+        extras: Sequence[Tensor | None] | None,
+        anchors: Tensor | None,
+    ) -> tuple[Placement, ...]:
+        """The affine space of each sample, as each energy sees it. *Shape of bases and extras:* ``(B, V, 3)``."""
+        extras = [None] * len(bases) if extras is None else extras
+        fixed = [self._own_anchors(members, anchors) for members in self.members[: len(bases)]]
+        parts = zip(modal.parts, bases, references, extras, fixed, strict=True)
+        return tuple(energy.place(base, reference, extra, own) for energy, base, reference, extra, own in parts)
+
+    def _own_anchors(self, members: Sequence[int], anchors: Tensor | None) -> Tensor | None:
+        """Those of some of the terms. *Shape:* ``(B, P, 3)``."""
+        if anchors is None:
+            return None
+        each = anchors.split(self.n_anchors, 1)
+        return torch.cat([each[i] for i in members], 1) if members else None
+
+
+def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor) -> Tensor:
+    """Values of the elements of the fine mesh on those of the coarse one: means over clusters, then over corners.
+
+    Args:
+        values: *Shape:* ``(B, M)``, or ``(B, 1)``, which stays.
+        fine: The term on the fine mesh.
+        coarse: The same term on the coarse mesh.
+        clusters: The coarse vertex of each fine one. *Shape:* ``(V,)``.
+
+    Returns:
+        *Shape:* ``(B, M_coarse)``.
+    """
+    if values.shape[-1] == 1:
+        return values
+    owners = clusters[fine.corners].flatten()
+    n = int(clusters.max()) + 1
+    sums = values.new_zeros(len(values), n).index_add(1, owners, values.repeat(1, len(fine.corners)))
+    counts = torch.bincount(owners, minlength=n)
+    # A cluster without elements of its own knows the mean only.
+    means = torch.where(counts > 0, sums / counts.clamp_min(1), values.mean(1, keepdim=True))
+    return means[:, coarse.corners].mean(1)

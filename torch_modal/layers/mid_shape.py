@@ -1,0 +1,73 @@
+"""The shape half-way between two key-frames, as a layer."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from torch import Tensor, nn
+
+from torch_modal.inbetween.samples import InBetweenResult
+from torch_modal.inbetween.settings import Objective, Preset, Solver, settings, with_space
+from torch_modal.layers.in_between import InBetween
+from torch_modal.precompute.basis import ModalBasis
+
+
+class MidShape(nn.Module):
+    r"""The mid-shape that is cheapest to reach from both key-frames: :class:`InBetween` at ``t = 1/2``.
+
+    Args:
+        bases: The basis at each end (:func:`torch_modal.extract_bases`), or one that serves for both.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        space: ``"joint"`` (one shape in the sum of both spaces) or ``"paired"`` (Eq. 4 of the paper). Default: the
+            objective's.
+        mu: Weight of the similarity of Eq. 4, of no effect in the joint space. Default: the objective's.
+        preset: As for :class:`InBetween`.
+        objective: What is minimised, in the place of the preset's.
+        solver: How it is solved, in the place of the preset's.
+
+    Raises:
+        ValueError: An argument is not usable.
+    """
+
+    def __init__(
+        self,
+        bases: ModalBasis | Sequence[ModalBasis],
+        faces: Tensor,
+        space: Literal["joint", "paired"] | None = None,
+        mu: float | Tensor | None = None,
+        *,
+        preset: Preset = "accurate",
+        objective: Objective | None = None,
+        solver: Solver | None = None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(bases, ModalBasis) and len(bases) != 2:
+            raise ValueError(f"a mid-shape lies between two bases, got {len(bases)}; pass [basis_a, basis_b]")
+        objective, solver = with_space(settings(preset, objective, solver), space, mu)
+        self.in_between = InBetween(bases, faces, objective=objective, solver=solver)
+
+    @property
+    def space(self) -> Any:
+        """The joint or paired space."""
+        return self.in_between.members[0].space
+
+    @property
+    def step(self) -> Any:
+        """The :class:`GaussNewtonStep` that is repeated."""
+        return self.in_between.members[0].step
+
+    def solve(self, x_a: Tensor, x_b: Tensor) -> InBetweenResult:
+        """The mid-shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
+        return self.in_between.solve(x_a, x_b, 0.5)
+
+    def forward(self, x_a: Tensor, x_b: Tensor) -> Tensor:
+        """The mid-shapes. *Shape:* ``(..., V, 3), (..., V, 3) -> (..., V, 3)``.
+
+        Args:
+            x_a: First key-frames. *Shape:* ``(..., V, 3)``.
+            x_b: Second key-frames. *Shape:* ``(..., V, 3)``.
+
+        Raises:
+            ValueError: Shapes, dtypes or devices that do not fit.
+            ConvergenceError: A sample did not converge, gradients are recorded and ``unconverged="raise"``.
+        """
+        return self.in_between(x_a, x_b, 0.5)

@@ -1,0 +1,1 @@
+"""Dense sequences and smooth paths through key-frames."""

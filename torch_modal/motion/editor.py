@@ -1,0 +1,107 @@
+"""A motion that is edited by hand: key-frames replaced and added, with only the affected intervals computed again."""
+
+import torch
+from torch import Tensor
+
+from torch_modal.autograd import lasting
+from torch_modal.motion.path import Path
+
+
+class PathEditor:
+    """The dense shapes of a path while its key-frames change.
+
+    Args:
+        path: The path.
+        keyframes: Its key-frames. *Shape:* ``(K, V, 3)``.
+        steps: Shapes of each interval.
+
+    Raises:
+        ValueError: The key-frames do not fit the path, or ``steps`` is below 1.
+    """
+
+    @lasting
+    def __init__(self, path: Path, keyframes: Tensor, steps: int = 16) -> None:
+        if keyframes.dim() != 3 or len(keyframes) != path.n_keyframes:
+            raise ValueError(
+                f"keyframes of this path have the shape ({path.n_keyframes}, V, 3); got {tuple(keyframes.shape)}"
+            )
+        if steps < 1:
+            raise ValueError(f"steps is 1 or more, got {steps}")
+        self.path = path
+        self.keyframes = keyframes.clone()
+        self.steps = steps
+        self._shapes: list[Tensor | None] = [None] * len(path.members)
+
+    def replace(self, i: int, shape: Tensor) -> None:
+        """Put another shape in the place of a key-frame.
+
+        Args:
+            i: Number of the key-frame.
+            shape: *Shape:* ``(V, 3)``.
+
+        Raises:
+            IndexError: There is no such key-frame.
+            ValueError: The shape does not fit.
+        """
+        if not -len(self.keyframes) <= i < len(self.keyframes):
+            raise IndexError(f"there are {len(self.keyframes)} key-frames; got the number {i}")
+        self.keyframes[i] = self._checked(shape)
+        self._forget(i % len(self.keyframes))
+
+    @lasting
+    def insert(self, t: float, shape: Tensor | None = None) -> int:
+        """Pin the motion at a time: the shape becomes a key-frame.
+
+        Args:
+            t: When, between the others; modulo the period, if the path is cyclic.
+            shape: *Shape:* ``(V, 3)``. Default: where the motion passes then.
+
+        Returns:
+            Number of the new key-frame.
+
+        Raises:
+            ValueError: The time is outside, or that of a key-frame; the shape does not fit. Nothing is changed then.
+        """
+        if shape is None:
+            shape = lasting(self.path)(self.keyframes, t)
+        shape = self._checked(shape)
+        path = self.path.insert(t)
+        i = int((path.times[:-1] == self.path.times).cumprod(0).sum())  # up to there, all times are as before
+        self.keyframes = torch.cat([self.keyframes[:i], shape[None], self.keyframes[i:]])
+        self._shapes = [*self._shapes[:i], None, *self._shapes[i:]]
+        self.path = path
+        self._forget(i)
+        return i
+
+    def times(self) -> Tensor:
+        """When the shapes are. *Shape:* ``(T,)``, float64."""
+        knots = self.path.times
+        part = torch.arange(self.steps, dtype=knots.dtype, device=knots.device) / self.steps
+        inner = (knots[:-1, None] + part * knots.diff()[:, None]).flatten()
+        return inner if self.path.cyclic else torch.cat([inner, knots[-1:]])
+
+    def shapes(self) -> Tensor:
+        """All shapes; intervals that no change has touched are those of the last time. *Shape:* ``(T, V, 3)``."""
+        at = self.times()
+        for i, kept in enumerate(self._shapes):
+            if kept is None:
+                own = at[i * self.steps : (i + 1) * self.steps]
+                self._shapes[i] = lasting(self.path)(self.keyframes, own)
+        found = [part for part in self._shapes if part is not None]
+        return torch.cat(found if self.path.cyclic else [*found, self.keyframes[-1:]])
+
+    def _forget(self, i: int) -> None:
+        """The intervals that depend on a key-frame: two on either side of it, where the motion is smooth."""
+        reach = 2 if self.path.smooth else 1
+        n = len(self._shapes)
+        for j in range(i - reach, i + reach):
+            if self.path.cyclic or 0 <= j < n:
+                self._shapes[j % n] = None
+
+    def _checked(self, shape: Tensor) -> Tensor:
+        if shape.shape != self.keyframes.shape[1:] or not bool(shape.isfinite().all()):
+            raise ValueError(
+                f"a key-frame holds finite numbers of the shape {tuple(self.keyframes.shape[1:])}; got a tensor of "
+                f"{tuple(shape.shape)}"
+            )
+        return shape.to(self.keyframes)

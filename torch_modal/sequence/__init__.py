@@ -1,1 +1,0 @@
-"""From key-frames to a dense sequence."""

@@ -1,0 +1,1 @@
+"""Minimisation in modal amplitudes, and the gradient of its solution."""
