@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,8 @@ from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.formats import Animation, animation_format, mesh_format
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.morph import Drawn, animate, place_frames, rows_of
-from torch_modal.io.normals import CarriedNormals
+from torch_modal.io.morph import Drawn, animate, place_frames
+from torch_modal.io.normals import carry_together
 
 # Normals double the file. Beyond this size (POSITION alone) they are left out.
 LARGEST_FILE_WITH_NORMALS = 48 * 2**20
@@ -57,10 +56,10 @@ def write_glb(animation: Animation, path: Path) -> None:
     if asset is not None:
         asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else HOLDS)
     if isinstance(asset, GltfAsset):
-        document, drawn, nodes = asset.rebuilt(shapes[kept])
+        document, drawn, nodes = asset.rebuilt(shapes[kept] if move_normals else shapes[:1])
     else:
-        document, drawn, nodes = _document(shapes[kept], faces, asset, Path(name).stem)
-    place_frames(document, drawn, shapes[kept], move_normals)
+        document, drawn, nodes = _document(shapes[kept], faces, asset, Path(name).stem, move_normals)
+    place_frames(document, drawn, shapes[kept])
     if len(kept) > 1:
         times, shown = timing.knots(kept)
         steps = len(shapes) if timing.cyclic else len(shapes) - 1
@@ -86,15 +85,15 @@ def thinned(n_frames: int, most: int, wanted: list[int]) -> IntArray:
 
 
 def _document(
-    shapes: FloatArray, faces: IntArray, asset: Asset | None, name: str
+    shapes: FloatArray, faces: IntArray, asset: Asset | None, name: str, move_normals: bool = True
 ) -> tuple[Document, list[Drawn], list[int]]:
     """A document of one node, with the parts of a file or with all faces in clay."""
     parts = [Part(np.arange(shapes.shape[1]), faces, Material())] if asset is None else asset.parts()
     document = Document()
-    normals = _normals(parts, shapes, faces, asset)
+    normals = _normals(parts, shapes, faces, asset, len(shapes) if move_normals else 1)
     primitives, drawn = [], []
     materials: dict[Material, int] = {}
-    for part, normal_at in zip(parts, normals, strict=True):
+    for part, own_normals in zip(parts, normals, strict=True):
         index_type = np.uint16 if len(part.vertices) <= 65535 else np.uint32  # 65535 itself is no valid uint16 index
         if part.material not in materials:
             materials[part.material] = document.append("materials", _material(document, part.material))
@@ -110,7 +109,7 @@ def _document(
         if part.colors is not None:
             primitive["attributes"]["COLOR_0"] = document.add(part.colors.astype(np.float32), "VEC4", ARRAY_BUFFER)
         primitives.append(primitive)
-        drawn.append(Drawn(primitive, part.vertices, None, normal_at))
+        drawn.append(Drawn(primitive, part.vertices, None, own_normals))
     document.append("meshes", {"name": name, "primitives": primitives})
     document.append("nodes", {"name": name, "mesh": 0})
     document.append("scenes", {"name": "scene", "nodes": [0]})
@@ -119,32 +118,25 @@ def _document(
 
 
 def _normals(
-    parts: Sequence[Part], shapes: FloatArray, faces: IntArray, asset: Asset | None
-) -> list[Callable[[int], FloatArray]]:
-    """For each part, its normals in a frame: the file's, rotated with the surface, or smooth ones."""
-    own = [part for part in parts if part.normals is not None]
-    starts = np.cumsum([len(part.vertices) for part in own])
+    parts: Sequence[Part], shapes: FloatArray, faces: IntArray, asset: Asset | None, n_frames: int
+) -> list[FloatArray]:
+    """For each part, its normals in the first frames: the file's, rotated with the surface, or smooth ones.
+
+    *Shape of each:* ``(n_frames, P, 3)``.
+    """
+    frames = shapes[:n_frames]
     copies = merge_seams(shapes[[0, -1]], faces)
     _, first = np.unique(copies, return_index=True)
-    smooth = cache(lambda number: vertex_normals(shapes[number][first], copies[faces])[copies])
-    carried = None
+    smooth = np.stack([vertex_normals(shape[first], copies[faces])[copies] for shape in frames])
+    found = [smooth[:, part.vertices] for part in parts]
+    own = [number for number, part in enumerate(parts) if part.normals is not None]
     if own and asset is not None:
-        vertices = np.concatenate([part.vertices for part in own])
-        triangles = [part.triangles + end - len(part.vertices) for part, end in zip(own, starts, strict=True)]
-        from_file = CarriedNormals(
-            np.concatenate([part.normals for part in own if part.normals is not None]),
-            asset.positions[vertices],
-            np.concatenate(triangles),
-        )
-        carried = cache(lambda number: from_file.at(shapes[number][vertices]))
-    ends = iter(starts.tolist())
-    found: list[Callable[[int], FloatArray]] = []
-    for part in parts:
-        if part.normals is None or carried is None:
-            found.append(partial(rows_of, smooth, part.vertices))
-        else:
-            end = next(ends)
-            found.append(partial(rows_of, carried, slice(end - len(part.vertices), end)))
+        vertices = np.concatenate([parts[number].vertices for number in own])
+        given = [
+            (part.normals, asset.positions[part.vertices], part.triangles) for part in parts if part.normals is not None
+        ]
+        for number, turned in zip(own, carry_together(given, [shape[vertices] for shape in frames]), strict=True):
+            found[number] = turned
     return found
 
 

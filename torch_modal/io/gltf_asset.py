@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Sequence
-from functools import cache, partial
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +13,8 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import FEATURES, Asset, Image, Material, Part
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
-from torch_modal.io.morph import Drawn, place_frames, rows_of
-from torch_modal.io.normals import CarriedNormals
+from torch_modal.io.morph import Drawn, place_frames
+from torch_modal.io.normals import carry_together
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -152,7 +151,7 @@ class GltfAsset(Asset):
         """A copy without positions and normals, and without unused content.
 
         Args:
-            frames: *Shape:* ``(N, V, 3)``.
+            frames: Those with normals, all or the first. *Shape:* ``(N, V, 3)``.
 
         Returns:
             The document; its primitives, for :func:`torch_modal.io.morph.place_frames`; the nodes that show them.
@@ -203,32 +202,16 @@ class GltfAsset(Asset):
 
     def _normals(
         self, primitives: Sequence[_Primitive], inverse: FloatArray, frames: FloatArray
-    ) -> dict[int, Callable[[int], FloatArray]]:
-        """How the normals of a node's primitives follow the frames, by the primitives' places.
-
-        All primitives of the node together: where materials meet, equal normals stay equal.
-        """
+    ) -> dict[int, FloatArray]:
+        """Normals of a node's primitives in each frame, by the primitives' places. *Shape of each:* ``(N, P, 3)``."""
         own = [p for p in primitives if "NORMAL" in p.json["attributes"]]
         if not own:
             return {}
-
-        def read(name: str) -> FloatArray:
-            return np.concatenate([self.document.floats(p.json["attributes"][name]) for p in own])
-
+        read = [[self.document.floats(p.json["attributes"][name]) for name in ("NORMAL", "POSITION")] for p in own]
         points = np.concatenate([np.arange(p.points.start, p.points.stop) for p in own])
-        ends = np.cumsum([p.points.stop - p.points.start for p in own])
-        starts = [0, *ends[:-1].tolist()]
-        triangles = np.concatenate([p.triangles + start for p, start in zip(own, starts, strict=True)])
-        carried = CarriedNormals(read("NORMAL"), read("POSITION"), triangles)
-
-        @cache
-        def normals_at(number: int) -> FloatArray:
-            return carried.at(frames[number][points] @ inverse[:3, :3].T + inverse[:3, 3])
-
-        return {
-            p.place: partial(rows_of, normals_at, slice(start, end))
-            for p, start, end in zip(own, starts, ends.tolist(), strict=True)
-        }
+        local = [shape[points] @ inverse[:3, :3].T + inverse[:3, 3] for shape in frames]
+        parts = [(normals, positions, p.triangles) for (normals, positions), p in zip(read, own, strict=True)]
+        return dict(zip([p.place for p in own], carry_together(parts, local), strict=True))
 
     def _take(self, document: Document, accessor: int, target: int, taken: dict[int, int]) -> int:
         """Copy an accessor as it is; its number in the copy."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,54 +21,45 @@ class Drawn(NamedTuple):
     """Its vertices among all; indices or a slice. *Shape:* ``(P,)``."""
     inverse: FloatArray | None = None
     """From the scene to the node. *Shape:* ``(4, 4)``."""
-    normals: Callable[[int], FloatArray] | None = None
-    """The normals of a frame, by its number. *Shape:* ``(P, 3)``."""
+    normals: FloatArray | None = None
+    """Of each frame, or of frame 0 alone if they do not move. *Shape:* ``(N, P, 3)`` or ``(1, P, 3)``."""
 
 
-def rows_of(vectors: Callable[[int], FloatArray], rows: IntArray | slice, number: int) -> FloatArray:
-    """Some rows of the vectors of a frame, for :attr:`Drawn.normals`."""
-    return vectors(number)[rows]
-
-
-def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray, move_normals: bool = True) -> None:
+def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray) -> None:
     """Add the positions of frame 0 to primitives, and a morph target for each further frame.
 
     Args:
         document: The document.
         drawn: Its primitives.
         frames: Positions of all vertices, in the scene. *Shape:* ``(N, V, 3)``.
-        move_normals: Whether morph targets hold normals too.
     """
     made: dict[tuple[int, int], tuple[Json, list[Json]]] = {}
     for primitive in drawn:
         key = (id(primitive.points), id(primitive.normals))
         if key not in made:
-            made[key] = _attributes(document, primitive, frames, move_normals)
+            made[key] = _attributes(document, primitive, frames)
         attributes, targets = made[key]
         primitive.json["attributes"] = {**attributes, **primitive.json.get("attributes", {})}
         if targets:
             primitive.json["targets"] = targets
 
 
-def _attributes(
-    document: Document, primitive: Drawn, frames: FloatArray, move_normals: bool
-) -> tuple[Json, list[Json]]:
+def _attributes(document: Document, primitive: Drawn, frames: FloatArray) -> tuple[Json, list[Json]]:
     local = frames[:, primitive.points]
     if primitive.inverse is not None:
         local = local @ primitive.inverse[:3, :3].T + primitive.inverse[:3, 3]
     base = local[0].astype(np.float32)
     attributes = {"POSITION": document.add(base, "VEC3", ARRAY_BUFFER, bounds=True)}
-    normals = None
-    if primitive.normals is not None:
-        normals = _unit(primitive.normals(0)).astype(np.float32)
-        attributes["NORMAL"] = document.add(normals, "VEC3", ARRAY_BUFFER)
+    normals = [] if primitive.normals is None else [_unit(own) for own in primitive.normals]
+    if normals:
+        normals[0] = normals[0].astype(np.float32)
+        attributes["NORMAL"] = document.add(normals[0], "VEC3", ARRAY_BUFFER)
     targets = []
     for number, shape in enumerate(local[1:], start=1):
         # Against the rounded base, so that its rounding is not carried into every frame.
         target = {"POSITION": document.add((shape - base).astype(np.float32), "VEC3", ARRAY_BUFFER, bounds=True)}
-        if move_normals and primitive.normals is not None and normals is not None:
-            turned = (_unit(primitive.normals(number)) - normals).astype(np.float32)
-            target["NORMAL"] = document.add(turned, "VEC3", ARRAY_BUFFER)
+        if number < len(normals):
+            target["NORMAL"] = document.add((normals[number] - normals[0]).astype(np.float32), "VEC3", ARRAY_BUFFER)
         targets.append(target)
     return attributes, targets
 

@@ -1,10 +1,11 @@
 """Normals of a file, rotated with the surface."""
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.normals import vertex_normals
-from torch_modal.geometry.turning import surface_frames, turn
 
 
 class CarriedNormals:
@@ -28,12 +29,22 @@ class CarriedNormals:
         self.neighbour = np.arange(len(self.first))
         for corner in (2, 1, 0):
             self.neighbour[self.triangles[:, corner]] = self.triangles[:, (corner + 1) % 3]
-        self.before = self._surface(positions)
+        self.before = self._frames(positions)
 
-    def _surface(self, positions: FloatArray) -> FloatArray:
-        """Frames of the surface at each point. *Shape:* ``(P, 3, 3)``."""
+    def _frames(self, positions: FloatArray) -> FloatArray:
+        """Right-handed frames of the surface at each point, with the normal as first column. *Shape:* ``(P, 3, 3)``.
+
+        The second column is the edge made perpendicular to it, or any perpendicular if the edge is along the normal.
+        """
         x = positions[self.first]
-        return surface_frames(vertex_normals(x, self.triangles), x[self.neighbour] - x)[self.group]
+        normals, sides = vertex_normals(x, self.triangles), x[self.neighbour] - x
+        along = sides - np.einsum("ij,ij->i", sides, normals)[:, None] * normals
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        usable = length > 1e-9 * np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        other = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+        other /= np.maximum(np.linalg.norm(other, axis=1, keepdims=True), 1e-12)
+        second = np.where(usable, along / np.where(usable, length, 1.0), other)
+        return np.stack([normals, second, np.cross(normals, second)], axis=2)[self.group]
 
     def at(self, positions: FloatArray) -> FloatArray:
         """The normals of the surface with other positions; bit for bit those of the file where it has not moved.
@@ -41,4 +52,25 @@ class CarriedNormals:
         Args:
             positions: *Shape:* ``(P, 3)``.
         """
-        return turn(self.normals, self.before, self._surface(positions))
+        after = self._frames(positions)
+        turned = np.einsum("nij,nkj,nk->ni", after, self.before, self.normals)
+        return np.where((self.before == after).all(axis=(1, 2))[:, None], self.normals, turned)
+
+
+def carry_together(
+    parts: Sequence[tuple[FloatArray, FloatArray, IntArray]], frames: Iterable[FloatArray]
+) -> list[FloatArray]:
+    """Normals of several parts of a surface in each frame; where parts meet, equal normals stay equal.
+
+    Args:
+        parts: Arguments of :class:`CarriedNormals` for each.
+        frames: Positions of the points of all parts, one part after the other. *Shape of each:* ``(P, 3)``.
+
+    Returns:
+        *Shape of each:* ``(N, P of the part, 3)``.
+    """
+    normals, positions, triangles = zip(*parts, strict=True)
+    ends = np.cumsum([len(part) for part in normals])
+    shifted = [part + end - len(own) for part, end, own in zip(triangles, ends, normals, strict=True)]
+    carried = CarriedNormals(np.concatenate(normals), np.concatenate(positions), np.concatenate(shifted))
+    return np.split(np.stack([carried.at(x) for x in frames]), ends[:-1], axis=1)
