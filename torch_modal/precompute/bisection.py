@@ -11,6 +11,8 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 UNITS = 256
 """Integer coordinates along the edge of a cube, so that edges can be bisected eight times."""
 _EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+_SECOND_HALF = np.array([(0, 1, 2, 3), (1, 1, 2, 3), (1, 2, 2, 3), (1, 2, 3, 3)])
+"""Corners of the second half by the end of the bisected edge; the midpoint replaces the one at its place."""
 
 
 class BisectedMesh(NamedTuple):
@@ -131,12 +133,8 @@ class _Mesh:
         old, tag = self.tets[index], 3 - self.halvings[index] % 3
         row = np.arange(len(index))
         middle = (old[:, 0] + old[row, tag]) // 2
-        first, second = old.copy(), np.empty_like(old)
-        first[row, tag] = middle
-        for d in (1, 2, 3):
-            own = tag == d
-            second[own] = old[own][:, [*range(1, d + 1), d, *range(d + 1, 4)]]
-        second[row, tag] = middle
+        first, second = old.copy(), np.take_along_axis(old, _SECOND_HALF[tag], axis=1)
+        first[row, tag] = second[row, tag] = middle
         # Barycentric coordinates in the half: the difference of both stays at one end, twice the smaller one goes
         # to the midpoint.
         other = np.full(len(self.tets), -1)
@@ -147,10 +145,9 @@ class _Mesh:
         start, end = shares[:, 0].copy(), shares[at, d].copy()
         near = start >= end
         shares[near, 0] -= end[near]
-        for tag_of in (1, 2, 3):
-            own = ~near & (d == tag_of)
-            shares[own] = shares[own][:, [*range(1, tag_of + 1), tag_of, *range(tag_of + 1, 4)]]
-            shares[own, tag_of - 1] = (end - start)[own]
+        far = ~near
+        shares[far] = np.take_along_axis(shares[far], _SECOND_HALF[d[far]], axis=1)
+        shares[far, d[far] - 1] = (end - start)[far]
         shares[at, d] = 2 * np.minimum(start, end)
         self.shares[moved] = shares
         self.owner[moved] = np.where(near, owner, other[owner])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.sparse import factorize
-from torch_modal.precompute.stiffness import hat_gradients
+from torch_modal.precompute.stiffness import dirichlet_matrix, hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes, tet_volumes
 
 FIT_WEIGHT = 1e4
@@ -77,12 +77,8 @@ class Carrier:
         self._area = areas.sum()
         # |W x - p|² is a mean over the surface, per diagonal squared; the other term a mean over the volume.
         self._pull = sp.diags(FIT_WEIGHT * self._volumes.sum() / extent**2 * areas / areas.sum()) @ weights
-        stiffness = np.einsum("tak,tbk->tab", self._gradients, self._gradients) * self._volumes[:, None, None]
-        rows = np.repeat(tetrahedra.tets, 4, axis=1).reshape(-1)
-        columns = np.tile(tetrahedra.tets, 4).reshape(-1)
-        n = len(tetrahedra.vertices)
-        laplacian = sp.coo_matrix((stiffness.reshape(-1), (rows, columns)), shape=(n, n))
-        self._factors = factorize(laplacian.tocsc() + weights.T @ self._pull)
+        laplacian = dirichlet_matrix(tetrahedra, self._gradients).tocsc()
+        self._factors = factorize(laplacian + weights.T @ self._pull)
 
     def carry(self, points: FloatArray) -> Carried:
         """Deform the tetrahedra to the pose of another key-frame.

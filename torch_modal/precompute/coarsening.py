@@ -52,10 +52,9 @@ class Coarsening:
 
     def restrict(self, x: FloatArray) -> FloatArray:
         """Cluster averages. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
-        lead = x.shape[:-2]
-        columns = np.moveaxis(x.reshape(-1, *x.shape[-2:]), 1, 0).reshape(x.shape[-2], -1)
-        coarse = (self.restriction() @ columns).reshape(self.n_vertices, -1, 3)
-        return np.moveaxis(coarse, 0, 1).reshape(*lead, self.n_vertices, 3)
+        matrix = self.restriction()
+        coarse = np.stack([matrix @ shape for shape in x.reshape(-1, *x.shape[-2:])])
+        return coarse.reshape(*x.shape[:-2], self.n_vertices, 3)
 
 
 class Collapses:
@@ -70,13 +69,6 @@ class Collapses:
         self._poses: dict[int, FloatArray] = {}
         self._known: dict[tuple[int, int], Coarsening] = {}
 
-    def __call__(self, keyframe: int, n_faces: int) -> Coarsening:
-        """The partition by the collapses of one key-frame to a number of faces."""
-        key = keyframe, n_faces
-        if key not in self._known:
-            self._known[key] = _collapse_once(self._poses[keyframe], self.faces, n_faces)
-        return self._known[key]
-
     def of(self, places: Sequence[int], keyframes: FloatArray) -> Callable[[int, int], Coarsening]:
         """A function of local indices of key-frames. The first pose passed for a key-frame is kept.
 
@@ -86,11 +78,14 @@ class Collapses:
         """
         for place, points in zip(places, keyframes, strict=True):
             self._poses.setdefault(place, points)
-        return partial(_renumbered, self, places)
+        return partial(self._at, tuple(places))
 
-
-def _renumbered(collapses: Collapses, chosen: Sequence[int], keyframe: int, n_faces: int) -> Coarsening:
-    return collapses(chosen[keyframe], n_faces)
+    def _at(self, places: tuple[int, ...], keyframe: int, n_faces: int) -> Coarsening:
+        """The partition by the collapses of one key-frame to a number of faces."""
+        key = places[keyframe], n_faces
+        if key not in self._known:
+            self._known[key] = _collapse_once(self._poses[key[0]], self.faces, n_faces)
+        return self._known[key]
 
 
 def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
@@ -114,10 +109,16 @@ def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsen
                 root[members] = members if few else members[_roots(points[members], compact, FACES_OF_PIECE)]
         coarse_faces = _coarse_faces(root, faces)
     # Clusters without faces carry no energy and are removed.
-    used = np.unique(coarse_faces)
-    index = np.full(len(points), -1)
-    index[used] = np.arange(len(used))
+    index = _compact(coarse_faces, len(points))
     return Coarsening(index[root], index[coarse_faces])
+
+
+def _compact(faces: IntArray, n: int) -> IntArray:
+    """Number of each vertex among those that faces use, -1 for the others. *Shape:* ``(n,)``."""
+    used = np.unique(faces)
+    index = np.full(n, -1)
+    index[used] = np.arange(len(used))
+    return index
 
 
 def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
@@ -175,9 +176,7 @@ def coarsen(
     if n_faces < 4:
         raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
     if len(faces) <= n_faces:
-        used = np.unique(faces)
-        index = np.full(keyframes.shape[1], -1)
-        index[used] = np.arange(len(used))
+        index = _compact(faces, keyframes.shape[1])
         return Coarsening(index, index[faces])
     collapses = Collapses(faces).of(range(len(keyframes)), keyframes) if collapses is None else collapses
     found: list[tuple[float, Coarsening]] = []

@@ -74,7 +74,8 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
     extent = np.ptp(tetrahedra.vertices, axis=0)
     below = points if normals is None else points - PUSH * np.linalg.norm(extent) * normals
     closest = closest_tetrahedra(below, tetrahedra)
-    adjacency = _adjacency(tetrahedra)
+    incidence = _incidence(tetrahedra.tets, len(tetrahedra.vertices))
+    adjacency = sp.csr_matrix(incidence.T @ incidence)  # of vertices, with a non-zero diagonal
 
     wanted = min(N_NEIGHBOURS, len(tetrahedra.vertices))
     found = Neighbours(np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64), np.zeros((len(points), N_NEIGHBOURS)))
@@ -130,14 +131,10 @@ def _chunks(indices: IntArray) -> list[IntArray]:
     return np.array_split(indices, max(1, -(-len(indices) // _CHUNK)))
 
 
-def _adjacency(tetrahedra: Tetrahedra) -> sp.csr_matrix:
-    """Adjacency matrix of the vertices with a non-zero diagonal. *Shape:* ``(N, N)``."""
-    n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
-    incidence = sp.csr_matrix(
-        (np.ones(4 * t, dtype=np.int32), tetrahedra.tets.reshape(-1), np.arange(0, 4 * t + 1, 4)),
-        shape=(t, n),
-    )
-    return sp.csr_matrix(incidence.T @ incidence)
+def _incidence(tets: IntArray, n_vertices: int) -> sp.csr_matrix:
+    """Ones at the vertices of each tetrahedron. *Shape:* ``(T, N)``."""
+    ones, starts = np.ones(tets.size, dtype=np.int32), np.arange(0, tets.size + 1, 4)
+    return sp.csr_matrix((ones, tets.reshape(-1), starts), shape=(len(tets), n_vertices))
 
 
 def _nearest_reached(
@@ -145,15 +142,7 @@ def _nearest_reached(
 ) -> tuple[Neighbours, IntArray]:
     """Nearest vertices among those that ``reached`` connects with the closest tetrahedron, and their number."""
     tets, row_of_point = np.unique(closest, return_inverse=True)
-    seeds = sp.csr_matrix(
-        (
-            np.ones(4 * len(tets), dtype=np.int32),
-            tetrahedra.tets[tets].reshape(-1),
-            np.arange(0, 4 * len(tets) + 1, 4),
-        ),
-        shape=(len(tets), len(tetrahedra.vertices)),
-    )
-    around = sp.csr_matrix(seeds @ reached)
+    around = sp.csr_matrix(_incidence(tetrahedra.tets[tets], len(tetrahedra.vertices)) @ reached)
     sizes = np.diff(around.indptr)
     width = max(int(sizes.max()), N_NEIGHBOURS + 1)
     padded = np.full((len(tets), width), -1, dtype=np.int64)

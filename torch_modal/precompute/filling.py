@@ -14,7 +14,7 @@ from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.embedding import Neighbours, find_neighbours, fit_weights
 from torch_modal.precompute.lattice import Lattice
-from torch_modal.precompute.proximity import self_proximity, separation
+from torch_modal.precompute.proximity import self_proximity
 from torch_modal.precompute.stiffness import mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
@@ -32,11 +32,6 @@ MESHERS: dict[str, Callable[[TetrahedraSettings], Mesher]] = {
     "tetwild": TetWild,
 }
 """Constructors of meshers by name."""
-
-MAX_SEPARATION = 0.014
-"""Largest separation of parts in contact at which carrying is tried
-(:func:`~torch_modal.precompute.proximity.separation`). On the samples and five data sets carrying worked up to 0.0105,
-never from 0.0127 on."""
 
 
 @dataclass(frozen=True)
@@ -195,8 +190,3 @@ def _as_arrays(tetrahedra: Tetrahedra) -> dict[str, NDArray[Any]]:
 def meshing_order(surfaces: list[CanonicalSurface]) -> list[int]:
     """Indices of the key-frames by ascending self-proximity."""
     return [int(i) for i in np.argsort([self_proximity(surface) for surface in surfaces], kind="stable")]
-
-
-def separates(rest: CanonicalSurface, posed: CanonicalSurface) -> bool:
-    """Whether parts in contact in one pose separate in another, so that carrying would fail."""
-    return separation(rest, posed) > MAX_SEPARATION

@@ -16,9 +16,8 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import bisected
 from torch_modal.precompute.parallel import closest_in
-from torch_modal.precompute.proximity import Clearance, clearances
-from torch_modal.precompute.sampling import SurfaceSamples, sampled
-from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
+from torch_modal.precompute.proximity import clearances
+from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface, SurfaceSamples, sampled
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
@@ -165,7 +164,7 @@ class Indicator(NamedTuple):
         return found
 
 
-def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Clearance | None = None) -> Tetrahedra:
+def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
     """Fill a surface with a graded lattice of tetrahedra, with the outer vertices moved onto the surface.
 
     Tetrahedra are bisected where the body or a gap is thin. Each has the fraction of its volume that is inside. The
@@ -175,7 +174,6 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Cleara
     Args:
         surface: The surface.
         edge_length_fac: Edge length of the cubes at the surface where nothing is thin, in bounding-box diagonals.
-        clearance: Thickness and gap of the surface, if known.
 
     Raises:
         TetrahedralizationError: The lattice would be too fine.
@@ -188,7 +186,7 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float, clearance: Cleara
             f"a lattice with cubes of {largest:g} % of the diagonal needs {counts.prod()} of them; give a larger "
             "edge_length_fac"
         )
-    thickness, gap = clearance or clearances(surface)
+    thickness, gap = clearances(surface)
     sizes = np.clip(np.minimum(thickness / ACROSS, gap / ACROSS_GAP), SMALLEST * largest, largest)
     samples = sampled(surface, np.minimum(SAMPLES_APART * sizes, (surface.area / FEWEST_SAMPLES) ** 0.5))
     points, wanted = samples.points, sizes[samples.faces]

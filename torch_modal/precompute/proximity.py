@@ -8,8 +8,7 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.precompute.parallel import closest_in
-from torch_modal.precompute.sampling import SurfaceSamples, sampled
-from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface
+from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface, SurfaceSamples, sampled
 
 NEAR = 0.03
 """Largest gap that counts as proximity, in bounding-box diagonals."""
@@ -35,8 +34,15 @@ def self_proximity(surface: CanonicalSurface) -> float:
 
     Tetrahedra fuse parts in contact, so such a pose is a poor rest pose.
     """
-    # Beyond half the gap, the opposing side is nearer than the point itself.
-    return _opposed_part(surface, np.array([1 / 16, 1 / 8, 1 / 4, 1 / 2]) * NEAR * DIAGONAL)
+    step = max(len(surface.points) // SEEN_POINTS, 1)
+    points, normals = surface.points[::step], surface.normals[::step]
+    tree = cKDTree(points)
+    opposed = np.zeros(len(points), dtype=bool)
+    for part in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
+        nearest = closest_in(tree, points + part * NEAR * DIAGONAL * normals)[1]
+        opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
+    areas = vertex_areas(surface.points, surface.faces)[::step]
+    return float(areas[opposed].sum() / areas.sum())
 
 
 def separation(rest: CanonicalSurface, posed: CanonicalSurface) -> float:
@@ -87,19 +93,6 @@ def clearances(surface: CanonicalSurface) -> Clearance:
         np.minimum.at(smallest, samples.faces[seen], 2 * radii)
         found.append(smallest)
     return Clearance(*found)
-
-
-def _opposed_part(surface: CanonicalSurface, distances: FloatArray) -> float:
-    """Fraction of the area whose offset points along the normal are nearest to an opposing side."""
-    step = max(len(surface.points) // SEEN_POINTS, 1)
-    points, normals = surface.points[::step], surface.normals[::step]
-    tree = cKDTree(points)
-    opposed = np.zeros(len(points), dtype=bool)
-    for distance in distances:
-        nearest = closest_in(tree, points + distance * normals)[1]
-        opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
-    areas = vertex_areas(surface.points, surface.faces)[::step]
-    return float(areas[opposed].sum() / areas.sum())
 
 
 def _opposed_radius(samples: SurfaceSamples, side: float, seen: IntArray, most: float) -> FloatArray:

@@ -60,11 +60,27 @@ def mass_matrix(tetrahedra: Tetrahedra) -> sp.csr_matrix:
     The mean of the consistent mass ``∫ h_i h_j``, which overestimates frequencies on coarse tetrahedra, and the lumped
     mass, which underestimates them. Most of both errors cancel. Row sums are the lumped masses.
     """
-    n = len(tetrahedra.vertices)
     # For each tetrahedron: (1 + δ) / 20 if consistent, δ / 4 if lumped.
     entries = solid_volumes(tetrahedra)[:, None, None] * (np.full((4, 4), 1 / 40) + np.eye(4) * (1 / 40 + 1 / 8))
+    return _assembled(entries, tetrahedra).tocsr()
+
+
+def dirichlet_matrix(tetrahedra: Tetrahedra, gradients: FloatArray) -> sp.coo_matrix:
+    """Matrix of ``∫ |∇f|²`` for a scalar at each vertex, entries ``Σ_t vol_t g_i · g_j``. *Shape:* ``(N, N)``.
+
+    Args:
+        tetrahedra: The mesh.
+        gradients: Its :func:`hat_gradients`. *Shape:* ``(T, 4, 3)``.
+    """
+    products = np.einsum("tak,tbk->tab", gradients, gradients)
+    return _assembled(products * solid_volumes(tetrahedra)[:, None, None], tetrahedra)
+
+
+def _assembled(entries: FloatArray, tetrahedra: Tetrahedra) -> sp.coo_matrix:
+    """Entries of pairs of corners at their vertices; duplicates are summed on conversion. *Shape:* ``(T, 4, 4)``."""
+    n = len(tetrahedra.vertices)
     rows, columns = np.repeat(tetrahedra.tets, 4, axis=1), np.tile(tetrahedra.tets, 4)
-    return sp.coo_matrix((entries.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(n, n)).tocsr()
+    return sp.coo_matrix((entries.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(n, n))
 
 
 def hat_gradients(tetrahedra: Tetrahedra) -> FloatArray:
@@ -146,21 +162,12 @@ def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
 
 def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[IntArray, IntArray, FloatArray]:
     """Every edge in both directions with its clamped cotangent weight ``c_ij = -Σ_t vol_t g_i · g_j``."""
-    n = len(tetrahedra.vertices)
-    g = hat_gradients(tetrahedra)
-    stiffness = -np.einsum("tak,tbk->tab", g, g) * solid_volumes(tetrahedra)[:, None, None]
-    rows = np.broadcast_to(tetrahedra.tets[:, :, None], stiffness.shape).reshape(-1)
-    columns = np.broadcast_to(tetrahedra.tets[:, None, :], stiffness.shape).reshape(-1)
-    off_diagonal = rows != columns
-    summed = sp.coo_matrix(
-        (stiffness.reshape(-1)[off_diagonal], (rows[off_diagonal], columns[off_diagonal])), shape=(n, n)
-    ).tocsr()
+    found = dirichlet_matrix(tetrahedra, hat_gradients(tetrahedra))
+    edges = found.row != found.col
+    summed = sp.coo_matrix((-found.data[edges], (found.row[edges], found.col[edges])), shape=found.shape).tocsr()
     summed = ((summed + summed.T) / 2).tocoo()  # equal up to rounding; exactly equal from here on
-    return (
-        summed.row.astype(np.int64),
-        summed.col.astype(np.int64),
-        np.maximum(summed.data, WEIGHT_FLOOR * np.abs(summed.data).mean()),
-    )
+    weights = np.maximum(summed.data, WEIGHT_FLOOR * np.abs(summed.data).mean())
+    return summed.row.astype(np.int64), summed.col.astype(np.int64), weights
 
 
 def _from_blocks(blocks: FloatArray, rows: NDArray, columns: NDArray, n: int) -> sp.csc_matrix:
