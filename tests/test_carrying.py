@@ -202,7 +202,7 @@ def test_what_is_known_to_tear_is_not_carried(monkeypatch: pytest.MonkeyPatch) -
 
     def solve(n_vertices: int, filling: Filling, n_modes: int, *_: object) -> Solved:
         filled.append(filling)
-        return Solved(np.zeros(n_modes), np.zeros((n_modes, n_vertices, 3)), np.zeros(6), filling, 6)
+        return Solved(np.zeros(n_modes), np.zeros((n_modes, n_vertices, 3)), np.zeros(6), 6)
 
     monkeypatch.setattr(solving, "solve", solve)
     monkeypatch.setattr(solving, "meshing_order", lambda surfaces: list(range(len(surfaces))))

@@ -48,9 +48,7 @@ def eigensolvers(name: str, vertices: FloatArray, faces: IntArray) -> None:
 def arpack(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float) -> FloatArray:
     """The lowest eigenvectors by ``eigsh``, with our factors of ``K + shift M``. *Shape:* ``(3N, n_pairs)``."""
     n = k.shape[0]
-    entries = k.tocoo()
-    blocks = (np.ones(entries.nnz), (entries.row // 3, entries.col // 3))
-    vertices, solve = factored(k, sp.csc_matrix(sp.coo_matrix(blocks, shape=(n // 3, n // 3))), mass, shift)
+    vertices, solve = factored(k, mass, shift)
     order = (3 * vertices[:, None] + np.arange(3)).reshape(-1)
     inverse = spla.LinearOperator((n, n), matvec=lambda b: solve(np.ascontiguousarray(b).reshape(-1)), dtype=float)
     vectors = np.empty((n, n_pairs))

@@ -129,10 +129,16 @@ class Filler:
         return _without_unused_pieces(Body(surface, Tetrahedra(**stored)))
 
     def _made(self, surface: CanonicalSurface, inputs: Arrays, key: dict[str, Any]) -> Tetrahedra:
-        """Run the mesher, unless a cached failure shows that it would fail again."""
+        """Run the mesher, unless it failed in an earlier run with at least as long a timeout."""
         key = {name: value for name, value in key.items() if name != "mesher"}
-        if (failure := self.cache.find("failure", inputs, key)) is not None:
-            self._raise_known(failure)
+        failure = self.cache.find("failure", inputs, key)
+        if failure is not None and self.timeout <= (fails_until := float(failure["fails_until"][0])):
+            longer = f"give a timeout of more than {fails_until:g} s, " if np.isfinite(fails_until) else ""
+            raise TetrahedralizationError(
+                f"{failure['reason'].tobytes().decode()}. An earlier run found this for the same surface and settings, "
+                f"and it was not tried again; to try again, {longer}clear the cache in {self.cache.folder} "
+                "(torch-modal cache --clear), or do without it"
+            )
         try:
             return self.mesher.fill(surface, self.timeout, self.stop)
         except TetrahedralizationError as error:
@@ -141,18 +147,6 @@ class Filler:
                 failure = {"reason": reason, "fails_until": np.array([error.fails_until])}
                 self.cache.keep("failure", inputs, key, failure)
             raise
-
-    def _raise_known(self, failure: Arrays) -> None:
-        """Raise a cached failure unless the timeout is longer than in the failed run."""
-        fails_until = float(failure["fails_until"][0])
-        if self.timeout > fails_until:
-            return
-        longer = f"give a timeout of more than {fails_until:g} s, " if np.isfinite(fails_until) else ""
-        raise TetrahedralizationError(
-            f"{failure['reason'].tobytes().decode()}. An earlier run found this for the same surface and settings, and "
-            f"it was not tried again; to try again, {longer}clear the cache in {self.cache.folder} (torch-modal cache "
-            "--clear), or do without it"
-        )
 
     def carried(self, body: Body, surface: CanonicalSurface) -> Filling | None:
         """Carry the tetrahedra to the pose of another key-frame; None if the result is too distorted."""

@@ -45,16 +45,14 @@ def lowest_spans(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, toler
     Raises:
         RuntimeError: Lanczos has not converged.
     """
-    graph = _vertex_graph(k)
-    n_pieces, piece = connected_components(graph, directed=False)
+    n_pieces, piece = connected_components(_vertex_graph(k), directed=False)
     if n_pieces == 1:
-        yield from (vectors for _, vectors in _component_pairs(k, graph, mass, n_pairs, shift, tolerance))
+        yield from (vectors for _, vectors in _component_pairs(k, mass, n_pairs, shift, tolerance))
         return
     owned = [_unknowns(np.flatnonzero(piece == index)) for index in range(n_pieces)]
     rounds = [
         _component_pairs(
             sp.csc_matrix(k[own][:, own]),
-            sp.csc_matrix(graph[own[::3] // 3][:, own[::3] // 3]),
             mass.of_vertices(own[::3] // 3),
             min(n_pairs, len(own)),
             shift,
@@ -83,15 +81,13 @@ def _merged(found: list[Pairs], owned: list[IntArray], n: int, n_pairs: int) -> 
     return whole[:, order]
 
 
-def _component_pairs(
-    k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, tolerance: float
-) -> Iterator[Pairs]:
+def _component_pairs(k: sp.csc_matrix, mass: Mass, n_pairs: int, shift: float, tolerance: float) -> Iterator[Pairs]:
     """Iterates of the eigenvalues, ascending, and eigenvectors of a connected component."""
     n = k.shape[0]
     if n < DENSE_BELOW or 2 * n_pairs > n:
         yield scipy.linalg.eigh(k.toarray(), mass.for_coordinates().toarray(), subset_by_index=(0, n_pairs - 1))
         return
-    vertices, solve = factored(k, graph, mass, shift)
+    vertices, solve = factored(k, mass, shift)
     order = _unknowns(vertices)
     for inverse, vectors in _block_lanczos(solve, mass.of_vertices(vertices), n_pairs, tolerance):
         restored = np.empty_like(vectors)
@@ -99,14 +95,12 @@ def _component_pairs(
         yield 1 / inverse - shift, restored
 
 
-def factored(
-    k: sp.csc_matrix, graph: sp.csc_matrix, mass: Mass, shift: float
-) -> tuple[IntArray, Callable[[FloatArray], FloatArray]]:
+def factored(k: sp.csc_matrix, mass: Mass, shift: float) -> tuple[IntArray, Callable[[FloatArray], FloatArray]]:
     """Elimination order of the vertices, and a solver for ``K + shift M`` in that order, for several columns.
 
     Ordering vertices instead of their three unknowns gives a third less fill.
     """
-    vertices = _elimination_order(graph)
+    vertices = _elimination_order(_vertex_graph(k))
     order = _unknowns(vertices)
     # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
     permuted = k[order][:, order].tocsr().T

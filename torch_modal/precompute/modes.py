@@ -12,7 +12,6 @@ from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_so
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import ENOUGH, N_RIGID
 from torch_modal.precompute.filling import MESHERS, Filler
-from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.precompute.surface import CanonicalSurface
@@ -172,14 +171,8 @@ def bases_of_checked(
             surfaces.append(CanonicalSurface.of(shape, triangles))
 
     with ProgressReport(2 * len(shapes), "vibration modes", progress) as bar:
-
-        def report(index: int, stage: str) -> None:
-            if filler.stop.is_set():
-                raise StoppedError
-            bar.describe(f"key-frame {index + 1}/{len(shapes)}: {stage}")
-
-        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, report, bar.update, meanwhile)
-        solved = work.solve_carried() if carry and len(shapes) > 1 else work.solve_each()
+        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, bar, meanwhile)
+        solved = work.solve(carry)
     _warn_of_pieces(solved)
     return [
         ModalBasis(

@@ -13,13 +13,14 @@ from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
 from torch_modal.io.cache import Cache
 from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, VolumeModes, lowest_modes
-from torch_modal.precompute.filling import Filler, Filling, meshing_order
+from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
 from torch_modal.precompute.following import deforming, larger_pieces
-from torch_modal.precompute.parallel import Budget, run_all
+from torch_modal.precompute.parallel import Budget, StoppedError, run_all
 from torch_modal.precompute.proximity import separation
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, loose_pieces
+from torch_modal.progress import ProgressReport
 
 MAX_SEPARATION = 0.014
 """Largest separation of parts in contact at which carrying is tried
@@ -36,7 +37,6 @@ class Solved(NamedTuple):
         eigenvalues: Ascending. *Shape:* ``(k,)``.
         modes: Displacements of all vertices, zero at unreferenced ones. *Shape:* ``(k, V, 3)``.
         rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
-        filling: The tetrahedra.
         n_zero: Number of zero eigenvalues, including the six rigid ones.
         n_pieces: Number of loose pieces of the tetrahedra, without small ones.
     """
@@ -44,7 +44,6 @@ class Solved(NamedTuple):
     eigenvalues: FloatArray
     modes: FloatArray
     rigid_eigenvalues: FloatArray
-    filling: Filling
     n_zero: int
     n_pieces: int = 1
 
@@ -60,8 +59,7 @@ class KeyframeSet:
         n_modes: Number of elastic modes of each.
         form: Form of the Hessian.
         tolerance: Residual of the modes.
-        report: Called with the index of a key-frame and its next stage.
-        done: Called twice for each key-frame: after meshing and after the modes.
+        bar: Updated twice for each key-frame: after meshing and after the modes.
         meanwhile: Background task, see :func:`~torch_modal.precompute.parallel.run_all`.
     """
 
@@ -71,66 +69,68 @@ class KeyframeSet:
     n_modes: int
     form: HessianForm
     tolerance: float
-    report: Callable[[int, str], None]
-    done: Callable[[], object]
+    bar: ProgressReport
     meanwhile: Callable[[], object] | None = None
     _memory: Budget = field(default_factory=lambda: Budget(VERTICES_AT_ONCE))
 
-    def solve_each(self) -> list[Solved]:
-        """Solve with separate tetrahedra for each key-frame."""
-        return self._all(lambda index: self._solved(index, self._own(index)))
+    def solve(self, carry: bool) -> list[Solved]:
+        """Modes of all key-frames, with separate tetrahedra, or with carried ones where possible.
 
-    def solve_carried(self) -> list[Solved]:
-        """Solve with the tetrahedra of the key-frame of least self-proximity, carried to the others where possible."""
-        first, *others = meshing_order(self.surfaces)
-        rest = self.surfaces[first]
-        # Key-frames with separating contacts are meshed in parallel with the first one.
-        alone = [first, *(index for index in others if separation(rest, self.surfaces[index]) > MAX_SEPARATION)]
-        made = run_all(lambda i: self._own(alone[i]), len(alone), self.filler.stop)
-        own = dict(zip(alone, made, strict=True))
+        Args:
+            carry: Whether the tetrahedra of the key-frame of least self-proximity are carried to the others.
+        """
+        own: dict[int, Filling] = {}
+        if carry and len(self.surfaces) > 1:
+            first, *others = meshing_order(self.surfaces)
+            rest = self.surfaces[first]
+            # Key-frames with separating contacts are meshed in parallel with the first one.
+            alone = [first, *(index for index in others if separation(rest, self.surfaces[index]) > MAX_SEPARATION)]
+            made = run_all(lambda i: self._own(alone[i]), len(alone), self.filler.stop)
+            own = dict(zip(alone, made, strict=True))
 
-        def solve(index: int) -> Solved:
+        def solve_one(index: int) -> Solved:
             if index in own:
                 return self._solved(index, own[index])
-            if (carried := self._carried(own[first], index)) is not None:
+            carried = self._carried(own[first].body, index) if own else None
+            if carried is not None:
                 with contextlib.suppress(ModalAnalysisError):  # too distorted: mesh separately
                     return self._solved(index, carried)
             return self._solved(index, self._own(index, counted=carried is None))
 
-        return self._all(solve)
-
-    def _all(self, solve: Callable[[int], Solved]) -> list[Solved]:
-        return run_all(solve, len(self.surfaces), self.filler.stop, self.meanwhile)
+        return run_all(solve_one, len(self.surfaces), self.filler.stop, self.meanwhile)
 
     def _own(self, index: int, counted: bool = True) -> Filling:
         """Mesh a key-frame; counted as done unless carried tetrahedra were counted before."""
-        surface = self.surfaces[index]
-        with self._naming(index):
-            self.report(index, "tetrahedra")
-            body = self.filler.body(surface)
+        with self._stage(index, "tetrahedra"):
+            body = self.filler.body(self.surfaces[index])
         if counted:
-            self.done()
-        return Filling(body, surface, body.tetrahedra)
+            self.bar.update()
+        return Filling(body, body.surface, body.tetrahedra)
 
-    def _carried(self, other: Filling, index: int) -> Filling | None:
+    def _carried(self, body: Body, index: int) -> Filling | None:
         """Carry tetrahedra to a key-frame; None if the result is too distorted."""
-        with self._naming(index):
-            self.report(index, "carrying tetrahedra")
-            filling = self.filler.carried(other.body, self.surfaces[index])
+        with self._stage(index, "carrying tetrahedra"):
+            filling = self.filler.carried(body, self.surfaces[index])
         if filling is not None:
-            self.done()
+            self.bar.update()
         return filling
 
     def _solved(self, index: int, filling: Filling) -> Solved:
         """The modes of a key-frame."""
-        with self._naming(index), self._memory.part(len(filling.tetrahedra.vertices)):
-            self.report(index, "modes")
+        with self._memory.part(len(filling.tetrahedra.vertices)), self._stage(index, "modes"):
             solved = solve(self.n_vertices, filling, self.n_modes, self.form, self.tolerance, self.filler.cache)
-        self.done()
+        self.bar.update()
         return solved
 
-    def _naming(self, index: int) -> contextlib.AbstractContextManager[None]:
-        return naming_keyframe(index, len(self.surfaces))
+    @contextlib.contextmanager
+    def _stage(self, index: int, what: str) -> Iterator[None]:
+        """Report a stage of a key-frame, unless the work was cancelled; its errors name the key-frame."""
+        n = len(self.surfaces)
+        with naming_keyframe(index, n):
+            if self.filler.stop.is_set():
+                raise StoppedError
+            self.bar.describe(f"key-frame {index + 1}/{n}: {what}")
+            yield
 
 
 @contextlib.contextmanager
@@ -201,7 +201,6 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
         result["eigenvalues"] * surface.scale**2,
         modes,
         result["rigid_eigenvalues"] * surface.scale**2,
-        filling,
         int(result["n_zero"][0]),
         int(result["n_pieces"][0]),
     )
