@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from torch_modal.precompute.eigen import GUARD, N_RIGID, SHIFT, relative_residual
 from torch_modal.precompute.lanczos import factored, lowest_spans
 from torch_modal.precompute.lattice import lattice
-from torch_modal.precompute.mass import Mass
-from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
+from torch_modal.precompute.stiffness import Mass, arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 
 FloatArray = NDArray[np.float64]

@@ -71,11 +71,6 @@ def consistent_winding(mesh: Connectivity) -> Winding:
     return Winding(repaired, np.flatnonzero(flip), np.flatnonzero(non_orientable))
 
 
-def unreferenced_vertices(faces: IntArray, n_vertices: int) -> IntArray:
-    """Unreferenced vertices. *Shape:* ``(·,)``."""
-    return np.flatnonzero(np.bincount(faces.reshape(-1), minlength=n_vertices) == 0)
-
-
 def diagonals(keyframes: FloatArray) -> FloatArray:
     """Bounding-box diagonal of each shape. *Shape:* ``(K, V, 3)`` to ``(K,)``."""
     rows = np.moveaxis(keyframes, 2, 0).copy()  # contiguous: ten times as fast

@@ -191,11 +191,8 @@ def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheConte
     Args:
         cache_dir: The folder, by default :func:`default_cache_dir`.
     """
-    sizes = []
-    for path in _files(cache_dir):
-        with contextlib.suppress(FileNotFoundError):  # another process may be clearing
-            sizes.append(path.stat().st_size)
-    return CacheContent(len(sizes), sum(sizes))
+    entries = _entries(cache_dir)
+    return CacheContent(len(entries), sum(entry.size for entry in entries))
 
 
 def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
@@ -212,7 +209,7 @@ def clear_cache(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent
     Raises:
         OSError: An entry cannot be removed.
     """
-    return _remove(_files(cache_dir))
+    return _remove(_entries(cache_dir))
 
 
 def shrink_cache(limit: int, cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
@@ -228,55 +225,60 @@ def shrink_cache(limit: int, cache_dir: str | os.PathLike[str] | None = None) ->
     Raises:
         OSError: An entry cannot be removed.
     """
-    return _remove(_oldest(_files(cache_dir), limit))
+    return _remove(_oldest(_entries(cache_dir), limit))
+
+
+class _Entry(NamedTuple):
+    used: int
+    """Time of the last use, in nanoseconds."""
+    size: int
+    path: Path
+
+
+def _entries(cache_dir: str | os.PathLike[str] | None) -> list[_Entry]:
+    """Entries and partial ones, known by their names; a user's own files may lie beside them. The oldest come first."""
+    folder = default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser()
+    found = []
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if _OWN_NAME.fullmatch(path.name):
+            with contextlib.suppress(FileNotFoundError):  # another process may be clearing
+                status = path.stat()
+                found.append(_Entry(status.st_mtime_ns, status.st_size, path))
+    return sorted(found)
 
 
 def _make_room(folder: Path, limit: int, newest: Path) -> None:
     """Remove the oldest entries if all together are too large; the newest stays in any case."""
-    others = [path for path in _files(folder) if path != newest]
-    with contextlib.suppress(FileNotFoundError):  # another process has made room already
-        size = newest.stat().st_size
-        if _oldest(others, limit - size):
-            for path in _oldest(others, int(KEPT_PART * limit) - size):
-                with contextlib.suppress(OSError):  # another process removed it, or has it open
-                    path.unlink()
+    entries = _entries(folder)
+    others = [entry for entry in entries if entry.path != newest]
+    size = sum(entry.size for entry in entries if entry.path == newest)
+    if _oldest(others, limit - size):
+        for entry in _oldest(others, int(KEPT_PART * limit) - size):
+            with contextlib.suppress(OSError):  # another process removed it, or has it open
+                entry.path.unlink()
 
 
-def _oldest(files: list[Path], limit: int) -> list[Path]:
-    """Which files to remove so that the rest takes no more than a limit: those not used for the longest."""
-    used = []
-    for path in files:
-        with contextlib.suppress(FileNotFoundError):
-            status = path.stat()
-            used.append((status.st_mtime_ns, status.st_size, path))
-    now, total, chosen = time.time(), sum(size for _, size, _ in used), []
-    for moment, size, path in sorted(used):
-        if path.suffix != SUFFIX and now - moment / 1e9 < ABANDONED:
+def _oldest(entries: list[_Entry], limit: int) -> list[_Entry]:
+    """Which entries to remove so that the rest takes no more than a limit: those not used for the longest."""
+    now, total, chosen = time.time(), sum(entry.size for entry in entries), []
+    for entry in entries:
+        if entry.path.suffix != SUFFIX and now - entry.used / 1e9 < ABANDONED:
             continue  # another process is writing it
         if total <= limit:
             break
-        chosen.append(path)
-        total -= size
+        chosen.append(entry)
+        total -= entry.size
     return chosen
 
 
-def _remove(files: list[Path]) -> CacheContent:
-    """Remove files; returns how many there were."""
+def _remove(entries: list[_Entry]) -> CacheContent:
+    """Remove entries; returns how many there were."""
     sizes = []
-    for path in files:
+    for entry in entries:
         with contextlib.suppress(FileNotFoundError):
-            size = path.stat().st_size
-            path.unlink()
-            sizes.append(size)
+            entry.path.unlink()
+            sizes.append(entry.size)
     return CacheContent(len(sizes), sum(sizes))
-
-
-def _files(cache_dir: str | os.PathLike[str] | None) -> list[Path]:
-    """Entries and partial ones, known by their names; a user's own files may lie beside them."""
-    folder = default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser()
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if _OWN_NAME.fullmatch(path.name))
 
 
 def content_key(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:

@@ -106,23 +106,26 @@ class Document:
         if not 0 <= count * width < LARGEST_ACCESSOR:
             raise ValueError(f"an accessor of {count} elements")
         if "bufferView" in accessor:
-            view = self.get("bufferViews", accessor["bufferView"])
-            stride = view.get("byteStride") or dtype.itemsize * width
-            offset = accessor.get("byteOffset", 0)
-            array = _strided(self.view(accessor["bufferView"]), dtype, count, width, offset, stride)
+            stride = self.get("bufferViews", accessor["bufferView"]).get("byteStride")
+            array = self._rows(accessor, dtype, count, width, stride)
         else:
             array = np.zeros((count, width), dtype)
         if "sparse" in accessor:
-            sparse = accessor["sparse"]
-            rows, values = sparse["indices"], sparse["values"]
-            kind = np.dtype(COMPONENTS[rows["componentType"]])
-            n = sparse["count"]
-            at = _strided(self.view(rows["bufferView"]), kind, n, 1, rows.get("byteOffset", 0), kind.itemsize)
-            size = dtype.itemsize * width
-            new = _strided(self.view(values["bufferView"]), dtype, n, width, values.get("byteOffset", 0), size)
+            n, indices, values = (accessor["sparse"][key] for key in ("count", "indices", "values"))
+            at = self._rows(indices, np.dtype(COMPONENTS[indices["componentType"]]), n, 1)
             array = array.copy()
-            array[at[:, 0]] = new
+            array[at[:, 0]] = self._rows(values, dtype, n, width)
         return array
+
+    def _rows(self, place: Json, dtype: np.dtype, count: int, width: int, stride: int | None = None) -> NDArray[Any]:
+        """Numbers in a buffer view. *Shape:* ``(count, width)``."""
+        data, offset, size = self.view(place["bufferView"]), place.get("byteOffset", 0), dtype.itemsize * width
+        stride = stride or size
+        if offset < 0 or stride < size:
+            raise ValueError("an accessor with a wrong offset or stride")
+        if count and offset + (count - 1) * stride + size > len(data):
+            raise ValueError("a buffer view is too short")
+        return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
 
     def floats(self, index: int) -> FloatArray:
         """The numbers of an accessor; normalised integers as fractions. *Shape:* ``(count, width)``."""
@@ -200,14 +203,6 @@ def _index(number: Any) -> int:
     if not isinstance(number, int) or number < 0:
         raise ValueError(f"an index {number!r}")
     return number
-
-
-def _strided(data: bytes, dtype: np.dtype, count: int, width: int, offset: int, stride: int) -> NDArray[Any]:
-    if offset < 0 or stride < dtype.itemsize * width:
-        raise ValueError("an accessor with a wrong offset or stride")
-    if count and offset + (count - 1) * stride + dtype.itemsize * width > len(data):
-        raise ValueError("a buffer view is too short")
-    return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
 
 
 def world_transforms(document: Document) -> dict[int, FloatArray]:

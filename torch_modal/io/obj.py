@@ -9,8 +9,7 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Material, Part, Polygons
-from torch_modal.io.colors import linear
+from torch_modal.io.asset import Asset, Material, Part, Polygons, linear
 from torch_modal.io.mtl import Libraries, read_libraries
 from torch_modal.io.normals import CarriedNormals
 
@@ -208,6 +207,7 @@ class ObjAsset(Asset):
     def parts(self) -> list[Part]:
         """One part for each material that faces use."""
         materials = self._materials_read.materials
+        colors = linear(np.array(self._colors)) if self._has_colors else None
         found = []
         for number in np.unique(self._material_of):
             corners = self._corners[self._triangles[self._material_of == number]].reshape(-1, 3)
@@ -215,7 +215,6 @@ class ObjAsset(Asset):
             vertices, texcoords, normals = points.T
             name = self._materials[number] if number >= 0 else ""
             material = materials.get(name) or (Material(name) if name else Material())
-            colors = self._linear_colors()
             if colors is not None and name not in materials:
                 material = material._replace(color=(1.0, 1.0, 1.0, 1.0))
             found.append(
@@ -229,6 +228,3 @@ class ObjAsset(Asset):
                 )
             )
         return found
-
-    def _linear_colors(self) -> FloatArray | None:
-        return linear(np.array(self._colors)) if self._has_colors else None

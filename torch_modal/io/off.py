@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from torch_modal.arrays import FloatArray
-from torch_modal.io.asset import Asset, Material, Part
-from torch_modal.io.bare_mesh import off_bytes
-from torch_modal.io.colors import linear
-from torch_modal.io.trimesh_reader import read_triangles
+from torch_modal.io.asset import Asset, Material, Part, linear
+from torch_modal.io.bare_mesh import off_bytes, read_triangles
 
 
 class OffAsset(Asset):

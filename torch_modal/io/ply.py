@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray
-from torch_modal.io.asset import Asset, Material, Part
-from torch_modal.io.colors import linear
+from torch_modal.io.asset import Asset, Material, Part, linear
+from torch_modal.io.bare_mesh import read_triangles
 from torch_modal.io.mtl import as_image
 from torch_modal.io.normals import CarriedNormals
-from torch_modal.io.trimesh_reader import read_triangles
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
 _TYPES |= {"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}

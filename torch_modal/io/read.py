@@ -105,16 +105,14 @@ def require_same_mesh(
     rows = np.sort(np.concatenate([faces, other_faces]), axis=1)
     _, ids = np.unique(rows, axis=0, return_inverse=True)
     mine, its = np.split(ids.reshape(-1), 2)
-    strange = np.flatnonzero(~np.isin(its, mine))
-    missing = np.flatnonzero(~np.isin(mine, its))
+    strange, missing = (np.flatnonzero(~np.isin(some, others)) for some, others in ((its, mine), (mine, its)))
     if len(strange) or len(missing):
-        # Equal numbers of faces: where something is strange or missing, its first place is shown.
-        where = (
-            f"face {strange[0]} of {other}, vertices {other_faces[strange[0]].tolist()}, is not in {first}"
-            if len(strange)
-            else f"face {missing[0]} of {first}, vertices {faces[missing[0]].tolist()}, is not in {other}"
+        # Of equally many faces, some may be strange, or missing, or both.
+        file, rows, found, whole = (
+            (other, other_faces, strange, first) if len(strange) else (first, faces, missing, other)
         )
         raise MeshError(
-            f"{where} ({max(len(strange), len(missing))} of {len(faces)} faces differ); {hint}; polygons "
+            f"face {found[0]} of {file}, vertices {rows[found[0]].tolist()}, is not in {whole} "
+            f"({max(len(strange), len(missing))} of {len(faces)} faces differ); {hint}; polygons "
             "that start at another corner are cut along another diagonal, so export triangles"
         )

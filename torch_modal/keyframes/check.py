@@ -261,7 +261,7 @@ def _check_surface(
             f"{len(overfull)} edges join three or more faces (non-manifold): they resist stretching but not "
             f"bending; the first is edge {overfull[0].tolist()}"
         )
-    loose = inspect.unreferenced_vertices(faces, mesh.n_vertices)
+    loose = np.setdiff1d(np.arange(mesh.n_vertices), mesh.used)
     if len(loose):
         note(
             f"{len(loose)} vertices belong to no face: they follow the interpolation of the key-frames; the "

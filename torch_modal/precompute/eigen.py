@@ -8,8 +8,8 @@ import scipy.sparse as sp
 
 from torch_modal.arrays import FloatArray
 from torch_modal.precompute.lanczos import lowest_spans
-from torch_modal.precompute.mass import Mass
 from torch_modal.precompute.parallel import one_blas_thread
+from torch_modal.precompute.stiffness import Mass
 
 N_RIGID = 6
 GUARD = 4

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
-from torch_modal.precompute.mass import Mass
+from torch_modal.precompute.stiffness import Mass
 
 Pairs = tuple[FloatArray, FloatArray]
 """Eigenvalues ``(k,)`` and eigenvectors ``(n, k)``."""
