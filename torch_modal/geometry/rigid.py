@@ -1,11 +1,11 @@
 """Rigid motions between shapes: best fit, and the geodesic along which they are interpolated."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import applied, traced
+from torch_modal.autograd import traced, transformed
 from torch_modal.geometry.rotations import exp, log
 
 
@@ -50,8 +50,8 @@ def best_rotation(covariance: Tensor) -> Tensor:
     """The rotation ``R`` that maximises ``tr(R^T A)``, differentiable to second order.
 
     The value comes from the singular value decomposition. Its derivative divides by differences of singular values and
-    fails on symmetric shapes, where the rotation itself is smooth. The first derivative is therefore explicit; higher
-    ones come from two Newton steps at the solution, each of which makes them exact to a higher order.
+    fails on symmetric shapes, where the rotation itself is smooth. Derivatives come instead from two Newton steps at
+    the solution, each of which makes them exact to a higher order.
 
     Args:
         covariance: ``A = sum_v w_v y_v x_v^T``. *Shape:* ``(..., 3, 3)``.
@@ -59,22 +59,12 @@ def best_rotation(covariance: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(..., 3, 3)``, determinant one.
     """
-    if traced(covariance):
-        rotation = _by_singular_values(covariance)
-        return _polished(covariance, rotation) if torch.is_grad_enabled() else rotation
-    return applied(_BestRotation, covariance)  # type: ignore[no-any-return]
-
-
-def _by_singular_values(covariance: Tensor) -> Tensor:
-    """The rotation without derivatives. *Shape:* ``(..., 3, 3)``."""
     u, _, vh = torch.linalg.svd(covariance.detach())
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)
-    return (u * sign[..., None, :]) @ vh
-
-
-def _polished(covariance: Tensor, rotation: Tensor) -> Tensor:
-    """The rotation with derivatives, by Newton steps. *Shape:* ``(..., 3, 3)``."""
+    rotation = (u * sign[..., None, :]) @ vh
+    if not torch.is_grad_enabled() and (traced(covariance) or not transformed(covariance)):
+        return rotation
     for _ in range(2):
         p = rotation.mT @ covariance
         # Never singular: `solve_ex` avoids a synchronisation of the GPU.
@@ -95,50 +85,6 @@ def _stiffness(p: Tensor) -> Tensor:
     # Collinear, collapsed or inverted shapes leave a rotation undetermined: a floor above rounding fixes it.
     floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, 64 * torch.finfo(p.dtype).eps * trace.abs(), 1)
     return trace * eye - 0.5 * (p + p.mT) + floor.detach() * eye
-
-
-def _skew(v: Tensor) -> Tensor:
-    """*Shape:* ``(..., 3) -> (..., 3, 3)``."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-
-
-def _turned_on(rotation: Tensor, covariance: Tensor, change: Tensor) -> Tensor:
-    """The self-adjoint derivative: a change of ``A`` turns ``R`` by ``w`` with ``stiffness w = torque``."""
-    back = rotation.mT
-    return rotation @ _skew(torch.linalg.solve_ex(_stiffness(back @ covariance), _torque(back @ change)).result)
-
-
-class _BestRotation(torch.autograd.Function):
-    """Rotation by singular values with an explicit first derivative."""
-
-    @staticmethod
-    def forward(covariance: Tensor) -> Tensor:
-        return _by_singular_values(covariance)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs, output)
-        ctx.save_for_forward(*inputs, output)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        covariance, rotation = ctx.saved_tensors
-        if torch.is_grad_enabled():  # gradients of gradients
-            (found,) = torch.func.vjp(lambda a: _polished(a, rotation.detach()), covariance)[1](grads[0])
-            return found  # type: ignore[no-any-return]
-        with torch.autocast(rotation.device.type, enabled=False):  # backward may be called within autocast
-            return _turned_on(rotation, covariance, grads[0])
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor) -> Tensor:
-        covariance, rotation = ctx.saved_tensors
-        return _turned_on(rotation, covariance, tangents[0])
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int], covariance: Tensor) -> tuple[Tensor, int]:
-        return _BestRotation.apply(covariance.movedim(in_dims[0], 0)), 0
 
 
 def best_fit(x: Tensor, y: Tensor, weights: Tensor) -> RigidMotion:

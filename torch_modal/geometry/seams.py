@@ -1,18 +1,16 @@
 """Seams: where files for rendering hold a vertex several times, once for each texture coordinate or normal."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-
-IntArray = NDArray[np.int64]
 
 TOLERANCE = 1e-7
 """Part of the bounding-box diagonal: the rounding of float32 and of text with seven digits."""
 
 
-def merge_seams(shapes: NDArray[np.float64], faces: IntArray) -> IntArray:
+def merge_seams(shapes: FloatArray, faces: IntArray) -> IntArray:
     """Which vertices are one, because the surface was cut there.
 
     Two vertices are one if both lie on a boundary and are at the same place in every shape. Surfaces that merely touch

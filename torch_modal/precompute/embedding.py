@@ -12,9 +12,8 @@ from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
 N_NEIGHBOURS = 12
-RINGS = 2
-"""Vertex rings around the closest tetrahedron from which neighbours are taken."""
 MAX_RINGS = 6
+"""Vertex rings around the closest tetrahedron from which neighbours are taken: two, and more up to this if needed."""
 PUSH = 0.005
 """Inward offset of points for the search of the closest tetrahedron, in bounding-box diagonals: above the tolerance
 of the mesher (0.004), below the thickness of a limb."""
@@ -80,12 +79,9 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
     wanted = min(N_NEIGHBOURS, len(tetrahedra.vertices))
     found = Neighbours(np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64), np.zeros((len(points), N_NEIGHBOURS)))
     left = np.arange(len(points))
-    reached: sp.csr_matrix | None = None
-    for rings in range(MAX_RINGS + 1):
-        if rings > 0:
-            reached = adjacency if reached is None else sp.csr_matrix(reached @ adjacency)
-        if rings < RINGS or reached is None:
-            continue
+    reached = adjacency
+    for rings in range(2, MAX_RINGS + 1):
+        reached = sp.csr_matrix(reached @ adjacency)
         last = rings == MAX_RINGS
         retry = []
         for chunk in _chunks(left):

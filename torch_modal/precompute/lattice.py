@@ -219,13 +219,6 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
     return _fitted(without_debris(filled), indicator)
 
 
-def _sizes_at_vertices(tetrahedra: Tetrahedra) -> FloatArray:
-    """Edge length of the cube with six times the volume of the smallest incident tetrahedron. *Shape:* ``(N,)``."""
-    sizes = np.full(len(tetrahedra.vertices), np.inf)
-    np.minimum.at(sizes, tetrahedra.tets.reshape(-1), np.repeat(np.cbrt(6 * tet_volumes(tetrahedra)), 4))
-    return sizes
-
-
 def is_too_fine(surface: CanonicalSurface, edge_length_fac: float) -> bool:
     """Whether a lattice would have too many root cubes."""
     return bool(_box(surface, ROOT * edge_length_fac * DIAGONAL)[1].prod() > MOST_CUBES)
@@ -243,7 +236,10 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     If the fit splits the mesh, loses volume or uncovers the surface, the tetrahedra stay as they were.
     """
     samples = indicator.samples
-    volumes, sizes = tet_volumes(filled), _sizes_at_vertices(filled)
+    volumes = tet_volumes(filled)
+    # At each vertex the edge length of the cube with six times the volume of the smallest incident tetrahedron.
+    sizes = np.full(len(filled.vertices), np.inf)
+    np.minimum.at(sizes, filled.tets.reshape(-1), np.repeat(np.cbrt(6 * volumes), 4))
     rim = np.unique(filled.tets[np.asarray(filled.inside) < 1 - LEAST_INSIDE])
     distance, nearest = closest_in(samples.tree, filled.vertices[rim])
     near = distance < REACH * sizes[rim]

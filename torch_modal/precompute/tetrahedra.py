@@ -34,12 +34,15 @@ class Tetrahedra(NamedTuple):
 class TetrahedralizationError(RuntimeError):
     """The mesher failed; the message names the mesh, the reason and a remedy.
 
-    Attributes:
+    Args:
+        message: The message.
         fails_until: Timeout in seconds up to which the same call fails again: infinity if the surface is the cause,
             zero if another attempt may succeed.
     """
 
-    fails_until: float = 0.0
+    def __init__(self, message: str, fails_until: float = 0.0) -> None:
+        super().__init__(message)
+        self.fails_until = fails_until
 
 
 class Mesher(Protocol):

@@ -11,7 +11,7 @@ import zipfile
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -146,26 +146,16 @@ def tetrahedralize(
     scale = DIAGONAL / np.linalg.norm(surface.max(axis=0) - surface.min(axis=0))
     surface = (surface - center) * scale
 
-    failure = _Failure(len(vertices), len(faces))
     compact = outward(surface, compact.reshape(-1, 3))
     settings = replace(settings, edge_length_fac=settings.edge_length(surface, compact))
-    raw = _run_worker(surface, compact, settings, timeout, stop or threading.Event(), failure)
-    tetrahedra = without_debris(oriented(raw))
-    _check_fills(tetrahedra, surface, settings, failure)
+    try:
+        raw = _run_worker(surface, compact, settings, timeout, stop or threading.Event())
+        tetrahedra = without_debris(oriented(raw))
+        _check_fills(tetrahedra, surface, settings)
+    except TetrahedralizationError as error:
+        mesh = f"a mesh of {len(vertices)} vertices and {len(faces)} faces"
+        raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.fails_until) from error
     return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
-
-
-class _Failure(NamedTuple):
-    """The mesh in error messages."""
-
-    n_vertices: int
-    n_faces: int
-
-    def error(self, why: str, advice: str, fails_until: float = np.inf) -> TetrahedralizationError:
-        mesh = f"a mesh of {self.n_vertices} vertices and {self.n_faces} faces"
-        error = TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {why}. {advice}")
-        error.fails_until = fails_until
-        return error
 
 
 def _run_worker(
@@ -174,12 +164,11 @@ def _run_worker(
     settings: TetrahedraSettings,
     timeout: float,
     stop: threading.Event,
-    failure: _Failure,
 ) -> Tetrahedra:
     """Run the worker process on the surface and read its result."""
     if not sys.executable:
-        raise failure.error(
-            "sys.executable is empty, so no worker process can be started", "Run in a normal interpreter", 0.0
+        raise TetrahedralizationError(
+            "sys.executable is empty, so no worker process can be started. Run in a normal interpreter"
         )
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
         job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
@@ -201,15 +190,15 @@ def _run_worker(
         finally:
             end_process(process)  # also on KeyboardInterrupt
         if code is None:
-            raise failure.error(
-                f"no result after the timeout of {timeout:g} s",
+            raise TetrahedralizationError(
+                f"no result after the timeout of {timeout:g} s. "
                 "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections",
                 timeout,
             )
         if code != 0:
             tail = last_line(log.read_text(errors="replace"))
-            raise failure.error(
-                f"the worker process ended with {describe_exit(code)}" + (f" ({tail})" if tail else ""),
+            raise TetrahedralizationError(
+                f"the worker process ended with {describe_exit(code)}{f' ({tail})' if tail else ''}. "
                 "Check the surface for self-intersections and degenerate faces, or try other settings",
                 np.inf if code in _OWN_FAILURES else 0.0,
             )
@@ -217,7 +206,7 @@ def _run_worker(
             with np.load(result) as arrays:
                 return Tetrahedra(arrays["vertices"], arrays["tets"])
         except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise failure.error(f"the worker process left no readable result ({error})", "Try again", 0.0) from error
+            raise TetrahedralizationError(f"the worker process left no readable result ({error}). Try again") from error
 
 
 def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Event) -> int | None:
@@ -236,25 +225,26 @@ def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Even
                 return None
 
 
-def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: TetrahedraSettings, failure: _Failure) -> None:
+def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: TetrahedraSettings) -> None:
     """Reject a mesh that is empty, not finite, or does not cover the surface (diagonal 100)."""
     advice = (
         "Check that the surface is closed, its winding consistent, and no part thinner than "
         f"{100 * settings.epsilon:g} % of the diagonal, or give a smaller epsilon"
     )
     if len(tetrahedra.tets) == 0:
-        raise failure.error("the result is empty", advice)
+        raise TetrahedralizationError(f"the result is empty. {advice}", np.inf)
     if not np.isfinite(tetrahedra.vertices).all():
-        raise failure.error("the result has coordinates that are not finite", advice)
+        raise TetrahedralizationError(f"the result has coordinates that are not finite. {advice}", np.inf)
     # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
     reach = DIAGONAL * (0.05 + 2 * (settings.edge_length_fac or EDGE_RANGE[1]))
     distance = cKDTree(tetrahedra.vertices).query(surface)[0]
     n_far = int((distance > reach).sum())
     if n_far:
-        raise failure.error(
-            f"{n_far} of its vertices are further than {reach:g} % of the diagonal from the result",
-            advice + ", or raise max_surface_faces if small parts were lost in the decimation",
+        raise TetrahedralizationError(
+            f"{n_far} of its vertices are further than {reach:g} % of the diagonal from the result. {advice}, or raise "
+            "max_surface_faces if small parts were lost in the decimation",
+            np.inf,
         )
     low, high = surface.min(axis=0) - reach, surface.max(axis=0) + reach
     if (tetrahedra.vertices < low).any() or (tetrahedra.vertices > high).any():
-        raise failure.error("the result reaches far beyond the surface", advice)
+        raise TetrahedralizationError(f"the result reaches far beyond the surface. {advice}", np.inf)
