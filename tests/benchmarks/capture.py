@@ -124,7 +124,7 @@ class Judge:
 
 def solid_modes(tetrahedra: Tetrahedra, form: HessianForm = "edge", lumped: bool = False) -> FloatArray:
     """The lowest modes, as the package computes them by default."""
-    mass = lumped_mass(tetrahedra) if lumped else mass_matrix(tetrahedra)
+    mass = sp.diags(lumped_mass(tetrahedra)) if lumped else mass_matrix(tetrahedra)
     return lowest_modes(arap_hessian(tetrahedra, form), mass, tetrahedra.vertices, N_MODES).modes
 
 

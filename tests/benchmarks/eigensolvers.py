@@ -27,7 +27,7 @@ def eigensolvers(name: str, vertices: FloatArray, faces: IntArray) -> None:
     surface = CanonicalSurface.of(vertices, faces)
     for cell in CELLS:
         solid = lattice(surface, cell)
-        k, mass = arap_hessian(solid), Mass.of(mass_matrix(solid))
+        k, mass = arap_hessian(solid), Mass(mass_matrix(solid))
         shift = SHIFT / float((np.ptp(solid.vertices, axis=0) ** 2).sum())
         for n_modes in MODES:
             n_pairs = n_modes + N_RIGID + GUARD

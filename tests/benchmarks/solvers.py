@@ -120,7 +120,7 @@ def main(name: str, job: str) -> None:
     k, mass = arap_hessian(solid), mass_matrix(solid)
     if name != "superlu":
         factored = OTHERS[name]
-        lanczos.factored = lambda k, graph, mass, shift: (  # type: ignore[attr-defined]
+        lanczos.factored = lambda k, mass, shift: (  # type: ignore[attr-defined]
             np.arange(mass.matrix.shape[0]),
             factored(sp.csc_matrix(k + shift * mass.for_coordinates())),
         )

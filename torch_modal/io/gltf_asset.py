@@ -24,8 +24,6 @@ class _Primitive(NamedTuple):
     """Triangles of one node."""
 
     node: int
-    place: int
-    """Which of the mesh's primitives it is."""
     json: Json
     points: slice
     """Its vertices among those of the asset; primitives that share them are alike here."""
@@ -71,7 +69,7 @@ class GltfAsset(Asset):
             posed += "skin" in node_json
             mirrored = np.linalg.det(world[:3, :3]) < 0
             shared: dict[int, slice] = {}
-            for place, primitive in enumerate(self.document.get("meshes", node_json["mesh"])["primitives"]):
+            for primitive in self.document.get("meshes", node_json["mesh"])["primitives"]:
                 attributes = primitive.get("attributes", {})
                 if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in attributes:
                     self.carries["groups"] = "lines and points"
@@ -86,7 +84,7 @@ class GltfAsset(Asset):
                 triangles = self._triangles(primitive, points.stop - points.start)
                 # A mirroring transform turns the winding over.
                 faces.append((triangles[:, ::-1] if mirrored else triangles) + points.start)
-                self._primitives.append(_Primitive(node, place, primitive, points, triangles))
+                self._primitives.append(_Primitive(node, primitive, points, triangles))
         self.positions = np.concatenate(positions)
         self.faces = np.concatenate(faces)
         names = {name for primitive in self._primitives for name in primitive.json["attributes"]}
@@ -183,7 +181,7 @@ class GltfAsset(Asset):
             mesh["primitives"] = []
             inverse = self._inverse(node)
             normals = self._normals(mine, inverse, frames)
-            for primitive in mine:
+            for primitive, own_normals in zip(mine, normals, strict=True):
                 attributes = primitive.json["attributes"]
                 copied: Json = {"attributes": {}}
                 for key in ("material", "mode", "extras"):
@@ -195,23 +193,24 @@ class GltfAsset(Asset):
                 if "indices" in primitive.json:
                     copied["indices"] = self._take(document, primitive.json["indices"], ELEMENT_ARRAY_BUFFER, taken)
                 mesh["primitives"].append(copied)
-                drawn.append(Drawn(copied, primitive.points, inverse, normals.get(primitive.place)))
+                drawn.append(Drawn(copied, primitive.points, inverse, own_normals))
             node_json["mesh"] = document.append("meshes", mesh)
             nodes.append(node)
         return document, drawn, nodes
 
     def _normals(
         self, primitives: Sequence[_Primitive], inverse: FloatArray, frames: FloatArray
-    ) -> dict[int, FloatArray]:
-        """Normals of a node's primitives in each frame, by the primitives' places. *Shape of each:* ``(N, P, 3)``."""
+    ) -> list[FloatArray | None]:
+        """Normals of a node's primitives in each frame, None for those without. *Shape of each:* ``(N, P, 3)``."""
         own = [p for p in primitives if "NORMAL" in p.json["attributes"]]
         if not own:
-            return {}
+            return [None] * len(primitives)
         read = [[self.document.floats(p.json["attributes"][name]) for name in ("NORMAL", "POSITION")] for p in own]
         points = np.concatenate([np.arange(p.points.start, p.points.stop) for p in own])
         local = [shape[points] @ inverse[:3, :3].T + inverse[:3, 3] for shape in frames]
         parts = [(normals, positions, p.triangles) for (normals, positions), p in zip(read, own, strict=True)]
-        return dict(zip([p.place for p in own], carry_together(parts, local), strict=True))
+        turned = iter(carry_together(parts, local))
+        return [next(turned) if "NORMAL" in p.json["attributes"] else None for p in primitives]
 
     def _take(self, document: Document, accessor: int, target: int, taken: dict[int, int]) -> int:
         """Copy an accessor as it is; its number in the copy."""

@@ -76,7 +76,7 @@ def rigid_motions(positions: FloatArray, mass: Mass) -> FloatArray:
 @one_blas_thread()
 def lowest_modes(
     k: sp.csc_matrix,
-    mass: FloatArray | sp.spmatrix,
+    mass: sp.spmatrix,
     positions: FloatArray,
     n_modes: int,
     tolerance: float = EXACT,
@@ -90,7 +90,7 @@ def lowest_modes(
 
     Args:
         k: Stiffness, symmetric positive semi-definite. *Shape:* ``(3N, 3N)``.
-        mass: Mass of each vertex, positive, or a mass matrix for vertices. *Shape:* ``(N,)`` or ``(N, N)``.
+        mass: Mass matrix, entries for vertices. *Shape:* ``(N, N)``.
         positions: Rest positions. *Shape:* ``(N, 3)``.
         n_modes: Number of elastic modes.
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` at which Lanczos ends.
@@ -109,7 +109,7 @@ def lowest_modes(
             f"{n_modes} modes requested, but {len(positions)} tetrahedral vertices have {possible} elastic modes; "
             f"give 1 to {possible}"
         )
-    inertia = Mass.of(mass)
+    inertia = Mass(sp.csr_matrix(mass))
     if not (has_mass := inertia.lumped() > 0).all():
         raise ModalAnalysisError(f"{int((~has_mass).sum())} vertices have no mass; remove unused vertices first")
     n_pairs = min(n_modes + N_RIGID + GUARD, k.shape[0])

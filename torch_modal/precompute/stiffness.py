@@ -77,13 +77,6 @@ class Mass:
 
     matrix: sp.csr_matrix
 
-    @classmethod
-    def of(cls, mass: "FloatArray | sp.spmatrix | Mass") -> "Mass":
-        """From vertex masses ``(N,)`` or a matrix ``(N, N)``."""
-        if isinstance(mass, Mass):
-            return mass
-        return cls(sp.csr_matrix(mass if sp.issparse(mass) else sp.diags(mass)))
-
     def lumped(self) -> FloatArray:
         """Row sums: the mass of each vertex. *Shape:* ``(N,)``."""
         return np.asarray(self.matrix.sum(axis=1)).reshape(-1)
