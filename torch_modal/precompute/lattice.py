@@ -22,6 +22,7 @@ from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
     face_connected_pieces,
+    kept_tetrahedra,
     solid_volumes,
     tet_volumes,
     without_debris,
@@ -214,8 +215,7 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
     kept = inside >= LEAST_INSIDE
     kept[mesh.owner] = True
     kept = _bridged(mesh.tets, kept, np.ones(len(kept), dtype=bool))
-    used, compact = np.unique(mesh.tets[kept], return_inverse=True)
-    filled = Tetrahedra(vertices[used], compact.reshape(-1, 4), np.maximum(inside[kept], LEAST_INSIDE))
+    filled = kept_tetrahedra(Tetrahedra(vertices, mesh.tets, np.maximum(inside, LEAST_INSIDE)), kept)
     return _fitted(without_debris(filled), indicator)
 
 
@@ -263,8 +263,8 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     placed[retreated] = False
     inside[placed[filled.tets].all(axis=1)] = 1.0
     kept = _bridged(filled.tets, kept, inside > 0)
-    used, compact = np.unique(filled.tets[kept], return_inverse=True)
-    fitted = without_debris(Tetrahedra(vertices[used], compact.reshape(-1, 4), np.maximum(inside[kept], LEAST_INSIDE)))
+    moved = Tetrahedra(vertices, filled.tets, np.maximum(inside, LEAST_INSIDE))
+    fitted = without_debris(kept_tetrahedra(moved, kept))
     if len(fitted.tets) == 0 or face_connected_pieces(fitted.tets).max() != face_connected_pieces(filled.tets).max():
         return filled
     if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():
