@@ -10,14 +10,17 @@ from conftest import Shapes
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.backends.warp.launch import has_kernels
+from torch_modal.backends.torch.distortion import Distortion, _weights
+from torch_modal.backends.torch.fine_energy import Rests
+from torch_modal.backends.warp.backend import WarpBackend
+from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.energy.terms import Mesh
-from torch_modal.inbetween.comparison import Distortion, _weights, no_worse
+from torch_modal.inbetween.comparison import no_worse
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.solve.adjoint import ConvergenceWarning
 from torch_modal.solve.solver import Status
 
-BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not has_kernels("auto"), reason="no Warp")), "torch"]
+BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not WarpBackend.works(), reason="no Warp")), "torch"]
 
 
 def preset(name: str, **solver: Any) -> dict[str, Any]:
@@ -129,34 +132,34 @@ class TestDistortion:
         _, (bent, _), _, stiffness = self.given(bars)
         x = bent + 1e-3 * torch.sin(3 * bent)
         mesh = Mesh.of(bars.faces, bent.shape[1])
-        distortion = Distortion(mesh, None, False)([x], (bent, bent), None, torch.tensor([0.5]).double(), stiffness)
+        rests = Rests((bent, bent), None, torch.tensor([0.5]).double(), stiffness, None)
+        distortion = Distortion(mesh, None)([x], rests)
         shell = tm.ShellEnergy(bars.faces, alpha=500.0, beta=10.0, gamma=0.0)
         # Beside that, Eq. 5 counts a relative strain squared, and the distortion the same.
         assert float(distortion) == pytest.approx(float(shell(x, bent)), rel=1e-9)
 
     def test_kernels_and_torch_agree(self, bars: Shapes) -> None:
-        if not has_kernels("auto"):
+        if not WarpBackend.works():
             pytest.skip("no Warp")
         shapes, ends, t, stiffness = self.given(bars)
         n = len(Mesh.of(bars.faces, ends[0].shape[1]).edges)
         stiffness[0] = torch.linspace(1, 2, n, dtype=torch.float64)[None]
         mesh = Mesh.of(bars.faces, ends[0].shape[1])
-        one, other = (Distortion(mesh, None, fused) for fused in (True, False))
-        torch.testing.assert_close(
-            one(shapes, ends, None, t, stiffness), other(shapes, ends, None, t, stiffness), rtol=1e-12, atol=0
-        )
+        rests = Rests(ends, None, t, stiffness, None)
+        one, other = (kind(mesh, None)(shapes, rests) for kind in (WarpDistortion, Distortion))
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
 
     def test_a_degenerate_face_does_not_dominate(self, bars: Shapes) -> None:
         """A vertex laid onto its neighbour in both key-frames: Eq. 5 divides by the length of that edge."""
         shapes, ends, t, stiffness = self.given(bars)
         mesh = Mesh.of(bars.faces, ends[0].shape[1])
-        distortion = Distortion(mesh, None, False)
-        before = distortion(shapes, ends, None, t, stiffness)
+        distortion = Distortion(mesh, None)
+        before = distortion(shapes, Rests(ends, None, t, stiffness, None))
         i, j = mesh.edges[50].tolist()
         collapsed = [x.clone() for x in ends]
         for x in collapsed:
             x[:, i] = x[:, j] + 1e-3
-        after = distortion(shapes, tuple(collapsed), None, t, stiffness)
+        after = distortion(shapes, Rests(tuple(collapsed), None, t, stiffness, None))
         assert (after < 3 * before).all(), "the faces around it were pulled out of shape, too"
         shell = tm.ShellEnergy(bars.faces)
         assert shell(shapes[0], collapsed[0]) > 100 * shell(shapes[0], ends[0])

@@ -444,7 +444,7 @@ def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
         pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas[0])
         y = settled(member, samples, pair, x, active, pull, 10)
         y = settled(member, samples, pair, y, active, pull, 10)
-        term = ActiveContacts(active, x.shape[1])
+        term = ActiveContacts(active, x)
         before, pushed = (term.value(z.contiguous()) for z in (x, y))
         assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(before[1])
         assert bool((pull.value(y) < 0.5 * pull.value(x)).all())

@@ -22,7 +22,6 @@ from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
 from torch_modal.contact.search import Contacts
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import Mesh
 from torch_modal.geometry.rigid import RigidMotion
 from torch_modal.inbetween.samples import Samples
 from torch_modal.inbetween.settings import PRESETS
@@ -119,7 +118,7 @@ def steps(energy: Energy, x: Tensor, reference: Any) -> None:
     at = energy.linearise(rows, reference)
     right = -energy.fold(energy.gradient(at))
     assert_there([energy.value(rows, reference), energy.value_at(at, reference)])
-    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3))
+    assert_there(_solved(energy, ConvexHessian(energy, at), right, 3, []))
 
 
 def assert_member_runs(member: Any, x: Tensor, t: Tensor, stiffness: list[Tensor]) -> None:
@@ -134,8 +133,9 @@ def assert_member_runs(member: Any, x: Tensor, t: Tensor, stiffness: list[Tensor
     derivatives = member.space.energy.derivatives(a, problem.placement)
     shapes = member.space.lift(a, problem)
     assert_there([problem, derivatives, shapes, member.frame.restore(shapes, pair, t)])
-    assert_there([member.fine_reference(samples, pair), member.anchors(pair, t) or []])
-    steps(member.fine, shapes, member.fine_reference(samples, pair))
+    reference = member.fine.reference(member.rests(samples, pair, None))
+    assert_there([reference, member.anchors(pair, t) or []])
+    steps(member.fine.energy, shapes, reference)
 
 
 def test_shell_energy(small_bars: Shapes) -> None:
@@ -174,16 +174,8 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
         assert_member_runs(layer.members[0], blank(2, 30, 3), t, layer.stiffness_of(t, t.shape))
 
 
-def test_energies_with_contacts(small_bars: Shapes) -> None:
-    mesh = Mesh.of(small_bars.faces, 30)
-    shell = tm.ShellEnergy(small_bars.faces).energy
-    terms = [part.term for part in shell.parts]
+def test_contacts() -> None:
     with gpu() as mode, torch.no_grad():
-        on_gpu(shell, mode)
         held = contacts(mode)
-        x = blank(2, 30, 3)
-        rest = shell.rest(shell.extend(x.movedim(-1, 0).contiguous()))
-        reference = held.joined(Energy.against(rest, [blank(2, 1) for _ in terms]))
-        steps(held.fine(mesh, terms), x, reference)
         assert_there(held.rows(torch.tensor([1], device="cuda")))
         assert_there(held.of_all(torch.arange(2, device="cuda")))

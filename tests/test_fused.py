@@ -18,15 +18,19 @@ from torch.func import functional_call, grad, vmap
 
 import torch_modal as tm
 from torch_modal import trees
-from torch_modal.backends.torch.modal_energy import ModalEnergy, Placement
+from torch_modal.backends.choice import choose
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.fine_energy import FineEnergy
 from torch_modal.backends.warp import alignment as fused_alignment
-from torch_modal.backends.warp import launch
+from torch_modal.backends.warp import backend, launch
 from torch_modal.backends.warp import modal_energy as fused_modal
-from torch_modal.backends.warp.fine_steps import FusedRelax
-from torch_modal.backends.warp.modal_energy import FusedModalEnergy, fused_reference
-from torch_modal.backends.warp.rotations import FusedRotations
-from torch_modal.backends.warp.shell import FusedShell
+from torch_modal.backends.warp.fine_energy import WarpFineEnergy
+from torch_modal.backends.warp.fine_steps import WarpSteps
+from torch_modal.backends.warp.modal_energy import WarpModalEnergy, shell_reference
+from torch_modal.backends.warp.rotations import WarpRotations
+from torch_modal.backends.warp.shell import WarpShell
 from torch_modal.energy.energy import Energy
+from torch_modal.energy.modal_energy import ModalEnergy, Placement
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
 from torch_modal.errors import MissingPackageError
@@ -48,7 +52,7 @@ class Case:
         generator = torch.Generator().manual_seed(0)
         mesh = self.mesh = Mesh.of(faces, shapes.keyframes.shape[1])
         self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
-        self.fused = FusedRelax(self.energy, mesh)
+        self.fused = WarpSteps(self.energy, mesh)
         x = shapes.keyframes * (DIAGONAL / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
         n_edges, n_hinges = len(mesh.edges), len(mesh.hinges)
         stiffness = [
@@ -158,9 +162,9 @@ class TestModal:
         generator = torch.Generator().manual_seed(2)
         columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
         own = torch.randn(start.shape, dtype=DOUBLE, generator=generator) if extra else None
-        shell = FusedShell(case.energy, case.mesh)
-        modals = FusedModalEnergy(shell, case.mesh, columns), ModalEnergy(case.energy, columns)
-        packed = fused_reference(shell, first, second, t, *stiffness)
+        shell = WarpShell(case.energy, case.mesh)
+        modals = WarpModalEnergy(shell, case.mesh, columns), ModalEnergy(case.energy, columns)
+        packed = shell_reference(shell, first, second, t, *stiffness)
         return [
             (modals[0], modals[0].place(start, packed, own)),
             (modals[1], modals[1].place(start, shell.unpacked(shell.reference_by_torch(*case.given[1:])), own)),
@@ -217,12 +221,12 @@ class TestModal:
         assert fused.derivatives(several, many, second_order=False).second_order is None
 
     def test_references(self, case: Case) -> None:
-        shell, given = FusedShell(case.energy, case.mesh), case.given[1:]
+        shell, given = WarpShell(case.energy, case.mesh), case.given[1:]
 
         def flat(run) -> Any:  # type: ignore[no-untyped-def]
             return lambda *given: torch.cat([part.flatten() for part in run(*given)[:-1]])
 
-        by_kernels, by_torch = partial(fused_reference, shell), shell.reference_by_torch
+        by_kernels, by_torch = partial(shell_reference, shell), shell.reference_by_torch
         for found, wanted in zip(by_kernels(*given), by_torch(*given), strict=True):
             torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
         assert_alike(gradients(flat(by_kernels), given), gradients(flat(by_torch), given), 1e-9)
@@ -231,11 +235,11 @@ class TestModal:
 
 class TestRotations:
     @pytest.fixture
-    def rotations(self, small_bars: Shapes) -> FusedRotations:
+    def rotations(self, small_bars: Shapes) -> WarpRotations:
         mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
-        return FusedRotations(mesh.connectivity, small_bars.keyframes[:2])
+        return WarpRotations(mesh.connectivity, small_bars.keyframes[:2])
 
-    def test_between_two(self, rotations: FusedRotations, small_bars: Shapes) -> None:
+    def test_between_two(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes
         given = [x[:2].clone(), x[1:3].clone(), torch.tensor([0.3, 0.8], dtype=DOUBLE)]
         torch.testing.assert_close(rotations(*given), rotations.oracle(*given), rtol=0, atol=1e-12)
@@ -255,19 +259,19 @@ class TestRotations:
         shapes = torch.stack([torch.cat([x, x + width]) for x in (flat, arc)])
         i = torch.arange(n - 1)
         faces = torch.cat([torch.stack([i, i + 1, i + n], 1), torch.stack([i + 1, i + n + 1, i + n], 1)])
-        rotations = FusedRotations(Mesh.of(faces, 2 * n).connectivity, shapes)
+        rotations = WarpRotations(Mesh.of(faces, 2 * n).connectivity, shapes)
         given = [shapes[:1].clone(), shapes[1:].clone(), torch.tensor([0.5], dtype=DOUBLE)]
         truth = rotations.oracle(*given)
         assert float(truth[0].min()) < -0.5 / (n - 1), "nothing turns by more than 90 degrees half-way"
         torch.testing.assert_close(rotations(*given), truth, rtol=0, atol=1e-12)
         assert_alike(gradients(rotations, given), gradients(rotations.oracle, given), 1e-9)
 
-    def test_the_same_shape(self, rotations: FusedRotations, small_bars: Shapes) -> None:
+    def test_the_same_shape(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes[:1]
         given = [x.clone(), x.clone(), torch.tensor([0.3], dtype=DOUBLE)]
         assert_alike(gradients(rotations, given)[:2], gradients(rotations.oracle, given)[:2], 1e-7)
 
-    def test_on_a_course(self, rotations: FusedRotations, small_bars: Shapes) -> None:
+    def test_on_a_course(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes
         hours = Spacing(*(torch.ones(1, dtype=DOUBLE) for _ in range(3)))
         which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
@@ -277,10 +281,10 @@ class TestRotations:
             return kind.along(rotations, trajectory, which, t)
 
         def by_warp(*given: Tensor) -> Tensor:
-            return by(FusedRotations, *given)
+            return by(WarpRotations, *given)
 
         def by_torch(*given: Tensor) -> Tensor:
-            return by(FusedRotations.__base__, *given)
+            return by(WarpRotations.__base__, *given)
 
         given = [x[:1].clone(), x[1:2].clone(), t]
         torch.testing.assert_close(by_warp(*given), by_torch(*given), rtol=0, atol=1e-12)
@@ -301,7 +305,8 @@ def test_alignment(small_bars: Shapes, turn: float) -> None:
     t = torch.tensor([0.3, 0.9], dtype=DOUBLE)
     with torch.no_grad():
         assert fused_alignment.serves(x, y, t)
-        pair, sizes = fused_alignment.place(frame, x, y)
+        pair, finite, sizes = fused_alignment.place(frame, x, y)
+        assert finite.all()
         truth = frame.place(x, y)
         for got, wanted in zip(trees.leaves(tuple(pair[:4])), trees.leaves(tuple(truth[:4])), strict=True):
             torch.testing.assert_close(got, wanted, rtol=0, atol=1e-11)
@@ -317,7 +322,7 @@ class TestLayers:
     def test_in_between(self, bars: Shapes, dtype: torch.dtype) -> None:
         x_a, x_b = bars.keyframes[:2].to(dtype)
         made = [tm.InBetween(bars.bases[:2], bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]
-        assert made[0].members[0].fused is not None and made[1].members[0].fused is None
+        assert [type(layer.members[0].fine) for layer in made] == [WarpFineEnergy, FineEnergy]
         found, truth = (layer.to(dtype)(x_a, x_b, torch.tensor([0.3, 0.5], dtype=dtype)) for layer in made)
         assert found.dtype == dtype
         torch.testing.assert_close(found, truth, rtol=0, atol=1e-7 if dtype == torch.float64 else 1e-4)
@@ -391,7 +396,7 @@ class TestLayers:
         for kind in ("warp", "torch"):
             solver = tm.Solver(backend=kind, polish=1)  # type: ignore[arg-type]
             path = tm.Path(bars.bases[:n], bars.faces, objective=objective, solver=solver)
-            assert (path.layer.members[0].fused is None) == (kind == "torch")
+            assert isinstance(path.layer.members[0].fine, WarpFineEnergy) == (kind == "warp")
             keyframes = bars.keyframes[:n].clone().requires_grad_()
             shape = path(keyframes, t)
             with torch.no_grad():
@@ -427,8 +432,7 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
 
 def test_the_first_of_a_thread_may_have_nothing_to_do(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     """Warp gives no command for no threads, so there was none to use again."""
-    shell = tm.InBetween(bars.bases[:2], bars.faces).members[0].fused
-    assert shell is not None
+    shell = tm.InBetween(bars.bases[:2], bars.faces).members[0].fine.steps
     none = bars.keyframes[:0]
     given: list[tuple[Any, ...]] = []
     monkeypatch.setattr(
@@ -452,25 +456,25 @@ class TestBackend:
     def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, small_bars: Shapes) -> None:
         there = importlib.util.find_spec
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else there(name))
-        launch._works.cache_clear()
+        backend._works.cache_clear()
         try:
-            assert tm.InBetween(small_bars.bases[:2], small_bars.faces).members[0].fused is None
+            assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).members[0].fine) is FineEnergy
             with pytest.raises(MissingPackageError, match="pip install warp-lang"):
                 tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
         finally:
-            launch._works.cache_clear()
+            backend._works.cache_clear()
 
     def test_not_usable(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def broken(name: str) -> None:
             raise OSError("the cache folder is not writable")
 
-        monkeypatch.setattr(launch, "kernels", broken)
-        launch._works.cache_clear()
+        monkeypatch.setattr(backend, "kernels", broken)
+        backend._works.cache_clear()
         try:
             with pytest.warns(UserWarning, match="the cache folder is not writable"):
-                assert not launch.has_kernels("auto")
+                assert type(choose("auto")) is TorchBackend
         finally:
-            launch._works.cache_clear()
+            backend._works.cache_clear()
 
     def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
         code = (

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 from torch.func import jacfwd
 
-from torch_modal.backends.torch.modal_energy import Derivatives, Placement
+from torch_modal.energy.modal_energy import Derivatives, Placement
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.inbetween.samples import ConvergenceError, report
 from torch_modal.layers.mid_shape import MidShape

@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from functools import cache
@@ -111,7 +112,6 @@ def test_layers_are_torch_only() -> None:
     """Bases are what comes in; only the frame and its coarse mesh, made once, use more of the pre-computation."""
     allowed = {"inbetween.frame": {"numpy", "precompute.coarsening"}}
     allowed["inbetween.resolution"] = {"precompute.coarsening"}
-    allowed["backends.torch.congruence"] = {"numpy"}
     foreign = {
         (module, name)
         for module in MODULES
@@ -121,6 +121,16 @@ def test_layers_are_torch_only() -> None:
         if name not in allowed.get(module, ())
     }
     assert not foreign
+
+
+def test_one_door_leads_to_the_backends() -> None:
+    """No other file names Warp or its kernels, or asks which backend it has; the setting of its name is one."""
+    asks = re.compile(r"\bwarp\b|\.kernels\b|isinstance\([^)]*backend|backend(\.name)? *(==|!=| is )", re.I)
+    paths = {str(path.relative_to(PACKAGE)): path for path in PACKAGE.rglob("*.py")}
+    found = {name for name, path in paths.items() if name.split("/")[0] != "backends" and asks.search(path.read_text())}
+    assert found == {"inbetween/settings.py"}
+    users = {name for name in MODULES if any(each.startswith("backends.warp") for each in own(name))}
+    assert {name for name in users if not name.startswith("backends.warp")} == {"backends.choice"}
 
 
 def test_one_lock_guards_the_decimation() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
 
 from torch_modal import trees
-from torch_modal.backends.torch.modal_energy import Derivatives, SumOfEnergies
+from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning, Samples
 from torch_modal.inbetween.settings import Solver
@@ -654,14 +654,14 @@ class TestTorch:
             space.blend.poisson._made = space.blend.poisson.weights, inverse
         x = torch.empty(2, *small_bars.keyframes.shape[1:], dtype=DOUBLE, device="meta")
         t = x[:, 0, 0]
-        pair = member.frame.place(x, x)
         samples = Samples(x, x, None, t, t, layer.stiffness_of(t, t.shape))
+        pair, usable = member.placing(samples)
         problem = member.problem(pair, samples)
         taken = member.step(x.new_empty(2, space.n_unknowns), problem.placement)
         derivatives = space.energy.derivatives(taken.amplitudes, problem.placement)
         back = space.energy.pull_back(taken.amplitudes, derivatives.gradient, problem.placement)
         shapes = member.frame.restore(space.lift(taken.amplitudes, problem), pair, t)
-        found = [*trees.leaves(taken), *trees.leaves(back), shapes, member._solvable(pair)]
+        found = [*trees.leaves(taken), *trees.leaves(back), shapes, usable]
         assert {value.device.type for value in found} == {"meta"} and shapes.shape == x.shape
 
     @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

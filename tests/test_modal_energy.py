@@ -8,7 +8,7 @@ from torch.func import hessian, jacfwd
 
 from torch_modal import trees
 from torch_modal.backends.torch import congruence
-from torch_modal.backends.torch.modal_energy import Derivatives, ModalEnergy
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
 
 N, BATCH = 5, 3

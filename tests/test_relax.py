@@ -9,11 +9,18 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd, vmap
 
-from torch_modal.backends.torch.fine_steps import RIDGE, STEP_LENGTHS, ConvexHessian, _downhill, relax
+from torch_modal.backends.torch.fine_energy import chunk_of
+from torch_modal.backends.torch.fine_steps import (
+    RIDGE,
+    STEP_LENGTHS,
+    ConvexHessian,
+    _downhill,
+    inverse_of_symmetric,
+    relax,
+)
 from torch_modal.energy.energy import Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry.vectors import norm
-from torch_modal.inbetween.between import fine_chunk
 
 BATCH = 2
 
@@ -88,7 +95,7 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
         assert float((got - truth).norm() / truth.norm()) < 1e-11
         assert float(torch.linalg.eigvalsh(got).amin()) > -1e-9 * float(torch.linalg.eigvalsh(got).amax())
 
-        blocks = convex.inverse_diagonal()[:, :, sample, : n // 3].permute(2, 0, 1)
+        blocks = inverse_of_symmetric(convex.diagonal())[:, :, sample, : n // 3].permute(2, 0, 1)
         own = truth.reshape(n // 3, 3, n // 3, 3)
         # The volume couples all vertices and is left out of the blocks.
         own_volume = to_volume[:, sample].T
@@ -116,7 +123,7 @@ def test_a_step_is_shortened_until_the_energy_falls(case: Case) -> None:
     core, at = case.core, case.at(case.x)
     before = core.value_at(at, case.reference)
     moves = -core.extend(core.fold(core.gradient(at))) * torch.tensor([0.1, 0.01])[:, None]
-    length = _downhill(core, before, case.rows, moves, case.reference)
+    length = _downhill(core, before, case.rows, moves, case.reference, ())
     for sample, own in enumerate(length.tolist()):
         reached = [float(core.value(case.rows + k * moves, case.reference)[sample]) for k in STEP_LENGTHS]
         assert own == next(k for k, energy in zip(STEP_LENGTHS, reached, strict=True) if energy < float(before[sample]))
@@ -142,6 +149,6 @@ def test_under_vmap(small_bars: Shapes, polish: int) -> None:
 
 
 def test_chunks_fit_into_caches_or_the_memory_of_a_gpu() -> None:
-    assert fine_chunk(10_000, torch.device("cpu")) == 2
-    assert fine_chunk(10_000, torch.device("cuda")) == 100
-    assert fine_chunk(10**8, torch.device("cpu")) == 1, "never none"
+    assert chunk_of(10_000, torch.device("cpu")) == 2
+    assert chunk_of(10_000, torch.device("cuda")) == 100
+    assert chunk_of(10**8, torch.device("cpu")) == 1, "never none"

@@ -7,7 +7,9 @@ import torch
 from conftest import Shapes, modal, problem_of
 from torch import Tensor
 
-from torch_modal.backends.warp.rotations import FusedRotations
+from torch_modal.backends.choice import choose
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.inbetween.blend import Blends, RotationBlend
@@ -77,7 +79,7 @@ def test_most_of_the_area_of_a_piece_says_which_way_it_turns(fused: bool) -> Non
 
     n_vertices, faces = 2 * len(angles) + 2, ribbon(0.0, len(angles))[1]
     first, second = (torch.cat([rolled(part, False), rolled(part, True)]) for part in (0.0, 1.0))
-    kind = FusedRotations if fused else LocalRotations
+    kind = WarpRotations if fused else LocalRotations
     mesh = Connectivity(torch.cat([faces, faces + n_vertices]).numpy())
     rotations = kind(mesh, torch.stack([first, second]))
     wanted = torch.cat([angles, angles, angles.flip(0), angles.flip(0)])
@@ -107,7 +109,7 @@ def test_blend_is_the_shape_of_these_edges(degrees: int) -> None:
     )
     faces = torch.cat([faces, faces + len(x_a)])
     mesh = Connectivity(faces.numpy(), len(first))
-    blend = RotationBlend(mesh, torch.stack([first, second]))
+    blend = RotationBlend(mesh, torch.stack([first, second]), TorchBackend())
     found = blend(first[None], second[None], T[2:3])[0]
     torch.testing.assert_close(edges(found, mesh), edges(halfway, mesh), rtol=0, atol=1e-9)
     for piece in (slice(0, len(x_a)), slice(len(x_a), -1), slice(-1, None)):
@@ -115,21 +117,22 @@ def test_blend_is_the_shape_of_these_edges(degrees: int) -> None:
         torch.testing.assert_close(found[piece].mean(0), centre, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("fused", [False, True])
+@pytest.mark.parametrize("kind", ["torch", "warp"])
 def test_pairs_share_a_blend_where_no_tree_would_tell_another_sense(
-    fused: bool, small_bars: Shapes, generator: torch.Generator
+    kind: str, small_bars: Shapes, generator: torch.Generator
 ) -> None:
-    if fused:
+    if kind == "warp":
         pytest.importorskip("warp")
+    backend = choose(kind)
     # Torn to pieces: neighbours turn any way, so that it matters which of them are compared.
     x = small_bars.keyframes
     torn = x[:1] + 0.5 * torch.randn(x[:1].shape, dtype=x.dtype, generator=generator)
     mesh, shapes = Connectivity(small_bars.faces.numpy()), torch.cat([x, torn])
-    blends = Blends(mesh, shapes, (0, 1), fused)
+    blends = Blends(mesh, shapes, (0, 1), backend)
     shared, own = blends.of(0, 1), blends.of(2, 3)
     assert blends.of(1, 2) is shared and blends.of(2, 0) is shared
     assert own is not shared and own.poisson is shared.poisson
-    alone = RotationBlend(mesh, shapes[2:], fused)
+    alone = RotationBlend(mesh, shapes[2:], backend)
     assert torch.equal(own.rotations.ancestors, alone.rotations.ancestors)
     assert not torch.equal(own.rotations.ancestors, shared.rotations.ancestors)
 
@@ -137,7 +140,7 @@ def test_pairs_share_a_blend_where_no_tree_would_tell_another_sense(
 def test_a_tree_of_another_pair_tells_the_way_round() -> None:
     (x, faces), half, whole = ribbon(0.0), ribbon(math.radians(130))[0], ribbon(math.radians(300))[0]
     mesh = Connectivity(faces.numpy())
-    blend = Blends(mesh, torch.stack([x, half, whole]), (0, 1)).of(0, 2)
+    blend = Blends(mesh, torch.stack([x, half, whole]), (0, 1), TorchBackend()).of(0, 2)
     found = blend(x[None], whole[None], T[2:3])[0]
     torch.testing.assert_close(edges(found, mesh), edges(ribbon(math.radians(150))[0], mesh), rtol=0, atol=1e-9)
 
@@ -148,7 +151,7 @@ def test_pieces_that_share_a_vertex_stay_together() -> None:
     first = torch.cat([x, x[1:] * torch.tensor([-1.0, 1.0, 1.0])])
     second = torch.cat([other, other[1:] * torch.tensor([-1.0, 1.0, 1.0])])
     mesh = Connectivity(joined.numpy())
-    blend = RotationBlend(mesh, torch.stack([first, second]))
+    blend = RotationBlend(mesh, torch.stack([first, second]), TorchBackend())
     half = ribbon(0.5)[0]
     wanted = torch.cat([half, half[1:] * torch.tensor([-1.0, 1.0, 1.0])])
     torch.testing.assert_close(

@@ -116,9 +116,9 @@ def test_what_only_touches_does_not_cross(apart: float, search: str) -> None:
     kernels = None
     if search == "warp":
         pytest.importorskip("warp")
-        from torch_modal.backends.warp.crossings import FusedPairs
+        from torch_modal.backends.warp.crossings import WarpPairs
 
-        kernels = FusedPairs(mesh, points[None])
+        kernels = WarpPairs(mesh, points[None])
     assert len(Crossings(mesh, points[None], search=kernels).pairs(points)) == 0
     # As deep as a quarter of an edge, the edges of both meet, and each pair is counted once.
     points[len(second) :, 0] -= 0.0625
@@ -147,17 +147,17 @@ def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Ge
     assert np.array_equal(crossing, triangles_cross(a, b))  # nothing is nearly flat here
     wanted = set(zip(one[crossing].tolist(), other[crossing].tolist(), strict=True))
     assert n_faces < 500 or len(wanted) > fused_crossings.ROOM  # which has to be made larger
-    found = fused_crossings.FusedPairs(mesh, first[None])(x)
+    found = fused_crossings.WarpPairs(mesh, first[None])(x)
     assert len(found) == len(wanted) and {tuple(pair) for pair in np.sort(found, 1).tolist()} == wanted
 
 
 def test_searches_agree_whoever_searches() -> None:
     pytest.importorskip("warp")
-    from torch_modal.backends.warp.crossings import FusedPairs
+    from torch_modal.backends.warp.crossings import WarpPairs
 
     sample = load_sample("hand")
     mesh, x = Connectivity(sample.faces.numpy(), sample.keyframes.shape[1]), sample.keyframes.numpy()
-    kernels = Crossings(mesh, x, search=FusedPairs(mesh, x))
+    kernels = Crossings(mesh, x, search=WarpPairs(mesh, x))
     middle = x.mean(0)  # as linear interpolation has it, which flattens fingers
     found = kernels.pairs(middle)
     assert len(found) > 20

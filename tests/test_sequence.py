@@ -10,6 +10,8 @@ from conftest import Shapes, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.warp.backend import WarpBackend
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.settings import Objective, Solver
@@ -236,7 +238,7 @@ def test_nearest_key_frame_by_edge_lengths(scattered: Shapes) -> None:
 
 def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
-    loaded: list[str] = []
+    loaded: list[bool] = []
 
     def extract(
         keyframes: Tensor, faces: Tensor, n_modes: int, progress: bool | None, meanwhile: Callable[[], None]
@@ -246,10 +248,11 @@ def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest
         return scattered.bases
 
     monkeypatch.setattr(sequence, "bases_of_checked", extract)
-    monkeypatch.setattr(sequence, "load_kernels", loaded.append)
+    monkeypatch.setattr(TorchBackend, "load", lambda self: loaded.append(True))
+    monkeypatch.setattr(WarpBackend, "load", TorchBackend.load)
     frames = subdivide(scattered.keyframes, scattered.faces, 1, n_modes=7, progress=False, **COARSE)
     assert asked == [(3, 7)]
-    assert loaded == ["auto"]
+    assert loaded == [True]
     given = subdivide(scattered.keyframes, scattered.faces, 1, bases=scattered.bases, progress=False, **COARSE)
     assert torch.equal(frames, given)
 

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 import torch_modal as tm
 from torch_modal.backends.torch.fine_steps import relax
-from torch_modal.backends.torch.modal_energy import ModalEnergy
 from torch_modal.energy.energy import Energy
+from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.terms import Bend, Mesh, Stretch, Term, Volume
 from torch_modal.inbetween.levels import coarse_values
 

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import traced, transformed
-from torch_modal.backends.torch.congruence import Congruence
 from torch_modal.energy.assembly import Curvature
+from torch_modal.energy.congruence import Congruence
 from torch_modal.energy.energy import Energy, Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
 
