@@ -9,11 +9,13 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, commands, expanded, run_python
 from test_examples import load_example
 
+from torch_modal.backends.choice import BACKENDS
 from torch_modal.cli import main as cli
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
@@ -29,13 +31,14 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def formats() -> Iterator[None]:
-    """Formats that a page registers are gone after it."""
-    before = {id(table): set(table) for table in (MESH_FORMATS, ANIMATION_FORMATS)}
+def registered() -> Iterator[None]:
+    """Formats and backends that a page registers are gone after it."""
+    tables: tuple[dict[str, Any], ...] = (MESH_FORMATS, ANIMATION_FORMATS, BACKENDS)
+    before = [set(table) for table in tables]
     yield
-    for table in (MESH_FORMATS, ANIMATION_FORMATS):
-        for suffix in set(table) - before[id(table)]:
-            del table[suffix]
+    for table, names in zip(tables, before, strict=True):
+        for name in set(table) - names:
+            del table[name]
 
 
 def pages_with(*languages: str) -> list[object]:

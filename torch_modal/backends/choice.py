@@ -5,7 +5,7 @@ from collections.abc import Callable
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.warp.backend import WarpBackend
 
-_BACKENDS: dict[str, Callable[[], TorchBackend]] = {"torch": TorchBackend, "warp": WarpBackend}
+BACKENDS: dict[str, Callable[[], TorchBackend]] = {"torch": TorchBackend, "warp": WarpBackend}
 
 
 def register_backend(name: str, make: Callable[[], TorchBackend]) -> None:
@@ -15,12 +15,12 @@ def register_backend(name: str, make: Callable[[], TorchBackend]) -> None:
         name: Its name. One that is known already is replaced.
         make: Called with no arguments for each layer that is made.
     """
-    _BACKENDS[name] = make
+    BACKENDS[name] = make
 
 
 def names() -> tuple[str, ...]:
     """What :func:`choose` takes."""
-    return ("auto", *_BACKENDS)
+    return ("auto", *BACKENDS)
 
 
 def choose(name: str) -> TorchBackend:
@@ -31,4 +31,4 @@ def choose(name: str) -> TorchBackend:
     """
     if name == "auto":
         name = "warp" if WarpBackend.works() else "torch"
-    return _BACKENDS[name]()
+    return BACKENDS[name]()
