@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.func import hessian, jacfwd
 
 from torch_modal import trees
-from torch_modal.backends.torch import congruence
+from torch_modal.energy import congruence
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
 

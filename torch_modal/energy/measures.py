@@ -1,24 +1,14 @@
-"""Lengths and dihedral angles of single elements: derivatives written out, components first.
-
-``torch.func`` gives the same through the measures themselves, which is what these are tested against, at ten times the
-cost (docs/how-it-works.md).
-"""
+"""Dihedral angles of single elements, components first."""
 
 import math
 
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.vectors import cross, inverse, norm, tiny
+from torch_modal.geometry.vectors import cross, norm, tiny
 
 # Altitude of a triangle over its edge below which the triangle has no normal worth the name.
 COLLAPSED = 1e-6
-
-
-def length_gradient(edge: Tensor) -> Tensor:
-    """Gradient of an edge's length, 0 where there is no length. *Shape:* ``(3, ...) -> (3, ...)``."""
-    squared = (edge * edge).sum(0)
-    return edge * inverse(squared.sqrt(), squared <= tiny(edge))
 
 
 def dihedral_angle(edge_vectors: Tensor) -> Tensor:
@@ -39,72 +29,6 @@ def dihedral_angle(edge_vectors: Tensor) -> Tensor:
     # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
     flat = collapsed(e, n1) | collapsed(e, n2)
     return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
-
-
-def dihedral_gradient(edge_vectors: Tensor) -> Tensor:
-    """Gradient of :func:`dihedral_angle` in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
-
-    Args:
-        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
-
-    Returns:
-        Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
-    """
-    e, a, b = edge_vectors
-    n1 = cross(e, a)
-    n2 = cross(b, e)
-    flat = collapsed(e, n1) | collapsed(e, n2)
-    length = norm(e)
-    to_a = n1 * (-length * inverse((n1 * n1).sum(0), flat))
-    to_b = n2 * (-length * inverse((n2 * n2).sum(0), flat))
-    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * inverse((e * e).sum(0), flat)
-    return torch.stack([to_e, to_a, to_b])
-
-
-def length_hessian(edge: Tensor) -> Tensor:
-    """Hessian of an edge's length, 0 where there is no length. *Shape:* ``(3, ...) -> (3, 3, ...)``."""
-    squared = (edge * edge).sum(0)
-    per_length = inverse(squared.sqrt(), squared <= tiny(edge))
-    unit = edge * per_length
-    eye = torch.eye(3, dtype=edge.dtype, device=edge.device).reshape(3, 3, *[1] * (edge.dim() - 1))
-    return (eye - unit[:, None] * unit) * per_length
-
-
-def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
-    r"""Hessian of :func:`dihedral_angle` in closed form, as its blocks between different vertices.
-
-    Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude ``h``
-    and ``w = n x e``: with :math:`S = (n w^T + w n^T)\, |e| / |n_1|^2` and :math:`U = e n^T / (|e| |n_1|)`, a tip
-    whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with ``j``. The edge's own,
-    between ``e`` and ``e``, is :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)`. The two tips have none. What is left
-    follows because translations change nothing.
-
-    Args:
-        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
-
-    Returns:
-        The blocks of the vertices ``ij, ki, kj, li, lj`` of a hinge, indexed by row, then column; zero where a triangle
-        is collapsed. *Shape:* ``(5, 3, 3, ...)``.
-    """
-    e, a, b = edge_vectors
-    n1, n2 = cross(e, a), cross(b, e)
-    flat = collapsed(e, n1) | collapsed(e, n2)
-    length = norm(e)
-    per_length = inverse(length, flat)
-    own = e.new_zeros(())
-    blocks = []
-    for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
-        area = (normal * normal).sum(0)
-        per_area = inverse(area, flat)
-        # n and w are not of length one here: their factors are in front.
-        half = (normal * (length * per_area * per_area))[:, None] * w
-        s = half + half.transpose(0, 1)
-        u = e[:, None] * (normal * (per_length * per_area))
-        r = (tip * e).sum(0) * per_length * per_length
-        across = u - r * s
-        own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1)) + across
-        blocks += [-s - across, across]
-    return torch.stack([-own, *blocks])
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:

@@ -2,8 +2,7 @@ r"""Terms of an energy: measures of the elements of a mesh, and their weights.
 
 A term has the energy :math:`\sum_m k_m w_m (q_m - \bar q_m)^2` over its elements ``m``, with a measure ``q`` of each,
 its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. All that a term must say is
-which elements it sees and what it measures on one of them: derivatives then come from ``torch.func``. The three terms
-of Eq. 5 write theirs out, because they are what all the time goes into.
+which elements it sees and what it measures on one of them: derivatives then come from ``torch.func``.
 """
 
 from collections.abc import Sequence
@@ -14,15 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import jacrev, vmap
 
-from torch_modal.energy.measures import (
-    collapsed,
-    dihedral_angle,
-    dihedral_gradient,
-    dihedral_hessian,
-    length_gradient,
-    length_hessian,
-    wrap_angle,
-)
+from torch_modal.energy.measures import collapsed, dihedral_angle, wrap_angle
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, inverse, norm
 
@@ -202,7 +193,10 @@ class Term(nn.Module):
     @staticmethod
     def _each(function: Any, edge_vectors: Tensor) -> Tensor:
         """A function of one element on all, which stay the last dimensions."""
-        out = vmap(function, in_dims=2, out_dims=-1)(edge_vectors.flatten(2))
+        flat = edge_vectors.flatten(2)
+        # vmap needs one element at least.
+        each = flat if flat.shape[-1] else flat.new_ones(*flat.shape[:2], 1)
+        out = vmap(function, in_dims=2, out_dims=-1)(each)[..., : flat.shape[-1]]
         return out.unflatten(-1, edge_vectors.shape[2:])
 
 
@@ -222,14 +216,6 @@ class Stretch(Term):
     def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
         """One over the length."""
         return inverse(measures, measures <= MIN_RELATIVE_LENGTH * measures.mean(-1, keepdim=True))
-
-    def gradients(self, edge_vectors: Tensor) -> Tensor:
-        """Unit vectors."""
-        return length_gradient(edge_vectors[0])[None]
-
-    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
-        """The length's Hessian with the other sign, between both ends."""
-        return [-slope * length_hessian(edge_vectors[0])]
 
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """Transverse stiffness of a stretched string; smoothly near zero under compression."""
@@ -265,18 +251,15 @@ class Bend(Term):
         """The short way round."""
         return wrap_angle(measures - rest)
 
-    def gradients(self, edge_vectors: Tensor) -> Tensor:
-        """In closed form."""
-        return dihedral_gradient(edge_vectors)
-
     def pairs(self, mesh: Mesh) -> Tensor:
         """Without that of the two tips, which have no mixed derivative."""
         i, j, k, m = mesh.hinges.unbind(1)
         return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
 
     def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
-        """In closed form."""
-        return (slope * dihedral_hessian(edge_vectors)).unbind()
+        """Those of all pairs, but for the tips'."""
+        ij, ik, im, jk, jm, _ = super().blocks(edge_vectors, slope)
+        return [ij, ik.transpose(0, 1), jk.transpose(0, 1), im.transpose(0, 1), jm.transpose(0, 1)]
 
 
 class Volume(Term):
