@@ -11,7 +11,7 @@ import torch
 from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def load_example(name: str) -> ModuleType:
