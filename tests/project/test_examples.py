@@ -62,6 +62,7 @@ def test_farthest_points_are_spread() -> None:
     assert sorted(load_example("train_timing").farthest_points(line, 3).tolist()) == [0, 4, 8]
 
 
+@pytest.mark.slow
 def test_train_parts_learns_more_from_in_betweens(tmp_path: Path) -> None:
     """The short form: one seed of three arms on the hand, in a fraction of the steps."""
     picture = tmp_path / "parts.png"
