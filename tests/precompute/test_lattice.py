@@ -81,7 +81,7 @@ import hashlib, sys
 import numpy as np
 import trimesh
 from torch_modal.precompute.modes import extract_bases
-mesh = trimesh.creation.capsule(height=3.0, radius=0.6, count=(12, 12))
+mesh = trimesh.creation.capsule(height=3.0, radius=0.6, count=(24, 24))
 keyframes = np.stack([mesh.vertices, mesh.vertices * [1.0, 1.1, 1.0]])
 total = hashlib.sha256()
 for basis in extract_bases(keyframes, mesh.faces, 12, mesher="lattice", cache=False):
