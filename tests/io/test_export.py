@@ -19,7 +19,6 @@ from torch_modal.io.frames import save_frames
 from torch_modal.io.read import open_asset
 from torch_modal.view.animation import save_animation
 
-HAND = Path(__file__).parents[1].parent / "shared" / "data" / "mh-hand-path"
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 DTYPES = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_SHORT: "<u2", pygltflib.UNSIGNED_INT: "<u4"}
 
@@ -72,12 +71,10 @@ def test_frames_read_back(tmp_path, fmt, tolerance):
         np.testing.assert_array_equal(mesh.faces, FACES)
 
 
-def test_ply_of_thousands_is_what_pyvista_reads(tmp_path):
-    if not HAND.is_dir():
-        pytest.skip(f"no test meshes at {HAND}")
+def test_ply_of_thousands_is_what_pyvista_reads(data_dir, tmp_path):
     import pyvista
 
-    mesh = trimesh.load_mesh(HAND / "00.obj", process=False, maintain_order=True)
+    mesh = trimesh.load_mesh(data_dir / "mh-hand-path" / "00.obj", process=False, maintain_order=True)
     (path,) = save_frames(mesh.vertices[None], mesh.faces, tmp_path)
     read = pyvista.read(path)
     np.testing.assert_array_equal(read.points, mesh.vertices.astype(np.float32))

@@ -8,7 +8,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1] / "torch_modal"
+PACKAGE = Path(__file__).parents[2] / "torch_modal"
 
 # From the ground up: a module imports from its own floor and lower ones, at the top of the file or inside functions.
 FLOORS = [

@@ -11,7 +11,7 @@ import torch
 from torch_modal.registration.landmarks import read_landmarks
 from torch_modal.registration.load import load_keyframes
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def load_example(name: str) -> ModuleType:
@@ -62,6 +62,7 @@ def test_farthest_points_are_spread() -> None:
     assert sorted(load_example("train_timing").farthest_points(line, 3).tolist()) == [0, 4, 8]
 
 
+@pytest.mark.slow
 def test_train_parts_learns_more_from_in_betweens(tmp_path: Path) -> None:
     """The short form: one seed of three arms on the hand, in a fraction of the steps."""
     picture = tmp_path / "parts.png"

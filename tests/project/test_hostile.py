@@ -21,7 +21,7 @@ from torch_modal.io.cache import cache_content
 from torch_modal.precompute.parallel import n_cpus
 
 ROOT = Path(tm.__file__).parents[1]
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 IN_EVERY_RUN = ("nan", "half-flipped")
 POSIX = pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
 

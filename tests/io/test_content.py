@@ -15,7 +15,7 @@ import torch_modal as tm
 from torch_modal.energy.terms import Stretch
 from torch_modal.io.content import ContentError, content_digest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 class Own(tm.Term):

@@ -2,7 +2,6 @@
 
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy import ndimage
 from torch_modal.view import drawing, picture
 from torch_modal.view.picture import render_sequence
 
-WOMAN = Path(__file__).parents[1].parent / "shared" / "data" / "mh-woman"
 CRASH = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
 BALL = trimesh.creation.icosphere(2)
 
@@ -271,10 +269,9 @@ def test_wrong_input_is_refused(tmp_path, options, message):
 
 
 @pytest.mark.parametrize("renderer", ["pyvista", "matplotlib"])
-def test_a_walking_woman_fills_her_cells(tmp_path, renderer):
-    if not WOMAN.is_dir():
-        pytest.skip(f"no test meshes at {WOMAN}")
-    a, b = (trimesh.load_mesh(path, process=False, maintain_order=True) for path in sorted(WOMAN.glob("*walk*")))
+def test_a_walking_woman_fills_her_cells(data_dir, tmp_path, renderer):
+    walk = sorted((data_dir / "mh-woman").glob("*walk*"))
+    a, b = (trimesh.load_mesh(path, process=False, maintain_order=True) for path in walk)
     frames = np.stack([(1 - t) * a.vertices + t * b.vertices for t in (0, 0.5, 1)])
     path = render_or_skip({"linear": frames}, a.faces, tmp_path / "a.png", renderer=renderer)
     image = np.asarray(Image.open(path).convert("RGB"))

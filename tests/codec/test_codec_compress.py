@@ -22,7 +22,7 @@ from torch_modal.codec.hierarchy import VertexHierarchy
 from torch_modal.codec.range_coder import IntegerDecoder, IntegerEncoder
 
 pytest.importorskip("constriction")
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,6 @@ from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes, require_solid
 from torch_modal.registration.load import load_keyframes
 
-DATA = Path(__file__).parents[1].parent / "shared" / "data"
-
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
 CUBE_FACES = np.concatenate(
     [
@@ -604,11 +602,9 @@ def test_a_thin_plate_whose_volume_turns_over_is_not_mirrored(thickness):
     assert not looks_mirrored(both.keyframes[:1], both.keyframes[1:], both.faces).any()
 
 
-def test_mirrored_bodies_in_any_pose_are_refused():
+def test_mirrored_bodies_in_any_pose_are_refused(data_dir):
     """After the best motion, most normals of a hand and its mirror image agree: it is flat."""
-    if not DATA.exists():
-        pytest.skip("needs the meshes in ../shared/data")
-    keyframes, faces = load_keyframes(sorted((DATA / "mh-hand").glob("*.obj")))
+    keyframes, faces = load_keyframes(sorted((data_dir / "mh-hand").glob("*.obj")))
     mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     turn = torch.from_numpy(trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3])
     i, j = torch.cartesian_prod(*2 * [torch.arange(len(keyframes))]).T
@@ -682,10 +678,8 @@ def test_a_second_check_finds_nothing():
         ("ict-face", 4, 6706, "the surface is open: 296 edges"),
     ],
 )
-def test_real_data(name, n_files, n_vertices, warning):
-    if not (DATA / name).is_dir():
-        pytest.skip(f"the data set {name} is not here")
-    paths = sorted((DATA / name).glob("*.obj"))
+def test_real_data(data_dir, name, n_files, n_vertices, warning):
+    paths = sorted((data_dir / name).glob("*.obj"))
     loaded = load_keyframes(paths)
     assert loaded.keyframes.shape == (n_files, n_vertices, 3)
     lines = [line.split()[1:4] for line in paths[-1].read_text().splitlines() if line.startswith("v ")]

@@ -304,7 +304,7 @@ def test_saved_and_loaded(encoded: tm.ModalSequence, tmp_path: Path) -> None:
 
 def test_files_of_version_2_are_read(small_bars: Shapes) -> None:
     """One motion, as a compact file and without loss, both written by an earlier program."""
-    folder = Path(__file__).parent / "fixtures"
+    folder = Path(__file__).parents[1] / "fixtures"
     exact = tm.ModalSequence.load(folder / "bar-exact-2.tms")
     ends = small_bars.keyframes[:2]
     frames = torch.lerp(ends[0], ends[1], torch.linspace(0, 1, 7).double()[:, None, None])

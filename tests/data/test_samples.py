@@ -13,7 +13,7 @@ from torch_modal.data.samples import FOLDER, SAMPLES, load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import consistent_winding, degenerate_faces, flat_faces, repeated_faces, signed_volume
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", SAMPLES)
