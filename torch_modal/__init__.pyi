@@ -24,7 +24,7 @@ from .data.stored import open_set as open_set
 from .data.stored import write_set as write_set
 from .energy.modal_energy import ModalEnergy as ModalEnergy
 from .energy.shell import ShellEnergy as ShellEnergy
-from .energy.terms import Term as Term
+from .energy.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals

@@ -29,10 +29,13 @@ from torch_modal.backends.warp.fine_steps import WarpSteps
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy, shell_reference
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.backends.warp.shell import WarpShell
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy, Placement
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh
+from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.inspect import signed_volume

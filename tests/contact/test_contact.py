@@ -27,7 +27,7 @@ from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.contact import Contact
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.position import Position
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.inbetween.between import Between

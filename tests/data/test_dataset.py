@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch.utils.data import DataLoader, default_collate
 
 import torch_modal as tm
-from torch_modal.energy.terms import Bend
+from torch_modal.energy.bend import Bend
 from torch_modal.io.cache import CacheWarning
 
 N_SETS, PER_SET = 3, 8

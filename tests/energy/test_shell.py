@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.autograd import gradcheck
 from torch.func import functional_call, grad, vmap
 
-from torch_modal.energy.measures import dihedral_angle, wrap_angle
+from torch_modal.energy.bend import Bend, dihedral_angle, wrap_angle
 from torch_modal.energy.shell import ShellEnergy
-from torch_modal.energy.terms import Bend
 
 TRIANGLE = torch.tensor([[0, 1, 2]])
 HINGE = torch.tensor([[0, 1, 2], [1, 0, 3]])

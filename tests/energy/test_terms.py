@@ -10,9 +10,12 @@ from torch import Tensor, nn
 
 import torch_modal as tm
 from torch_modal.backends.torch.fine_steps import relax
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy
-from torch_modal.energy.terms import Bend, Mesh, Stretch, Term, Volume
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.energy.volume import Volume
 from torch_modal.inbetween.levels import coarse_values
 
 DOUBLE = torch.float64

@@ -7,8 +7,11 @@ from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev
 
 from torch_modal.backends.torch.alignment import Pair
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.shell import ShellEnergy
-from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh
+from torch_modal.energy.volume import Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.frame import Frame

@@ -8,7 +8,7 @@ from bodies import body
 from conftest import Shapes
 
 import torch_modal as tm
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.inbetween.resolution import ENOUGH_FACES, spread, stretching
 from torch_modal.precompute.coarsening import FACES_OF_PIECE, coarsen

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torch_modal as tm
-from torch_modal.energy.terms import Stretch
+from torch_modal.energy.stretch import Stretch
 from torch_modal.io.content import ContentError, content_digest
 
 ROOT = Path(__file__).parents[2]

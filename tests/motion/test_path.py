@@ -277,7 +277,7 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
     """A course is at rest; what pulls at it is felt, and so is its stiffness."""
 
     class Area(tm.Term):
-        def elements(self, mesh: "tm.energy.terms.Mesh") -> Tensor:  # type: ignore[name-defined]
+        def elements(self, mesh: "tm.energy.term.Mesh") -> Tensor:  # type: ignore[name-defined]
             return mesh.faces
 
         def measure(self, edge_vectors: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch_modal.backends.torch.distortion import Distortion, _weights
 from torch_modal.backends.torch.fine_energy import Rests
 from torch_modal.backends.warp.backend import WarpBackend
 from torch_modal.backends.warp.distortion import WarpDistortion
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.comparison import no_worse
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.solve.adjoint import ConvergenceWarning

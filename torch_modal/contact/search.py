@@ -10,7 +10,7 @@ from torch_modal.contact.detect import Search
 from torch_modal.energy.contact import GAP, STIFFNESS, Contact
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.modal_energy import ModalEnergy, Placement
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
 
 ROUNDS = 4

@@ -15,7 +15,8 @@ from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.torch.fine_energy import FineEnergy, Rests
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.inbetween.blend import Blends
 from torch_modal.inbetween.comparison import SLACK, SLACK_OF_PATHS, no_worse
 from torch_modal.inbetween.frame import Collapsing, Frame, mean_areas, shared_collapses

@@ -11,7 +11,8 @@ from torch_modal.backends.torch.coarse_energy import CoarseEnergy
 from torch_modal.backends.torch.fine_energy import FineEnergy
 from torch_modal.energy.energy import Energy, OnMesh, Reference
 from torch_modal.energy.modal_energy import Placement, SumOfEnergies
-from torch_modal.energy.terms import N_SHELL_TERMS, Mesh
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.columns import Columns
 from torch_modal.inbetween.frame import Frame
 

@@ -6,8 +6,11 @@ from typing import Literal, NamedTuple
 from torch import Tensor
 
 from torch_modal.backends.choice import names
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.shell import ALPHA, BETA, GAMMA
-from torch_modal.energy.terms import Bend, Stretch, Term, Volume
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Term
+from torch_modal.energy.volume import Volume
 
 
 def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:

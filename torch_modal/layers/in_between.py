@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, lasting, outlasting
 from torch_modal.contact.rounds import ContactRounds
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.between import Between, Shared
 from torch_modal.inbetween.samples import InBetweenResult, Samples, report

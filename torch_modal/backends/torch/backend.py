@@ -11,7 +11,7 @@ from torch_modal.backends.torch.coarse_energy import CoarseEnergy
 from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.torch.fine_energy import FineEnergy
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Poisson

@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.backends.torch.fine_energy import Rests
+from torch_modal.energy.bend import collapsed, dihedral_angle, wrap_angle
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.measures import collapsed, dihedral_angle, wrap_angle
-from torch_modal.energy.shell import DIAGONAL
-from torch_modal.energy.terms import N_SHELL_TERMS, Mesh
+from torch_modal.energy.shell import DIAGONAL, N_SHELL_TERMS
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.vectors import cross, inverse, norm
 
 # Elements of each kind that are looked at, spread evenly: the sum is then known to a few percent.

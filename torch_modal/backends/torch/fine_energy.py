@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch_modal import trees
 from torch_modal.backends.torch.fine_steps import FurtherEnergy, relax
 from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import cross, pick
 
 # Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into

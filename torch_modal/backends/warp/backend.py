@@ -19,7 +19,7 @@ from torch_modal.backends.warp.launch import kernels, load_kernels
 from torch_modal.backends.warp.poisson import WarpPoisson
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 

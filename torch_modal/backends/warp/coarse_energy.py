@@ -10,7 +10,7 @@ from torch_modal.backends.torch.coarse_energy import CoarseEnergy
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy, shell_reference
 from torch_modal.backends.warp.shell import WarpShell
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 
 
 class WarpCoarseEnergy(CoarseEnergy):

@@ -10,7 +10,7 @@ from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.torch.fine_energy import Rests
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 
 
 class WarpDistortion(Distortion):

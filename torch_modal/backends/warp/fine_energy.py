@@ -11,7 +11,8 @@ from torch_modal.backends.torch.fine_energy import Beside, FineEnergy, Rests, ch
 from torch_modal.backends.torch.fine_steps import ConvexHessian, FurtherDerivatives, FurtherEnergy
 from torch_modal.backends.warp.fine_steps import WarpSteps
 from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.term import Mesh, Term
 
 
 class WarpFineEnergy(FineEnergy):

@@ -11,7 +11,7 @@ from torch_modal.autograd import applied, flattened, made_outside, traced, trans
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torch_modal.backends.warp.launch import kernels, launch, zeros
 from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 
 
 class ShellReference(NamedTuple):
