@@ -211,9 +211,9 @@ def test_coarse_values_by_hand() -> None:
     values = torch.tensor([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
     # Cluster 0 has the ends of 1, 1, 2, 3; cluster 1 of 2, 3, 4, 4, 5, 6; cluster 2 of 5, 6.
     zero, one, two = 7 / 4, 24 / 6, 11 / 2
-    found = coarse_values(values, fine, coarse, clusters)
+    found = coarse_values(values, fine, coarse, clusters, 3)
     assert found[0].tolist() == pytest.approx([(zero + one) / 2, (zero + two) / 2, (one + two) / 2])
-    assert torch.equal(coarse_values(values[:, :1], fine, coarse, clusters), values[:, :1])
+    assert torch.equal(coarse_values(values[:, :1], fine, coarse, clusters, 3), values[:, :1])
 
 
 @pytest.mark.parametrize("shape", [(4,), (3, 2)])

@@ -20,6 +20,7 @@ from torch.func import functional_call, grad, jacrev, vmap
 from torch_modal import trees
 from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning, Samples
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
@@ -646,7 +647,9 @@ class TestTorch:
     @pytest.mark.parametrize("rotations", [False, True])
     def test_the_step_stays_on_its_device(self, small_bars: Shapes, rotations: bool) -> None:
         # Tensors without numbers: asking for one, or bringing in a tensor of the CPU, is an error.
-        layer = InBetween(small_bars.bases[:2], small_bars.faces, **modal(rotations, backend="torch"))
+        edges = Connectivity(small_bars.faces.numpy()).edges
+        alpha = torch.linspace(400, 600, len(edges), dtype=DOUBLE)  # of each edge: it is brought to the coarse mesh
+        layer = InBetween(small_bars.bases[:2], small_bars.faces, **modal(rotations, backend="torch", alpha=alpha))
         member, space = layer.members[0], layer.members[0].space
         inverse = space.blend.poisson.solver if rotations else None
         layer.to("meta")

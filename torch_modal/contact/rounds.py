@@ -101,9 +101,12 @@ class ContactRounds(Between):
 
     def _step(self, batch: Batch, x: Tensor, active: Contacts) -> Tensor:
         """Steps of all vertices of one sample with its contacts. *Shape:* ``(1, V, 3)``."""
-        rests = self.rests(batch.samples, batch.pair, batch.anchors)
         stages = [(FINE_STEPS, FINE_PRODUCTS)]
-        return self.fine.relax(x, rests, stages, lambda own, like: [ActiveContacts(active.rows(own), like)])
+
+        def contacts(own: slice, like: Tensor) -> list[ActiveContacts]:
+            return [ActiveContacts(active.rows(own), like)]
+
+        return self.fine.relax(x, self.rests_of(batch), stages, contacts)
 
 
 def _left(search: ContactSearch) -> tuple[int, int]:

@@ -226,6 +226,11 @@ class Between(nn.Module):
             trajectory = self.space.on_trajectory(pair, samples.which, t)[0]
         return Rests((trajectory,), None, t, stiffness, anchors)
 
+    def rests_of(self, batch: Batch) -> Rests:
+        """The same of a batch."""
+        trajectory = None if batch.pair.around is None else batch.problem.base
+        return self.rests(batch.samples, batch.pair, batch.anchors, trajectory)
+
     def coarse_reference(self, samples: Samples, pair: Pair) -> Any:
         """The reference of Eq. 5 on the coarse mesh."""
         levels = self.space.levels
@@ -249,8 +254,7 @@ class Between(nn.Module):
     def _refine(self, x: Tensor, batch: Batch) -> Tensor:
         """Local interpolation and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
         stages = (self.solver.local_steps, LOCAL_PRODUCTS), (self.solver.polish, POLISH_PRODUCTS)
-        base = None if batch.pair.around is None else batch.problem.base
-        return self.fine.relax(x, self.rests(batch.samples, batch.pair, batch.anchors, base), stages)
+        return self.fine.relax(x, self.rests_of(batch), stages)
 
     def anchors(self, placed: Pair, t: Tensor) -> Tensor | None:
         """Those of all terms, in the frame. *Shape:* ``(B, P, 3)``."""

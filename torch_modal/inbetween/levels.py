@@ -44,7 +44,7 @@ class Levels(nn.Module):
                 sampled = own_terms[0].sampled
                 parts.append(CoarseEnergy(Energy(fine.mesh if sampled else self.mesh, own_terms, sampled)))
         self.parts: Any = nn.ModuleList(parts)
-        self.clusters, self._fine = frame.coarse.clusters, (fine,)
+        self._frame, self._fine = (frame,), (fine,)
         #: Whether terms are evaluated at vertices of the fine mesh.
         self.sampled = bool(members[2])
 
@@ -68,12 +68,14 @@ class Levels(nn.Module):
         Args:
             values: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
-        fine, found = self._fine[0].energy.parts, []
+        fine, coarse, found = self._fine[0].energy.parts, self._frame[0].coarse, []
         for energy, members in zip(self.energies, self.members, strict=True):
             own = [values[i] for i in members]
             if not energy.sampled:
                 parts = zip(own, members, energy.parts, strict=True)
-                own = [coarse_values(value, fine[i], part, self.clusters) for value, i, part in parts]
+                own = [
+                    coarse_values(value, fine[i], part, coarse.clusters, coarse.n_vertices) for value, i, part in parts
+                ]
             found.append(own)
         return found
 
@@ -131,7 +133,7 @@ class Levels(nn.Module):
         return torch.cat([each[i] for i in members], 1) if members else None
 
 
-def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor) -> Tensor:
+def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor, n: int) -> Tensor:
     """Values of the elements of the fine mesh on those of the coarse one: means over clusters, then over corners.
 
     Args:
@@ -139,6 +141,7 @@ def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor
         fine: The term on the fine mesh.
         coarse: The same term on the coarse mesh.
         clusters: The coarse vertex of each fine one. *Shape:* ``(V,)``.
+        n: How many coarse vertices there are.
 
     Returns:
         *Shape:* ``(B, M_coarse)``.
@@ -146,9 +149,8 @@ def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor
     if values.shape[-1] == 1:
         return values
     owners = clusters[fine.corners].flatten()
-    n = int(clusters.max()) + 1
     sums = values.new_zeros(len(values), n).index_add(1, owners, values.repeat(1, len(fine.corners)))
-    counts = torch.bincount(owners, minlength=n)
+    counts = values.new_zeros(n).index_add(0, owners, values.new_ones(len(owners)))
     # A cluster without elements of its own knows the mean only.
     means = torch.where(counts > 0, sums / counts.clamp_min(1), values.mean(1, keepdim=True))
     return means[:, coarse.corners].mean(1)
