@@ -23,7 +23,7 @@ extensions = [
 ]
 exclude_patterns = ["README.md"]
 highlight_language = "none"  # of indented blocks: equations, tables, output
-nb_execution_mode = "off"  # tests/test_notebooks.py runs them
+nb_execution_mode = "off"  # tests/project/test_docs.py runs them
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@3/es5/tex-mml-chtml.js"  # what alone needs a network

@@ -1,5 +1,6 @@
 """Fixtures that several test files share; everything made once per run."""
 
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -35,8 +36,9 @@ limit_threads()  # small problems, and often several processes at once: threads 
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The run's own cache: nothing is taken from the user's, and nothing left there."""
-    folder = tmp_path_factory.mktemp("cache")
+    """The run's own cache, shared by its processes: nothing is taken from the user's, and nothing left there."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCH_MODAL_CACHE", str(folder))
         yield folder

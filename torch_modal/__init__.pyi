@@ -1,6 +1,5 @@
 """The public names, and the modules that they are loaded from when they are first used."""
 
-from .backends.torch.modal_energy import ModalEnergy as ModalEnergy
 from .codec.compress import Compressed as Compressed
 from .codec.compress import compress as compress
 from .codec.sequence import ModalSequence as ModalSequence
@@ -23,8 +22,9 @@ from .data.stored import StoredSet as StoredSet
 from .data.stored import find_sets as find_sets
 from .data.stored import open_set as open_set
 from .data.stored import write_set as write_set
+from .energy.modal_energy import ModalEnergy as ModalEnergy
 from .energy.shell import ShellEnergy as ShellEnergy
-from .energy.terms import Term as Term
+from .energy.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals

@@ -12,9 +12,12 @@ from scipy import sparse
 from torch import Tensor
 
 from torch_modal.energy.assembly import PairBlocks
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy, Linearised, Reference, Rest
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh
+from torch_modal.energy.volume import Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import factorize

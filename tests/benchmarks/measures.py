@@ -12,7 +12,7 @@ from torch import Tensor
 from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 
 import torch_modal as tm
-from torch_modal.energy.measures import wrap_angle
+from torch_modal.energy.bend import wrap_angle
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import best_fit

@@ -14,7 +14,7 @@ from motions import Motion, fractions
 from timing import timed
 from torch import Tensor
 
-from torch_modal.energy.measures import wrap_angle
+from torch_modal.energy.bend import wrap_angle
 from torch_modal.motion.path import Path
 
 COLLAPSED = 0.05  # of the smaller area in both key-frames

@@ -28,7 +28,9 @@ from timing import timed
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.energy.terms import Bend, Stretch, Volume
+from torch_modal.energy.bend import Bend
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.volume import Volume
 
 N_MODES = 30
 REFERENCE = "accurate"

@@ -6,15 +6,12 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.backends.further import FurtherDerivatives
 from torch_modal.backends.torch.alignment import Pair
-from torch_modal.backends.torch.fine_steps import relax
+from torch_modal.backends.torch.fine_steps import FurtherDerivatives, FurtherEnergy
 from torch_modal.contact.search import Contacts
 from torch_modal.energy.contact import Contact
-from torch_modal.energy.energy import Reference
-from torch_modal.energy.position import Position
 from torch_modal.geometry.vectors import pick
-from torch_modal.inbetween.between import Between, fine_chunk
+from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import Samples
 
 
@@ -23,15 +20,16 @@ class ActiveContacts:
 
     Args:
         active: Of all shapes.
-        n: How many vertices a shape has, V.
+        like: The shapes, whose dtype it has. *Shape:* ``(T, V, 3)``.
     """
 
-    def __init__(self, active: Contacts, n: int) -> None:
+    def __init__(self, active: Contacts, like: Tensor) -> None:
+        n = like.shape[1]
         #: The shape of each, and which element it is. *Shape:* ``(N,)``.
         self.shapes, which = torch.nonzero(active.weights > 0, as_tuple=True)
         #: The vertices of each, in rows of all shapes. *Shape:* ``(4, N)``.
         self.corners = (active.elements[which] + (self.shapes * n)[:, None]).T.contiguous()
-        self.weights, self.gaps = active.weights[self.shapes, which], active.gaps[self.shapes, which]
+        self.weights, self.gaps = (own[self.shapes, which].to(like) for own in (active.weights, active.gaps))
         self.term, self.n_shapes = Contact(active.elements), len(active.weights)
 
     def _missing(self, flat: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,15 +74,9 @@ class Pull(NamedTuple):
     weights: Tensor
     """Of the squared distances. *Shape:* ``(V,)``."""
 
-    def rows(self, some: slice) -> "Pull":
-        """Of some shapes."""
-        return self._replace(to=self.to[some])
-
-    def joined(self, reference: Reference) -> Reference:
-        """A reference with that of :class:`~torch_modal.energy.position.Position`, which comes last."""
-        places = self.to.mT.flatten(1)[:, None]
-        weights = self.weights.repeat(3).expand_as(places)
-        return Reference((*reference.measures, places), (*reference.weights, weights), reference.constant)
+    def rows(self, some: slice, like: Tensor) -> "Pull":
+        """Of some shapes, in the dtype of a tensor."""
+        return Pull(self.to[some].to(like), self.weights.to(like))
 
     def value(self, x: Tensor) -> Tensor:
         """Of each shape. *Shape:* ``(T, V, 3) -> (T,)``."""
@@ -93,7 +85,7 @@ class Pull(NamedTuple):
     def at(self, x: Tensor) -> FurtherDerivatives:
         """*Shape:* ``(T, V, 3)``."""
         twice = 2 * self.weights[:, None]
-        diagonal = twice * twice.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
+        diagonal = (twice * twice.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])).expand(len(x), -1, -1)
         return FurtherDerivatives(self.value(x), twice * (x - self.to), diagonal, lambda field: twice * field)
 
 
@@ -112,37 +104,12 @@ def settled(
         pull: What pulls them elsewhere.
         n_products: Iterations of conjugate gradients.
     """
-    fixed = member.anchors(trees.picked(pair, samples.which), samples.t)
-    if member.fused is None:
-        return _by_torch(member, samples, pair, x, active, pull, n_products, fixed)
-    moving, pull, parts = x.double(), Pull(pull.to.double(), pull.weights.double()), []
-    for own, to, others in member.fused_chunks(samples, pair, fixed):
-        more = [*others, ActiveContacts(active.rows(own), x.shape[1]), pull.rows(own)]
-        parts.append(member.fused.descend(moving[own].contiguous(), to, more, 1, n_products))
-    return torch.cat(parts).to(x)
+    anchors = member.anchors(trees.picked(pair, samples.which), samples.t)
 
+    def beside(own: slice, like: Tensor) -> list[FurtherEnergy]:
+        return [ActiveContacts(active.rows(own), like), pull.rows(own, like)]
 
-def _by_torch(
-    member: Between,
-    samples: Samples,
-    pair: Pair,
-    x: Tensor,
-    active: Contacts,
-    pull: Pull,
-    n_products: int,
-    fixed: Tensor | None,
-) -> Tensor:
-    energy = active.fine(member.mesh, [*member.terms, Position(member.mesh.n_vertices)])
-    origin = x.new_zeros(len(x), 1, 3)
-    fixed = origin if fixed is None else torch.cat([fixed, origin], 1)
-    reference = member.fine_reference(samples, pair)
-    size, parts = fine_chunk(x.shape[1], x.device), []
-    for i in range(0, len(x), size):
-        own = slice(i, i + size)
-        rest, anchors = trees.rows((reference, fixed), own)
-        rest = active.rows(own).joined(pull.rows(own).joined(rest))
-        parts.append(relax(energy, x[own], rest, 1, n_products, anchors))
-    return torch.cat(parts)
+    return member.fine.relax(x, member.rests(samples, pair, anchors), [(1, n_products)], beside)
 
 
 def _flat(x: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.backends.torch.fine_steps import relax
 from torch_modal.contact.active import ActiveContacts
 from torch_modal.contact.search import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
 from torch_modal.inbetween.between import Batch, Between
@@ -102,13 +101,12 @@ class ContactRounds(Between):
 
     def _step(self, batch: Batch, x: Tensor, active: Contacts) -> Tensor:
         """Steps of all vertices of one sample with its contacts. *Shape:* ``(1, V, 3)``."""
-        if self.kernels_serve(x):
-            weights, gaps = active.weights.double(), active.gaps.double()
-            contacts = ActiveContacts(active._replace(weights=weights, gaps=gaps), x.shape[1])
-            return self.descend(x, batch, [(FINE_STEPS, FINE_PRODUCTS)], [contacts])
-        ((_, reference, fixed),) = self.fine_chunks(batch)
-        energy = active.fine(self.mesh, self.terms)
-        return relax(energy, x, active.joined(reference), FINE_STEPS, FINE_PRODUCTS, fixed)
+        stages = [(FINE_STEPS, FINE_PRODUCTS)]
+
+        def contacts(own: slice, like: Tensor) -> list[ActiveContacts]:
+            return [ActiveContacts(active.rows(own), like)]
+
+        return self.fine.relax(x, self.rests_of(batch), stages, contacts)
 
 
 def _left(search: ContactSearch) -> tuple[int, int]:

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.modal_energy import ModalEnergy, Placement
 from torch_modal.contact.detect import Search
 from torch_modal.energy.contact import GAP, STIFFNESS, Contact
 from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.modal_energy import ModalEnergy, Placement
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
 
 ROUNDS = 4
@@ -90,10 +90,6 @@ class Contacts(NamedTuple):
             self.joined(Reference((), (), zero)),
             None if extra is None else extra[:, vertices],
         )
-
-    def fine(self, mesh: Mesh, terms: Sequence[Term]) -> Energy:
-        """The energy on the fine mesh with the term."""
-        return Energy(mesh, [*terms, self.term]).to(self.elements.device)
 
 
 class ContactSearch:

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.fine_steps import STEP_LENGTHS
-from torch_modal.backends.torch.modal_energy import SumOfEnergies
 from torch_modal.contact.search import Contacts
 from torch_modal.contact.splines import splines
+from torch_modal.energy.modal_energy import SumOfEnergies
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import Samples
 

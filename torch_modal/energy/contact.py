@@ -8,7 +8,7 @@ wanted. It is zero, with its first derivative, where the gap is kept.
 import torch
 from torch import Tensor
 
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import cross, inverse, norm
 
 GAP = 0.15

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import lasting
-from torch_modal.energy.terms import Mesh, Term
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import inverse, pick
 
 

@@ -6,12 +6,18 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, lasting
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy, Reference, Rest
-from torch_modal.energy.terms import Bend, Mesh, Stretch, Term, Volume
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.energy.volume import Volume
 from torch_modal.keyframes.arrays import as_faces
 
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
 """The paper's stiffnesses, for shapes of a size of 100."""
+
+N_SHELL_TERMS = 3
+"""How many terms Eq. 5 has; they come first."""
 
 DIAGONAL = 100.0
 """Eq. 5 is not scale-invariant: its stiffnesses are meant for shapes of this size, which is that of

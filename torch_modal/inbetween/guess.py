@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.local_rotations import LocalRotations, weights_per_length
 from torch_modal.geometry.vectors import pick
 

@@ -10,13 +10,13 @@ from torch import Tensor, nn
 from torch_modal import trees
 from torch_modal.autograd import lasting
 from torch_modal.backends.torch.alignment import Pair, vertex_tangent_offset
-from torch_modal.backends.torch.modal_energy import Placement, SumOfEnergies
+from torch_modal.energy.modal_energy import Placement, SumOfEnergies
 from torch_modal.geometry.hermite import beyond
 from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.inbetween.columns import Columns
 from torch_modal.inbetween.frame import Frame
 from torch_modal.inbetween.guess import Guess
-from torch_modal.inbetween.levels import Levels, Stiffness
+from torch_modal.inbetween.levels import Levels
 
 
 class Difference(NamedTuple):
@@ -125,7 +125,13 @@ class JointSpace(nn.Module):
         return len(self.columns) + 1
 
     def problem(
-        self, pair: Pair, index: Tensor | None, t: Tensor, stiffness: Stiffness, mu: Tensor, anchors: Tensor | None
+        self,
+        pair: Pair,
+        index: Tensor | None,
+        t: Tensor,
+        stiffness: list[list[Tensor]],
+        mu: Tensor,
+        anchors: Tensor | None,
     ) -> JointProblem:
         """Set up the in-betweens of a batch.
 
@@ -133,7 +139,7 @@ class JointSpace(nn.Module):
             pair: P pairs of key-frames.
             index: Which of them each sample lies between; each its own where None. *Shape:* ``(B,)``.
             t: Times. *Shape:* ``(B,)``.
-            stiffness: Of each sample.
+            stiffness: On each level.
             mu: Plays no part.
             anchors: Of the terms, in the frame. *Shape:* ``(B, P, 3)``.
         """

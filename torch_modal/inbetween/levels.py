@@ -1,29 +1,20 @@
 """Where the terms of an in-between's energy are evaluated: on the coarse mesh, or at the vertices that they name."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal import trees
-from torch_modal.backends.torch.modal_energy import ModalEnergy, Placement, SumOfEnergies
-from torch_modal.backends.warp.launch import Backend
-from torch_modal.backends.warp.modal_energy import FusedModalEnergy, fused_reference
-from torch_modal.backends.warp.shell import FusedShell
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.coarse_energy import CoarseEnergy
+from torch_modal.backends.torch.fine_energy import FineEnergy
 from torch_modal.energy.energy import Energy, OnMesh, Reference
-from torch_modal.energy.terms import N_SHELL_TERMS, Mesh, Term
+from torch_modal.energy.modal_energy import Placement, SumOfEnergies
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.columns import Columns
 from torch_modal.inbetween.frame import Frame
-
-
-class Stiffness(NamedTuple):
-    """Stiffnesses of each sample, with those of the elements of either mesh."""
-
-    fine: list[Tensor]
-    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
-    levels: list[list[Tensor]]
-    """Of the terms of each level. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
 
 
 class Levels(nn.Module):
@@ -31,37 +22,62 @@ class Levels(nn.Module):
 
     Args:
         frame: The frame of both bases.
-        fine: The caller's mesh.
-        terms: All terms.
-        backend: Whether kernels may take the coarse level.
+        fine: All terms on the caller's mesh.
+        backend: Makes the energy of Eq. 5 on the coarse mesh.
     """
 
-    def __init__(self, frame: Frame, fine: Mesh, terms: Sequence[Term], backend: Backend = "torch") -> None:
+    def __init__(self, frame: Frame, fine: FineEnergy, backend: TorchBackend) -> None:
         super().__init__()
         self.mesh = Mesh.of(frame.coarse.faces, frame.coarse.n_vertices)
+        terms = fine.terms
         kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
         members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
         #: Which terms each level has: those of Eq. 5, others on the coarse mesh, others at vertices of the fine mesh.
         self.members = [own for own in members if own]
         self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
-        own_terms = [[terms[i] for i in own] for own in self.members]
-        energies = [Energy(fine, own, True) if own[0].sampled else Energy(self.mesh, own) for own in own_terms]
-        self.energies: Any = nn.ModuleList(energies)
-        #: Whether any are.
+        parts = []
+        for own in self.members:
+            own_terms = [terms[i] for i in own]
+            if own[0] == 0:
+                parts.append(backend.coarse_energy(Energy(self.mesh, own_terms), self.mesh))
+            else:
+                sampled = own_terms[0].sampled
+                parts.append(CoarseEnergy(Energy(fine.mesh if sampled else self.mesh, own_terms, sampled)))
+        self.parts: Any = nn.ModuleList(parts)
+        self._frame, self._fine = (frame,), (fine,)
+        #: Whether terms are evaluated at vertices of the fine mesh.
         self.sampled = bool(members[2])
-        #: The kernels of Eq. 5, where there are some.
-        self.shell = FusedShell(energies[0], self.mesh) if FusedShell.serves(energies[0], backend) else None
+
+    @property
+    def energies(self) -> list[Energy]:
+        """The energy of each level."""
+        return [part.energy for part in self.parts]
 
     def modal(self, columns: Columns) -> SumOfEnergies:
         """All of them in the amplitudes of a space."""
-        parts = []
-        for i, energy in enumerate(self.energies):
-            if i or self.shell is None:
-                own = columns.at(energy.vertices) if energy.sampled else columns.coarse
-                parts.append(ModalEnergy(energy, own))
-            else:
-                parts.append(FusedModalEnergy(self.shell, self.mesh, columns.coarse))
-        return SumOfEnergies(*parts)
+        return SumOfEnergies(
+            *(
+                part.modal(columns.at(part.energy.vertices) if part.energy.sampled else columns.coarse)
+                for part in self.parts
+            )
+        )
+
+    def stiffness(self, values: list[Tensor]) -> list[list[Tensor]]:
+        """Stiffnesses of the elements of the fine mesh, on those of each level.
+
+        Args:
+            values: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
+        """
+        fine, coarse, found = self._fine[0].energy.parts, self._frame[0].coarse, []
+        for energy, members in zip(self.energies, self.members, strict=True):
+            own = [values[i] for i in members]
+            if not energy.sampled:
+                parts = zip(own, members, energy.parts, strict=True)
+                own = [
+                    coarse_values(value, fine[i], part, coarse.clusters, coarse.n_vertices) for value, i, part in parts
+                ]
+            found.append(own)
+        return found
 
     def seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
         """A fine shape and its coarse one as each energy sees them. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
@@ -73,7 +89,7 @@ class Levels(nn.Module):
         second: Sequence[Tensor],
         index: Tensor | None,
         t: Tensor,
-        stiffness: Stiffness,
+        stiffness: Sequence[Sequence[Tensor]],
     ) -> list[Any]:
         """References of in-betweens at the times ``t``, of the pairs ``index`` (each its own where None).
 
@@ -82,22 +98,17 @@ class Levels(nn.Module):
             second: Of the weight ``t``. *Shape of each:* ``(P, V, 3)``.
             index: *Shape:* ``(B,)``.
             t: *Shape:* ``(B,)``.
-            stiffness: Of each sample.
+            stiffness: Of :meth:`stiffness`.
 
         Returns:
-            A :class:`Reference` of each energy, or a :class:`ShellReference` for kernels.
+            What each energy compares with.
         """
-        found: list[Any] = []
-        for energy, a, b, own in zip(self.energies, first, second, stiffness.levels, strict=True):
-            if self.shell is not None and not found:
-                found.append(fused_reference(self.shell, *trees.picked((a, b), index), t, *own))
-            else:
-                found.append(energy.between(*trees.picked((energy.rest_of(a), energy.rest_of(b)), index), t, own))
-        return found
+        parts = zip(self.parts, first, second, stiffness, strict=True)
+        return [part.between(a, b, index, t, own) for part, a, b, own in parts]
 
-    def against(self, x: Tensor, coarse: Tensor, stiffness: Stiffness) -> list[Reference]:
+    def against(self, x: Tensor, coarse: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Reference]:
         """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
-        parts = zip(self.energies, self.seen(x, coarse), stiffness.levels, strict=True)
+        parts = zip(self.energies, self.seen(x, coarse), stiffness, strict=True)
         return [Energy.against(energy.rest_of(own), factors) for energy, own, factors in parts]
 
     def place(
@@ -122,7 +133,7 @@ class Levels(nn.Module):
         return torch.cat([each[i] for i in members], 1) if members else None
 
 
-def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor) -> Tensor:
+def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor, n: int) -> Tensor:
     """Values of the elements of the fine mesh on those of the coarse one: means over clusters, then over corners.
 
     Args:
@@ -130,6 +141,7 @@ def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor
         fine: The term on the fine mesh.
         coarse: The same term on the coarse mesh.
         clusters: The coarse vertex of each fine one. *Shape:* ``(V,)``.
+        n: How many coarse vertices there are.
 
     Returns:
         *Shape:* ``(B, M_coarse)``.
@@ -137,9 +149,8 @@ def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor
     if values.shape[-1] == 1:
         return values
     owners = clusters[fine.corners].flatten()
-    n = int(clusters.max()) + 1
     sums = values.new_zeros(len(values), n).index_add(1, owners, values.repeat(1, len(fine.corners)))
-    counts = torch.bincount(owners, minlength=n)
+    counts = values.new_zeros(n).index_add(0, owners, values.new_ones(len(owners)))
     # A cluster without elements of its own knows the mean only.
     means = torch.where(counts > 0, sums / counts.clamp_min(1), values.mean(1, keepdim=True))
     return means[:, coarse.corners].mean(1)

@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.backends.torch.alignment import Pair
-from torch_modal.backends.torch.modal_energy import Derivatives, Placement, SumOfEnergies
+from torch_modal.energy.modal_energy import Derivatives, Placement, SumOfEnergies
 from torch_modal.inbetween.columns import Columns
 from torch_modal.inbetween.frame import Frame
-from torch_modal.inbetween.levels import Levels, Stiffness
+from torch_modal.inbetween.levels import Levels
 
 
 class PairedPlacement(NamedTuple):
@@ -138,7 +138,13 @@ class PairedSpace(nn.Module):
         return len(self.energy.gap)
 
     def problem(
-        self, pair: Pair, index: Tensor | None, t: Tensor, stiffness: Stiffness, mu: Tensor, anchors: Tensor | None
+        self,
+        pair: Pair,
+        index: Tensor | None,
+        t: Tensor,
+        stiffness: list[list[Tensor]],
+        mu: Tensor,
+        anchors: Tensor | None,
     ) -> PairedProblem:
         """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. Arguments as for the joint space."""
         ends = (pair.first, pair.second)

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.terms import Mesh, Stretch
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh
 from torch_modal.precompute.coarsening import Coarsening, coarsen
 
 ENOUGH_FACES = 1000

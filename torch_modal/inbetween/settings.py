@@ -5,8 +5,12 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
+from torch_modal.backends.choice import names
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.shell import ALPHA, BETA, GAMMA
-from torch_modal.energy.terms import Bend, Stretch, Term, Volume
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Term
+from torch_modal.energy.volume import Volume
 
 
 def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -85,8 +89,8 @@ class Solver:
             reach: fingertips, hooves, creases. Gradients go through them; they cost memory in proportion to V.
         polish: Further steps on the fine mesh, each four times as long; two come within 2 % of the optimum.
         backend: ``"warp"`` (kernels of NVIDIA Warp for the local rotations, the modal energy and the local steps),
-            ``"torch"``, or ``"auto"``: kernels where Warp is installed. They compute in float64. Terms beyond Eq. 5 are
-            computed by torch.
+            ``"torch"``, ``"auto"`` (kernels where Warp is installed), or one that was registered (docs/extending.md).
+            Kernels compute in float64. Terms beyond Eq. 5 are computed by torch.
 
     Raises:
         ValueError: A choice that does not exist, or a number out of range.
@@ -98,12 +102,12 @@ class Solver:
     unconverged: Literal["warn", "raise"] = "warn"
     local_steps: int = 2
     polish: int = 0
-    backend: Literal["auto", "torch", "warp"] = "auto"
+    backend: str = "auto"
 
     def __post_init__(self) -> None:
         _choice("gradient", self.gradient, ("implicit", "unroll"))
         _choice("unconverged", self.unconverged, ("warn", "raise"))
-        _choice("backend", self.backend, ("auto", "torch", "warp"))
+        _choice("backend", self.backend, names())
         for name, lowest in (("max_steps", 0), ("local_steps", 0), ("polish", 0)):
             _whole(name, getattr(self, name), lowest)
         if not self.tolerance >= 0:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, lasting, outlasting
 from torch_modal.contact.rounds import ContactRounds
-from torch_modal.energy.terms import Mesh
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.between import Between, Shared
 from torch_modal.inbetween.samples import InBetweenResult, Samples, report
@@ -271,7 +271,7 @@ class InBetween(nn.Module):
     def stiffness_of(self, times: Tensor, lead: torch.Size) -> list[Tensor]:
         """Stiffnesses of a flat batch, of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
         found = []
-        for term, part in zip(self.terms, self.members[0].fine.parts, strict=True):
+        for term, part in zip(self.terms, self.members[0].fine.energy.parts, strict=True):
             values = torch.as_tensor(term.stiffness, dtype=times.dtype, device=times.device)
             values = values[None] if values.dim() == 0 else values
             n = 1 if term.total else part.corners.shape[1]

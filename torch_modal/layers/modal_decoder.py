@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, lasting, outlasting
 from torch_modal.backends.torch.alignment import Alignment, Pair, vertex_tangent_offset
+from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.hermite import Spacing, TangentOffset, around, beyond, located
@@ -133,7 +134,7 @@ class ModalDecoder(nn.Module):
     def _forget(self) -> None:
         self._made_of = [x.detach().clone() for x in (self.keyframes, self.times, self.reference)]
         self._known: list[Interval | None] = [None] * self.n_intervals
-        self._shared = Blends(self._mesh, self._made_of[0].double().cpu(), (0, 1))
+        self._shared = Blends(self._mesh, self._made_of[0].double().cpu(), (0, 1), TorchBackend())
         self._blends: list[RotationBlend | None] = [None] * self.n_intervals
         self._made: list[int] = []
 

@@ -4,14 +4,13 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_modal.backends.warp.launch import load_kernels
+from torch_modal.backends.choice import choose
 from torch_modal.contact.trajectory import push_apart
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
@@ -105,8 +104,9 @@ def subdivide(
     if smooth and chosen.objective.space == "paired":
         raise ValueError("the paired space (Eq. 4) knows pairs only: smooth=True needs space='joint'")
     if bases is None:
-        load = partial(load_kernels, chosen.solver.backend)
-        bases = bases_of_checked(keyframes, working_faces, n_modes, progress=progress, meanwhile=load)
+        bases = bases_of_checked(
+            keyframes, working_faces, n_modes, progress=progress, meanwhile=choose(chosen.solver.backend).load
+        )
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from torch_modal.backends.torch.modal_energy import Derivatives
+from torch_modal.energy.modal_energy import Derivatives
 
 # Fractions of a step that are tried, side by side, where the whole step disappoints.
 STEP_LENGTHS = (0.5, 0.25, 0.1, 0.03, 0.003)

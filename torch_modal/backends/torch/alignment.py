@@ -45,6 +45,16 @@ class Pair(NamedTuple):
         return self._replace(first=self.first[:, :0], second=self.second[:, :0], around=around)
 
 
+class PlacedPairs(NamedTuple):
+    """Pairs of key-frames in the frame."""
+
+    pair: Pair
+    finite: Tensor
+    """Whether both ends are; otherwise the reference stands in for them. *Shape:* ``(P,)``, bool."""
+    sizes: Tensor
+    """Diagonal of the bounding box of the smaller end. *Shape:* ``(P,)``."""
+
+
 class Alignment(nn.Module):
     """Between the caller's coordinates and a frame that is centred, scaled and turned to a reference.
 
@@ -63,6 +73,14 @@ class Alignment(nn.Module):
         self.register_buffer("scale", scale, persistent=False)
         self.register_buffer("weights", weights, persistent=False)
         self.register_buffer("reference", reference, persistent=False)
+
+    def finite(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Key-frames, the reference in the place of those that are not finite; which are. *Shape:* ``(P, V, 3)``.
+
+        What is not finite must not reach the factorisations of the other samples.
+        """
+        finite = x.isfinite().flatten(1).all(1)
+        return torch.where(finite[:, None, None], x, self.reference / self.scale), finite
 
     def place(self, x_a: Tensor, x_b: Tensor) -> Pair:
         """Bring key-frames into the frame. *Shape:* ``(B, V, 3)`` each."""

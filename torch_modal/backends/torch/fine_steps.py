@@ -1,7 +1,7 @@
 """An energy with every vertex free: a convex Hessian that is applied without being assembled, and steps with it."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -13,8 +13,34 @@ from torch_modal.energy.energy import Energy, Linearised, Reference
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
 
+# A symmetric block from its upper triangle.
+_UNPACKED = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+
 # The whole step, and what is tried where it goes uphill. Contacts that a step activates need the shortest ones.
 STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.003, 0.001)
+
+
+class FurtherDerivatives(NamedTuple):
+    """An energy beside Eq. 5 at given shapes."""
+
+    value: Tensor
+    """*Shape:* ``(B,)``."""
+    gradient: Tensor
+    """*Shape:* ``(B, V, 3)``."""
+    diagonal: Tensor
+    """The blocks of its convex Hessian's diagonal, packed. *Shape:* ``(B, V, 6)``."""
+    product: Callable[[Tensor], Tensor]
+    """With the convex Hessian. *Shape:* ``(B, V, 3) -> (B, V, 3)``."""
+
+
+class FurtherEnergy(Protocol):
+    """An energy that steps of all vertices take beside Eq. 5."""
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+
+    def at(self, x: Tensor) -> FurtherDerivatives:
+        """*Shape:* ``(B, V, 3)``."""
 
 
 class ConvexHessian:
@@ -66,10 +92,6 @@ class ConvexHessian:
         summed = blocks.new_zeros(*blocks.shape[:-1], self.energy.n_extended)
         return summed.index_add(-1, self.energy.corners, blocks)
 
-    def inverse_diagonal(self) -> Tensor:
-        """Inverses of the 3 x 3 blocks of all vertices. *Shape:* ``(3, 3, B, V)``, extended."""
-        return inverse_of_symmetric(self.diagonal())
-
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:
     """Inverse by cofactors, with a ridge. *Shape:* ``(3, 3, ...)``."""
@@ -86,7 +108,13 @@ def inverse_of_symmetric(blocks: Tensor) -> Tensor:
 
 
 def relax(
-    energy: Energy, x: Tensor, reference: Reference, n_steps: int, n_products: int, anchors: Tensor | None = None
+    energy: Energy,
+    x: Tensor,
+    reference: Reference,
+    n_steps: int,
+    n_products: int,
+    anchors: Tensor | None = None,
+    beside: Sequence[FurtherEnergy] = (),
 ) -> Tensor:
     """Steps of a truncated Newton method on all vertices, never uphill.
 
@@ -101,6 +129,7 @@ def relax(
         n_steps: Newton steps.
         n_products: Iterations of conjugate gradients in each.
         anchors: Of the energy's terms, where there are some. *Shape:* ``(B, P, 3)``.
+        beside: Further energies.
 
     Returns:
         *Shape:* ``(B, V, 3)``.
@@ -109,22 +138,28 @@ def relax(
     rows = x.movedim(-1, 0).contiguous()
     for _ in range(n_steps):
         extended = energy.extend(rows, fixed)
-        at = energy.linearise(extended, reference)
-        right = -energy.fold(energy.gradient(at))
-        direction = _solved(energy, ConvexHessian(energy, at), right, n_products)
+        at, more = energy.linearise(extended, reference), [one.at(rows.movedim(0, -1).contiguous()) for one in beside]
+        right = -sum((one.gradient.movedim(-1, 0) for one in more), start=energy.fold(energy.gradient(at)))
+        direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more)
         moves = energy.extend(direction)
-        before = energy.value_at(at, reference)
-        length = _downhill(energy, before, extended, moves, reference)
+        before = sum((one.value for one in more), start=energy.value_at(at, reference))
+        length = _downhill(energy, before, extended, moves, reference, beside)
         rows = rows + length[:, None] * direction
     return rows.movedim(0, -1)
 
 
-def _solved(energy: Energy, hessian: ConvexHessian, right: Tensor, n_products: int) -> Tensor:
+def _solved(
+    energy: Energy, hessian: ConvexHessian, right: Tensor, n_products: int, more: Sequence[FurtherDerivatives]
+) -> Tensor:
     """An approximate solution. *Shape:* ``(3, B, V)``."""
-    inverse = hessian.inverse_diagonal()[..., : right.shape[-1]]
+    blocks = hessian.diagonal()[..., : right.shape[-1]]
+    for one in more:
+        blocks = blocks + one.diagonal.movedim(-1, 0)[_UNPACKED].unflatten(0, (3, 3))
+    inverse = inverse_of_symmetric(blocks)
 
     def product(field: Tensor) -> Tensor:
-        return energy.fold(hessian(energy.extend(field)))
+        own = energy.fold(hessian(energy.extend(field)))
+        return sum((one.product(field.movedim(0, -1).contiguous()).movedim(-1, 0) for one in more), start=own)
 
     def precondition(residual: Tensor) -> Tensor:
         return (inverse * residual).sum(1)
@@ -173,25 +208,45 @@ def conjugate_gradients(
     return solution
 
 
-def _downhill(energy: Energy, before: Tensor, rows: Tensor, moves: Tensor, reference: Reference) -> Tensor:
+def _downhill(
+    energy: Energy,
+    before: Tensor,
+    rows: Tensor,
+    moves: Tensor,
+    reference: Reference,
+    beside: Sequence[FurtherEnergy],
+) -> Tensor:
     """The longest of the steps that goes downhill. *Shape:* ``(B,), (3, B, V), (3, B, V) -> (B,)``."""
     batched = (before, rows.transpose(0, 1), moves.transpose(0, 1), *trees.leaves(reference))
     if torch.compiler.is_compiling():
         # It looks at numbers: a graph ends here, and another begins. No decorator: that takes a second to import.
-        return torch.compiler.disable(_Length.apply)(energy, trees.skeleton(reference), *batched)
-    return _Length.apply(energy, trees.skeleton(reference), *batched)
+        return torch.compiler.disable(_Length.apply)(energy, beside, trees.skeleton(reference), *batched)
+    return _Length.apply(energy, beside, trees.skeleton(reference), *batched)
 
 
 class _Length(torch.autograd.Function):
     """The longest of the steps that goes downhill, of each sample; 0 where none does. It has no gradient."""
 
     @staticmethod
-    def forward(energy: Energy, tree: Any, before: Tensor, x: Tensor, moves: Tensor, *inputs: Tensor) -> Tensor:
+    def forward(
+        energy: Energy,
+        beside: Sequence[FurtherEnergy],
+        tree: Any,
+        before: Tensor,
+        x: Tensor,
+        moves: Tensor,
+        *inputs: Tensor,
+    ) -> Tensor:
         rows, direction, reference = x.transpose(0, 1), moves.transpose(0, 1), trees.filled(tree, inputs)
+
+        def value(rows: Tensor) -> Tensor:
+            x = rows[..., : energy.n_vertices].movedim(0, -1).contiguous()
+            return sum((one.value(x) for one in beside), start=energy.value(rows, reference))
+
         chosen = torch.zeros_like(before)
         searching = torch.ones_like(before, dtype=torch.bool)
         for length in STEP_LENGTHS:
-            downhill = searching & (energy.value(rows + length * direction, reference) < before)
+            downhill = searching & (value(rows + length * direction) < before)
             chosen = torch.where(downhill, length, chosen)
             searching = searching & ~downhill
             if not bool(searching.any()):
@@ -208,6 +263,13 @@ class _Length(torch.autograd.Function):
         return (None,) * ctx.n_inputs
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], energy: Energy, tree: Any, *tensors: Tensor) -> tuple[Tensor, int]:
+    def vmap(
+        info: Any,
+        in_dims: tuple[Any, ...],
+        energy: Energy,
+        beside: Sequence[FurtherEnergy],
+        tree: Any,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, int]:
         flat = flattened(info.batch_size, in_dims[-len(tensors) :], tensors)
-        return _Length.apply(energy, tree, *flat).unflatten(0, (info.batch_size, -1)), 0
+        return _Length.apply(energy, beside, tree, *flat).unflatten(0, (info.batch_size, -1)), 0

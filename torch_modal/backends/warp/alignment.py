@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
-from torch_modal.backends.torch.alignment import Alignment, Pair
+from torch_modal.backends.torch.alignment import Alignment, Pair, PlacedPairs
 from torch_modal.backends.warp.launch import kernels, launch, zeros
 from torch_modal.geometry.rigid import RigidMotion
 
@@ -20,7 +20,7 @@ def serves(*given: Tensor) -> bool:
     return plain and not (torch.is_grad_enabled() and any(x.requires_grad for x in given))
 
 
-def place(frame: Alignment, x_a: Tensor, x_b: Tensor) -> tuple[Pair, Tensor] | None:
+def place(frame: Alignment, x_a: Tensor, x_b: Tensor) -> PlacedPairs | None:
     """Bring key-frames into a frame.
 
     Args:
@@ -29,7 +29,7 @@ def place(frame: Alignment, x_a: Tensor, x_b: Tensor) -> tuple[Pair, Tensor] | N
         x_b: Key-frames at 1. *Shape:* ``(B, V, 3)``.
 
     Returns:
-        The pair, and the sizes of the smaller of both ends, *shape* ``(B,)``; None where something is not finite.
+        None where something is not finite.
     """
     module, (b, n) = kernels("alignment"), x_a.shape[:2]
     x_a, x_b, weights, reference = x_a.contiguous(), x_b.contiguous(), frame.weights, frame.reference
@@ -51,7 +51,8 @@ def place(frame: Alignment, x_a: Tensor, x_b: Tensor) -> tuple[Pair, Tensor] | N
     for (x, moved), centre, rotation, *reach in each:
         launch(module.carried, (b, n), [x, centre, rotation, source, n, moved, *reach])
     motions = RigidMotion(turn, centres[0], own_end), RigidMotion(between, source, end)
-    return Pair(first, second, *motions), (highest - lowest).norm(dim=-1).amin(0)
+    finite = torch.ones(b, dtype=torch.bool, device=x_a.device)
+    return PlacedPairs(Pair(first, second, *motions), finite, (highest - lowest).norm(dim=-1).amin(0))
 
 
 def restore(frame: Alignment, x: Tensor, pair: Pair, t: Tensor) -> Tensor:

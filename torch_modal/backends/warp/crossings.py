@@ -12,7 +12,7 @@ ROOM = 4096
 """Pairs that there is room for at first."""
 
 
-class FusedPairs:
+class WarpPairs:
     """Pairs of triangles that cross, or miss each other by rounding only, and share no vertex.
 
     The tree is made once, of what lies together in given shapes; of others, only its boxes are made.

@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import applied, flattened, traced
-from torch_modal.backends.further import FurtherDerivatives, FurtherEnergy
-from torch_modal.backends.torch.fine_steps import STEP_LENGTHS, relax
+from torch_modal.backends.torch.fine_steps import STEP_LENGTHS, FurtherDerivatives, FurtherEnergy, relax
 from torch_modal.backends.warp.launch import kernels, launch
-from torch_modal.backends.warp.shell import FusedShell, ShellPoint, ShellReference
+from torch_modal.backends.warp.shell import ShellPoint, ShellReference, WarpShell
 
 
-class FusedRelax(FusedShell):
+class WarpSteps(WarpShell):
     """:func:`torch_modal.backends.torch.fine_steps.relax` towards two rest shapes, for the terms of Eq. 5 alone.
 
     It computes in float64, whatever comes in.
@@ -321,7 +320,7 @@ class _Relaxed(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        fused: FusedRelax, n_steps: int, n_products: int, kept: list[_Taken] | None, *given: Tensor
+        fused: WarpSteps, n_steps: int, n_products: int, kept: list[_Taken] | None, *given: Tensor
     ) -> tuple[Tensor, Tensor]:
         return fused.steps(n_steps, n_products, *(value.detach().contiguous() for value in given), kept=kept)
 
@@ -344,7 +343,7 @@ class _Relaxed(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], fused: FusedRelax, n_steps: int, n_products: int, kept: Any, *given: Tensor
+        info: Any, in_dims: tuple[Any, ...], fused: WarpSteps, n_steps: int, n_products: int, kept: Any, *given: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
         flat = flattened(info.batch_size, in_dims[4:], given)
         x, lengths = _Relaxed.apply(fused, n_steps, n_products, None, *flat)

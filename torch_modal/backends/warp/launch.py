@@ -6,11 +6,9 @@ calls take 47 microseconds for a kernel of 13 arrays, which is 13 % of an in-bet
 
 import ctypes
 import importlib
-import importlib.util
 import math
 import os
 import threading
-import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Literal
@@ -18,11 +16,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_modal.errors import MissingPackageError
 from torch_modal.extras import uncollected
 from torch_modal.progress import ProgressReport
 
-Backend = Literal["auto", "torch", "warp"]
 Module = Literal[
     "alignment",
     "shell",
@@ -64,39 +60,15 @@ def _load(wp: Any, module: str) -> None:
         wp.config.log_level = before
 
 
-@cache
-def _works() -> bool:
-    if importlib.util.find_spec("warp") is None:
-        return False
-    try:
-        kernels("shell")
-    except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
-        warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
-        return False
-    return True
+def load_kernels() -> None:
+    """Load those of in-betweens, so that nobody waits for it later."""
+    import warp as wp
 
-
-def has_kernels(backend: Backend) -> bool:
-    """Whether kernels are used.
-
-    Raises:
-        MissingPackageError: ``"warp"`` is requested and not installed.
-    """
-    if backend == "warp" and importlib.util.find_spec("warp") is None:
-        raise MissingPackageError("backend='warp' needs warp-lang, which is not installed: pip install warp-lang")
-    return backend != "torch" and _works()
-
-
-def load_kernels(backend: Backend) -> None:
-    """Load those of in-betweens, if they are used, so that nobody waits for it later."""
-    if has_kernels(backend):
-        import warp as wp
-
-        for name in IN_BETWEENS:
-            importlib.import_module(f"{PACKAGE}.{name}")
-        _load(wp, PACKAGE)
-        for name in IN_BETWEENS:
-            kernels(name)
+    for name in IN_BETWEENS:
+        importlib.import_module(f"{PACKAGE}.{name}")
+    _load(wp, PACKAGE)
+    for name in IN_BETWEENS:
+        kernels(name)
 
 
 class _Commands(threading.local):

@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import applied, flattened, made_outside, traced, transformed
-from torch_modal.backends.torch.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
 from torch_modal.backends.warp.launch import kernels, launch
-from torch_modal.backends.warp.shell import FusedShell, ShellReference
-from torch_modal.energy.terms import Mesh
+from torch_modal.backends.warp.shell import ShellReference, WarpShell
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
+from torch_modal.energy.term import Mesh
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8
@@ -23,15 +23,15 @@ MOST_NUMBERS = 2**27
 """Of an array that all samples of a batch have at a time (1 GiB): kernels index with 32 bits, and memory is finite."""
 
 
-def fused_reference(shell: FusedShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
-    """:meth:`FusedShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
+def shell_reference(shell: WarpShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
+    """:meth:`WarpShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
     given = [value.double() for value in (first, second, t, *stiffness)]
     return shell.reference_by_torch(*given) if traced(t) else ShellReference(*applied(_Referred, shell, *given))
 
 
 class _Referred(torch.autograd.Function):
     @staticmethod
-    def forward(shell: FusedShell, *given: Tensor) -> tuple[Tensor, ...]:
+    def forward(shell: WarpShell, *given: Tensor) -> tuple[Tensor, ...]:
         return tuple(shell.reference(*(value.detach().contiguous() for value in given)))
 
     @staticmethod
@@ -50,13 +50,13 @@ class _Referred(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], shell: FusedShell, *given: Tensor
+        info: Any, in_dims: tuple[Any, ...], shell: WarpShell, *given: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         found = _Referred.apply(shell, *flattened(info.batch_size, in_dims[1:], given))
         return tuple(value.unflatten(0, (info.batch_size, -1)) for value in found), (0,) * len(found)
 
 
-class FusedModalEnergy(ModalEnergy):
+class WarpModalEnergy(ModalEnergy):
     """:class:`ModalEnergy` whose values and derivatives come from kernels, in float64.
 
     It does so for placements with a :class:`ShellReference`, which shapes are not extended for; others, and what is
@@ -74,7 +74,7 @@ class FusedModalEnergy(ModalEnergy):
     slots: Tensor
     face_slots: Tensor
 
-    def __init__(self, shell: FusedShell, mesh: Mesh, columns: Tensor) -> None:
+    def __init__(self, shell: WarpShell, mesh: Mesh, columns: Tensor) -> None:
         super().__init__(shell.energy, columns)
         self._shell = (shell,)
         places = self.curvature.places.int()
@@ -103,7 +103,7 @@ class FusedModalEnergy(ModalEnergy):
             self._kept = self.columns, made_outside(self._made_tables)
         return self._kept[1]
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "FusedModalEnergy":
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "WarpModalEnergy":
         """Nothing is made in a lower precision, or on another device, than the columns came in."""
         after = fn(self.columns)
         if (after.dtype, after.device) == (self.columns.dtype, self.columns.device):
@@ -114,7 +114,7 @@ class FusedModalEnergy(ModalEnergy):
         return self
 
     @property
-    def shell(self) -> FusedShell:
+    def shell(self) -> WarpShell:
         """The kernels."""
         return self._shell[0]
 

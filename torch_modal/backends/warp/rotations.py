@@ -10,7 +10,7 @@ from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 
 
-class FusedRotations(LocalRotations):
+class WarpRotations(LocalRotations):
     """:class:`~torch_modal.geometry.local_rotations.LocalRotations` whose edges come from kernels, in float64."""
 
     def __init__(self, *args: Any) -> None:
@@ -133,7 +133,7 @@ class _OnTrajectory(torch.autograd.Function):
     """Edges, and the sums that backward needs."""
 
     @staticmethod
-    def forward(fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(fused: WarpRotations, packed: Tensor, which: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         total = fused.trajectory_sums(which, packed.detach().contiguous(), t.detach().contiguous())
         return _means(total), total
 
@@ -156,7 +156,7 @@ class _OnTrajectory(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, packed: Tensor, which: Tensor, t: Tensor
+        info: Any, in_dims: tuple[Any, ...], fused: WarpRotations, packed: Tensor, which: Tensor, t: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
         n = info.batch_size
         packed, which, t = (
@@ -172,7 +172,7 @@ class _Turned(torch.autograd.Function):
     """Edges, and the signs and sums that backward needs."""
 
     @staticmethod
-    def forward(fused: FusedRotations, *given: Tensor) -> tuple[Tensor, ...]:
+    def forward(fused: WarpRotations, *given: Tensor) -> tuple[Tensor, ...]:
         first, second, t = (value.detach().contiguous() for value in given)
         turns = fused._turned(first, second)
         sign = fused.sign(*turns[:2])
@@ -195,7 +195,7 @@ class _Turned(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], fused: FusedRotations, *given: Tensor
+        info: Any, in_dims: tuple[Any, ...], fused: WarpRotations, *given: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         edges, sign, total = _Turned.apply(fused, *flattened(info.batch_size, in_dims[1:], given))
         found = (

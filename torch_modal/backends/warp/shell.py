@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.backends.warp.launch import Backend, has_kernels, kernels, launch, zeros
+from torch_modal.backends.warp.launch import kernels, launch, zeros
 from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.terms import Bend, Mesh, Stretch, Volume
+from torch_modal.energy.term import Mesh
 
 
 class ShellReference(NamedTuple):
@@ -49,7 +49,7 @@ class ShellPoint(NamedTuple):
     """First derivative of the energy in the volume. *Shape:* ``(B,)``."""
 
 
-class FusedShell(nn.Module):
+class WarpShell(nn.Module):
     """The terms of Eq. 5 towards two rest shapes, in float64.
 
     Args:
@@ -83,11 +83,6 @@ class FusedShell(nn.Module):
         self.n_used = len(energy.used)
         #: Vertices of faces. *Shape:* ``(V, 1)``, bool.
         self.register_buffer("used", used.to(energy.used.device), persistent=False)
-
-    @staticmethod
-    def serves(energy: Energy, backend: Backend) -> bool:
-        """Whether it can stand in for an energy."""
-        return [type(part.term) for part in energy.parts] == [Stretch, Bend, Volume] and has_kernels(backend)
 
     @property
     def energy(self) -> Energy:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from torch_modal.energy.measures import COLLAPSED
+from torch_modal.energy.bend import COLLAPSED
 
 real = wp.float64
 vec3 = wp.vec3d

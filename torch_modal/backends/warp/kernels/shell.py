@@ -21,7 +21,9 @@ from torch_modal.backends.warp.kernels.elements import (
     vec4,
     wrapped,
 )
-from torch_modal.energy.terms import MAX_BENDING_RATIO, MIN_RELATIVE_LENGTH, MIN_RELATIVE_VOLUME, SLACK
+from torch_modal.energy.bend import MAX_BENDING_RATIO
+from torch_modal.energy.stretch import MIN_RELATIVE_LENGTH, SLACK
+from torch_modal.energy.volume import MIN_RELATIVE_VOLUME
 
 RATIO = wp.constant(real(MAX_BENDING_RATIO))
 SHORT = wp.constant(real(MIN_RELATIVE_LENGTH))

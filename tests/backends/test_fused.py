@@ -1,0 +1,509 @@
+"""Kernels against the torch code that they stand in for: values, gradients, vmap, and where they are not used."""
+
+import importlib.util
+import math
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+from torch.func import functional_call, grad, vmap
+
+import torch_modal as tm
+from torch_modal import trees
+from torch_modal.backends.choice import choose
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.fine_energy import FineEnergy
+from torch_modal.backends.warp import alignment as fused_alignment
+from torch_modal.backends.warp import backend, launch
+from torch_modal.backends.warp import modal_energy as fused_modal
+from torch_modal.backends.warp.fine_energy import WarpFineEnergy
+from torch_modal.backends.warp.fine_steps import WarpSteps
+from torch_modal.backends.warp.modal_energy import WarpModalEnergy, shell_reference
+from torch_modal.backends.warp.rotations import WarpRotations
+from torch_modal.backends.warp.shell import WarpShell
+from torch_modal.energy.bend import Bend
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.modal_energy import ModalEnergy, Placement
+from torch_modal.energy.shell import DIAGONAL
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh
+from torch_modal.energy.volume import Volume
+from torch_modal.errors import MissingPackageError
+from torch_modal.geometry.hermite import Spacing
+from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.rotations import exp
+from torch_modal.inbetween.frame import Frame
+from torch_modal.inbetween.settings import PRESETS
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+DOUBLE = torch.float64
+
+
+class Case:
+    """Two samples between two shapes each, with stiffnesses of each element."""
+
+    def __init__(self, shapes: Shapes, faces: Tensor, roughness: float) -> None:
+        generator = torch.Generator().manual_seed(0)
+        mesh = self.mesh = Mesh.of(faces, shapes.keyframes.shape[1])
+        self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
+        self.fused = WarpSteps(self.energy, mesh)
+        x = shapes.keyframes * (DIAGONAL / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
+        n_edges, n_hinges = len(mesh.edges), len(mesh.hinges)
+        stiffness = [
+            500 + 100 * torch.rand(2, n_edges, generator=generator, dtype=DOUBLE),
+            10 + torch.rand(2, n_hinges, generator=generator, dtype=DOUBLE),
+            torch.full((2, 1), 1e3, dtype=DOUBLE),
+        ]
+        t = torch.tensor([0.3, 0.6], dtype=DOUBLE)
+        start = torch.lerp(x[:2], x[1:3], 0.5)
+        start = start + roughness * torch.randn(start.shape, dtype=DOUBLE, generator=generator)
+        self.given = [start, x[:2].clone(), x[1:3].clone(), t, *stiffness]
+
+    def by_torch(self, *given: Tensor) -> Tensor:
+        return self.fused.oracle(2, 4, *given)
+
+    def by_warp(self, *given: Tensor, chunk: int = 1) -> Tensor:
+        x, first, second, t, *stiffness = given
+        return self.fused(x, first, second, t, stiffness, 2, 4, chunk)
+
+
+@pytest.fixture(params=["closed", "open", "flat"])
+def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
+    if request.param == "flat":  # no volume: its weight is bounded by the area
+        line = torch.linspace(0, 1, 6, dtype=DOUBLE)
+        grid = torch.stack([*torch.meshgrid(line, line, indexing="ij"), torch.zeros(6, 6, dtype=DOUBLE)], -1)
+        bent = grid + torch.stack([torch.zeros(6, 6), torch.zeros(6, 6), 0.3 * grid[..., 0] ** 2], -1)
+        shapes = torch.stack([grid, bent, 1.1 * bent]).flatten(1, 2)
+        corner = (6 * torch.arange(5)[:, None] + torch.arange(5)).flatten()
+        faces = torch.cat(
+            [torch.stack([corner, corner + 6, corner + 1], 1), torch.stack([corner + 1, corner + 6, corner + 7], 1)]
+        )
+        return Case(Shapes(shapes, faces, []), faces, 0.1)
+    faces = small_bars.faces[6:] if request.param == "open" else small_bars.faces
+    return Case(small_bars, faces, 0.3)
+
+
+def gradients(run, given: list[Tensor], create: bool = False) -> tuple[Tensor, ...]:
+    leaves = [value.clone().requires_grad_() for value in given]
+    out = run(*leaves)
+    weights = torch.randn(out.shape, dtype=out.dtype, generator=torch.Generator().manual_seed(1))
+    found = torch.autograd.grad((out * weights).sum(), leaves, create_graph=create)
+    if not create:
+        return found
+    return torch.autograd.grad(sum(g.square().sum() for g in found), leaves)
+
+
+def assert_alike(found: tuple[Tensor, ...], truth: tuple[Tensor, ...], to: float) -> None:
+    for got, wanted in zip(found, truth, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=0, atol=to * max(float(wanted.abs().max()), 0.01))
+
+
+def test_local_steps(case: Case) -> None:
+    found, truth = case.by_warp(*case.given), case.by_torch(*case.given)
+    assert float((truth - case.given[0]).abs().max()) > 1e-2
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-8 * DIAGONAL)
+    truth = gradients(case.by_torch, case.given)
+    assert_alike(gradients(case.by_warp, case.given), truth, 1e-6)
+    assert_alike(gradients(partial(case.by_warp, chunk=2), case.given), truth, 1e-6)  # steps are kept
+
+
+def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 0.3)
+    one, other = case.mesh.edges[0].tolist()
+    case.given[1][:, other] = case.given[1][:, one] + 1e-7
+    given = [value.contiguous() for value in case.given[1:]]
+    found, truth = (run(*given) for run in (case.fused.reference, case.fused.reference_by_torch))
+    for got, wanted in zip(found, truth, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-9)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
+
+
+def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 10.0)
+    case.given[5] *= 1e5
+    found, lengths = case.fused.steps(2, 4, *(value.contiguous() for value in case.given))
+    assert len(lengths.unique()) > 1 and float(lengths.min()) < 0.5, "no line search in this case"
+    torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * DIAGONAL)
+
+
+def test_gradient_where_the_steps_start(small_bars: Shapes) -> None:
+    # Edges that turned rigidly have a slope of rounding there: no kink may make noise of it.
+    case = Case(small_bars, small_bars.faces, 0.0)
+    start = case.given[1].clone()
+    given = [start, case.given[1], case.given[1].clone(), *case.given[3:]]
+    assert_alike(gradients(case.by_warp, given), gradients(case.by_torch, given), 1e-5)
+
+
+def test_gradients_of_gradients(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 0.3)
+    assert_alike(gradients(case.by_warp, case.given, True), gradients(case.by_torch, case.given, True), 1e-7)
+
+
+def test_vmap(small_bars: Shapes) -> None:
+    case = Case(small_bars, small_bars.faces, 0.3)
+    moved = torch.stack([case.given[0], 1.01 * case.given[0]])
+    found = vmap(lambda x: case.by_warp(x, *case.given[1:]))(moved)
+    truth = torch.stack([case.by_warp(x, *case.given[1:]) for x in moved])
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-12 * DIAGONAL)
+
+
+class TestModal:
+    """The energy in the amplitudes of a space."""
+
+    @staticmethod
+    def both(case: Case, extra: bool) -> list[tuple[ModalEnergy, Placement]]:
+        start, first, second, t, *stiffness = case.given
+        generator = torch.Generator().manual_seed(2)
+        columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
+        own = torch.randn(start.shape, dtype=DOUBLE, generator=generator) if extra else None
+        shell = WarpShell(case.energy, case.mesh)
+        modals = WarpModalEnergy(shell, case.mesh, columns), ModalEnergy(case.energy, columns)
+        packed = shell_reference(shell, first, second, t, *stiffness)
+        return [
+            (modals[0], modals[0].place(start, packed, own)),
+            (modals[1], modals[1].place(start, shell.unpacked(shell.reference_by_torch(*case.given[1:])), own)),
+        ]
+
+    @pytest.mark.parametrize("extra", [False, True])
+    @torch.no_grad()
+    def test_values_and_derivatives(self, case: Case, extra: bool) -> None:
+        a = 0.1 * torch.randn(2, 5 + extra, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), (plain, truth) = self.both(case, extra)
+        several = torch.stack([a, 2 * a, -a])
+        torch.testing.assert_close(fused.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
+        torch.testing.assert_close(fused.rows(a, own), plain.rows(a, truth), rtol=0, atol=1e-11)
+        found, wanted = fused.derivatives(a, own), plain.derivatives(a, truth)
+        assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
+        assert_alike(found, wanted, 1e-9)
+        assert_alike((fused.second_order(a, own),), (plain.second_order(a, truth),), 1e-9)
+        value, gradient = fused.value_and_gradient(a, own)
+        torch.testing.assert_close(value, plain.value(a, truth), rtol=1e-12, atol=0)
+        torch.testing.assert_close(plain.value_and_gradient(a, truth)[0], plain.value(a, truth), rtol=1e-12, atol=0)
+        assert_alike((gradient, plain.value_and_gradient(a, truth)[1]), (wanted.gradient,) * 2, 1e-9)
+
+    @pytest.mark.parametrize("extra", [False, True])
+    def test_pull_back(self, case: Case, extra: bool) -> None:
+        generator = torch.Generator().manual_seed(4)
+        a, direction = torch.randn(2, 2, 5 + extra, dtype=DOUBLE, generator=generator).mul(0.1)
+        (fused, own), _ = self.both(case, extra)
+        with torch.no_grad():
+            found = trees.leaves(fused.pull_back(a, direction, own))
+        assert_alike(found, trees.leaves(fused.pull_back(a, direction, own)), 1e-10)  # by torch, to be differentiated
+
+    @pytest.mark.parametrize("extra", [False, True])
+    @torch.no_grad()
+    def test_samples_that_are_too_many_at_a_time(
+        self, case: Case, extra: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """No array of all samples outgrows what kernels count: they are taken in chunks."""
+        a = 0.1 * torch.randn(2, 5 + extra, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), _ = self.both(case, extra)
+        several, many = torch.cat([a, -a, 2 * a])[:5], trees.rows(own, torch.tensor([0, 1, 0, 1, 0]))
+        truth = [*fused.derivatives(several, many), fused.second_order(several, many)]
+        largest = len(fused.blocks) * fused.blocks.shape[1] * 8
+        monkeypatch.setattr(fused_modal, "MOST_NUMBERS", largest)
+        sizes: list[int] = []
+
+        def watched(kernel: Any, dim: tuple[int, ...], given: list[Any]) -> None:
+            sizes.extend(x.numel() for x in given if isinstance(x, Tensor))
+            launch.launch(kernel, dim, given)
+
+        monkeypatch.setattr(fused_modal, "launch", watched)
+        found = [*fused.derivatives(several, many), fused.second_order(several, many)]
+        assert max(sizes) <= largest
+        assert_alike(tuple(found), tuple(truth), 1e-13)
+        assert fused.derivatives(several, many, second_order=False).second_order is None
+
+    def test_references(self, case: Case) -> None:
+        shell, given = WarpShell(case.energy, case.mesh), case.given[1:]
+
+        def flat(run) -> Any:  # type: ignore[no-untyped-def]
+            return lambda *given: torch.cat([part.flatten() for part in run(*given)[:-1]])
+
+        by_kernels, by_torch = partial(shell_reference, shell), shell.reference_by_torch
+        for found, wanted in zip(by_kernels(*given), by_torch(*given), strict=True):
+            torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+        assert_alike(gradients(flat(by_kernels), given), gradients(flat(by_torch), given), 1e-9)
+        assert_alike(gradients(flat(by_kernels), given, True), gradients(flat(by_torch), given, True), 1e-7)
+
+
+class TestRotations:
+    @pytest.fixture
+    def rotations(self, small_bars: Shapes) -> WarpRotations:
+        mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
+        return WarpRotations(mesh.connectivity, small_bars.keyframes[:2])
+
+    def test_between_two(self, rotations: WarpRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes
+        given = [x[:2].clone(), x[1:3].clone(), torch.tensor([0.3, 0.8], dtype=DOUBLE)]
+        torch.testing.assert_close(rotations(*given), rotations.oracle(*given), rtol=0, atol=1e-12)
+        assert_alike(gradients(rotations, given), gradients(rotations.oracle, given), 1e-9)
+        assert_alike(gradients(rotations, given, True), gradients(rotations.oracle, given, True), 1e-7)
+        found = vmap(lambda t: rotations(*given[:2], t.expand(2)))(given[2])
+        torch.testing.assert_close(found[1], rotations(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
+
+    def test_beyond_half_a_turn(self) -> None:
+        # A strip that is rolled up: its far end turns by 300 degrees, which only its neighbours tell from -60.
+        n = 24
+        s = torch.linspace(0, 1, n, dtype=DOUBLE)
+        angle = math.radians(300) * s
+        arc = torch.stack([angle.sin(), 0 * s, 1 - angle.cos()], -1) / math.radians(300)
+        width = torch.tensor([0.0, 0.2, 0.0], dtype=DOUBLE)
+        flat = torch.stack([s, 0 * s, 0 * s], -1)
+        shapes = torch.stack([torch.cat([x, x + width]) for x in (flat, arc)])
+        i = torch.arange(n - 1)
+        faces = torch.cat([torch.stack([i, i + 1, i + n], 1), torch.stack([i + 1, i + n + 1, i + n], 1)])
+        rotations = WarpRotations(Mesh.of(faces, 2 * n).connectivity, shapes)
+        given = [shapes[:1].clone(), shapes[1:].clone(), torch.tensor([0.5], dtype=DOUBLE)]
+        truth = rotations.oracle(*given)
+        assert float(truth[0].min()) < -0.5 / (n - 1), "nothing turns by more than 90 degrees half-way"
+        torch.testing.assert_close(rotations(*given), truth, rtol=0, atol=1e-12)
+        assert_alike(gradients(rotations, given), gradients(rotations.oracle, given), 1e-9)
+
+    def test_the_same_shape(self, rotations: WarpRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes[:1]
+        given = [x.clone(), x.clone(), torch.tensor([0.3], dtype=DOUBLE)]
+        assert_alike(gradients(rotations, given)[:2], gradients(rotations.oracle, given)[:2], 1e-7)
+
+    def test_on_a_course(self, rotations: WarpRotations, small_bars: Shapes) -> None:
+        x = small_bars.keyframes
+        hours = Spacing(*(torch.ones(1, dtype=DOUBLE) for _ in range(3)))
+        which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
+
+        def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+            trajectory = rotations.trajectory(x[2:3], first, second, None, hours)
+            return kind.along(rotations, trajectory, which, t)
+
+        def by_warp(*given: Tensor) -> Tensor:
+            return by(WarpRotations, *given)
+
+        def by_torch(*given: Tensor) -> Tensor:
+            return by(WarpRotations.__base__, *given)
+
+        given = [x[:1].clone(), x[1:2].clone(), t]
+        torch.testing.assert_close(by_warp(*given), by_torch(*given), rtol=0, atol=1e-12)
+        assert_alike(gradients(by_warp, given), gradients(by_torch, given), 1e-9)
+        assert_alike(gradients(by_warp, given, True), gradients(by_torch, given, True), 1e-7)
+        found = vmap(lambda t: by_warp(*given[:2], t))(torch.stack([t, 0.5 * t]))
+        torch.testing.assert_close(found[1], by_warp(*given[:2], 0.5 * t), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.0, math.pi])
+def test_alignment(small_bars: Shapes, turn: float) -> None:
+    """Into the frame and back; at half a turn the same sense is taken."""
+    shapes = small_bars.keyframes
+    frame = Frame(shapes[:2], small_bars.faces, 20)
+    x = shapes[1:3] + torch.tensor([5.0, -2.0, 1.0], dtype=DOUBLE)
+    other = x if turn == math.pi else shapes[:2]  # half a turn to the last bit
+    y = other @ exp(turn * torch.tensor([-0.6, 0.8, 0.0], dtype=DOUBLE)).mT
+    t = torch.tensor([0.3, 0.9], dtype=DOUBLE)
+    with torch.no_grad():
+        assert fused_alignment.serves(x, y, t)
+        pair, finite, sizes = fused_alignment.place(frame, x, y)
+        assert finite.all()
+        truth = frame.place(x, y)
+        for got, wanted in zip(trees.leaves(tuple(pair[:4])), trees.leaves(tuple(truth[:4])), strict=True):
+            torch.testing.assert_close(got, wanted, rtol=0, atol=1e-11)
+        extents = [(end.amax(1) - end.amin(1)).norm(dim=1) for end in truth[:2]]
+        torch.testing.assert_close(sizes, torch.minimum(*extents))
+        back = fused_alignment.restore(frame, truth.first, truth, t)
+        torch.testing.assert_close(back, frame.restore(truth.first, truth, t), rtol=0, atol=1e-11)
+        assert fused_alignment.place(frame, x, y.index_fill(1, torch.tensor(3), torch.inf)) is None
+
+
+class TestLayers:
+    @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+    def test_in_between(self, bars: Shapes, dtype: torch.dtype) -> None:
+        x_a, x_b = bars.keyframes[:2].to(dtype)
+        made = [tm.InBetween(bars.bases[:2], bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]
+        assert [type(layer.members[0].fine) for layer in made] == [WarpFineEnergy, FineEnergy]
+        found, truth = (layer.to(dtype)(x_a, x_b, torch.tensor([0.3, 0.5], dtype=dtype)) for layer in made)
+        assert found.dtype == dtype
+        torch.testing.assert_close(found, truth, rtol=0, atol=1e-7 if dtype == torch.float64 else 1e-4)
+
+    def test_local_steps_after_the_papers_space(self, bars: Shapes) -> None:
+        solvers = [tm.Solver(backend=kind) for kind in ("warp", "torch")]
+        found, truth, without = (
+            tm.InBetween(bars.bases[:2], bars.faces, "paper", solver=solver)(*bars.keyframes[:2], 0.5)
+            for solver in [*solvers, tm.Solver(local_steps=0)]
+        )
+        torch.testing.assert_close(found, truth, rtol=0, atol=1e-7)
+        assert float((found - without).abs().max()) > 1e-3
+
+    def test_path(self, bars: Shapes) -> None:
+        paths = [tm.Path(bars.bases, bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]
+        times = torch.tensor([0.2, 1.0, 1.7], dtype=DOUBLE)
+        found, truth = (path(bars.keyframes, times) for path in paths)
+        torch.testing.assert_close(found, truth, rtol=0, atol=1e-9)
+
+    @pytest.mark.parametrize("over", ["t", "terms.0.stiffness", "terms.1.stiffness", "terms.2.stiffness"])
+    @pytest.mark.parametrize("preset", ["accurate", "fast"])
+    def test_vmap(self, small_bars: Shapes, preset: Any, over: str) -> None:
+        """Over what not every tensor of a solve depends on; with its gradients, with and without recording."""
+        stiffness = {"alpha": torch.tensor(500.0), "beta": torch.tensor(10.0), "gamma": torch.tensor(1e3)}
+        objective = replace(PRESETS[preset].objective, **stiffness)
+        layer = tm.InBetween(small_bars.bases[:2], small_bars.faces, preset, objective=objective).double()
+        ends = small_bars.keyframes[:2]
+        given = torch.tensor([0.3, 0.5, 0.8] if over == "t" else [100.0, 500.0, 900.0], dtype=DOUBLE)
+
+        def at(value: Tensor) -> Tensor:
+            return layer(*ends, value) if over == "t" else functional_call(layer, {over: value}, (*ends, 0.5))
+
+        def slope(value: Tensor) -> Tensor:
+            return grad(lambda value: at(value).square().sum())(value)
+
+        for recorded in (True, False):
+            with torch.set_grad_enabled(recorded):
+                truth = torch.stack([at(value) for value in given])
+                assert float((truth[0] - truth[1]).abs().max()) > 1e-6
+                torch.testing.assert_close(vmap(at)(given), truth, rtol=0, atol=1e-9)
+        slopes = torch.stack([slope(value) for value in given])
+        torch.testing.assert_close(vmap(slope)(given), slopes, rtol=1e-7, atol=1e-9 * float(slopes.abs().max()))
+
+    @pytest.mark.parametrize("smooth", [False, True], ids=["pair", "path"])
+    def test_a_term_of_ones_own_is_beside_the_kernels(self, bars: Shapes, smooth: bool) -> None:
+        """The same with kernels and without, with a gradient and without."""
+
+        class Area(tm.Term):
+            def elements(self, mesh: Mesh) -> Tensor:
+                return mesh.faces
+
+            def measure(self, edge_vectors: Tensor) -> Tensor:
+                return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
+
+        class Spring(tm.Term):
+            sampled = True
+
+            @property
+            def anchors(self) -> Tensor:
+                return bars.keyframes[0, :1] + 0.3
+
+            def elements(self, mesh: Mesh) -> Tensor:
+                return torch.tensor([[mesh.first_anchor, 5]])
+
+            def measure(self, edge_vectors: Tensor) -> Tensor:
+                return edge_vectors[0].square().sum()
+
+        objective = tm.Objective(terms=(Area(0.3), Volume(1.0), Spring(1e-3)))
+        n, t = (3, 1.3) if smooth else (2, 0.3)
+        found = []
+        for kind in ("warp", "torch"):
+            solver = tm.Solver(backend=kind, polish=1)  # type: ignore[arg-type]
+            path = tm.Path(bars.bases[:n], bars.faces, objective=objective, solver=solver)
+            assert isinstance(path.layer.members[0].fine, WarpFineEnergy) == (kind == "warp")
+            keyframes = bars.keyframes[:n].clone().requires_grad_()
+            shape = path(keyframes, t)
+            with torch.no_grad():
+                torch.testing.assert_close(path(keyframes, t), shape.detach(), rtol=0, atol=1e-9)
+            found.append((shape.detach(), torch.autograd.grad(shape.square().sum(), keyframes)[0]))
+        torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-7)
+        torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-5)
+
+    def test_what_has_no_numbers_is_torchs(self, small_bars: Shapes) -> None:
+        from torch._subclasses import FakeTensorMode
+
+        layer = tm.InBetween(small_bars.bases[:2], small_bars.faces)
+        member = layer.members[0]
+        with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
+            x = mode.from_tensor(small_bars.keyframes[:1])
+            assert member.space.blend.rotations(x, x, mode.from_tensor(torch.zeros(1, dtype=DOUBLE))).shape[0] == 3
+
+
+def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
+    """Also by ``python -O``. Indices have 32 bits: beyond, they would wrap."""
+    x = torch.zeros(4, 3, dtype=DOUBLE)
+    normal, total = torch.zeros_like(x), torch.zeros(1, dtype=DOUBLE)
+    capped_faces = torch.zeros(2, 3, dtype=torch.int32)
+    volume = launch.kernels("shell").volume
+    for wrong in (x.float(), torch.zeros(3, 4, dtype=DOUBLE).T):
+        with pytest.raises(ValueError, match=r"contiguous tensor of torch\.float64"):
+            launch.launch(volume, (1, 2), [wrong, None, capped_faces, 4, total, normal])
+    huge = torch.empty(2**31, 3, dtype=DOUBLE, device="meta")
+    with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):
+        launch._length(huge, 3, DOUBLE)
+    assert launch._length(huge[1:], 3, DOUBLE) == 2**31 - 1
+
+
+def test_the_first_of_a_thread_may_have_nothing_to_do(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warp gives no command for no threads, so there was none to use again."""
+    shell = tm.InBetween(bars.bases[:2], bars.faces).members[0].fine.steps
+    none = bars.keyframes[:0]
+    given: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(
+        "torch_modal.backends.warp.shell.launch", lambda *call: given.append(call) or launch.launch(*call)
+    )
+    launch._COMMANDS.known.clear()
+    assert shell.volumes(none, none).shape == (0, 2)
+    assert given and not launch._COMMANDS.known
+    # The same kernels take what they are given here.
+    some = bars.keyframes[:2].contiguous()
+    truth = torch.tensor([signed_volume(x.numpy(), bars.faces.numpy()) for x in some], dtype=DOUBLE)
+    torch.testing.assert_close(shell.volumes(some, some), truth[:, None].expand(2, 2).clone())
+    assert len(launch._COMMANDS.known) == 1
+
+
+class TestBackend:
+    def test_no_such_backend(self) -> None:
+        with pytest.raises(ValueError, match="backend is one of 'auto', 'torch', 'warp'; got 'cuda'"):
+            tm.Solver(backend="cuda")  # type: ignore[arg-type]
+
+    def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, small_bars: Shapes) -> None:
+        there = importlib.util.find_spec
+        monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else there(name))
+        backend._works.cache_clear()
+        try:
+            assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).members[0].fine) is FineEnergy
+            with pytest.raises(MissingPackageError, match="pip install warp-lang"):
+                tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
+        finally:
+            backend._works.cache_clear()
+
+    def test_not_usable(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def broken(name: str) -> None:
+            raise OSError("the cache folder is not writable")
+
+        monkeypatch.setattr(backend, "kernels", broken)
+        backend._works.cache_clear()
+        try:
+            with pytest.warns(UserWarning, match="the cache folder is not writable"):
+                assert type(choose("auto")) is TorchBackend
+        finally:
+            backend._works.cache_clear()
+
+    def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
+        code = (
+            "import sys; from torch_modal.backends.warp.launch import kernels; kernels('rotations'); "
+            "sys.exit(any(f'torch_modal.backends.warp.kernels.{name}' in sys.modules "
+            "for name in ('shell', 'modal', 'steps')))"
+        )
+        folder = Path(tm.__file__).parents[1]
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
+        assert (result.returncode, result.stdout) == (0, "")
+        # Warp's C code says so where there is no CUDA driver.
+        said = [line for line in result.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
+        assert said == []
+
+    def test_import_does_not_load_warp(self) -> None:
+        code = "import sys, torch_modal.layers.in_between; sys.exit('warp' in sys.modules)"
+        folder = Path(tm.__file__).parents[1]
+        assert subprocess.run([sys.executable, "-c", code], timeout=120, cwd=folder).returncode == 0
+
+
+def test_what_warp_says_of_itself_is_left_alone() -> None:
+    import warp
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        before = warp.config.log_level
+        launch.kernels.cache_clear()
+        launch.kernels("shell")
+        assert warp.config.log_level == before

@@ -1,0 +1,703 @@
+"""In-betweens whose parts are kept from passing through each other: alone, as a course, and their gradients."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import Shapes
+from scipy.optimize import minimize
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal import trees
+from torch_modal.backends.torch.alignment import Pair
+from torch_modal.cli import main as cli
+from torch_modal.contact import rounds as contact_rounds
+from torch_modal.contact import together
+from torch_modal.contact import trajectory as contact
+from torch_modal.contact.acceleration import AccelerationLimit
+from torch_modal.contact.active import ActiveContacts, Pull, settled
+from torch_modal.contact.detect import Search, _nearest_faces
+from torch_modal.contact.rounds import ContactRounds
+from torch_modal.contact.search import Contacts, ContactSearch
+from torch_modal.contact.splines import splines, through
+from torch_modal.data.samples import load_sample, sample_files
+from torch_modal.energy.contact import Contact
+from torch_modal.energy.energy import Energy, Reference
+from torch_modal.energy.position import Position
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.crossings import Crossings
+from torch_modal.inbetween.between import Between
+from torch_modal.inbetween.samples import Samples
+from torch_modal.motion import path as path_module
+
+pytest.importorskip("ipctk")
+DOUBLE = torch.float64
+
+
+@pytest.fixture(scope="module")
+def hand() -> Shapes:
+    """Open and closed; on the way, fingers go through each other."""
+    sample = load_sample("hand")
+    bases = tm.extract_bases(sample.keyframes, sample.faces, 20, mesher="lattice", progress=False)
+    return Shapes(sample.keyframes, sample.faces, bases)
+
+
+@pytest.fixture(scope="module")
+def fists(data_dir: Path) -> Shapes:
+    """A hand that closes to a fist."""
+    files = sorted((data_dir / "mh-hand").glob("*.obj"))[1:3]
+    keyframes, faces = tm.load_keyframes(files)
+    return Shapes(keyframes, faces, tm.extract_bases(keyframes, faces, 20, progress=False))
+
+
+def far(x: Tensor, shapes: Shapes) -> Tensor:
+    """Pairs of triangles of parts that went through each other."""
+    return tm.self_contacts(x, shapes.faces, ignore=shapes.keyframes).n_far
+
+
+def peak_acceleration(frames: Tensor) -> float:
+    return float((frames[2:] - 2 * frames[1:-1] + frames[:-2]).norm(dim=-1).max())
+
+
+def stuck_in_first(hand: Shapes) -> Shapes:
+    """The tip of the little finger goes into its neighbour, in the open hand."""
+    crossed = hand.keyframes.clone()
+    x = crossed[0]
+    reach = (x - x[x[:, 0].argmin()]).norm(dim=-1)
+    x[:, 0] += 0.22 * torch.exp(-((reach / 0.12) ** 2))
+    return Shapes(crossed, hand.faces, hand.bases)
+
+
+# ---------------------------------------------------------------------------------------------------------------- term
+def test_term_measures_the_height_over_a_plane(generator: torch.Generator) -> None:
+    x = torch.randn(9, 3, dtype=DOUBLE, generator=generator)
+    elements = torch.tensor([[0, 1, 2, 5], [3, 4, 5, 8], [6, 7, 8, 0]])
+    energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [3, 4, 5], [6, 7, 8]]), 9), [Contact(elements)], sampled=True)
+    heights = energy.parts[0].measures(energy.parts[0].edge_vectors(energy.extend(x[energy.vertices].T)))
+    for (a, b, c, v), height in zip(x[elements].unbind(0), heights, strict=True):
+        normal = torch.linalg.cross(b - a, c - a)
+        assert float(height) == pytest.approx(float((v - b) @ normal / normal.norm()), abs=1e-12)
+
+
+def test_term_has_the_derivatives_of_torch_func(generator: torch.Generator) -> None:
+    edge_vectors = torch.randn(3, 3, 2, 5, dtype=DOUBLE, generator=generator)
+    term = Contact(torch.zeros(5, 4, dtype=torch.int64))
+    torch.testing.assert_close(term.gradients(edge_vectors), Term.gradients(term, edge_vectors), rtol=1e-12, atol=1e-12)
+
+
+def test_positions_pull_to_places(generator: torch.Generator) -> None:
+    x, places = torch.randn(2, 2, 3, 5, dtype=DOUBLE, generator=generator)
+    weights = torch.rand(2, 5, dtype=DOUBLE, generator=generator)
+    energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [2, 3, 4]]), 5), [Position(5)])
+    rows = x.transpose(0, 1).contiguous()
+    reference = Reference((places.flatten(1)[:, None],), (weights.repeat(1, 3)[:, None],), 0.0)
+    at = energy.linearise(energy.extend(rows), reference)
+    torch.testing.assert_close(energy.value_at(at, reference), (weights * ((x - places) ** 2).sum(1)).sum(1))
+    torch.testing.assert_close(energy.fold(energy.gradient(at)), (2 * weights[:, None] * (x - places)).transpose(0, 1))
+
+
+def test_term_is_one_sided(generator: torch.Generator) -> None:
+    faces, elements = torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1, 2, 3]])
+    x = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0]], dtype=DOUBLE).repeat(3, 1, 1)
+    x[:, 3, 2] = torch.tensor([-0.1, 0.1, 0.3])
+    energy = Energy(Mesh.of(faces, 4), [Contact(elements, gap=0.2)], sampled=True)
+    gaps = torch.full((3, 1, 1), 0.2, dtype=DOUBLE)
+    reference = Reference((gaps,), (torch.full_like(gaps, 5.0),), torch.zeros(3, dtype=DOUBLE))
+    rows = energy.extend(x.movedim(-1, 0))
+    assert energy.value(rows, reference).tolist() == pytest.approx([5 * 0.3**2, 5 * 0.1**2, 0])
+    (at,) = energy.linearise(rows, reference)
+    assert at.slope[:, 0].tolist() == pytest.approx([-3.0, -1.0, 0])
+    assert at.curvature[:, 0].tolist() == [10, 10, 0]
+
+
+# --------------------------------------------------------------------------------------------------------------- layer
+def test_layer_pushes_fingers_apart(hand: Shapes) -> None:
+    x_a, x_b = hand.keyframes
+    t = torch.tensor([0.25, 0.875], dtype=DOUBLE)
+    with torch.no_grad():
+        plain = tm.InBetween(hand.bases, hand.faces)(x_a, x_b, t)
+        layer = tm.InBetween(hand.bases, hand.faces, contact=True)
+        shapes, solution = layer.solve(x_a, x_b, t)
+    before = far(plain, hand)
+    assert int(before[0]) == 0 and int(before[1]) > 20
+    assert solution.n_crossing is not None and solution.n_crossing.tolist() == far(shapes, hand).tolist() == [0, 0]
+    assert bool(solution.usable.all())
+    # What does not touch is what it is without contact; what does is bent no more than it has to.
+    assert torch.equal(shapes[0], plain[0])
+    shell = tm.ShellEnergy(hand.faces)
+    scale = 100 / float((x_a.amax(0) - x_a.amin(0)).norm())
+
+    def energy(x: Tensor) -> float:
+        return float(torch.lerp(shell(scale * x, scale * x_a), shell(scale * x, scale * x_b), t[1]))
+
+    assert energy(shapes[1]) < 1.01 * energy(plain[1])
+
+
+def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    x_a, x_b = hand.keyframes
+    layer = tm.InBetween(hand.bases, hand.faces, contact=True)
+    member = layer.members[0]
+    first: list[Any] = []
+    search = ContactRounds.found
+
+    def kept(*given: Any) -> Any:
+        if not first:
+            first.append(search(*given))
+        return first[0]
+
+    monkeypatch.setattr(ContactRounds, "found", kept)
+
+    def samples(x_a: Tensor, x_b: Tensor, t: Tensor) -> Samples:
+        return Samples(x_a[None], x_b[None], None, t, layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape))
+
+    given = [x_a.clone(), x_b.clone(), torch.tensor([0.875], dtype=DOUBLE)]
+    for tensor in given:
+        tensor.requires_grad_()
+    shapes = member(samples(*given), None).shapes[0]
+    assert len(first[0].rounds[0].elements) > 10
+    weights = torch.cos(7 * x_a)
+    gradients = torch.autograd.grad((shapes * weights).sum(), given)
+    direction = 0.01 * torch.sin(9 * x_a + 1)
+
+    def value(*arguments: Tensor) -> float:
+        moved = [argument.clone().requires_grad_() for argument in arguments]  # as if for a gradient: to the tolerance
+        return float((member(samples(*moved), None).shapes[0].detach() * weights).sum())
+
+    at = [tensor.detach() for tensor in given]
+    # Small: where a contact becomes active, the steps jump.
+    for which, moved, size in ((0, direction, 1e-4), (1, direction, 1e-4), (2, torch.ones(1, dtype=DOUBLE), 1e-6)):
+        up, down = (
+            value(*(x + sign * size * moved if i == which else x for i, x in enumerate(at))) for sign in (1, -1)
+        )
+        assert float((gradients[which] * moved).sum()) == pytest.approx((up - down) / (2 * size), rel=1e-5)
+
+
+def test_however_many_rounds_one_report(hand: Shapes) -> None:
+    layer = tm.InBetween(hand.bases, hand.faces, solver=tm.Solver(max_steps=2), contact=True)
+    x_a, x_b = hand.keyframes.clone().requires_grad_()
+    with pytest.warns(tm.ConvergenceWarning, match="1 of 1") as said:
+        layer(x_a, x_b, 0.875)
+    assert len(said) == 1
+
+
+@pytest.fixture(scope="module")
+def frogs(data_dir: Path) -> Shapes:
+    """Poses of a frog whose limbs lie deep in each other on the way."""
+    clips = np.load(data_dir / "animals" / "frog.npz")
+    keyframes = torch.from_numpy(clips["frames"][[35, 46, 50, 52]].astype(np.float64))
+    faces = torch.from_numpy(clips["faces"].astype(np.int64))
+    return Shapes(keyframes, faces, tm.extract_bases(keyframes, faces, 30, mesher="lattice", progress=False))
+
+
+def deepest(x: Tensor, shapes: Shapes) -> float:
+    """How deep the contacts of a shape are: of vertices, and of triangles that cross."""
+    found = tm.self_contacts(x, shapes.faces, ignore=shapes.keyframes)
+    most = float(found.depth.max())
+    for one, other in x[shapes.faces[found.pairs[found.far]]]:
+        reaches = []
+        for own, plane in ((one, other), (other, one)):
+            normal = torch.linalg.cross(plane[1] - plane[0], plane[2] - plane[0])
+            height = (own - plane[0]) @ normal / normal.norm()
+            reaches.append(min(float(height.max()), -float(height.min())))
+        most = max(most, min(reaches))
+    return most
+
+
+@pytest.mark.parametrize(
+    ("pair", "times"), [((0, 1), [0.051, 0.677]), ((1, 2), [0.507, 0.538]), ((1, 3), [0.583, 0.627])]
+)
+def test_a_shape_is_never_made_worse(frogs: Shapes, pair: tuple[int, int], times: list[float]) -> None:
+    shapes, t = frogs.pick(*pair), torch.tensor(times, dtype=DOUBLE)
+    x_a, x_b = shapes.keyframes
+    with torch.no_grad():
+        plain = tm.InBetween(shapes.bases, shapes.faces)(x_a, x_b, t)
+        pushed, solution = tm.InBetween(shapes.bases, shapes.faces, contact=True).solve(x_a, x_b, t)
+    before, after = far(plain, shapes), far(pushed, shapes)
+    assert int(before.max()) > 0
+    assert bool((after <= before).all())
+    assert solution.n_crossing.tolist() == after.tolist()
+    gap = 0.0016 * float((x_a.amax(0) - x_a.amin(0)).norm())
+    for x, y in zip(plain, pushed, strict=True):
+        assert float((y - x).norm(dim=-1).max()) <= 3 * (deepest(x, shapes) + gap)
+
+
+def test_a_push_that_moves_too_much_is_not_kept(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    x_a, x_b = hand.keyframes
+    layers = [tm.InBetween(hand.bases, hand.faces, contact=contact) for contact in (False, True)]
+    monkeypatch.setattr(contact_rounds, "MOST_MOVED", 1e-3)
+    with torch.no_grad():
+        plain = layers[0](x_a, x_b, 0.875)
+        kept, solution = layers[1].solve(x_a, x_b, 0.875)
+    torch.testing.assert_close(kept, plain, rtol=0, atol=1e-12)
+    assert int(solution.n_crossing) == int(far(plain, hand)) > 0
+
+
+def test_the_round_with_the_fewest_crossings_is_kept(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    layer = tm.InBetween(hand.bases, hand.faces, contact=True)
+    step, taken = ContactRounds._step, []
+
+    def worsening(self: ContactRounds, batch: Any, x: Tensor, active: Contacts) -> Tensor:
+        # Most of a push first; then back to the shape without contact.
+        taken.append(torch.lerp(x, step(self, batch, x, active), 0.7) if not taken else start[0])
+        return taken[-1]
+
+    found, start = ContactRounds.found, []
+
+    def starting(self: ContactRounds, batch: Any, x: Tensor, search: ContactSearch) -> Any:
+        start.append(x)
+        return found(self, batch, x, search)
+
+    monkeypatch.setattr(ContactRounds, "_step", worsening)
+    monkeypatch.setattr(ContactRounds, "found", starting)
+    with torch.no_grad():
+        shape, solution = layer.solve(*hand.keyframes, 0.875)
+        plain = tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, 0.875)
+    assert len(taken) > 1
+    assert int(solution.n_crossing) == int(far(shape, hand)) < int(far(plain, hand))
+
+
+def test_a_sample_does_not_depend_on_its_batch(hand: Shapes) -> None:
+    x_a, x_b = hand.keyframes
+    t = torch.tensor([0.7, 0.875, 0.1, 0.8, 0.85, 0.9, 0.95], dtype=DOUBLE)
+    layer = tm.InBetween(hand.bases, hand.faces, contact=True)
+    size = float((x_a.amax(0) - x_a.amin(0)).norm())
+    with torch.no_grad():
+        alone = torch.stack([layer(x_a, x_b, own) for own in t])
+        batches = [
+            layer(x_a.expand(7, -1, -1), x_b.expand(7, -1, -1), t),
+            layer(x_a, x_b, t),
+            torch.cat([layer(x_a, x_b, t[i : i + 2]) for i in range(0, 7, 2)]),
+        ]
+        twice = layer(x_a, x_b, t[[1, 1]])
+        noise = size * 1e-13 * torch.cos(1e4 * hand.keyframes)
+        moved = torch.stack([layer(x_a + noise[0], x_b + noise[1], own) for own in t])
+        plain = tm.InBetween(hand.bases, hand.faces)(x_a, x_b, t)
+    assert int(((alone - plain).abs().amax((1, 2)) > 1e-3 * size).sum()) >= 2  # these were pushed apart
+    for found in batches:
+        assert float((found - alone).norm(dim=-1).max()) < 1e-12 * size
+    assert torch.equal(twice[0], twice[1])
+    assert float((moved - alone).norm(dim=-1).max()) < 1e-6 * size
+
+
+def test_rounding_does_not_choose_among_faces_around_the_nearest_point() -> None:
+    v, f = np.array([7, 7, 7, 7, 9, 9]), np.array([4, 3, 2, 1, 6, 5])
+    height = np.array([0.5, 0.8, -0.8, 0.1, 1.0, 1.0])
+    for sign in (1, -1):
+        distance = 1 + sign * 1e-13 * np.array([1.0, -2, 3, -4, 5, -6])
+        distance[3] = 1.1
+        chosen = _nearest_faces(v, f, distance, height * (1 - sign * 1e-13 * np.arange(6)))
+        assert f[chosen].tolist() == [2, 5]
+
+
+def test_a_displacement_fades_out_where_it_makes_shapes_worse() -> None:
+    n = 15
+    differences = torch.eye(n + 2, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
+    turns = torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1)
+    limit = AccelerationLimit(torch.zeros(3, n, 2, dtype=DOUBLE), differences, turns, 10.0)
+    field = torch.ones(3, n, 2, dtype=DOUBLE)
+
+    class Fake:
+        t = torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1]
+
+        def __init__(self, worse: list[int]) -> None:
+            self.worse, self.n_far = worse, torch.full((n,), 2)
+
+        def count(self, x: Tensor) -> None:
+            moved = x.abs().amax((1, 2)) > 1e-9
+            self.n_far = torch.tensor([3 if i in self.worse and moved[i] else 1 + 1 * ~moved[i] for i in range(n)])
+
+    for worse in ([], [7], [3, 4]):
+        fake: Any = Fake(worse)
+        found = contact._never_worse(torch.zeros(n, 2, 3, dtype=DOUBLE), field, fake, limit)
+        assert found is not None and bool((fake.n_far <= 2).all())
+        assert float(found[:, worse].abs().sum()) == 0 and float(found[:, 12].min()) == 1
+    every: Any = Fake(list(range(n)))
+    none = contact._never_worse(torch.zeros(n, 2, 3, dtype=DOUBLE), field, every, limit)
+    assert none is not None and not bool(none.any())
+
+
+def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    def folding(member: Between, grid: Samples, shapes: Tensor) -> contact.Displacement:
+        """One half of the hand onto the other."""
+        own = member.frame.bring(shapes, trees.picked(member.placed(grid), grid.which), grid.t)
+        side = own[..., 0] - own[..., 0].mean(-1, keepdim=True)
+        field = torch.zeros_like(own).movedim(-1, 0).contiguous()
+        field[0] = -2 * side.clamp_min(0)
+        none = torch.zeros(len(shapes), dtype=torch.int64)
+        return contact.Displacement(field, grid.t, none, none)
+
+    t = torch.tensor([0.3, 0.45], dtype=DOUBLE)
+    with torch.no_grad():
+        plain = tm.Path(hand.bases, hand.faces)(hand.keyframes, t)
+        monkeypatch.setattr(path_module, "push_apart", folding)
+        kept, solution = tm.Path(hand.bases, hand.faces, contact=True).solve(hand.keyframes, t)
+    torch.testing.assert_close(kept, plain, rtol=0, atol=1e-9)
+    assert solution.n_crossing is not None and solution.n_crossing.tolist() == far(plain, hand).tolist()
+
+
+def test_contacts_of_earlier_rounds_stay_active(fists: Shapes) -> None:
+    """Without them, twelve pairs are left: what was pushed out of reach falls back."""
+    with torch.no_grad():
+        _, solution = tm.InBetween(fists.bases, fists.faces, contact=True).solve(*fists.keyframes, 0.675)
+    assert int(solution.n_crossing) == 0
+
+
+@pytest.mark.slow
+def test_no_shape_of_a_path_is_made_worse(frogs: Shapes) -> None:
+    shapes = frogs.pick(1, 2)
+    t = torch.linspace(0.06, 0.97, 9, dtype=DOUBLE)
+    with torch.no_grad():
+        plain = tm.Path(shapes.bases, shapes.faces)(shapes.keyframes, t)
+        pushed, solution = tm.Path(shapes.bases, shapes.faces, contact=True).solve(shapes.keyframes, t)
+    before, after = far(plain, shapes), far(pushed, shapes)
+    assert int(before.max()) > 0 and bool((after <= before).all())
+    assert solution.n_crossing.tolist() in (after.tolist(), [0] * 9)
+
+
+def test_contact_needs_one_shape() -> None:
+    with pytest.raises(ValueError, match="joint"):
+        tm.Objective(space="paired", contact=True)
+
+
+def test_missing_extra_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch_modal import extras
+
+    real = extras.importlib.util.find_spec
+    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None if name == "ipctk" else real(name))
+    for make in (
+        lambda: tm.InBetween(hand.bases, hand.faces, contact=True),
+        lambda: tm.Path(hand.bases, hand.faces, contact=True),
+        lambda: tm.ShapeSpace(hand.bases, hand.faces, contact=True),
+        lambda: tm.subdivide(hand.keyframes, hand.faces, contact=True),
+    ):
+        with pytest.raises(ImportError, match=r"contact needs ipctk.*torch_modal\[contact\]"):
+            make()
+
+
+def test_what_was_pushed_out_of_reach_is_held_on() -> None:
+    first, second = torch.tensor([[0, 1, 2, 9], [3, 4, 5, 8]]), torch.tensor([[0, 1, 3, 9], [3, 4, 5, 7]])
+    samples = torch.arange(2)
+    former = Contacts(samples, first, torch.tensor([[1.0, 2], [3, 4]]), torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
+    now = Contacts(samples, second, torch.tensor([[5.0, 0], [0, 6]]), torch.tensor([[0.5, 0.15], [0.15, 0.6]]))
+    both = now.beside(former)
+    found = {
+        (s, *element): (weight, gap)
+        for s in range(2)
+        for element, weight, gap in zip(
+            both.elements.tolist(), both.weights[s].tolist(), both.gaps[s].tolist(), strict=True
+        )
+        if weight
+    }
+    values = {key: tuple(round(x, 6) for x in value) for key, value in found.items()}
+    assert values == {
+        (0, 0, 1, 3, 9): (5, 0.5),  # what holds a vertex now is all that does
+        (0, 3, 4, 5, 8): (2, 0.2),
+        (1, 3, 4, 5, 7): (6, 0.6),
+        (1, 0, 1, 2, 9): (3, 0.3),
+        (1, 3, 4, 5, 8): (4, 0.4),
+    }
+
+
+def test_counting_finds_what_searching_finds(hand: Shapes) -> None:
+    x_a, x_b = (100 * x[None] for x in hand.keyframes)
+    t = torch.tensor([0.25, 0.875], dtype=DOUBLE)
+    with torch.no_grad():
+        x = 100 * tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, t)
+    mesh = Mesh.of(hand.faces, hand.keyframes.shape[1])
+    search = ContactSearch(mesh, x_a, x_b, torch.zeros(2, dtype=torch.int64), t)
+    assert search(x) is not None
+    found = search.n_far.tolist()
+    assert found[0] == 0 < found[1] and list(search.crossing(x, [0, 1])) == [1]
+    search.count(x)
+    assert search.n_far.tolist() == search.n_left.tolist() == found
+
+
+# ------------------------------------------------------------------------------------------------ steps of each shape
+def first_interval(hand: Shapes, t: Tensor, smooth: bool, backend: Any) -> tuple[Between, Samples, Pair]:
+    """Times between the first two key-frames of a hand that closes and opens."""
+    three = hand.pick(0, 1, 0)
+    path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
+    member = path.layer.members[0]
+    samples = path.samples(three.keyframes[None], 0, torch.zeros(len(t), dtype=torch.int64), t)
+    return member, samples, member.placed(samples)
+
+
+@pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
+def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
+    pytest.importorskip("warp")
+    t = torch.tensor([0.2, 0.75 if smooth else 0.875], dtype=DOUBLE)
+    results = []
+    for backend in ("torch", "warp"):
+        member, samples, pair = first_interval(hand, t, smooth, backend)
+        x = member.frame.bring(member(samples, None).shapes, trees.picked(pair, samples.which), t)
+        search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t)
+        active = search(x)
+        assert active is not None and active.samples.tolist() == [1]
+        active = active.of_all(torch.arange(2))
+        # One shape is free, the other is held, and a corner of both is pulled elsewhere.
+        distance = (x[0] - x[0].amin(0)).norm(dim=-1)
+        corner = distance <= distance.kthvalue(40).values
+        pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas[0])
+        y = settled(member, samples, pair, x, active, pull, 10)
+        y = settled(member, samples, pair, y, active, pull, 10)
+        term = ActiveContacts(active, x)
+        before, pushed = (term.value(z.contiguous()) for z in (x, y))
+        assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(before[1])
+        assert bool((pull.value(y) < 0.5 * pull.value(x)).all())
+        results.append(y)
+    torch.testing.assert_close(*results, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("which", [None, torch.tensor([0, 0, 1])], ids=["own", "shared"])
+def test_some_samples_keep_what_is_theirs(which: Tensor | None) -> None:
+    x, t = torch.zeros(3, 4, 3, dtype=DOUBLE), torch.tensor([0.1, 0.2, 0.3], dtype=DOUBLE)
+    some = Samples(x, x, which, t, 10 * t, [20 * t[:, None]]).rows(torch.tensor([2, 0]))
+    assert some.t.tolist() == [0.3, 0.1] and some.which is not None
+    assert some.which.tolist() == ([2, 0] if which is None else [1, 0])
+    torch.testing.assert_close([some.mu, some.stiffness[0][:, 0]], [10 * some.t, 20 * some.t])
+
+
+# ------------------------------------------------------------------------------------------------------------ sequence
+def test_splines_vanish_at_the_ends_and_know_their_curvature() -> None:
+    t = torch.linspace(0, 1, 4001, dtype=DOUBLE)
+    values, bend = splines(t, 8)
+    assert values.shape == (4001, 9) and float(values[[0, -1]].abs().max()) == 0
+    second = (values[2:] - 2 * values[1:-1] + values[:-2]) * 4000**2
+    torch.testing.assert_close(second.T @ second / 4000, bend, rtol=2e-3, atol=2e-3 * float(bend.max()))
+    at = torch.tensor([0.3], dtype=DOUBLE, requires_grad=True)
+    (slope,) = torch.autograd.grad(splines(at, 8).values[0, 3], at)
+    assert float(slope) == pytest.approx(float((values[1201, 3] - values[1199, 3]) * 2000), rel=1e-5)
+
+
+def test_values_in_time_lie_on_a_curve_through_them() -> None:
+    times = torch.tensor([0.2, 0.5, 0.6, 0.9], dtype=DOUBLE)
+    torch.testing.assert_close(through(times, times), torch.eye(4, dtype=DOUBLE))
+    assert float(through(times, torch.tensor([0.0, 1.0], dtype=DOUBLE)).abs().max()) < 1e-15
+    t = torch.linspace(0, 1, 1001, dtype=DOUBLE)
+    line = through(times, t) @ torch.sin(torch.pi * times)
+    torch.testing.assert_close(line, torch.sin(torch.pi * t), rtol=0, atol=0.02)
+    at = torch.tensor([0.3], dtype=DOUBLE, requires_grad=True)
+    (slope,) = torch.autograd.grad(through(times, at) @ torch.sin(torch.pi * times), at)
+    assert float(slope) == pytest.approx(float((line[301] - line[299]) * 500), rel=1e-4)
+
+
+def test_course_is_free_of_crossings_and_does_not_pop(hand: Shapes, caplog: pytest.LogCaptureFixture) -> None:
+    options = {"bases": hand.bases, "progress": False}
+    plain = tm.subdivide(hand.keyframes, hand.faces, 5, **options)
+    with caplog.at_level("INFO"):
+        frames = tm.subdivide(hand.keyframes, hand.faces, 5, contact=True, **options)
+    before = int((far(plain, hand) > 0).sum())
+    assert before >= 6
+    # Half of them come to rest on their own: the others are counted, too.
+    assert f"in {before} of 31 in-betweens looked at, and do in 0 still" in caplog.text
+    assert int(far(frames, hand).sum()) == 0
+    assert torch.equal(frames[[0, -1]], hand.keyframes)
+    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
+
+
+def test_path_takes_any_time(hand: Shapes) -> None:
+    path = tm.Path(hand.bases, hand.faces, contact=True)
+    t = torch.tensor([0.1, 0.86, 0.9, 1.0], dtype=DOUBLE)
+    with torch.no_grad():
+        shapes, solution = path.solve(hand.keyframes, t)
+        alone = path(hand.keyframes, 0.9)
+    assert int(far(shapes, hand).sum()) == 0
+    assert int(solution.n_crossing.sum()) == 0
+    torch.testing.assert_close(alone, shapes[2], rtol=0, atol=1e-6)  # the time alone says what a shape is
+    assert torch.equal(shapes[3], hand.keyframes[1])
+
+
+def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> None:
+    mesh = Connectivity(hand.faces.numpy(), hand.keyframes.shape[1])
+    known = hand.keyframes.numpy().copy()
+    x = hand.keyframes[0]
+    tip = x[:, 0].argmin()
+    known[0, :, 0] += (0.22 * torch.exp(-(((x - x[tip]).norm(dim=-1) / 0.12) ** 2))).numpy()
+    search = Search(Crossings(mesh, known))
+    depth = search.tolerated
+    assert depth[:, 1].max() == 0 < depth[:, 0].max() < 0.1 and depth[tip, 0] > 0
+    assert np.linalg.norm(known[0][depth[:, 0] > 0] - known[0][tip], axis=1).max() < 0.5 * search.crossings.diagonal
+    slack = np.array([[2.0, 0.0]])
+    trajectory = [float(search.tolerance(slack, t)[0, 0]) for t in (0.0, 0.02, 0.05, 0.07, 0.5)]
+    assert trajectory[0] == 1 and trajectory[3:] == [0, 0] and sorted(trajectory, reverse=True) == trajectory
+    pairs = np.array([[int(face) for face in torch.nonzero((hand.faces == tip).any(1)).flatten()[:2]]])
+    assert search.n_left(pairs, 0.02) == 0 and search.n_left(pairs, 0.5) == 1
+
+
+def test_in_a_course_nothing_is_tolerated(hand: Shapes) -> None:
+    stuck = stuck_in_first(hand)
+    first, second = (100 * x[None] for x in stuck.keyframes)
+    mesh, t = Mesh.of(hand.faces, hand.keyframes.shape[1]), torch.tensor([0.02], dtype=DOUBLE)
+    at_tip = torch.nonzero((hand.faces == hand.keyframes[0, :, 0].argmin()).any(1)).flatten()
+    pairs = at_tip[:2].numpy()[None]
+    alone, trajectory = (ContactSearch(mesh, first, second, None, t, is_tolerant=each) for each in (True, False))
+    assert alone.has_crossed and trajectory.has_crossed
+    assert alone._counts(0, pairs) == (1, 0) and trajectory._counts(0, pairs) == (1, 1)
+
+
+def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
+    # A vertex in the finger beside it is also behind faces on that finger's far side.
+    stuck = stuck_in_first(hand)
+    search = Search(Crossings(Connectivity(hand.faces.numpy(), hand.keyframes.shape[1]), stuck.keyframes.numpy()))
+    deep = search.tolerated
+    assert deep[:, 0].max() > 0 == deep[:, 1].max()
+    x = 0.9 * stuck.keyframes[0] + 0.1 * hand.keyframes[0]
+    active = search(x.numpy(), search.crossings.within(deep[:, 0] > 0, 0.02))
+    beside = np.maximum(deep[active.vertices], deep[hand.faces.numpy()[active.faces]].max(1))
+    assert (beside[:, 0] > 0).sum() > 10
+    np.testing.assert_array_equal(active.slack[beside > 0], beside[beside > 0])
+
+
+def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> None:
+    differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
+    differences = 64 * torch.cat([differences, 2 * torch.eye(7, dtype=DOUBLE)[:1]])  # and it goes on at the start
+    trajectory = 8 * torch.randn(3, 8, 5, dtype=DOUBLE, generator=generator)
+    seen = torch.randn(3, 7, 5, dtype=DOUBLE, generator=generator)
+    seen[..., 4] *= 1e-3
+    # The coordinates of displacements turn as time goes on; accelerations are seen from outside.
+    angle = torch.linspace(0, 1.2, 7, dtype=DOUBLE)
+    turns = torch.eye(3, dtype=DOUBLE).repeat(7, 1, 1)
+    turns[:, 0, 0], turns[:, 1, 1] = angle.cos(), angle.cos()
+    turns[:, 1, 0], turns[:, 0, 1] = angle.sin(), -angle.sin()
+    wanted = torch.einsum("tij,itv->jtv", turns, seen)
+    found, kept = AccelerationLimit(trajectory, differences, turns, 25.0).nearest(wanted)
+    assert kept.tolist() == [0, 1, 2, 3]
+    assert torch.equal(found[..., 4], wanted[..., 4]) and not torch.equal(found[..., 0], wanted[..., 0])
+    turned = torch.einsum("tij,jtv->itv", turns, found)
+    assert float((trajectory + differences @ turned).norm(dim=0).max()) < 25.0 * 1.02
+    for v in range(4):
+
+        def room(x: np.ndarray, v: int = v) -> np.ndarray:
+            rows = trajectory[..., v].numpy() + x.reshape(3, 7) @ differences.numpy().T
+            return 25.0**2 - (rows**2).sum(0)
+
+        goal = seen[..., v].numpy().ravel()
+        best = minimize(
+            lambda x, goal=goal: ((x - goal) ** 2).sum(),
+            goal,
+            jac=lambda x, goal=goal: 2 * (x - goal),
+            constraints={"type": "ineq", "fun": room},
+            method="SLSQP",
+            options={"maxiter": 300},
+        )
+        assert float(((turned[..., v] - seen[..., v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
+
+
+@pytest.mark.filterwarnings("ignore:in .* in-betweens looked at")
+def test_limit_keeps_a_course_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Three times the peak acceleration, if nothing but this little weight held it.
+    monkeypatch.setattr(together, "SMOOTHNESS", 0.02)
+    options = {"bases": hand.bases, "progress": False}
+    plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
+    frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)
+    assert not torch.equal(frames, plain)
+    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
+
+
+def test_smooth_path_through_three_keyframes(hand: Shapes) -> None:
+    there_and_back = hand.pick(0, 1, 0)
+    options = {"bases": there_and_back.bases, "progress": False}
+    plain = tm.subdivide(there_and_back.keyframes, hand.faces, 3, **options)
+    frames = tm.subdivide(there_and_back.keyframes, hand.faces, 3, contact=True, **options)
+    assert int((far(plain, hand) > 0).sum()) >= 4
+    assert int(far(frames, hand).sum()) == 0
+    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
+
+
+def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
+    pair = bars.pick(0, 1)
+    options = {"levels": 2, "bases": pair.bases, "progress": False}
+    plain = tm.subdivide(pair.keyframes, pair.faces, **options)
+    assert torch.equal(plain, tm.subdivide(pair.keyframes, pair.faces, contact=True, **options))
+
+
+def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
+    both = stuck_in_first(hand)
+    crossed = both.keyframes
+    pairs = int(tm.self_contacts(crossed[0], hand.faces).number)
+    assert pairs > 10
+    options = {"levels": 3, "bases": hand.bases, "progress": False}
+    plain = tm.subdivide(crossed, hand.faces, **options)
+    with pytest.warns(tm.MeshWarning, match=f"key-frame 0 passes through itself: {pairs} pairs"):
+        frames = tm.subdivide(crossed, hand.faces, contact=True, **options)
+    assert int(far(frames, both).sum()) <= int(far(plain, both).sum())
+    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
+    assert torch.equal(frames[[0, -1]], crossed)
+
+
+def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
+    space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
+    assert int(far(space.table(0, 1).double(), hand).sum()) == 0
+
+
+@pytest.mark.slow
+def test_command_line(tmp_path: Path) -> None:
+    keys = [str(file) for file in sample_files("hand")]
+    out = tmp_path / "frames"
+    assert cli.main(["subdivide", *keys, "--out", str(out), "--levels", "3", "--contact", "--quiet"]) == 0
+    files = sorted(map(str, out.glob("frame-*.ply")))
+    assert cli.main(["check", *files, "--keyframes", *keys]) == 0
+
+
+@pytest.mark.slow
+def test_scanned_like_figure_walks_with_few_crossings(women: Shapes) -> None:
+    """Thighs and hands of 13,380 vertices: of some 150 pairs, a few are left where parts lie deep in each other."""
+    pair = women.pick(1, 2)
+    layers = [tm.InBetween(pair.bases, pair.faces, contact=contact) for contact in (False, True)]
+    with torch.no_grad():
+        plain, pushed = (layer.solve(*pair.keyframes, 0.5) for layer in layers)
+    crossings = Crossings(Connectivity(pair.faces.numpy()), pair.keyframes.numpy())
+    before, after = (len(crossings.far_pairs(result.shapes.numpy())) for result in (plain, pushed))
+    assert before > 50 and after <= 0.2 * before
+    assert int(pushed.solution.n_crossing) <= 0.2 * before
+
+
+def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shapes on springs of different stiffness, held below the limit: SciPy finds the same rest."""
+    n, places = 7, 2 * torch.randn(7, 3, 3, dtype=DOUBLE, generator=generator)
+    springs = torch.tensor([1.0, 30, 1, 5, 1, 0.2, 3], dtype=DOUBLE)
+    differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
+    limit = AccelerationLimit(torch.zeros(3, 7, 3, dtype=DOUBLE), differences, torch.eye(3).repeat(7, 1, 1).double(), 1)
+
+    class Fake:
+        t = torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1]
+        areas = torch.ones(1, 3, dtype=DOUBLE)
+        n_far = torch.full((n,), 99)
+
+        def is_watched(self, some: Tensor) -> Tensor:
+            return torch.ones(len(some), dtype=torch.bool)
+
+        def count(self, x: Tensor, some: object = None) -> None:
+            self.n_far = self.n_far - 1  # the last is the best
+
+        def __call__(self, x: Tensor, some: object) -> None:
+            return None
+
+        def rows(self, some: Tensor) -> Tensor:
+            return some
+
+    def rest(member: Any, own: Tensor, pair: Any, x: Tensor, active: Any, pull: Pull, n_products: int) -> Tensor:
+        own_springs = springs[own, None, None]
+        pulls = pull.weights[:, None]
+        found: Tensor = (own_springs * places[own] + pulls * pull.to) / (own_springs + pulls)
+        return found
+
+    monkeypatch.setattr(contact, "settled", rest)
+    monkeypatch.setattr(contact, "ROUNDS", (4, 90))
+    monkeypatch.setattr(contact, "PULL", 3.0)
+    start = torch.zeros_like(places)
+    fake: Any = Fake()
+    x = contact._at_rest(fake, fake, fake, start, start, fake, torch.arange(n), fake, limit)
+    for v in range(3):
+        best = minimize(
+            lambda d, v=v: float((springs.numpy()[:, None] * (d.reshape(n, 3) - places[:, v].numpy()) ** 2).sum()),
+            np.zeros(3 * n),
+            constraints={"type": "ineq", "fun": lambda d: 1 - ((differences.numpy() @ d.reshape(n, 3)) ** 2).sum(1)},
+            method="SLSQP",
+            options={"maxiter": 500},
+        )
+        np.testing.assert_allclose(x[:, v].numpy(), best.x.reshape(n, 3), rtol=0, atol=0.03)

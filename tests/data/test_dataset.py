@@ -1,0 +1,355 @@
+"""The dataset over stored sets: deterministic, safe in workers, and small in memory."""
+
+import gc
+import pickle
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import Shapes
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch.utils.data import DataLoader, default_collate
+
+import torch_modal as tm
+from torch_modal.energy.bend import Bend
+from torch_modal.io.cache import CacheWarning
+
+N_SETS, PER_SET = 3, 8
+
+
+@pytest.fixture(scope="module")
+def root(bars: Shapes, small_bars: Shapes, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sets of one connectivity and one of another, at different depths."""
+    folder = tmp_path_factory.mktemp("sets")
+    names = ["straight", "bent", "twisted"]
+    tm.write_set(folder / "a", *bars, names)
+    tm.write_set(folder / "deep" / "b", bars.keyframes.flip(0), bars.faces, bars.bases[::-1], names[::-1])
+    tm.write_set(folder / "deep" / "small", *small_bars, names)
+    return folder
+
+
+def everything(p: float = 0.7) -> tm.AugmentationSequential:
+    return tm.AugmentationSequential(
+        tm.RandomInBetween(p=p),
+        tm.RandomExtrapolation(p=0.3),
+        tm.RandomModalDeformation(p=p),
+        tm.RandomRigidMotion(p=p),
+    )
+
+
+def dataset(root: Path, **options: Any) -> tm.ShapeDataset:
+    return tm.ShapeDataset(root, everything(), **{"samples_per_set": PER_SET, "normals": True, "seed": 4, **options})
+
+
+def batches(data: tm.ShapeDataset, epochs: int = 1, **options: Any) -> list[dict[str, Any]]:
+    loader = DataLoader(data, batch_sampler=tm.SetBatchSampler(data, 4), **options)
+    found = []
+    for epoch in range(epochs):
+        data.set_epoch(epoch)
+        found += list(loader)
+    return found
+
+
+def assert_same(found: list[dict[str, Any]], expected: list[dict[str, Any]]) -> None:
+    assert len(found) == len(expected)
+    for mine, its in zip(found, expected, strict=True):
+        assert mine.keys() == its.keys()
+        for name in mine:
+            assert torch.equal(torch.as_tensor(mine[name]), torch.as_tensor(its[name])), name
+
+
+def test_samples(root: Path, bars: Shapes) -> None:
+    data = dataset(root, faces=True)
+    assert len(data) == N_SETS * PER_SET
+    assert [Path(path).name for path in data.sets] == ["a", "b", "small"]
+    sample = data[0]
+    assert sorted(sample) == ["faces", "keyframe", "normals", "set", "vertices"]
+    assert (sample["vertices"].shape, sample["vertices"].dtype) == ((164, 3), torch.float32)
+    assert torch.equal(sample["faces"], bars.faces)
+    assert torch.equal(data.faces(0), bars.faces)
+    torch.testing.assert_close(sample["normals"], tm.vertex_normals(sample["vertices"][None], bars.faces)[0])
+    assert data[-1]["set"] == 2
+    assert data[-1]["vertices"].shape == (30, 3)
+    assert dataset(root, dtype=torch.float64)[0]["vertices"].dtype == torch.float64
+    with pytest.raises(IndexError, match="24 of 24"):
+        data[24]
+    # Key-frames take turns as starts, over epochs too.
+    starts = [data[i]["keyframe"] for i in range(PER_SET)]
+    data.set_epoch(1)
+    starts += [data[i]["keyframe"] for i in range(PER_SET)]
+    assert starts == [i % 3 for i in range(2 * PER_SET)]
+
+
+def test_samples_are_the_transforms(root: Path, bars: Shapes) -> None:
+    """In-betweens of the key-frames: without them the key-frames themselves."""
+    still = tm.ShapeDataset(root, tm.RandomInBetween(p=0.0), samples_per_set=3, dtype=torch.float64)
+    for i in range(3):
+        assert torch.equal(still[i]["vertices"], bars.keyframes[i])
+    middle = tm.ShapeDataset(root, tm.RandomInBetween(t=(0.5, 0.5), p=1.0), samples_per_set=12, dtype=torch.float64)
+    layer = tm.InBetween(bars.bases, bars.faces, "fast", pairs=[(0, 1), (1, 2), (0, 2)])
+    truths = {
+        pair: layer(bars.keyframes[pair[0]], bars.keyframes[pair[1]], 0.5, i)
+        for i, pair in enumerate([(0, 1), (1, 2), (0, 2)])
+    }
+    seen = set()
+    for i in range(12):
+        sample = middle[i]
+        distances = {pair: float((sample["vertices"] - x).abs().max()) for pair, x in truths.items()}
+        pair = min(distances, key=lambda pair: distances[pair])
+        assert distances[pair] < 1e-3
+        assert sample["keyframe"] in pair
+        seen.add((sample["keyframe"], pair))
+    assert len(seen) > 3
+
+
+def test_a_sample_depends_on_seed_epoch_and_index_alone(root: Path) -> None:
+    data = dataset(root)
+    first = data[5]["vertices"]
+    data.__getitems__([7, 3, 11])
+    assert torch.equal(data[5]["vertices"], first)
+    assert torch.equal(dataset(root)[5]["vertices"], first)
+    together = data.__getitems__([20, 5, 1])[1]["vertices"]
+    torch.testing.assert_close(together, first, rtol=0, atol=1e-4)
+    others = [data[6]["vertices"], dataset(root, seed=5)[5]["vertices"]]
+    data.set_epoch(1)
+    others.append(data[5]["vertices"])
+    for other in others:
+        assert not torch.equal(other, first)
+
+
+@pytest.mark.parametrize(("workers", "method"), [(1, "fork"), (2, "fork"), (2, "spawn")])
+def test_workers_change_nothing(root: Path, workers: int, method: str) -> None:
+    """Also where the parent has used everything before, with threads of its own."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        data = dataset(root)
+        torch.randn(400, 400) @ torch.randn(400, 400)
+        expected = batches(data, epochs=2, num_workers=0)
+        assert torch.get_num_threads() == 2
+        options = {"num_workers": workers, "multiprocessing_context": method, "timeout": 120}
+        if method == "fork":
+            assert_same(batches(dataset(root), epochs=2, **options), expected)
+        assert_same(batches(data, epochs=2, persistent_workers=True, **options), expected)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_ordinary_loaders_mix_sets_of_one_connectivity(root: Path) -> None:
+    data = dataset(root)
+    data.sets = data.sets[:2]
+    loader = DataLoader(data, batch_size=5, shuffle=True, generator=torch.Generator().manual_seed(0))
+    found = list(loader)
+    assert [len(batch["vertices"]) for batch in found] == [5, 5, 5, 1]
+    assert any(len(batch["set"].unique()) == 2 for batch in found)
+    alone = {tuple(data[i]["vertices"][0].tolist()): i for i in range(len(data))}
+    assert len(alone) == len(data)
+    first = torch.tensor(list(alone))
+    rows = torch.cat([batch["vertices"][:, 0] for batch in found])
+    distances = torch.cdist(rows, first)
+    assert float(distances.amin(1).max()) < 1e-4
+    assert sorted(distances.argmin(1).tolist()) == list(range(len(data)))
+
+
+def test_batches_of_one_set(root: Path) -> None:
+    data = dataset(root)
+    sampler = tm.SetBatchSampler(data, 3)
+    drawn = list(sampler)
+    assert len(drawn) == len(sampler) == N_SETS * 3
+    assert sorted(index for batch in drawn for index in batch) == list(range(len(data)))
+    assert all(len({index // PER_SET for index in batch}) == 1 for batch in drawn)
+    assert list(sampler) == drawn
+    data.set_epoch(1)
+    assert list(sampler) != drawn
+    short = tm.SetBatchSampler(data, 3, shuffle=False, drop_last=True)
+    assert list(short)[:3] == [[0, 1, 2], [3, 4, 5], [8, 9, 10]]
+    assert len(list(short)) == len(short) == N_SETS * 2
+    with pytest.raises(ValueError, match="batch_size"):
+        tm.SetBatchSampler(data, 0)
+
+
+def label_poses(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
+    classes = {"straight": 0, "bent": 1, "twisted": 2}
+    part = torch.arange(stored.n_vertices) % 4
+    return {"vertex_labels": part, "shape_labels": torch.eye(3)[[classes[name] for name in stored.names]]}
+
+
+def test_labels_from_a_function(root: Path) -> None:
+    transform = tm.RandomInBetween(p=1.0, blend_labels=True)
+    with pytest.raises(ValueError, match="vertex_labels must be floating-point"):
+        tm.ShapeDataset(root, transform, labels=label_poses)[0]
+    hard = tm.ShapeDataset(root, tm.RandomInBetween(p=1.0), labels=label_poses, samples_per_set=PER_SET)
+    for sample in hard.__getitems__(list(range(len(hard)))):
+        assert torch.equal(sample["vertex_labels"], torch.arange(len(sample["vertices"])) % 4)
+        assert sorted(sample["shape_labels"].tolist()) == [0, 0, 1]
+    soft = tm.ShapeDataset(root, transform, labels=soft_poses, samples_per_set=PER_SET)
+    batch = default_collate(soft.__getitems__(list(range(PER_SET))))
+    torch.testing.assert_close(batch["shape_labels"].sum(1), torch.ones(PER_SET))
+    assert float(batch["shape_labels"].amax(1).min()) < 0.9
+    assert_same(
+        list(
+            DataLoader(soft, batch_sampler=tm.SetBatchSampler(soft, 4), num_workers=1, multiprocessing_context="spawn")
+        ),
+        list(DataLoader(soft, batch_sampler=tm.SetBatchSampler(soft, 4))),
+    )
+
+
+def soft_poses(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
+    return {"shape_labels": label_poses(stored)["shape_labels"]}
+
+
+def test_labels_from_the_folder(bars: Shapes, tmp_path: Path) -> None:
+    tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
+    per_keyframe = torch.stack([torch.full((164,), k) for k in range(3)])
+    save_file(
+        {"vertex_labels": per_keyframe, "shape_labels": torch.tensor([4, 5, 6])},
+        tmp_path / "set" / "labels.safetensors",
+    )
+    data = tm.ShapeDataset(tmp_path, tm.RandomModalDeformation(p=1.0), samples_per_set=3)
+    for k in range(3):
+        assert data[k]["shape_labels"] == 4 + k
+        assert data[k]["vertex_labels"].unique().tolist() == [k]
+    save_file({"vertex_labels": torch.zeros(163)}, tmp_path / "set" / "labels.safetensors")
+    with pytest.raises(ValueError, match=r"vertex_labels of 3 key-frames.*got \(163,\)"):
+        tm.ShapeDataset(tmp_path)[0]
+
+
+def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
+    tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
+    first = batches(tm.ShapeDataset(tmp_path))
+    tables = sorted((tmp_path / "set").glob("between-*.safetensors"))
+    assert [path.name for path in tables] == [f"between-{pair}.safetensors" for pair in ("0-1", "0-2", "1-2")]
+    times = [path.stat().st_mtime_ns for path in tables]
+    assert_same(batches(tm.ShapeDataset(tmp_path)), first)
+    assert [path.stat().st_mtime_ns for path in tables] == times
+    # Other settings, or a damaged file, and they are made again.
+    tables[0].write_bytes(tables[0].read_bytes()[:-100])
+    assert_same(batches(tm.ShapeDataset(tmp_path)), first)
+    tm.ShapeDataset(tmp_path, times=9)[0]
+    assert [path.stat().st_mtime_ns for path in tables] != times
+    # A folder's tables of other shapes are not taken for one's own.
+    moved = bars.pick(1, 0, 2)
+    shapes = tm.ShapeSpace(moved.bases, moved.faces, folder=tmp_path / "set").table(0, 1)
+    assert torch.equal(shapes[0], bars.keyframes[1].float())
+    # Where nothing can be written, nothing is.
+    for path in tables:
+        path.unlink()
+    without = tm.ShapeDataset(tmp_path, folder=None)
+    assert_same(batches(without), first)
+    assert not list((tmp_path / "set").glob("between-*"))
+
+
+def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
+    bars: Shapes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is exchanged for zeros under the same key: whoever reads it is found out."""
+    path = tmp_path / "between-0-1.safetensors"
+
+    def table(bases: list[tm.ModalBasis] = bars.bases, faces: torch.Tensor = bars.faces, **options: Any) -> Any:
+        return tm.ShapeSpace(bases, faces, folder=tmp_path, **options).table(0, 1)
+
+    right = table()
+    with safe_open(path, framework="pt") as file:
+        key = file.metadata()
+
+    def plant() -> None:
+        path.unlink()
+        save_file({"shapes": torch.zeros_like(right)}, path, key)
+
+    plant()
+    assert float(table().abs().max()) == 0
+    first = bars.bases[0]
+    modes = first.modes + 0.1 * torch.sin(first.reference)  # eigenvalues and shape stay
+    other = tm.ModalBasis(first.reference, first.eigenvalues, modes, first.rigid_eigenvalues)
+    changes: list[dict[str, Any]] = [
+        {"bases": [other, *bars.bases[1:]]},
+        {"faces": bars.faces.roll(1, 1)},
+        {"preset": "accurate"},
+        {"objective": tm.Objective(coarse_faces=300, beta=torch.full((1,), 20.0))},
+        {"objective": tm.Objective(coarse_faces=300, terms=(Bend(2.0),))},
+        {"objective": tm.Objective(coarse_faces=300, terms=(Bend(3.0),))},
+        {"objective": tm.Objective(coarse_faces=300, terms=(Bend(torch.tensor([3.0])),))},
+        {"solver": tm.Solver(tolerance=1e-5, local_steps=1)},
+    ]
+    for change in changes:
+        plant()
+        found = table(**change)
+        assert torch.equal(found[0], bars.keyframes[0].float()), change
+        path.unlink()
+        assert torch.equal(table(**change), found)
+    plant()
+    monkeypatch.setattr("torch_modal.data.space.__version__", "0.0.1")
+    assert torch.equal(table(), right)
+
+
+class Area(tm.Term):
+    def elements(self, mesh: Any) -> torch.Tensor:
+        return mesh.faces
+
+    def measure(self, spokes: torch.Tensor) -> torch.Tensor:
+        return 0.5 * torch.linalg.cross(spokes[0], spokes[1]).norm()
+
+
+def test_tables_of_a_users_own_term_are_not_stored(bars: Shapes, tmp_path: Path) -> None:
+    """Its code is no part of any key, so that another term's table would be read."""
+    objective = tm.Objective(coarse_faces=300, terms=(Area(2.0),))
+    space = tm.ShapeSpace(bars.bases, bars.faces, objective=objective, folder=tmp_path)
+    with pytest.warns(CacheWarning, match="are not stored.*Area"):
+        space.table(0, 1)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="times=None"):
+        tm.ShapeSpace(bars.bases, bars.faces, times=None).table(0, 1)
+
+
+def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> None:
+    hasty = tm.Solver(max_steps=1, tolerance=1e-12, local_steps=0)
+    tm.write_set(tmp_path / "set", *bars, ["0", "1", "2"])
+    between = tm.RandomInBetween(t=(0.4, 0.6), p=1.0)
+    data = tm.ShapeDataset(tmp_path, between, solver=hasty, samples_per_set=3)
+    with pytest.warns(tm.ConvergenceWarning, match=r"of 17 in-betweens near the key-frames . and . .*OUT_OF_STEPS"):
+        data[0]
+    # It is not kept, so that the next run hears of it too.
+    assert not list(tmp_path.rglob("between-*"))
+    space = tm.ShapeSpace(bars.bases, bars.faces, solver=hasty, times=None)
+    with pytest.warns(tm.ConvergenceWarning, match=r"1 of 1 in-betweens near the key-frames 0 and 1"):
+        space.keyframe_in_between(1, 0, torch.tensor([0.5], dtype=torch.float64))
+    x = bars.keyframes + 0.01 * torch.sin(bars.keyframes)
+    with pytest.warns(tm.ConvergenceWarning, match="OUT_OF_STEPS"):
+        between(x, space=space)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert bool(tm.ShapeDataset(tmp_path, between)[0]["vertices"].isfinite().all())
+        between(x, space=tm.ShapeSpace(bars.bases, bars.faces))
+
+
+def test_sets_with_one_key_frame(bars: Shapes, tmp_path: Path) -> None:
+    tm.write_set(tmp_path / "one", bars.keyframes[:1], bars.faces, bars.bases[:1], ["0"])
+    data = tm.ShapeDataset(tmp_path, everything(p=1.0), samples_per_set=2)
+    assert bool(data[1]["vertices"].isfinite().all())
+    assert torch.equal(tm.ShapeDataset(tmp_path)[0]["vertices"], bars.keyframes[0].float())
+
+
+def test_only_the_last_sets_stay_open(root: Path) -> None:
+    def spaces() -> int:
+        gc.collect()
+        return sum(type(each) is tm.ShapeSpace for each in gc.get_objects())
+
+    before = spaces()  # of other tests
+    data = dataset(root, open_sets=2)
+    for i in (0, PER_SET, 2 * PER_SET, 0):
+        data[i]
+        assert len(data._opened) <= 2
+        assert spaces() <= before + 2
+    assert len(pickle.dumps(data)) < 4000
+
+
+def test_refuses(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no stored key-frame set in"):
+        tm.ShapeDataset(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no folder"):
+        tm.ShapeDataset(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="samples_per_set"):
+        tm.ShapeDataset(root, samples_per_set=0)

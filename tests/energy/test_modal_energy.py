@@ -1,0 +1,202 @@
+"""Derivatives in the amplitudes against autograd of the energy, on closed, open and odd surfaces."""
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+from torch.func import hessian, jacfwd
+
+from torch_modal import trees
+from torch_modal.energy import congruence
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy
+from torch_modal.energy.shell import ShellEnergy
+
+N, BATCH = 5, 3
+MOEBIUS = [[i, (i + 1) % 7, (i + 2) % 7] if i % 2 == 0 else [(i + 1) % 7, i, (i + 2) % 7] for i in range(7)]
+FINS = [[0, 1, 2], [1, 0, 3], [0, 1, 4]]
+
+
+class Case:
+    """A shell in a random space, away from rest, with two references of different pull."""
+
+    def __init__(self, faces: Tensor, x: Tensor, extra: bool, seed: int = 0, **stiffness: float) -> None:
+        generator = torch.Generator().manual_seed(seed)
+
+        def random(*shape: int) -> Tensor:
+            return torch.randn(*shape, dtype=torch.float64, generator=generator)
+
+        size = float(x[faces.unique()].std())
+        self.shell = ShellEnergy(faces, **stiffness)
+        self.columns = random(N, *x.shape)
+        self.modal = ModalEnergy(self.shell, self.columns)
+        self.base = base = x + 0.05 * size * random(BATCH, *x.shape)
+        self.rests = [base + 0.1 * size * random(BATCH, *x.shape) for _ in range(2)]
+        self.pulls = [torch.tensor([0.5, 0.9, 0.0], dtype=torch.float64), torch.tensor([0.5, 0.2, 2.0]).double()]
+        both = self.pulls[0] + self.pulls[1]
+        factors = [both[:, None] * stiffness for stiffness in self.shell.stiffness]
+        rests = [self.shell.rest(r) for r in self.rests]
+        reference = self.shell.energy.between(rests[0], rests[1], self.pulls[1] / both, factors)
+        self.extra = random(BATCH, *x.shape) if extra else None
+        self.placement = self.modal.place(base, reference, self.extra)
+        self.a = 0.02 * size * random(BATCH, N + extra)
+
+    def shape_by_hand(self, a: Tensor) -> Tensor:
+        x = self.base + torch.einsum("bn,nvc->bvc", a[:, :N], self.columns)
+        return x if self.extra is None else x + a[:, N, None, None] * self.extra
+
+    def energy_by_hand(self, a: Tensor) -> Tensor:
+        x = self.shape_by_hand(a)
+        return sum(p * self.shell(x, r) for r, p in zip(self.rests, self.pulls, strict=True))
+
+    def residuals_by_hand(self, a: Tensor) -> Tensor:
+        x = self.shape_by_hand(a)
+        parts = [p.sqrt()[:, None] * self.shell.residuals(x, r) for r, p in zip(self.rests, self.pulls, strict=True)]
+        return torch.cat(parts, -1)
+
+    def hessian_by_autograd(self) -> Tensor:
+        whole = hessian(lambda a: self.energy_by_hand(a).sum())(self.a)
+        return torch.stack([whole[i, :, i] for i in range(BATCH)])
+
+    def jacobian_by_autograd(self) -> Tensor:
+        whole = jacfwd(self.residuals_by_hand)(self.a)
+        return torch.stack([whole[i, :, i] for i in range(BATCH)])
+
+    def derivatives(self, second_order: bool = True) -> Derivatives:
+        return self.modal.derivatives(self.a, self.placement, second_order)
+
+
+def odd_surface(faces: list[list[int]]) -> tuple[Tensor, Tensor]:
+    n = 1 + max(max(face) for face in faces)
+    x = torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    return torch.tensor(faces), 5 * x
+
+
+def relative(got: Tensor, truth: Tensor) -> float:
+    return float((got - truth).norm() / truth.norm())
+
+
+@pytest.fixture(params=["closed", "open", "open in pieces", "unused vertex"])
+def surface_of(request: pytest.FixtureRequest, small_bars: Shapes) -> tuple[Tensor, Tensor]:
+    faces, x = small_bars.faces, small_bars.keyframes[1] * 20
+    if request.param == "open":
+        faces = faces[6:]
+    elif request.param == "open in pieces":
+        faces = faces[torch.arange(len(faces)) % 5 > 1]
+    elif request.param == "unused vertex":
+        faces, x = faces + 1, torch.cat([torch.full((1, 3), 1e3, dtype=torch.float64), x])
+    return faces, x
+
+
+@pytest.mark.parametrize("extra", [False, True])
+def test_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) -> None:
+    case = Case(*surface_of, extra)
+    rows = case.modal.rows(case.a, case.placement)[..., : case.base.shape[1]]
+    torch.testing.assert_close(rows.movedim(0, -1), case.shape_by_hand(case.a))
+    torch.testing.assert_close(case.modal.value(case.a, case.placement), case.energy_by_hand(case.a))
+    gradient = torch.autograd.functional.jacobian(lambda a: case.energy_by_hand(a).sum(), case.a)
+    got = case.derivatives()
+    assert relative(got.gradient, gradient) < 1e-12
+    both = case.modal.value_and_gradient(case.a, case.placement)
+    torch.testing.assert_close(both[0], case.energy_by_hand(case.a))
+    assert relative(both[1], gradient) < 1e-12
+    jacobian = case.jacobian_by_autograd()
+    assert relative(got.gauss_newton, 2 * jacobian.mT @ jacobian) < 1e-12
+    assert torch.linalg.eigvalsh(got.gauss_newton).amin() > 0
+    truth = case.hessian_by_autograd()
+    assert relative(got.gauss_newton, truth) > 1e-2, "at rest there would be nothing to see"
+    assert got.second_order is not None
+    assert relative(got.gauss_newton + got.second_order, truth) < 1e-11
+
+
+@pytest.mark.parametrize("extra", [False, True])
+def test_pull_back_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) -> None:
+    case = Case(*surface_of, extra)
+    along = torch.randn(case.a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    leaves = [leaf.clone().requires_grad_() for leaf in trees.leaves(case.placement)]
+    tracked = trees.filled(case.placement, leaves)
+    slope = (case.modal.derivatives(case.a, tracked, second_order=False).gradient * along).sum()
+    truth = torch.autograd.grad(slope, leaves, allow_unused=True, materialize_grads=True)
+    found = trees.leaves(case.modal.pull_back(case.a, along, case.placement))
+    assert len(found) == len(truth) == 8 + extra
+    for value, wanted in zip(found, truth, strict=True):
+        assert float((value - wanted).norm()) <= 1e-11 * float(wanted.norm())
+
+
+@pytest.mark.parametrize("stiffness", [(500.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 1000.0)])
+def test_each_term_alone(stiffness: tuple[float, float, float], small_bars: Shapes) -> None:
+    names = dict(zip(("alpha", "beta", "gamma"), stiffness, strict=True))
+    for faces in (small_bars.faces, small_bars.faces[6:]):
+        case = Case(faces, small_bars.keyframes[1] * 20, True, **names)
+        got = case.derivatives()
+        assert got.second_order is not None
+        assert relative(got.gauss_newton + got.second_order, case.hessian_by_autograd()) < 1e-11
+
+
+@pytest.mark.parametrize("faces", [FINS, MOEBIUS], ids=["three faces at an edge", "moebius strip"])
+def test_no_consistent_winding_without_volume(faces: list[list[int]]) -> None:
+    case = Case(*odd_surface(faces), True, gamma=0.0)
+    got = case.derivatives()
+    assert got.second_order is not None
+    assert relative(got.gauss_newton + got.second_order, case.hessian_by_autograd()) < 1e-11
+
+
+@pytest.mark.parametrize("faces", [FINS, MOEBIUS], ids=["three faces at an edge", "moebius strip"])
+def test_no_consistent_winding_with_volume(faces: list[list[int]]) -> None:
+    case = Case(*odd_surface(faces), True, alpha=0.0, beta=0.0)
+    got = case.derivatives()
+    gradient = torch.autograd.functional.jacobian(lambda a: case.energy_by_hand(a).sum(), case.a)
+    assert relative(got.gradient, gradient) < 1e-12
+    assert got.second_order is not None
+    assert relative(got.gauss_newton + got.second_order, case.hessian_by_autograd()) < 1e-11
+
+
+def test_second_order_is_optional_and_comes_in_chunks(small_bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, True)
+    whole, first_order = case.derivatives(), case.derivatives(second_order=False)
+    assert first_order.second_order is None
+    assert torch.equal(whole.gauss_newton, first_order.gauss_newton)
+    monkeypatch.setattr(congruence, "_CHUNK_BYTES", 1)  # one sample at a time
+    assert whole.second_order is not None
+    torch.testing.assert_close(case.derivatives().second_order, whole.second_order, rtol=1e-12, atol=1e-9)
+
+
+def test_cardinality_value_takes_more_leading_dimensions(small_bars: Shapes) -> None:
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, True)
+    many = case.a + 0.01 * torch.arange(4, dtype=torch.float64)[:, None, None]
+    energies = case.modal.value(many, case.placement)
+    assert energies.shape == (4, BATCH)
+    for a, energy in zip(many, energies, strict=True):
+        torch.testing.assert_close(energy, case.energy_by_hand(a))
+
+
+@pytest.mark.parametrize("second_order", [False, True])
+def test_collapsed_triangles_give_finite_derivatives(second_order: bool, small_bars: Shapes) -> None:
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, False)
+    base = case.placement.base.clone()
+    base[0, :, small_bars.faces[0, 0]] = base[0, :, small_bars.faces[0, 1]]
+    base[1, :, small_bars.faces[0]] = base[1, :, small_bars.faces[0, :1]]
+    placement = case.placement._replace(base=base)
+    got = case.modal.derivatives(torch.zeros(BATCH, N, dtype=torch.float64), placement, second_order)
+    got = got if second_order else got._replace(second_order=got.gradient)
+    for value in got:
+        assert value is not None
+        assert value.isfinite().all()
+    assert torch.linalg.eigvalsh(got.gauss_newton).amin() > 0
+
+
+def test_resolution_is_the_size_of_rounding(bars: Shapes) -> None:
+    """Moving the shape far away rounds its positions: the gradient then changes by about ``resolution``."""
+    shell = ShellEnergy(bars.faces)
+    modal = ModalEnergy(shell, bars.bases[0].modes)
+    x = bars.keyframes[:1] * 25
+    a = torch.zeros(1, 8, dtype=torch.float64)
+    for far in (1e5, 1e7):
+        got = modal.derivatives(a, modal.place(x + far, shell.against(x)), second_order=False)
+        noise, bound = float(got.gradient.norm()), float(got.resolution)
+        assert 0 < noise < 4 * bound
+        assert bound < 1e3 * noise
+
+
+def test_nothing_of_it_is_saved(small_bars: Shapes) -> None:
+    """All of it follows from the faces and the columns."""
+    assert not Case(small_bars.faces, small_bars.keyframes[1] * 20, True).modal.state_dict()

@@ -1,0 +1,185 @@
+"""Where the minimisation starts: edges of triangles that turn part of the way."""
+
+import math
+
+import pytest
+import torch
+from conftest import Shapes, modal, problem_of
+from torch import Tensor
+
+from torch_modal.backends.choice import choose
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.warp.rotations import WarpRotations
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.inbetween.blend import Blends, RotationBlend
+from torch_modal.layers.mid_shape import MidShape
+
+T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
+
+
+def ribbon(turn: float, n: int = 13) -> tuple[Tensor, Tensor]:
+    """Rigid plates, each turned against the last one about the edge between them: the last by ``turn`` in all."""
+    angles = torch.linspace(0, turn, n, dtype=torch.float64)
+    steps = torch.stack([angles.cos(), torch.zeros_like(angles), angles.sin()], -1)
+    spine = torch.cat([torch.zeros(1, 3, dtype=torch.float64), steps.cumsum(0)])
+    x = torch.cat([spine, spine + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)])
+    i = torch.arange(n)
+    m = n + 1
+    faces = torch.cat([torch.stack([i, i + 1, i + m], -1), torch.stack([i + 1, i + 1 + m, i + m], -1)])
+    return x, faces
+
+
+def rotations_of(first: Tensor, second: Tensor, faces: Tensor) -> tuple[LocalRotations, Connectivity]:
+    mesh = Connectivity(faces.numpy())
+    return LocalRotations(mesh, torch.stack([first, second])), mesh
+
+
+def edges(x: Tensor, mesh: Connectivity) -> Tensor:
+    start, end = torch.tensor(mesh.edges).T
+    return x[..., end, :] - x[..., start, :]
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 170, 250, 340])
+def test_plates_turn_at_constant_speed(degrees: int) -> None:
+    """Beyond half a turn too, where a plate alone would take the other way round."""
+    turn = math.radians(degrees)
+    (x_a, faces), (x_b, _) = ribbon(0.0), ribbon(turn)
+    rotations, mesh = rotations_of(x_a, x_b, faces)
+    found = rotations(x_a.expand(len(T), -1, -1), x_b.expand(len(T), -1, -1), T).movedim(0, -1)
+    for t, row in zip(T, found, strict=True):
+        torch.testing.assert_close(row, edges(ribbon(float(t) * turn)[0], mesh), rtol=0, atol=1e-12)
+    half_scale = rotations(x_a[None], 2 * x_b[None], T[2:3])[:, 0].mT
+    torch.testing.assert_close(half_scale, 1.5 * edges(ribbon(0.5 * turn)[0], mesh), rtol=0, atol=1e-12)
+
+
+def test_pieces_have_a_sense_of_their_own() -> None:
+    (x_a, faces), (x_b, _), (x_c, _) = ribbon(0.0), ribbon(math.radians(250)), ribbon(math.radians(-250))
+    both, twice = torch.cat([x_a, x_a + 5]), torch.cat([faces, faces + len(x_a)])
+    moved = torch.cat([x_b, x_c + 5])
+    rotations, mesh = rotations_of(both, moved, twice)
+    found = rotations(both[None], moved[None], T[2:3])[:, 0].mT
+    wanted = torch.cat([ribbon(math.radians(125))[0], ribbon(math.radians(-125))[0]])
+    torch.testing.assert_close(found, edges(wanted, mesh), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_most_of_the_area_of_a_piece_says_which_way_it_turns(fused: bool) -> None:
+    """Many small plates turn by more than half a turn, few large ones by less. A tree has its root at either end."""
+    if fused:
+        pytest.importorskip("warp")
+    angles = torch.tensor([*range(300, 190, -10), 160, 120, 80, 40, 0], dtype=torch.float64).deg2rad()
+    lengths = torch.tensor([1.0] * 11 + [10.0] * 5, dtype=torch.float64)
+
+    def rolled(part: float, backwards: bool) -> Tensor:
+        own, long = (x.flip(0) if backwards else x for x in (part * angles, lengths))
+        spine = torch.stack([long * own.cos(), 0 * own, long * own.sin()], -1).cumsum(0)
+        spine = torch.cat([torch.zeros_like(spine[:1]), spine])
+        return torch.cat([spine, spine + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)])
+
+    n_vertices, faces = 2 * len(angles) + 2, ribbon(0.0, len(angles))[1]
+    first, second = (torch.cat([rolled(part, False), rolled(part, True)]) for part in (0.0, 1.0))
+    kind = WarpRotations if fused else LocalRotations
+    mesh = Connectivity(torch.cat([faces, faces + n_vertices]).numpy())
+    rotations = kind(mesh, torch.stack([first, second]))
+    wanted = torch.cat([angles, angles, angles.flip(0), angles.flip(0)])
+    roots = wanted[rotations.ancestors[0] == torch.arange(len(wanted))]
+    assert len(roots) == 2 and float(roots.min()) < math.pi < float(roots.max())
+    found = rotations.turns(first[None], second[None])[0, 0]
+    torch.testing.assert_close(found, (0.5 * wanted).cos(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_triangles_without_area_are_survived(dtype: torch.dtype) -> None:
+    (x_a, faces), (x_b, _) = ribbon(0.0), ribbon(2.0)
+    x_a[3], x_b[5] = x_a[4], 0.5 * (x_b[4] + x_b[6])
+    x_a, x_b = x_a.to(dtype), x_b.to(dtype)
+    rotations, _ = rotations_of(x_a, x_b, faces)
+    assert rotations(x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype)).isfinite().all()
+
+
+@pytest.mark.parametrize("degrees", [0, 120, 300])
+def test_blend_is_the_shape_of_these_edges(degrees: int) -> None:
+    """Two ribbons that touch in nothing but a vertex, one apart, and a vertex of no face: each at its place."""
+    turn = math.radians(degrees)
+    x_a, faces = ribbon(0.0)
+    first, second, halfway = (
+        torch.cat([ribbon(s * turn)[0], ribbon(s * -turn)[0] + torch.tensor([0, 0, 40 * s]), torch.full((1, 3), s)])
+        for s in (0.0, 1.0, 0.5)
+    )
+    faces = torch.cat([faces, faces + len(x_a)])
+    mesh = Connectivity(faces.numpy(), len(first))
+    blend = RotationBlend(mesh, torch.stack([first, second]), TorchBackend())
+    found = blend(first[None], second[None], T[2:3])[0]
+    torch.testing.assert_close(edges(found, mesh), edges(halfway, mesh), rtol=0, atol=1e-9)
+    for piece in (slice(0, len(x_a)), slice(len(x_a), -1), slice(-1, None)):
+        centre = 0.5 * (first + second)[piece].mean(0)
+        torch.testing.assert_close(found[piece].mean(0), centre, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["torch", "warp"])
+def test_pairs_share_a_blend_where_no_tree_would_tell_another_sense(
+    kind: str, small_bars: Shapes, generator: torch.Generator
+) -> None:
+    if kind == "warp":
+        pytest.importorskip("warp")
+    backend = choose(kind)
+    # Torn to pieces: neighbours turn any way, so that it matters which of them are compared.
+    x = small_bars.keyframes
+    torn = x[:1] + 0.5 * torch.randn(x[:1].shape, dtype=x.dtype, generator=generator)
+    mesh, shapes = Connectivity(small_bars.faces.numpy()), torch.cat([x, torn])
+    blends = Blends(mesh, shapes, (0, 1), backend)
+    shared, own = blends.of(0, 1), blends.of(2, 3)
+    assert blends.of(1, 2) is shared and blends.of(2, 0) is shared
+    assert own is not shared and own.poisson is shared.poisson
+    alone = RotationBlend(mesh, shapes[2:], backend)
+    assert torch.equal(own.rotations.ancestors, alone.rotations.ancestors)
+    assert not torch.equal(own.rotations.ancestors, shared.rotations.ancestors)
+
+
+def test_a_tree_of_another_pair_tells_the_way_round() -> None:
+    (x, faces), half, whole = ribbon(0.0), ribbon(math.radians(130))[0], ribbon(math.radians(300))[0]
+    mesh = Connectivity(faces.numpy())
+    blend = Blends(mesh, torch.stack([x, half, whole]), (0, 1), TorchBackend()).of(0, 2)
+    found = blend(x[None], whole[None], T[2:3])[0]
+    torch.testing.assert_close(edges(found, mesh), edges(ribbon(math.radians(150))[0], mesh), rtol=0, atol=1e-9)
+
+
+def test_pieces_that_share_a_vertex_stay_together() -> None:
+    (x, faces), other = ribbon(0.0), ribbon(1.0)[0]
+    joined = torch.cat([faces, torch.where(faces == 0, 0, faces + len(x) - 1)])
+    first = torch.cat([x, x[1:] * torch.tensor([-1.0, 1.0, 1.0])])
+    second = torch.cat([other, other[1:] * torch.tensor([-1.0, 1.0, 1.0])])
+    mesh = Connectivity(joined.numpy())
+    blend = RotationBlend(mesh, torch.stack([first, second]), TorchBackend())
+    half = ribbon(0.5)[0]
+    wanted = torch.cat([half, half[1:] * torch.tensor([-1.0, 1.0, 1.0])])
+    torch.testing.assert_close(
+        edges(blend(first[None], second[None], T[2:3])[0], mesh), edges(wanted, mesh), rtol=0, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("degrees", [0, 1e-7, 1, 120, 300])
+def test_derivatives(degrees: float, generator: torch.Generator) -> None:
+    """Where nothing turns, too: most of a shape does not."""
+    (x_a, faces), (x_b, _) = ribbon(0.0, 5), ribbon(math.radians(degrees), 5)
+    roughness = 0.0 if degrees == 0 else 0.01
+    x_b = x_b + roughness * torch.randn(x_b.shape, generator=generator, dtype=torch.float64)
+    rotations, _ = rotations_of(x_a, x_b, faces)
+    inputs = tuple(x.clone().requires_grad_() for x in (x_a[None], x_b[None], T[1:2]))
+    assert torch.autograd.gradcheck(rotations, inputs, eps=1e-6, atol=1e-7, rtol=1e-6)
+    assert torch.autograd.gradgradcheck(rotations, inputs, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
+
+
+@pytest.mark.parametrize(("ends", "bound"), [((0, 4), 1.15), ((0, 2), 1.03), ((2, 4), 1.15)], ids=["0-8", "0-4", "4-8"])
+def test_starts_near_the_end_on_a_hand(ends: tuple[int, int], bound: float, hands: Shapes) -> None:
+    """Linear interpolation has 11.8, 3.7 and 6.6 times its energy; fingers turn by up to 300 degrees."""
+    pair = hands.pick(*ends)
+    layer = MidShape(pair.bases, pair.faces, **modal())
+    frame = layer.space.frame
+    t = torch.tensor([0.5], dtype=torch.float64)
+    problem = problem_of(layer, frame.place(*pair.keyframes[:, None]), t)
+    energies = [float(layer.step.energy.value(a, problem.placement)) for a in (problem.start, 0 * problem.start)]
+    least = float(layer.solve(*pair.keyframes).solution.energy)
+    assert energies[0] < bound * least
+    assert energies[1] > 3 * least

@@ -1,0 +1,73 @@
+"""Coarse meshes get as many faces as thin limbs and small pieces need."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from bodies import body
+from conftest import Shapes
+
+import torch_modal as tm
+from torch_modal.energy.term import Mesh
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.inbetween.resolution import ENOUGH_FACES, spread, stretching
+from torch_modal.precompute.coarsening import FACES_OF_PIECE, coarsen
+
+
+@pytest.mark.parametrize("name, most", [("wire bent 60", 0.1), ("bar twisted 60", 0.05)])
+def test_fast_resolves_thin_limbs(name: str, most: float) -> None:
+    """With 300 faces, the edges of a ball with a thin leg were 26 times as far off as by linear interpolation."""
+    shape = body(name)
+    first, middle, last = (torch.from_numpy(shape.pose(t)) for t in (0.0, 0.5, 1.0))
+    faces = torch.tensor(shape.faces)
+    i, j = torch.tensor(Connectivity(shape.faces).edges).unbind(1)
+
+    def error(x: torch.Tensor) -> float:
+        return float(((x[i] - x[j]).norm(dim=-1) - (middle[i] - middle[j]).norm(dim=-1)).norm())
+
+    bases = tm.extract_bases(torch.stack([first, last]), faces, 30, mesher="lattice", progress=False)
+    layer = tm.InBetween(bases, faces, "fast")
+    with torch.no_grad():
+        found = layer(first, last, 0.5)
+    assert error(found) < most * error((first + last) / 2)
+    n_faces = len(layer.members[0].frame.coarse.faces)
+    assert n_faces <= (ENOUGH_FACES if name.startswith("wire") else 300), "more than a body of one thickness needs"
+
+
+def test_spread_by_hand() -> None:
+    fine = torch.diag(torch.tensor([1.0, 100.0, 4.0], dtype=torch.float64))
+    assert spread(fine, 0.1 * fine) == pytest.approx(1.0, rel=1e-4)
+    assert spread(fine, torch.diag(torch.tensor([0.5, 100.0, 12.0], dtype=torch.float64))) == pytest.approx(6, rel=1e-4)
+    # Directions in which neither has any stiffness count as alike, up to the uniform factor.
+    loose = torch.diag(torch.tensor([1.0, 100.0, 0.0], dtype=torch.float64))
+    assert spread(loose, 3 * loose) == pytest.approx(1.5, rel=1e-4)
+    assert spread(fine, loose) > 1e4
+
+
+def test_stretching_is_the_hessian_of_the_energy(bars: Shapes) -> None:
+    x, modes = bars.keyframes[0], bars.bases[0].modes[:3]
+    shell = tm.ShellEnergy(bars.faces, alpha=1.0, beta=0.0, gamma=0.0)
+    amplitudes = torch.zeros(3, dtype=torch.float64)
+    hessian = torch.autograd.functional.hessian(lambda a: shell(x + torch.einsum("k,kvc->vc", a, modes), x), amplitudes)
+    found = stretching(Mesh.of(bars.faces, len(x)), x, modes)
+    torch.testing.assert_close(2 * found, hessian)
+
+
+def test_pieces_keep_faces() -> None:
+    """Small pieces beside a large one vanished, and with them all that kept their shape."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    parts = [ball]
+    for i, scale in enumerate((0.05, 0.1, 0.2)):
+        part = trimesh.creation.icosphere(subdivisions=2, radius=scale)
+        parts.append(part.apply_translation([0, 0, 1.5 + i]))
+    tetrahedron = trimesh.creation.icosahedron()
+    parts.append(tetrahedron.apply_scale(0.02).apply_translation([2.0, 0, 0]))
+    whole = trimesh.util.concatenate(parts)
+    faces = np.asarray(whole.faces)
+    coarse = coarsen(whole.vertices[None], faces, 200)
+    piece = connected_pieces(np.concatenate([coarse.faces[:, :2], coarse.faces[:, 1:]]), coarse.n_vertices)
+    counts = np.bincount(piece[coarse.faces[:, 0]])
+    assert len(counts) == len(parts)
+    assert counts.min() >= FACES_OF_PIECE - 4
+    assert (coarse.clusters >= 0).all()
+    assert len(coarse.faces) <= 200 + 4 * FACES_OF_PIECE

@@ -1,0 +1,498 @@
+"""Motion through many key-frames: its laws, its gradients, and how close it comes to known motions."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+import torch
+from conftest import Shapes, random_rotation
+from torch import Tensor, nn
+from torch.func import vmap
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+from torch_modal.geometry import hermite
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.motion.path import Path
+
+DOUBLE = torch.float64
+
+
+def times(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=DOUBLE)
+
+
+def largest(x: Tensor) -> float:
+    return float(x.abs().max())
+
+
+def diagonal(x: Tensor) -> float:
+    return float((x.amax(-2) - x.amin(-2)).norm(dim=-1).max())
+
+
+@pytest.fixture(scope="module")
+def motion(bars: Shapes) -> Shapes:
+    """Five poses of a bar: straight, bent, twisted, bent, straight."""
+    return bars.pick(0, 1, 2, 1, 0)
+
+
+@pytest.fixture(scope="module")
+def path(motion: Shapes) -> Path:
+    return Path(motion.bases, motion.faces)
+
+
+# --------------------------------------------------------------------------------------------------- cubic motion
+
+
+def test_half_way_it_is_the_four_point_scheme(generator: torch.Generator) -> None:
+    a, b, c, d = 0.1 * torch.randn(4, 50, dtype=DOUBLE, generator=generator) + times(0, 1, 2, 3)[:, None]
+    even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
+    bend = hermite.tangent_offset(c - b, b - a, d - c, even)
+    half = b + 0.5 * (c - b) + hermite.beyond(bend, times(0.5))
+    torch.testing.assert_close(half, 9 / 16 * (b + c) - 1 / 16 * (a + d))
+
+
+def test_a_parabola_is_followed_whatever_the_spacing() -> None:
+    def at(t: Tensor) -> Tensor:
+        return 3 + 2 * t + 0.5 * t * t
+
+    knots, u = times(0.0, 0.7, 1.9, 2.4), torch.linspace(0, 1, 9, dtype=DOUBLE)
+    steps, h = at(knots).diff(), hermite.Spacing(*knots.diff())
+    bend = hermite.tangent_offset(steps[1], steps[0], steps[2], h)
+    found = at(knots[1]) + u * steps[1] + hermite.beyond(bend, u)
+    torch.testing.assert_close(found, at(knots[1] + u * h.own))
+
+
+def test_what_stops_does_not_overshoot() -> None:
+    """Key-frames on a line, unevenly spaced, and one that rests: the motion between never turns back."""
+    places = times(0.0, 0.1, 5.0, 5.0, 5.2, 9.0)
+    even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
+    u = torch.linspace(0, 1, 33, dtype=DOUBLE)
+    for i in range(1, 4):
+        steps = places.diff()
+        bend = hermite.tangent_offset(steps[i], steps[i - 1], steps[i + 1], even)
+        trajectory = places[i] + u * steps[i] + hermite.beyond(bend, u)
+        assert bool((trajectory.diff() >= -1e-12).all())
+    rest = hermite.tangent_offset(places.diff()[2], places.diff()[1], places.diff()[3], even)
+    assert largest(hermite.beyond(rest, u)) == 0
+
+
+def test_ends_are_natural() -> None:
+    """No second derivative where there is no neighbour, and a straight line with none at all."""
+    step, after = times(1.0), times(1.6)
+    even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
+    u = torch.tensor(0.0, dtype=DOUBLE, requires_grad=True)
+    value = hermite.beyond(hermite.tangent_offset(step, None, after, even), u).sum()
+    (first,) = torch.autograd.grad(value, u, create_graph=True)
+    assert float(torch.autograd.grad(first, u)[0]) == pytest.approx(0, abs=1e-12)
+    alone = hermite.tangent_offset(step, None, None, even)
+    assert largest(alone.first) == largest(alone.last) == 0
+
+
+# ------------------------------------------------------------------------------------------------------------- laws
+
+
+def test_keyframes_bit_for_bit(path: Path, motion: Shapes) -> None:
+    for dtype in (DOUBLE, torch.float32):
+        keyframes = motion.keyframes.to(dtype)
+        assert torch.equal(path(keyframes, path.times), keyframes)
+
+
+@pytest.mark.parametrize(
+    ("lead", "t_shape", "expected"),
+    [((), (), ()), ((), (3,), (3,)), ((2,), (2,), (2,)), ((2, 1), (3,), (2, 3)), ((2,), (), (2,)), ((0,), (), (0,))],
+)
+def test_cardinality(
+    path: Path, motion: Shapes, lead: tuple[int, ...], t_shape: tuple[int, ...], expected: tuple[int, ...]
+) -> None:
+    keyframes = motion.keyframes.expand(*lead, -1, -1, -1)
+    found = path(keyframes, torch.full(t_shape, 1.4, dtype=DOUBLE))
+    assert found.shape == (*expected, *motion.keyframes.shape[1:])
+    if found.numel():
+        torch.testing.assert_close(found, path(motion.keyframes, 1.4).expand_as(found), rtol=0, atol=1e-9)
+
+
+def test_pairs_alone_are_the_layers(motion: Shapes) -> None:
+    path = Path(motion.bases, motion.faces, smooth=False)
+    layer = path.layer
+    found = path(motion.keyframes, times(0.3, 2.6))
+    for x, i, u in ((found[0], 0, 0.3), (found[1], 2, 0.6)):
+        torch.testing.assert_close(x, layer(*motion.keyframes[i : i + 2], u, i), rtol=0, atol=1e-9)
+    two = motion.pick(0, 1)
+    smooth, straight = (Path(two.bases, two.faces, smooth=s)(two.keyframes, 0.4) for s in (True, False))
+    assert torch.equal(smooth, straight), "two key-frames have no neighbours"
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_rigid_motions_of_all_keyframes(motion: Shapes, generator: torch.Generator, smooth: bool) -> None:
+    path = Path(motion.bases, motion.faces, smooth=smooth)
+    turn, move = random_rotation(generator), times(30.0, -20.0, 10.0)
+    at = times(0.2, 1.5, 3.7)
+    moved = path(motion.keyframes @ turn.mT + move, at)
+    wanted = path(motion.keyframes, at) @ turn.mT + move
+    assert largest(moved - wanted) < (1e-8 if smooth else 1e-6) * diagonal(wanted)
+
+
+def test_a_rigid_motion_is_smooth_too(bars: Shapes) -> None:
+    """Key-frames that only turn and travel: a uniform screw is followed exactly."""
+    x = bars.keyframes[0]
+    centre = x.mean(0)
+
+    def posed(t: float) -> Tensor:
+        c, s = math.cos(0.8 * t), math.sin(0.8 * t)
+        return (x - centre) @ torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=DOUBLE) + centre + t
+
+    path = Path([bars.bases[0]] * 4, bars.faces)
+    keyframes = torch.stack([posed(i) for i in range(4)])
+    found = path(keyframes, times(0.25, 1.5, 2.9))
+    for y, t in zip(found, (0.25, 1.5, 2.9), strict=True):
+        wanted = posed(t)
+        # The turn is about the area centroid, which travels: shapes are compared about their means.
+        assert largest((y - y.mean(0)) - (wanted - wanted.mean(0))) < 1e-8
+
+
+def test_reversed_in_time(motion: Shapes) -> None:
+    when = times(0.0, 0.5, 2.0, 2.5, 4.0)
+    there = Path(motion.bases, motion.faces, when)
+    back = Path(motion.bases[::-1], motion.faces, 4.0 - when.flip(0))
+    at = times(0.2, 1.1, 2.2, 3.3)
+    torch.testing.assert_close(back(motion.keyframes.flip(0), 4.0 - at), there(motion.keyframes, at), rtol=0, atol=1e-9)
+
+
+def test_a_cycle_may_begin_anywhere(motion: Shapes) -> None:
+    own = motion.pick(0, 1, 2, 3)
+    cycle = Path(own.bases, own.faces, cyclic=True)
+    rolled = Path(own.bases[1:] + own.bases[:1], own.faces, cyclic=True)
+    at = times(0.3, 1.6, 2.5, 3.9)
+    found = cycle(own.keyframes, at)
+    torch.testing.assert_close(rolled(own.keyframes.roll(-1, 0), at - 1), found, rtol=0, atol=1e-9)
+    torch.testing.assert_close(cycle(own.keyframes, at + 8), found, rtol=0, atol=1e-9)
+
+
+def test_velocities_are_continuous(path: Path, motion: Shapes) -> None:
+    h, keys = 1e-3, times(1.0, 2.0, 3.0)
+    pair = Path(motion.bases, motion.faces, smooth=False)
+
+    def jump(trajectory: Path) -> float:
+        left = (trajectory(motion.keyframes, keys) - trajectory(motion.keyframes, keys - h)) / h
+        right = (trajectory(motion.keyframes, keys + h) - trajectory(motion.keyframes, keys)) / h
+        return largest(right - left)
+
+    assert jump(path) < 0.02 * jump(pair)
+
+
+def test_velocities_are_continuous_where_edges_change(bars: Shapes) -> None:
+    """Both sides of a key-frame fit vertices to edges by the same weights."""
+    x, key, h = bars.keyframes.clone(), times(1.0), 1e-5
+    x[1] *= 1 + 0.5 * torch.sin(3 * x[1][:, :1])
+    bases = [dataclasses.replace(basis, reference=shape) for basis, shape in zip(bars.bases, x, strict=True)]
+    jumps = [
+        largest((trajectory(x, key + h) + trajectory(x, key - h) - 2 * x[1]) / h)
+        for trajectory in (Path(bases, bars.faces, smooth=smooth) for smooth in (True, False))
+    ]
+    assert jumps[0] < 1e-4 * jumps[1]
+
+
+def test_what_rests_between_equal_keyframes_does_not_move(bars: Shapes) -> None:
+    still = bars.pick(0, 1, 1, 2)
+    path = Path(still.bases, still.faces)
+    found = path(still.keyframes, torch.linspace(1, 2, 9, dtype=DOUBLE))
+    assert largest(found - still.keyframes[1]) < 5e-3 * diagonal(still.keyframes[0])
+    assert largest(found - still.keyframes[1]) < 1e-9
+
+
+def test_a_stop_is_not_passed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar bends, stops, and goes back at uneven times; without the limit it would run on."""
+    own = bars.pick(0, 2, 1, 1, 0)
+    path = Path(own.bases, own.faces, [0.0, 0.9, 1.2, 2.0, 2.3])
+    stop = own.keyframes[2]
+
+    def overshoot() -> float:
+        worst = largest(path(own.keyframes, torch.linspace(1.2, 2.0, 17, dtype=DOUBLE)) - stop)
+        for other, start, end in ((1, 0.9, 1.2), (4, 2.0, 2.3)):
+            away = stop - own.keyframes[other]
+            beyond = path(own.keyframes, torch.linspace(start, end, 17, dtype=DOUBLE)[1:-1]) - stop
+            moving = away.norm(dim=-1) > 1e-3 * diagonal(stop)
+            worst = max(worst, float(((beyond * away).sum(-1) / away.norm(dim=-1))[:, moving].amax()))
+        return worst / diagonal(stop)
+
+    assert overshoot() < 5e-3
+    monkeypatch.setattr(hermite, "_velocity", lambda v, w, h, k, _: (k * v + h * w) / (h + k))
+    assert overshoot() > 5e-3
+
+
+def test_times_scale(motion: Shapes) -> None:
+    when = times(0.0, 1.0, 1.5, 3.0, 4.0)
+    own, slow = Path(motion.bases, motion.faces, when), Path(motion.bases, motion.faces, 10 * when - 3)
+    at = times(0.4, 1.3, 2.2, 3.9)
+    torch.testing.assert_close(slow(motion.keyframes, 10 * at - 3), own(motion.keyframes, at), rtol=0, atol=1e-9)
+
+
+def test_subdivide_is_the_path_at_even_times(motion: Shapes) -> None:
+    when = [0.0, 1.0, 1.5, 3.0, 4.0]
+    path = Path(motion.bases, motion.faces, when)
+    for options in ({"levels": 2}, {"n_frames": 11}):
+        frames = tm.subdivide(motion.keyframes, motion.faces, bases=motion.bases, times=when, progress=False, **options)
+        at = tm.frame_times(5, times=when, **options)
+        assert len(at) == len(frames)
+        torch.testing.assert_close(frames, path(motion.keyframes, at), rtol=0, atol=1e-9)
+        places = tm.keyframe_places(5, times=when, **options)
+        assert at[places].tolist() == when
+        assert torch.equal(frames[places], motion.keyframes)
+
+
+# -------------------------------------------------------------------------------------------------------- gradients
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_gradients_against_central_differences(motion: Shapes, smooth: bool) -> None:
+    """To the key-frames that a time depends on, and to the time."""
+    path = Path(motion.bases, motion.faces, smooth=smooth, solver=tm.Solver(tolerance=1e-13))
+    weights = torch.randn(2, *motion.keyframes.shape[1:], dtype=DOUBLE, generator=torch.Generator().manual_seed(1))
+    inputs = {"keyframes": motion.keyframes + 0.01 * weights[0], "t": times(1.3, 3.6)}
+
+    def value(keyframes: Tensor, t: Tensor) -> Tensor:
+        return (path(keyframes, t) * weights).sum()
+
+    leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
+    gradients = dict(zip(leaves, torch.autograd.grad(value(**leaves), list(leaves.values())), strict=True))
+    path = Path(motion.bases, motion.faces, smooth=smooth, solver=tm.Solver(tolerance=1e-13))
+    generator = torch.Generator().manual_seed(2)
+    for name, step in (("keyframes", 1e-6), ("t", 1e-5)):
+        along = torch.randn(inputs[name].shape, dtype=DOUBLE, generator=generator)
+        with torch.no_grad():
+            ends = [value(**{**inputs, name: inputs[name] + s * step * along}) for s in (-2, -1, 1, 2)]
+        slope = float((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step))
+        assert float((gradients[name] * along).sum()) == pytest.approx(slope, rel=1e-5)
+    # At 3.6 the last four key-frames have a say, or the last two.
+    single = inputs["keyframes"].clone().requires_grad_()
+    (own,) = torch.autograd.grad((path(single, 3.6) * weights[0]).sum(), single)
+    felt = own.flatten(1).abs().amax(1) > 1e-9
+    assert felt.tolist() == [False, False, smooth, True, True]
+
+
+def test_gradients_reach_a_term(motion: Shapes) -> None:
+    """A course is at rest; what pulls at it is felt, and so is its stiffness."""
+
+    class Area(tm.Term):
+        def elements(self, mesh: "tm.energy.term.Mesh") -> Tensor:  # type: ignore[name-defined]
+            return mesh.faces
+
+        def measure(self, edge_vectors: Tensor) -> Tensor:
+            return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
+
+        def at_rest(self, measures: Tensor) -> Tensor:
+            return 0.9 * measures
+
+    def shapes(stiffness: Tensor) -> Tensor:
+        objective = tm.Objective(terms=(Area(stiffness),), coarse_faces=200)
+        return Path(motion.bases, motion.faces, objective=objective)(motion.keyframes, 1.4)
+
+    stiffness = nn.Parameter(torch.tensor(200.0, dtype=DOUBLE))
+    (slope,) = torch.autograd.grad(shapes(stiffness).square().sum(), stiffness)
+    h = 0.1
+    with torch.enable_grad():
+        ends = [
+            float(shapes(torch.tensor(200.0 + s * h, dtype=DOUBLE, requires_grad=True)).square().sum()) for s in (-1, 1)
+        ]
+    assert float(slope) == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-4)
+    bare = Path(motion.bases, motion.faces)(motion.keyframes, 1.4)
+    assert largest(shapes(stiffness).detach() - bare) > 1e-3
+
+
+def test_vmap_over_motions(path: Path, motion: Shapes) -> None:
+    many = torch.stack([motion.keyframes, motion.keyframes + 0.02])
+    found = vmap(lambda keyframes: path(keyframes, times(0.5, 2.5)))(many)
+    torch.testing.assert_close(found, path(many[:, None], times(0.5, 2.5)), rtol=0, atol=1e-9)
+
+
+def test_state_dict_round_trip(motion: Shapes) -> None:
+    own = Path(motion.bases, motion.faces, [0.0, 1.0, 1.5, 3.0, 4.0])
+    other = Path(motion.bases[::-1], motion.faces)
+    other.load_state_dict(own.state_dict())
+    assert torch.equal(other(motion.keyframes, 2.2), own(motion.keyframes, 2.2))
+
+
+# -------------------------------------------------------------------------------------------------------- exceptions
+
+
+def test_exception(path: Path, motion: Shapes) -> None:
+    make: Callable[..., Path] = Path
+    for at in (-0.1, 4.2, math.nan):
+        with pytest.raises(ValueError, match="between the times of the first and the last key-frame, 0 and 4"):
+            path(motion.keyframes, at)
+    with pytest.raises(ValueError, match=r"shape \(\.\.\., 5, V, 3\); got \(4, 164, 3\)"):
+        path(motion.keyframes[:4], 0.5)
+    with pytest.raises(ValueError, match="does not broadcast against motions"):
+        path(motion.keyframes.expand(2, -1, -1, -1), torch.rand(3))
+    with pytest.raises(ValueError, match="two key-frames or more, got 1"):
+        make(motion.bases[:1], motion.faces)
+    with pytest.raises(ValueError, match=r"one time for each key-frame: \(5,\)"):
+        make(motion.bases, motion.faces, [0.0, 1.0])
+    with pytest.raises(ValueError, match=r"and one when the first comes again: \(6,\)"):
+        make(motion.bases, motion.faces, [0.0, 1.0, 2.0, 3.0, 4.0], cyclic=True)
+    with pytest.raises(ValueError, match="must ascend"):
+        make(motion.bases, motion.faces, [0.0, 1.0, 1.0, 3.0, 4.0])
+    with pytest.raises(ValueError, match="middle of a pair only"):
+        make(motion.bases, motion.faces, preset="paper")
+    with pytest.raises(ValueError, match="knows pairs only"):
+        tm.subdivide(motion.keyframes, motion.faces, bases=motion.bases, smooth=True, preset="paper")
+
+
+# ----------------------------------------------------------------------------------------------------- known motions
+
+
+def errors(path: Path, keyframes: Tensor, at: Tensor, truth: Tensor) -> tuple[float, float]:
+    """Mean distance of vertices, and mean relative error of edge lengths."""
+    x = path(keyframes, at)
+    start, end = torch.tensor(Connectivity(path.layer.faces.numpy()).edges).T
+    now, wanted = ((y[:, end] - y[:, start]).norm(dim=-1) for y in (x, truth))
+    return float((x - truth).norm(dim=-1).mean()), float(((now - wanted).abs() / wanted).mean())
+
+
+def test_the_sample_creature(cache_folder: object) -> None:
+    """Six key-frames of a gallop, the truth half-way between them."""
+    sample = load_sample("creature")
+    bases = tm.extract_bases(sample.keyframes, sample.faces, 20, mesher="lattice", progress=False)
+    at = torch.tensor(sample.true_times, dtype=DOUBLE)
+    (near, edges), (far, worse) = (
+        errors(Path(bases, sample.faces, cyclic=True, smooth=s), sample.keyframes, at, sample.truth)
+        for s in (True, False)
+    )
+    assert near < 0.4 * far
+    assert edges < 0.5 * worse
+
+
+@pytest.mark.parametrize("kept", [(0, 2, 4, 6, 8), (0, 4, 8)])
+def test_a_hand_that_closes(kept: tuple[int, ...], hands: Shapes, hand_frames: Tensor) -> None:
+    rest = [i for i in range(9) if i not in kept]
+    own = hands.pick(*(i // 2 for i in kept))
+    at = torch.tensor([i / kept[1] for i in rest], dtype=DOUBLE)
+    found = [
+        errors(Path(own.bases, own.faces, smooth=smooth), own.keyframes, at, hand_frames[rest])
+        for smooth in (True, False)
+    ]
+    assert all(ours < 0.7 * pairs for ours, pairs in zip(*found, strict=True))
+
+
+def test_second_differences_on_the_hand(hands: Shapes) -> None:
+    path = Path(hands.bases, hands.faces)
+    at = torch.linspace(0, 4, 4 * 16 + 1, dtype=DOUBLE)
+    x = path(hands.keyframes, at)
+    second = torch.stack([(c - 2 * b + a).norm(dim=-1).mean() for (a, b), c in zip(pairwise(x), x[2:], strict=False)])
+    keys = torch.tensor([15, 31, 47])
+    elsewhere = torch.ones(len(second), dtype=torch.bool)
+    elsewhere[keys] = False
+    assert float(second[keys].amax() / second[elsewhere].median()) < 1.5
+
+
+# ----------------------------------------------------------------------------------------------------------- editing
+
+
+@pytest.mark.parametrize(("cyclic", "smooth", "touched"), [(False, True, 3), (True, True, 4), (False, False, 2)])
+def test_a_change_is_local(bars: Shapes, cyclic: bool, smooth: bool, touched: int) -> None:
+    own = bars.pick(0, 1, 2, 1, 0, 2)
+    path = Path(own.bases, own.faces, cyclic=cyclic, smooth=smooth)
+    editor = tm.PathEditor(path, own.keyframes, steps=3)
+    before = editor.shapes()
+    torch.testing.assert_close(before, path(own.keyframes, editor.times()), rtol=0, atol=1e-9)
+    other = own.keyframes.clone()
+    other[1] += 0.1
+    computed: list[int] = []
+    path.register_forward_pre_hook(lambda *_: computed.append(1))
+    editor.replace(1, other[1])
+    after = editor.shapes()
+    assert len(computed) == touched
+    torch.testing.assert_close(after, path(other, editor.times()), rtol=0, atol=1e-9)
+    assert torch.equal(editor.shapes(), after)
+    assert torch.equal(own.keyframes[1] + 0.1, other[1]), "the caller's key-frames stay"
+
+
+def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> None:
+    editor = tm.PathEditor(path, motion.keyframes, steps=2)
+    passing = path(motion.keyframes, 2.3)
+    assert editor.insert(2.3) == 3
+    assert editor.path.layer is path.layer
+    assert editor.path.times.tolist() == [0, 1, 2, 2.3, 3, 4]
+    torch.testing.assert_close(editor.shapes()[6], passing, rtol=0, atol=1e-12)
+    moved = passing + 0.05
+    editor.replace(3, moved)
+    assert torch.equal(editor.path(editor.keyframes, 2.3), moved)
+    with pytest.raises(ValueError, match="already"):
+        path.insert(2.0)
+    with pytest.raises(ValueError, match="between the times"):
+        editor.insert(9.0)
+    with pytest.raises(IndexError, match="6 key-frames"):
+        editor.replace(6, moved)
+    with pytest.raises(ValueError, match="holds finite numbers"):
+        editor.replace(0, moved * math.nan)
+
+
+@pytest.mark.parametrize("turns", [-2, -1, 1, 3])
+def test_a_key_frame_of_another_period_is_that_of_the_first(motion: Shapes, turns: int) -> None:
+    """Times of a cycle are taken modulo the period: an inserted key-frame too."""
+    own = motion.pick(0, 1, 2)
+    path = Path(own.bases, own.faces, times(0.0, 1.0, 2.0, 4.0), cyclic=True)
+    inside, outside = (tm.PathEditor(path, own.keyframes, steps=2) for _ in range(2))
+    moved = own.keyframes[1] + 0.1
+    assert inside.insert(2.5, moved) == outside.insert(2.5 + 4 * turns, moved) == 3
+    assert outside.path.times.tolist() == [0.0, 1.0, 2.0, 2.5, 4.0]
+    assert torch.equal(outside.path(outside.keyframes, 2.5 + 4 * turns), moved)
+    assert torch.equal(outside.shapes(), inside.shapes())
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+@pytest.mark.parametrize("t", [math.nan, math.inf, -math.inf, 0.2, 0.2 + 1e-16, 0.8, -0.4, 5.0])
+def test_an_insert_that_fails_changes_nothing(bars: Shapes, cyclic: bool, t: float) -> None:
+    own = bars.pick(0, 1, 2)
+    path = Path(own.bases, own.faces, times(0.2, 0.6, 0.8, 1.4)[: 3 + cyclic], cyclic=cyclic)
+    editor = tm.PathEditor(path, own.keyframes, steps=2)
+    before, at = editor.shapes(), editor.times()
+    if cyclic and t == 5.0:
+        with pytest.raises(ValueError, match="finite numbers"):
+            editor.insert(t, own.keyframes[0] * math.nan)
+    else:
+        with pytest.raises(ValueError, match=r"lies between|already"):
+            editor.insert(t, own.keyframes[0])
+    assert editor.path is path
+    assert torch.equal(editor.keyframes, own.keyframes)
+    assert torch.equal(editor.times(), at)
+    assert torch.equal(editor.shapes(), before)
+    moved = own.keyframes[0] + 0.1
+    assert editor.insert(0.7, moved) == 2
+    assert torch.equal(editor.path(editor.keyframes, 0.7), moved)
+
+
+def test_solve_tells_how_it_went(motion: Shapes, path: Path) -> None:
+    t = times(0.0, 3.5, 1.2, 0.4)
+    with torch.no_grad():
+        result = path.solve(motion.keyframes, t)
+        assert torch.equal(result.shapes, path(motion.keyframes, t))
+        alone = path.solve(motion.keyframes, 1.2)
+        nothing = path.solve(motion.keyframes, t[:0])
+    assert result.solution.status.shape == (4,)
+    assert bool(result.solution.usable.all())
+    torch.testing.assert_close(result.solution.energy[2], alone.solution.energy)
+    assert nothing.shapes.shape == (0, *motion.keyframes.shape[1:]) and nothing.solution.status.shape == (0,)
+
+
+def test_times_in_float32_reach_the_key_frames(motion: Shapes) -> None:
+    at = [2.0, 2.3, 2.7, 3.1, 3.3]
+    t = torch.tensor(at).requires_grad_()
+    for cyclic in (False, True):
+        layer = Path(motion.bases, motion.faces, times=[*at, 3.9] if cyclic else at, cyclic=cyclic)
+        shapes = layer(motion.keyframes, t)
+        assert torch.equal(shapes, motion.keyframes)
+        assert torch.autograd.grad(shapes[1:4].square().sum(), t)[0][1:4].abs().min() > 0
+        assert layer(motion.keyframes, torch.linspace(2.0, 3.3, 17)).isfinite().all()
+    with pytest.raises(ValueError, match="lies between"):
+        Path(motion.bases, motion.faces, times=at)(motion.keyframes, 3.3 + 1e-5)
+
+
+def test_times_in_a_list_reach_the_key_frames(motion: Shapes) -> None:
+    """0.1 is no number of float32."""
+    path = Path(motion.bases[:3], motion.faces, [0.1, 0.3, 0.7])
+    with torch.no_grad():
+        assert torch.equal(path(motion.keyframes[:3], times(0.1, 0.3, 0.7)), motion.keyframes[:3])

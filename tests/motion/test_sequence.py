@@ -1,0 +1,301 @@
+"""The main job on bars: counts, places, what stays bit for bit, and the order of modes and motions."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from conftest import Shapes, random_rotation
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.warp.backend import WarpBackend
+from torch_modal.geometry import connectivity
+from torch_modal.geometry.rigid import blend
+from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.layers.mid_shape import MidShape
+from torch_modal.motion import subdivide as sequence
+from torch_modal.motion.subdivide import keyframe_places, linear_sequence, subdivide
+
+COARSE: dict[str, Any] = {"objective": Objective(coarse_faces=200)}
+PAIRED: dict[str, Any] = {"objective": Objective(space="paired", coarse_faces=200), "solver": Solver(local_steps=0)}
+
+
+@pytest.fixture(scope="module")
+def scattered(bars: Shapes) -> Shapes:
+    """Three bars far from each other, each turned its own way, with bases that were made there."""
+    generator = torch.Generator().manual_seed(2)
+    keyframes, bases = [], []
+    for x, basis in zip(bars.keyframes, bars.bases, strict=True):
+        turn = random_rotation(generator)
+        keyframes.append(x @ turn.mT + 20 * torch.randn(3, dtype=torch.float64, generator=generator))
+        bases.append(replace(basis, reference=keyframes[-1], modes=basis.modes @ turn.mT))
+    return Shapes(torch.stack(keyframes), bars.faces, bases)
+
+
+def largest(x: Tensor) -> float:
+    return float(x.abs().max())
+
+
+# ------------------------------------------------------------------------------------------------------- places
+
+
+@pytest.mark.parametrize(
+    ("options", "places"),
+    [
+        ({"levels": 0}, [0, 1, 2]),
+        ({"levels": 3}, [0, 8, 16]),
+        ({"levels": 2, "cyclic": True}, [0, 4, 8, 12]),
+        ({"n_frames": 3}, [0, 1, 2]),
+        ({"n_frames": 10}, [0, 5, 9]),  # 4.5 rounds up
+        ({"n_frames": 101}, [0, 50, 100]),
+        ({"n_frames": 10, "cyclic": True}, [0, 3, 7, 10]),
+        ({"n_frames": 3, "cyclic": True}, [0, 1, 2, 3]),
+    ],
+)
+def test_places_by_hand(options: dict[str, Any], places: list[int]) -> None:
+    assert keyframe_places(3, **options) == places
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_places_are_even(cyclic: bool) -> None:
+    for n_keyframes in range(2, 7):
+        for n_frames in range(n_keyframes, 40):
+            places = torch.tensor(keyframe_places(n_keyframes, cyclic=cyclic, n_frames=n_frames))
+            steps = places.diff()
+            assert places[0] == 0
+            assert places[-1] == (n_frames if cyclic else n_frames - 1)
+            assert steps.min() >= 1
+            assert steps.max() - steps.min() <= 1
+
+
+# ------------------------------------------------------------------------------------------ counts and keyframes
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({"levels": 0}, 3),
+        ({"levels": 2}, 9),
+        ({"levels": 1, "cyclic": True}, 6),
+        ({"levels": 1, "n_frames": 12}, 12),
+        ({"levels": 1, "n_frames": 12, "cyclic": True}, 12),
+        ({"levels": 2, "n_frames": 4}, 4),
+        ({"levels": 1, **PAIRED}, 5),
+    ],
+)
+def test_keyframes_bit_for_bit_at_their_places(
+    dtype: torch.dtype, options: dict[str, Any], count: int, scattered: Shapes
+) -> None:
+    keyframes = scattered.keyframes.to(dtype)
+    before = keyframes.clone()
+    frames = subdivide(keyframes, scattered.faces, bases=scattered.bases, progress=False, **{**COARSE, **options})
+    assert frames.shape == (count, *keyframes.shape[1:])
+    assert frames.dtype == dtype
+    assert frames.isfinite().all()
+    assert torch.equal(keyframes, before), "the input was written to"
+    where = {name: options[name] for name in ("levels", "cyclic", "n_frames") if name in options}
+    places = keyframe_places(3, **where)
+    assert torch.equal(frames[places[:3]], keyframes)
+
+
+def test_takes_arrays_and_two_keyframes(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 2)
+    options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
+    frames = subdivide(pair.keyframes, pair.faces, 1, **options)
+    from_arrays = subdivide(list(pair.keyframes.numpy()), pair.faces.numpy(), 1, **options)
+    assert torch.equal(frames, from_arrays)
+    assert not frames.requires_grad
+
+
+def test_steps_on_the_fine_mesh_by_default(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 1)
+    options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
+    default = subdivide(pair.keyframes, pair.faces, 1, **options)[1]
+    without = subdivide(pair.keyframes, pair.faces, 1, solver=Solver(local_steps=0), **options)[1]
+    torch.testing.assert_close(default, MidShape(pair.bases, pair.faces, **COARSE)(*pair.keyframes), rtol=0, atol=1e-12)
+    assert largest(default - without) > 1e-5
+
+
+def test_presets_are_those_of_the_layers(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 1)
+    for preset in tm.PRESETS:
+        found = subdivide(pair.keyframes, pair.faces, 1, bases=pair.bases, preset=preset, progress=False)[1]
+        layer = MidShape(pair.bases, pair.faces, preset=preset)
+        torch.testing.assert_close(found, layer(*pair.keyframes), rtol=0, atol=1e-12)
+
+
+def test_is_public() -> None:
+    assert tm.subdivide is subdivide
+    assert tm.keyframe_places is keyframe_places
+    assert tm.linear_sequence is linear_sequence
+
+
+# ---------------------------------------------------------------------------------------------- the shapes between
+
+
+def test_recursion_by_hand(scattered: Shapes) -> None:
+    """Two levels of the joint space are three mid-shapes with the modes of both ends."""
+    pair = scattered.pick(1, 2)
+    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **COARSE)
+    layer = MidShape(pair.bases, pair.faces, **COARSE)
+    middle = layer(*pair.keyframes)
+    by_hand = [pair.keyframes[0], layer(pair.keyframes[0], middle), middle, layer(middle, pair.keyframes[1])]
+    for frame, truth in zip(frames, by_hand, strict=False):
+        assert largest(frame - truth) < 1e-9
+    assert largest(middle - pair.keyframes.mean(0)) > 0.1, "nothing would tell it from linear interpolation"
+
+
+def test_cycle_closes(scattered: Shapes) -> None:
+    options: dict[str, Any] = {"smooth": False, "bases": scattered.bases, "progress": False, **COARSE}
+    cycle = subdivide(scattered.keyframes, scattered.faces, 1, cyclic=True, **options)
+    last = scattered.pick(2, 0)
+    closing = subdivide(last.keyframes, last.faces, 1, bases=last.bases, progress=False, **COARSE)
+    assert torch.equal(cycle[4:], closing[:2])
+    # Where one starts makes no difference.
+    order = [1, 2, 0]
+    turned = scattered.pick(*order)
+    other = subdivide(
+        turned.keyframes, turned.faces, 1, cyclic=True, smooth=False, bases=turned.bases, progress=False, **COARSE
+    )
+    assert torch.equal(other, cycle.roll(-2, 0))
+
+
+def test_moves_along_with_all_keyframes(scattered: Shapes, generator: torch.Generator) -> None:
+    turn, move = random_rotation(generator), torch.tensor([11.0, -12.0, 13.0], dtype=torch.float64)
+    options: dict[str, Any] = {"bases": scattered.bases, "progress": False, "n_frames": 11, **COARSE}
+    here = subdivide(scattered.keyframes, scattered.faces, 1, **options)
+    there = subdivide(scattered.keyframes @ turn.mT + move, scattered.faces, 1, **options)
+    assert largest(there - (here @ turn.mT + move)) < 1e-7
+
+
+@pytest.mark.parametrize("levels", [0, 1])
+def test_fill_is_exact_on_a_rigid_motion(levels: int, bars: Shapes) -> None:
+    x = bars.keyframes[1]
+    axis, angle = torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64) / 3, 2.4
+    move = torch.tensor([5.0, 0.0, -3.0], dtype=torch.float64)
+    zero = torch.zeros((), dtype=torch.float64)
+    skew = torch.stack([zero, -axis[2], axis[1], axis[2], zero, -axis[0], -axis[1], axis[0], zero]).reshape(3, 3)
+    weights = torch.from_numpy(connectivity.vertex_areas(x.numpy(), bars.faces.numpy()))
+    centre = (weights[:, None] * x).sum(0) / weights.sum()
+
+    def at(t: float) -> Tensor:
+        return (x - centre) @ torch.linalg.matrix_exp(t * angle * skew).mT + centre + t * move
+
+    keyframes = torch.stack([x, at(1.0)])
+    basis = bars.bases[1]
+    frames = subdivide(keyframes, bars.faces, levels, bases=[basis] * 2, n_frames=8, progress=False, **COARSE)
+    for i, frame in enumerate(frames):
+        assert largest(frame - at(i / 7)) < 1e-8
+
+
+def test_fill_lies_on_the_geodesics_between_subdivided_shapes(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 1)
+    options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
+    shapes = subdivide(pair.keyframes, pair.faces, 1, **options)
+    filled = subdivide(pair.keyframes, pair.faces, 1, n_frames=7, **options)
+    weights = torch.from_numpy(connectivity.vertex_areas(pair.keyframes[0].numpy(), pair.faces.numpy()))
+    for i, frame in enumerate(filled):
+        position = 2 * i / 6
+        left = min(int(position), 1)
+        t = torch.tensor(position - left, dtype=torch.float64)
+        assert largest(frame - blend(shapes[left], shapes[left + 1], t, weights)) < 1e-9
+    assert largest(filled[3] - shapes[1]) < 1e-9
+
+
+def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[tuple[int, int]] = []
+    wrapped = sequence._Segment._layer
+
+    def record(self: Any, a: int, b: int) -> MidShape:
+        used.append((a, b))
+        return wrapped(self, a, b)
+
+    monkeypatch.setattr(sequence._Segment, "_layer", record)
+    x_a, x_b = scattered.keyframes[:2]
+    pair = scattered.pick(0, 1)
+    frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **PAIRED)
+    i, j = torch.tensor(connectivity.Connectivity(pair.faces.numpy()).edges).T
+    lengths = [torch.linalg.norm(x[i] - x[j], dim=1) for x in (x_a, x_b, frames[2])]
+    nearest = int((lengths[2] - lengths[1]).norm() < (lengths[2] - lengths[0]).norm())
+    assert used == [(0, 1), (0, nearest), (nearest, 1)]
+    # The same from the layers themselves.
+    left = MidShape([pair.bases[0], pair.bases[nearest]], pair.faces, "paired", **PAIRED)(x_a, frames[2])
+    assert largest(frames[1] - left) < 1e-9
+
+
+def test_nearest_key_frame_by_edge_lengths(scattered: Shapes) -> None:
+    pair = scattered.pick(0, 1)
+    segment = sequence._Segment((pair.bases[0], pair.bases[1]), pair.faces, tm.PRESETS["paper"], torch.device("cpu"))
+    weights = torch.ones(pair.keyframes.shape[1], dtype=torch.float64)
+    times = torch.tensor([0.0, 0.1, 0.3, 0.7, 0.9, 1.0], dtype=torch.float64)
+    shapes = blend(pair.keyframes[:1].expand(6, -1, -1), pair.keyframes[1:].expand(6, -1, -1), times, weights)
+    assert segment._nearest(shapes) == [0, 0, 0, 1, 1, 1]
+
+
+def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    loaded: list[bool] = []
+
+    def extract(
+        keyframes: Tensor, faces: Tensor, n_modes: int, progress: bool | None, meanwhile: Callable[[], None]
+    ) -> list[tm.ModalBasis]:
+        asked.append((len(keyframes), n_modes))
+        meanwhile()
+        return scattered.bases
+
+    monkeypatch.setattr(sequence, "bases_of_checked", extract)
+    monkeypatch.setattr(TorchBackend, "load", lambda self: loaded.append(True))
+    monkeypatch.setattr(WarpBackend, "load", TorchBackend.load)
+    frames = subdivide(scattered.keyframes, scattered.faces, 1, n_modes=7, progress=False, **COARSE)
+    assert asked == [(3, 7)]
+    assert loaded == [True]
+    given = subdivide(scattered.keyframes, scattered.faces, 1, bases=scattered.bases, progress=False, **COARSE)
+    assert torch.equal(frames, given)
+
+
+# -------------------------------------------------------------------------------------------- linear, for comparison
+
+
+def test_linear_sequence(scattered: Shapes) -> None:
+    x = scattered.keyframes
+    straight = linear_sequence(x, [0, 4, 6])
+    assert straight.shape == (7, *x.shape[1:])
+    assert torch.equal(straight[[0, 4, 6]], x)
+    torch.testing.assert_close(straight[1], 0.75 * x[0] + 0.25 * x[1])
+    torch.testing.assert_close(straight[5], 0.5 * x[1] + 0.5 * x[2])
+    cycle = linear_sequence(x, [0, 4, 6, 8])
+    assert cycle.shape == (8, *x.shape[1:])
+    torch.testing.assert_close(cycle[7], 0.5 * x[2] + 0.5 * x[0])
+
+
+# ------------------------------------------------------------------------------------------------------- exceptions
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"levels": -1}, "levels is a whole number from 0 to 12 .*got -1"),
+        ({"levels": 13}, "got 13"),
+        ({"levels": 1.5}, "got 1.5"),
+        ({"n_frames": 2}, "n_frames=2 leaves no room for 3 key-frames"),
+        ({"bases": []}, "got 0 bases for 3 key-frames"),
+        ({"preset": "both"}, "preset is one of 'accurate', 'fast', 'paper'; got 'both'"),
+    ],
+)
+def test_exception(options: dict[str, Any], message: str, scattered: Shapes) -> None:
+    with pytest.raises(ValueError, match=message):
+        subdivide(scattered.keyframes, scattered.faces, **{"bases": scattered.bases, "levels": 1, **options})
+
+
+def test_exception_keyframes(scattered: Shapes) -> None:
+    one = scattered.pick(0)
+    with pytest.raises(ValueError, match="at least 2 are needed"):
+        subdivide(one.keyframes, one.faces, bases=one.bases)
+    broken = scattered.keyframes.clone()
+    broken[1, 5, 2] = torch.inf
+    with pytest.raises(ValueError, match="vertex 5 of key-frame 1"):
+        subdivide(broken, scattered.faces, bases=scattered.bases)

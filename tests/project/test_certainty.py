@@ -1,0 +1,207 @@
+"""One function in every mode, and no shape that is worse than what it started from without a status that says so."""
+
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.backends.torch.distortion import Distortion, _weights
+from torch_modal.backends.torch.fine_energy import Rests
+from torch_modal.backends.warp.backend import WarpBackend
+from torch_modal.backends.warp.distortion import WarpDistortion
+from torch_modal.energy.term import Mesh
+from torch_modal.inbetween.comparison import no_worse
+from torch_modal.inbetween.settings import PRESETS
+from torch_modal.solve.adjoint import ConvergenceWarning
+from torch_modal.solve.solver import Status
+
+BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not WarpBackend.works(), reason="no Warp")), "torch"]
+
+
+def preset(name: str, **solver: Any) -> dict[str, Any]:
+    objective, given = PRESETS[name]
+    return {"objective": replace(objective, coarse_faces=200), "solver": replace(given, **solver)}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_gradients_do_not_change_the_result(bars: Shapes, name: str, backend: str) -> None:
+    layer = tm.InBetween(bars.bases[1:], bars.faces, **preset(name, backend=backend))
+    x_a, x_b = bars.keyframes[1:]
+    with torch.no_grad():
+        plain = layer(x_a, x_b, 0.5)
+    with torch.inference_mode():
+        inferred = layer(x_a, x_b, 0.5).clone()
+    recorded = layer(x_a.clone().requires_grad_(), x_b, 0.5).detach()
+    assert (plain - recorded).abs().max() < 1e-11 and (plain - inferred).abs().max() < 1e-11
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+@pytest.mark.parametrize("ends", [(0, 4), (0, 8)])
+def test_gradients_do_not_change_the_result_on_a_hand(hands: Shapes, name: str, ends: tuple[int, int]) -> None:
+    i, j = (end // 2 for end in ends)
+    layer = tm.InBetween([hands.bases[i], hands.bases[j]], hands.faces, preset=name)
+    x_a, x_b = hands.keyframes[i], hands.keyframes[j]
+    with torch.no_grad():
+        plain = layer(x_a, x_b, 0.5)
+    recorded = layer(x_a.clone().requires_grad_(), x_b, 0.5).detach()
+    diagonal = (x_a.amax(0) - x_a.amin(0)).norm()
+    assert (plain - recorded).abs().max() < 1e-9 * diagonal
+
+
+class TestFallBack:
+    """A result that is worse than its start."""
+
+    @pytest.mark.parametrize("backend", BACKENDS)
+    def test_the_start_is_returned_and_the_status_says_so(self, bars: Shapes, backend: str, monkeypatch: Any) -> None:
+        layer = tm.InBetween(bars.bases[1:], bars.faces, **preset("fast", backend=backend))
+        space, x_a, x_b = layer.members[0].space, *bars.keyframes[1:]
+        spoiled = type(space).lift
+
+        def lift(self: Any, a: Tensor, problem: Any) -> Tensor:
+            x = spoiled(self, a, problem)
+            return torch.cat([x[:1] + 10 * torch.sin(37 * x[:1]), x[1:]])
+
+        good = layer.solve(x_a, x_b, torch.tensor([0.5, 0.5]))
+        assert good.solution.status.tolist() == [Status.CONVERGED] * 2
+        monkeypatch.setattr(type(space), "lift", lift)
+        result = layer.solve(x_a, x_b, torch.tensor([0.5, 0.5]))
+        assert result.solution.status.tolist() == [Status.FELL_BACK, Status.CONVERGED]
+        assert result.solution.usable.all() and result.solution.converged.tolist() == [False, True]
+        torch.testing.assert_close(result.shapes[1], good.shapes[1], rtol=0, atol=1e-10)
+        # Without a step the shape is the blend by local rotations.
+        solver = replace(layer.solver, max_steps=0)
+        blend = tm.InBetween(bars.bases[1:], bars.faces, objective=layer.objective, solver=solver)
+        monkeypatch.setattr(type(space), "lift", spoiled)
+        torch.testing.assert_close(result.shapes[0], blend.solve(x_a, x_b, 0.5).shapes, rtol=0, atol=1e-10)
+        assert (good.shapes[0] - result.shapes[0]).abs().max() > 1e-6
+        monkeypatch.setattr(type(space), "lift", lift)
+        with pytest.warns(ConvergenceWarning, match="1 of 2 in-betweens came out worse.*FELL_BACK"):
+            layer(x_a, x_b, torch.tensor([0.5, 0.5]))
+
+    def test_what_has_no_in_between_stays_so(self, bars: Shapes, monkeypatch: Any) -> None:
+        layer = tm.InBetween(bars.bases[1:], bars.faces, **preset("fast"))
+        spoiled = type(layer.members[0].space).lift
+        monkeypatch.setattr(type(layer.members[0].space), "lift", lambda *given: 10 * torch.sin(37 * spoiled(*given)))
+        result = layer.solve(bars.keyframes[1], bars.keyframes[2] * torch.nan, 0.5)
+        assert result.solution.status == Status.INVALID and result.shapes.isnan().all()
+
+    @pytest.mark.parametrize("backend", BACKENDS)
+    def test_gradients_are_those_of_what_is_returned(self, small_bars: Shapes, backend: str, monkeypatch: Any) -> None:
+        layer = tm.InBetween(small_bars.bases[1:], small_bars.faces, **preset("fast", backend=backend))
+        space, (x_a, x_b) = layer.members[0].space, small_bars.keyframes[1:]
+        spoiled = type(space).lift
+        monkeypatch.setattr(type(space), "lift", lambda *given: 10 * torch.sin(37 * spoiled(*given)))
+        leaf = x_a.clone().requires_grad_()
+        result = layer.solve(leaf, x_b, 0.4)
+        assert result.solution.status == Status.FELL_BACK
+        weights = torch.randn(x_a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        (gradient,) = torch.autograd.grad((result.shapes * weights).sum(), leaf)
+        step = 1e-6 * torch.randn(x_a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+        with torch.no_grad():
+            there, back = ((layer.solve(x_a + s * step, x_b, 0.4).shapes * weights).sum() for s in (1, -1))
+        assert float((gradient * step).sum()) == pytest.approx(float(there - back) / 2, rel=1e-5)
+
+
+def test_nothing_falls_back_at_a_key_frame(bars: Shapes) -> None:
+    """There, all shapes are the same, and their distortions are rounding."""
+    path = tm.Path(bars.bases, bars.faces)
+    layer = tm.InBetween(bars.bases[1:], bars.faces)
+    t = torch.tensor([0.0, 1e-9, 1.0, 2.0], dtype=torch.float64)
+    for dtype in (torch.float64, torch.float32):
+        keyframes = bars.keyframes.to(dtype)
+        found = path.to(dtype).solve(keyframes, t.to(dtype)), layer.to(dtype).solve(*keyframes[1:], t[:3].to(dtype))
+        assert all((result.solution.status != Status.FELL_BACK).all() for result in found)
+
+
+class TestDistortion:
+    """What results are judged by."""
+
+    def given(self, bars: Shapes) -> tuple[list[Tensor], tuple[Tensor, Tensor], Tensor, list[Tensor]]:
+        straight, bent, twisted = bars.keyframes[:, None] * 20
+        shapes = [torch.lerp(bent, twisted, 0.5), straight, bent + 0.2 * torch.sin(straight), 3.0 * bent]
+        stiffness = [torch.tensor([[value]], dtype=torch.float64) for value in (500.0, 10.0, 1000.0)]
+        return shapes, (bent, twisted), torch.tensor([0.3], dtype=torch.float64), stiffness
+
+    def test_is_eq_5_without_volume_where_strains_are_small(self, bars: Shapes) -> None:
+        _, (bent, _), _, stiffness = self.given(bars)
+        x = bent + 1e-3 * torch.sin(3 * bent)
+        mesh = Mesh.of(bars.faces, bent.shape[1])
+        rests = Rests((bent, bent), None, torch.tensor([0.5]).double(), stiffness, None)
+        distortion = Distortion(mesh, None)([x], rests)
+        shell = tm.ShellEnergy(bars.faces, alpha=500.0, beta=10.0, gamma=0.0)
+        # Beside that, Eq. 5 counts a relative strain squared, and the distortion the same.
+        assert float(distortion) == pytest.approx(float(shell(x, bent)), rel=1e-9)
+
+    def test_kernels_and_torch_agree(self, bars: Shapes) -> None:
+        if not WarpBackend.works():
+            pytest.skip("no Warp")
+        shapes, ends, t, stiffness = self.given(bars)
+        n = len(Mesh.of(bars.faces, ends[0].shape[1]).edges)
+        stiffness[0] = torch.linspace(1, 2, n, dtype=torch.float64)[None]
+        mesh = Mesh.of(bars.faces, ends[0].shape[1])
+        rests = Rests(ends, None, t, stiffness, None)
+        one, other = (kind(mesh, None)(shapes, rests) for kind in (WarpDistortion, Distortion))
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
+
+    def test_a_degenerate_face_does_not_dominate(self, bars: Shapes) -> None:
+        """A vertex laid onto its neighbour in both key-frames: Eq. 5 divides by the length of that edge."""
+        shapes, ends, t, stiffness = self.given(bars)
+        mesh = Mesh.of(bars.faces, ends[0].shape[1])
+        distortion = Distortion(mesh, None)
+        before = distortion(shapes, Rests(ends, None, t, stiffness, None))
+        i, j = mesh.edges[50].tolist()
+        collapsed = [x.clone() for x in ends]
+        for x in collapsed:
+            x[:, i] = x[:, j] + 1e-3
+        after = distortion(shapes, Rests(tuple(collapsed), None, t, stiffness, None))
+        assert (after < 3 * before).all(), "the faces around it were pulled out of shape, too"
+        shell = tm.ShellEnergy(bars.faces)
+        assert shell(shapes[0], collapsed[0]) > 100 * shell(shapes[0], ends[0])
+
+    def test_the_best_of_the_starts_is_taken(self) -> None:
+        x, starts = torch.zeros(3, 4, 3), [torch.full((3, 4, 3), value) for value in (1.0, 2.0)]
+        found, worse = no_worse(x, starts, torch.tensor([[9.0, 9.0, 1.0], [1.0, 3.0, 1.0], [2.0, 2.0, 1.0]]))
+        assert worse.tolist() == [True, True, False] and found[:, 0, 0].tolist() == [1.0, 2.0, 0.0]
+
+    def test_needles_have_a_bounded_weight(self) -> None:
+        e, b = torch.tensor([1.0, 0, 0]), torch.tensor([0.5, -1e-3, 0])
+        edge_vectors = torch.stack([torch.stack([e, torch.tensor([0.5, h, 0]), b]) for h in (0.866, 1e-3, 0.0)], -1)
+        weights = _weights(edge_vectors[:, :, None].double())[0]
+        assert weights[0] == pytest.approx(2 / 0.867, rel=1e-3) and weights[1:].tolist() == [8.0, 0.0]
+
+    def test_what_is_not_finite_is_worse(self) -> None:
+        x, start = torch.zeros(2, 4, 3), torch.ones(2, 4, 3)
+        found, worse = no_worse(x, [start], torch.tensor([[torch.nan, 1.0], [1.0, 1.0]]))
+        assert worse.tolist() == [True, False] and torch.equal(found[0], start[0]) and torch.equal(found[1], x[1])
+
+
+def test_a_key_frame_is_returned_beside_one_that_is_not_finite(small_bars: Shapes) -> None:
+    layer = tm.InBetween(small_bars.bases[:2], small_bars.faces)
+    x_a, x_b = small_bars.keyframes[:2]
+    leaf = x_a.clone().requires_grad_()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        for t in (0, torch.tensor(0.0, dtype=torch.float64)):
+            shape = layer(leaf, x_b * torch.nan, t)
+            assert torch.equal(shape, x_a)
+            (gradient,) = torch.autograd.grad(shape.sum(), leaf)
+            assert gradient.isfinite().all()
+        assert layer(leaf, x_b * torch.nan, 0.5).isnan().all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_other_units_than_those_of_the_bases_are_told_once(small_bars: Shapes, backend: str) -> None:
+    solver = tm.Solver(backend=backend)
+    layer = tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=solver)
+    with pytest.warns(tm.MeshWarning, match=r"are 4 times as large as the shapes"):
+        layer.solve(*(4 * small_bars.keyframes[:2]), 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        layer.solve(*(4 * small_bars.keyframes[:2]), 0.5)
+        tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=solver).solve(*(2 * small_bars.keyframes[:2]), 0.5)

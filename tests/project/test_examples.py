@@ -1,0 +1,153 @@
+"""The examples do what they say, in a short form."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from torch_modal.registration.landmarks import read_landmarks
+from torch_modal.registration.load import load_keyframes
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def load_example(name: str) -> ModuleType:
+    """An example as a module, as ``python examples/name.py`` would run it."""
+    path = EXAMPLES / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(path.parent))  # where it finds the examples beside it
+    sys.modules[name] = module  # its named tuples look their annotations up there
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_train_timing_learns_times_without_labels(tmp_path: Path) -> None:
+    picture = tmp_path / "timing.png"
+    layer, linear = load_example("train_timing").main(steps=25, out=picture)
+    # An encoder that has learned nothing says 1/2 to everything: 0.167 off.
+    assert layer.timing_error < 0.05
+    assert layer.timing_error < 0.8 * linear.timing_error
+    # The truth is known whole; the encoder was shown 16 noisy markers. Linear decoding is 3.4 % and 8 % off.
+    assert layer.vertex_error < 2.4
+    assert layer.vertex_error < 0.7 * linear.vertex_error
+    assert layer.edge_error < 0.25 * linear.edge_error
+    first, last = layer.losses[0], sum(layer.losses[-5:]) / 5
+    assert last < 0.45 * first, (first, last)
+    assert last < 0.65 * sum(linear.losses[-5:]) / 5
+    assert picture.stat().st_size > 50_000
+
+
+def test_train_timing_depends_on_its_seed_only() -> None:
+    example = load_example("train_timing")
+    data = example.load_data(n_seen=8)
+    x_a, x_b = data.keyframes
+
+    def straight(t: torch.Tensor) -> torch.Tensor:
+        return x_a + t[:, None, None] * (x_b - x_a)
+
+    runs = [example.train(data, straight, steps=3, seed=seed) for seed in (0, 0, 1)]
+    assert runs[0].losses == runs[1].losses != runs[2].losses
+    assert runs[0].times.equal(runs[1].times)
+
+
+def test_farthest_points_are_spread() -> None:
+    """On a line of 9 points, three are the ends and the middle."""
+    line = torch.zeros(9, 3, dtype=torch.float64)
+    line[:, 0] = torch.arange(9)
+    assert sorted(load_example("train_timing").farthest_points(line, 3).tolist()) == [0, 4, 8]
+
+
+@pytest.mark.slow
+def test_train_parts_learns_more_from_in_betweens(tmp_path: Path) -> None:
+    """The short form: one seed of three arms on the hand, in a fraction of the steps."""
+    picture = tmp_path / "parts.png"
+    example = load_example("train_parts")
+    found = example.main(["hand"], seeds=1, steps=300, out=picture, arms=example.ARMS[:3])["hand"]
+    iou = {arm: runs[0].iou for arm, runs in found.items()}
+    # Measured: 0.69, 0.57 and 0.48.
+    assert iou["torch_modal"] > iou["linear"] + 0.04
+    assert iou["torch_modal"] > iou["none"] + 0.04
+    assert found["torch_modal"][0].right.shape == (3, 3782)
+    assert picture.stat().st_size > 10_000
+
+
+def test_morph_animals_goes_from_one_body_to_another(tmp_path: Path) -> None:
+    """The short form, on coarse meshes: legs that swing keep their lengths, which linear interpolation cuts short."""
+    found, frames, faces, _ = load_example("morph_animals").main(tmp_path, levels=1, cell=0.042, n_modes=8)
+    assert not found.doubtful and found.flipped_area < 0.02
+    assert found.to_target.mean < 0.12 and found.from_target.mean < 0.12
+    assert frames.shape == (3, len(found.positions), 3)
+    torch.testing.assert_close(frames[2], found.positions)
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+    def lengths(x: torch.Tensor) -> torch.Tensor:
+        return (x[edges[:, 0]] - x[edges[:, 1]]).norm(dim=1)
+
+    between = (lengths(frames[0]) + lengths(frames[2])) / 2
+
+    def off(x: torch.Tensor) -> float:
+        return float((lengths(x) / between - 1).abs().mean())
+
+    assert off(frames[1]) < 0.6 * off((frames[0] + frames[2]) / 2)
+    assert read_landmarks(tmp_path / "landmarks.txt", 2).shape == (8, 2)
+    assert (tmp_path / "morph.glb").stat().st_size > 50_000 and (tmp_path / "morph.png").stat().st_size > 30_000
+    assert len(load_keyframes([tmp_path / "slender.obj"]).keyframes[0]) == len(frames[0])
+
+
+@pytest.mark.slow
+def test_motion_from_markers_is_nearer_than_pca_and_than_the_path() -> None:
+    errors = load_example("motion_from_markers").main()
+    assert errors["amplitudes"] < 0.5 * min(errors["path"], errors["PCA"])
+
+
+@pytest.mark.slow
+def test_figures_of_the_paper_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of the samples; the others have tests of their own."""
+    load_example("paper/run").main(tmp_path, ["1", "3", "6"])
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == [f"paper-figure{n}.png" for n in (1, 3, 6)]
+    said = capsys.readouterr().out
+    errors = [float(line.split()[-2]) for line in said.splitlines() if "edge error, quarters" in line]
+    assert errors[2] < errors[1] < errors[0]  # ours, Eq. 4, linear
+    head, _, ours, theirs = load_example("paper/table1").main(tmp_path, names=["hand"])
+    assert head.count("|") == ours.count("|") == theirs.count("|")
+
+
+@pytest.mark.slow
+def test_local_interpolation_mends_the_worst_regions(tmp_path: Path) -> None:
+    lines = load_example("paper/figure5").main(tmp_path)
+    plain, local, own = ([float(word) for word in line.split()[-6::2]] for line in lines[1:])
+    assert local[1] < 0.7 * plain[1] and own[1] < 0.5 * local[1]  # in the regions
+    assert own[0] < 0.5 * local[0] < 0.5 * plain[0]
+    assert (tmp_path / "paper-figure5.png").stat().st_size > 50_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "cell"), [(2, 0.05), (7, 0.018)])
+def test_sculpted_figures_of_the_paper_are_drawn(tmp_path: Path, number: int, cell: float) -> None:
+    found = load_example(f"paper/figure{number}").main(tmp_path, cell=cell, levels=1)
+    errors = [float(line.split("%")[0].split()[-1]) for line in found[1:4]]
+    assert errors[2] < 0.6 * errors[1]  # ours, and Eq. 4 before it
+    assert (tmp_path / f"paper-figure{number}.png").stat().st_size > 30_000
+
+
+@pytest.mark.slow
+def test_figure_8_keeps_the_length_of_the_tail(tmp_path: Path) -> None:
+    found = load_example("paper/figure8").main(tmp_path, cell=0.042, across=False)
+    ours = [float(word) for line in found if line.startswith("poses   torch_modal") for word in line.split()[2:]]
+    assert len(ours) == 3 and all(abs(ratio - 1) < 0.03 for ratio in ours)
+    assert (tmp_path / "paper-figure8-poses.png").stat().st_size > 30_000
+
+
+@pytest.mark.slow
+def test_train_motion_learns_more_in_amplitudes() -> None:
+    """A short run: what follows two true shapes, and the stride that is told from them."""
+    data, found = load_example("train_motion").main(n_animals=2, steps=12, n_modes=16)
+    own = found.pop("amplitudes")
+    assert own.held < 1 and own.shapes.shape == data.test[0, 2:].shape
+    assert own.stride < 0.7 * min(other.stride for other in found.values())
+    assert own.edges < 0.5 * min(other.edges for other in found.values())

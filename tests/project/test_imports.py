@@ -1,0 +1,197 @@
+"""Imports go one way, and what is heavy is loaded by those who need it only."""
+
+import ast
+import graphlib
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[2] / "torch_modal"
+
+# From the ground up: a module imports from its own floor and lower ones, at the top of the file or inside functions.
+FLOORS = [
+    "version",
+    "arrays",
+    "errors",
+    "extras",
+    "progress",
+    "autograd",
+    "trees",
+    "geometry",
+    "io",
+    "keyframes",
+    "precompute",
+    "energy",
+    "backends",
+    "solve",
+    "inbetween",
+    "contact",
+    "layers",
+    "motion",
+    "registration",
+    "codec",
+    "data",
+    "view",
+    "",
+    "cli",
+    "__main__",
+]
+MODULES = sorted(
+    str(path.relative_to(PACKAGE).with_suffix("")).replace("/", ".").removesuffix("__init__").removesuffix(".")
+    for path in PACKAGE.rglob("*.py")
+)
+LAYERS = {"backends", "solve", "inbetween", "layers"}
+FOREIGN_TO_LAYERS = set("numpy scipy fast_simplification trimesh pytetwild tqdm pyvista matplotlib pygltflib".split())
+
+
+@cache
+def imported(module: str) -> set[str]:
+    """Every module that a file imports, anywhere in it; of this package without its name."""
+    folder = PACKAGE / module.replace(".", "/")
+    path = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module} has a relative import"
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                within = whole.removeprefix("torch_modal.")
+                found.add(whole if within in MODULES and within != whole else str(node.module))
+    return {name.removeprefix("torch_modal").removeprefix(".") if is_own(name) else name for name in found}
+
+
+def is_own(name: str) -> bool:
+    return name == "torch_modal" or name.startswith("torch_modal.")
+
+
+def own(module: str) -> set[str]:
+    return {name for name in imported(module) if name in MODULES}
+
+
+def floor(module: str) -> int:
+    return FLOORS.index(module.split(".")[0])
+
+
+def test_every_module_has_its_floor() -> None:
+    assert {module.split(".")[0] for module in MODULES} == set(FLOORS)
+    assert "precompute.modes" in own("motion.subdivide"), "imports are not seen"
+    assert "geometry.connectivity" in own("inbetween.frame"), (
+        "from torch_modal.geometry import connectivity is not seen"
+    )
+
+
+def test_imports_go_down() -> None:
+    upwards = [
+        f"{module or '__init__'} imports {name}, on a higher floor"
+        for module in MODULES
+        for name in sorted(own(module))
+        if floor(name) > floor(module)
+    ]
+    assert not upwards
+
+
+def test_no_imports_go_round() -> None:
+    graphlib.TopologicalSorter({module: own(module) - {module} for module in MODULES}).prepare()
+
+
+def test_precompute_is_without_torch() -> None:
+    """Besides the basis: ``modes.py`` alone makes tensors, for ``basis.py``."""
+    with_torch = {
+        name
+        for name in MODULES
+        if name.startswith("precompute.") and "torch" in {found.split(".")[0] for found in imported(name)}
+    }
+    assert with_torch == {"precompute.basis", "precompute.modes"}
+
+
+def test_layers_are_torch_only() -> None:
+    """Bases are what comes in; only the frame and its coarse mesh, made once, use more of the pre-computation."""
+    allowed = {"inbetween.frame": {"numpy", "precompute.coarsening"}}
+    allowed["inbetween.resolution"] = {"precompute.coarsening"}
+    foreign = {
+        (module, name)
+        for module in MODULES
+        if module.split(".")[0] in LAYERS
+        for name in {found if found in MODULES else found.split(".")[0] for found in imported(module)}
+        if name in FOREIGN_TO_LAYERS or (name.startswith("precompute.") and name != "precompute.basis")
+        if name not in allowed.get(module, ())
+    }
+    assert not foreign
+
+
+def test_one_door_leads_to_the_backends() -> None:
+    """No other file names Warp or its kernels, or asks which backend it has; the setting of its name is one."""
+    asks = re.compile(r"\bwarp\b|\.kernels\b|isinstance\([^)]*backend|backend(\.name)? *(==|!=| is )", re.I)
+    paths = {str(path.relative_to(PACKAGE)): path for path in PACKAGE.rglob("*.py")}
+    found = {name for name, path in paths.items() if name.split("/")[0] != "backends" and asks.search(path.read_text())}
+    assert found == {"inbetween/settings.py"}
+    users = {name for name in MODULES if any(each.startswith("backends.warp") for each in own(name))}
+    assert {name for name in users if not name.startswith("backends.warp")} == {"backends.choice"}
+
+
+def test_one_lock_guards_the_decimation() -> None:
+    """fast-simplification is not thread-safe; the worker is a process of its own."""
+    users = [name for name in MODULES if "fast_simplification" in imported(name)]
+    assert users == ["geometry.decimation", "precompute._tetwild_worker"]
+
+
+def printed(code: str) -> list[str]:
+    """What a fresh interpreter prints, in words."""
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120, cwd=PACKAGE.parent
+    )
+    return result.stdout.split()
+
+
+def test_import_loads_nothing_heavy() -> None:
+    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch_geometric", "torch._dynamo"]
+    heavy += ["scipy.interpolate", "sympy"]
+    code = (
+        "import sys, torch_modal; torch_modal.extract_bases, torch_modal.subdivide, torch_modal.InBetween; "
+        "from torch_modal.autograd import broadcast_shapes; "
+        "assert broadcast_shapes((2, 1), [3], ()) == (2, 3); "
+        f"print([name for name in {heavy} if name in sys.modules])"
+    )
+    assert printed(code) == ["[]"]
+
+
+def test_nothing_searches_for_garbage_while_names_are_loaded() -> None:
+    """Each search takes a tenth of a second with torch there; afterwards it is as it was before."""
+    code = (
+        "import gc, sys, torch, torch_modal as tm;"
+        "known, searches, during = len(sys.modules), [], [];"
+        "gc.callbacks.append(lambda phase, info: searches.append(len(sys.modules)));"
+        "gc.set_threshold(50);"
+        "tm.subdivide;"
+        "during = [n for n in searches if known < n < len(sys.modules)];"
+        "on = gc.isenabled(); gc.disable(); tm.ShapeDataset;"
+        "print(len(sys.modules) > known + 50, during, on, gc.isenabled())"
+    )
+    assert printed(code) == ["True", "[]", "True", "False"]
+
+
+def test_what_was_loaded_is_old() -> None:
+    """The next search, of what is young, does not go through all of it; what callers have frozen stays so."""
+    code = (
+        "import gc, torch, torch_modal as tm;"
+        "old = len(gc.get_objects(2));"
+        "tm.subdivide;"
+        "young = len(gc.get_objects(0)) + len(gc.get_objects(1));"
+        "print(len(gc.get_objects(2)) > old + 10_000, young < 2_000);"
+        "gc.freeze(); frozen = gc.get_freeze_count(); tm.ShapeDataset; print(gc.get_freeze_count() > 0.9 * frozen)"
+    )
+    assert printed(code) == ["True", "True", "True"]
+
+
+def test_public_names_are_there() -> None:
+    import torch_modal
+
+    assert sorted(torch_modal.__all__) == torch_modal.__all__
+    for name in torch_modal.__all__:
+        assert getattr(torch_modal, name) is not None
+    fixed = "load_keyframes extract_modes extract_bases ModalBasis ShellEnergy GaussNewtonStep MidShape subdivide"
+    assert set(fixed.split()) <= set(torch_modal.__all__)

@@ -1,0 +1,108 @@
+"""Every snippet of README and of the documentation runs as it is written.
+
+The blocks of a page run in their order, in a folder with the files that ``examples/write_meshes.py`` writes: Python in
+one namespace, ``torch-modal`` in this process. Of other commands it is checked that what they name is there. A block
+that is not run says so, and why, in the line before it: ``*Not run by the tests: it needs Blender.*``
+"""
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from snippets import COMMAND, LANGUAGES, NOT_RUN, PAGES, ROOT, Block, blocks, commands, expanded, run_python
+from test_examples import load_example
+
+from torch_modal.backends.choice import BACKENDS
+from torch_modal.cli import main as cli
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
+
+QUICK = {"layer", "viewing"}
+"""Pages that are tried in the default run; what others cost is not known beforehand."""
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("meshes")
+    load_example("write_meshes").main(folder)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def registered() -> Iterator[None]:
+    """Formats and backends that a page registers are gone after it."""
+    tables: tuple[dict[str, Any], ...] = (MESH_FORMATS, ANIMATION_FORMATS, BACKENDS)
+    before = [set(table) for table in tables]
+    yield
+    for table, names in zip(tables, before, strict=True):
+        for name in set(table) - names:
+            del table[name]
+
+
+def pages_with(*languages: str) -> list[object]:
+    found = [page for page in PAGES if any(block.language in languages and block.is_run for block in blocks(page))]
+    assert len(found) > 6
+    return [pytest.param(page, id=page.stem, marks=[pytest.mark.slow] * (page.stem not in QUICK)) for page in found]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_says_what_it_is(page: Path) -> None:
+    """So that none is left out by its form."""
+    for block in blocks(page):
+        if block.language == "":
+            assert not COMMAND.match(block.text) and "import " not in block.text, f"{block}: fence it as sh or python"
+        else:
+            assert block.language in LANGUAGES or block.language.startswith("{"), str(block)
+    said = len(re.findall(rf"^\*{NOT_RUN}", page.read_text(encoding="utf-8"), re.M))
+    assert said == sum(not block.is_run for block in blocks(page)), "a mark that belongs to no block, or has no reason"
+
+
+@pytest.mark.parametrize("page", pages_with("python", "sh"))
+def test_blocks_run_in_their_order(page: Path, meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(shutil.copytree(meshes, tmp_path / "work"))
+    monkeypatch.setattr("webbrowser.open", lambda url: True)
+    names: dict[str, object] = {"__name__": "__main__"}
+    for block in blocks(page):
+        if block.is_run and block.language == "python":
+            run_python(block, names)
+        elif block.is_run and block.language == "sh":
+            for words in commands(block):
+                run_command(block, words)
+
+
+def run_command(block: Block, words: list[str]) -> None:
+    """Run ``torch-modal``; of all else, check that it could be."""
+    program, *arguments = words
+    if Path(program).name == "torch-modal":
+        try:
+            status = cli.main(expanded(arguments))
+        except SystemExit as end:  # --help
+            status = end.code
+        # What crosses is an answer too.
+        assert status in ({0, 3} if arguments[0] == "check" else {0}), f"{block}: {' '.join(words)}"
+    elif program == "pip":
+        extras = re.findall(r"\[(.+?)\]", " ".join(arguments))
+        known = re.findall(r'^    "(\w+)": \[', (ROOT / "setup.py").read_text(), re.M)
+        assert set(",".join(extras).split(",")) <= {*known, "all", ""}, str(block)
+    else:
+        assert Path(program).name in {"python", "sh"}, f"{block}: {program}"
+        script = (ROOT / arguments[0]).read_text()
+        for option in (word for word in arguments[1:] if word.startswith("--")):
+            assert f'"{option}"' in script or arguments[0].endswith(".sh"), f"{block}: {option}"
+
+
+def test_a_block_that_fails_is_seen(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```python\nx = 1\n```\n\n*Not run by the tests: no.*\n\n```python\ny\n```\n\n```python\n\nx / 0\n```\n"
+    )
+    first, second, third = blocks(page)
+    names: dict[str, object] = {}
+    run_python(first, names)
+    assert first.is_run and not second.is_run and third.is_run
+    with pytest.raises(ZeroDivisionError) as caught:
+        run_python(third, names)
+    assert caught.traceback[-1].lineno + 1 == 13  # the page's own
+    assert names["x"] == 1

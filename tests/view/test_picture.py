@@ -1,0 +1,283 @@
+"""Sheets of pictures by both renderers, looked at through their pixels."""
+
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from scipy import ndimage
+
+from torch_modal.view import drawing, picture
+from torch_modal.view.picture import render_sequence
+
+CRASH = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
+BALL = trimesh.creation.icosphere(2)
+
+
+def growing(n=5):
+    """A ball that grows from radius 1 to 2."""
+    return np.linspace(1, 2, n)[:, None, None] * np.asarray(BALL.vertices)
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """Smooth shading by ten thousands of faces is not what these tests look at."""
+    monkeypatch.setattr(drawing, "SMOOTH_FACES", 1000)
+
+
+def drawn(image, level=250):
+    return (np.asarray(image).astype(int)[..., :3] < level).any(axis=-1)
+
+
+def render_or_skip(*args, **options):
+    try:
+        return render_sequence(*args, **options)
+    except RuntimeError as error:
+        pytest.skip(f"{error}")
+
+
+def shapes_on(path):
+    """The shapes on a sheet, in reading order: area, centre x, centre y, mean colour of each."""
+    image = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    labels, _ = ndimage.label(drawn(image))
+    found = []
+    for number, (rows, columns) in enumerate(ndimage.find_objects(labels), start=1):
+        mask = labels[rows, columns] == number
+        if mask.sum() > 3000:  # letters are smaller
+            y, x = (s.start + c for s, c in zip((rows, columns), ndimage.center_of_mass(mask), strict=True))
+            found.append((mask.sum(), x, y, image[rows, columns][mask].mean(axis=0)))
+    return sorted(found, key=lambda shape: (round(shape[2] / 100), shape[1]))
+
+
+@pytest.mark.parametrize("renderer", ["pyvista", "matplotlib"])
+def test_sheet_has_every_shape_at_its_place(tmp_path, renderer):
+    """Rows and columns of discs: their radii are those of the frames, key-frames have the other colour."""
+    frames = growing()
+    out = tmp_path / "new" / "sheet.png"
+    rows = {"grows": frames, "shrinks": torch.tensor(frames[::-1].copy(), requires_grad=True)}
+    path = render_or_skip(rows, torch.tensor(np.asarray(BALL.faces)), out, renderer=renderer)
+    assert path == out and list(out.parent.iterdir()) == [out]
+    shapes = shapes_on(out)
+    assert len(shapes) == 10
+    areas, x, y = (np.array([shape[i] for shape in shapes]).reshape(2, 5) for i in range(3))
+    radius = picture.CELL_PIXELS / 2 / picture.MARGIN  # the largest ball fills its cell
+    expected = np.pi * (radius * np.linspace(0.5, 1, 5)) ** 2
+    np.testing.assert_allclose(areas, [expected, expected[::-1]], rtol=0.06)
+    np.testing.assert_allclose(np.diff(x, axis=1), np.diff(x, axis=1)[0, 0], atol=1.5)
+    np.testing.assert_allclose(x[0], x[1], atol=1.5)
+    assert np.ptp(y, axis=1).max() < 1.5
+    for number, shape in enumerate(shapes):
+        red, _, blue = shape[3]
+        assert (red > blue + 20) if number % 5 in (0, 4) else (blue > red + 20)
+
+
+def test_columns_and_keyframes_are_chosen(tmp_path):
+    options = {"renderer": "matplotlib", "overwrite": True}
+    rows, faces, out = {"a": growing(9)}, np.asarray(BALL.faces), tmp_path / "a.png"
+    largest = np.pi * (picture.CELL_PIXELS / 2 / picture.MARGIN) ** 2
+
+    def radii(**more):
+        shapes = shapes_on(render_sequence(rows, faces, out, **options, **more))
+        warm = [i for i, shape in enumerate(shapes) if shape[3][0] > shape[3][2]]
+        return np.sqrt([shape[0] / largest for shape in shapes]), warm
+
+    # Frame n of 9 has radius 1 + n / 8; the largest that is shown fills its cell.
+    for more, frames, warm in [
+        ({}, [0, 2, 4, 6, 8], [0, 4]),
+        ({"columns": 3, "keyframe_indices": [4]}, [0, 4, 8], [1]),
+        ({"columns": [1, 4], "keyframe_indices": [0, 4, 8]}, [1, 4], [1]),
+        ({"columns": 1}, [0], [0]),
+        ({"columns": 3, "keyframe_indices": []}, [0, 4, 8], []),
+    ]:
+        sizes, warm_found = radii(**more)
+        expected = 1 + np.array(frames) / 8
+        np.testing.assert_allclose(sizes, expected / expected[-1], rtol=0.03)
+        assert warm_found == warm
+
+
+def test_titles_stand_above_the_columns(tmp_path):
+    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
+    given = [["t = 0", "t = 0.5", "t = 1"], ["t = 0", "mode 2", "t = 1"]]
+    sheets = []
+    for titles in (None, *given):
+        render_sequence(rows, faces, tmp_path / "a.png", titles=titles, renderer="matplotlib", overwrite=True)
+        sheets.append(np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int))
+    np.testing.assert_array_equal(sheets[0], sheets[1], "times are the default")
+    changed = np.argwhere(np.abs(sheets[0] - sheets[2]).sum(2) > 0)
+    height, width = sheets[0].shape[:2]
+    assert len(changed) and changed[:, 0].max() < height / 4, "only what is above the shapes"
+    assert width / 3 < changed[:, 1].min() and changed[:, 1].max() < 5 * width / 6, "only the one in the middle"
+
+
+def test_numbers_become_colours_with_one_bar(tmp_path):
+    """The first row is 0 (the scale's light end), the second 5 (its dark end), the third has none."""
+    frames, faces = growing(3), np.asarray(BALL.faces)
+    colors = {"zero": np.zeros(frames.shape[:2]), "five": torch.full(frames.shape[:2], 5.0)}
+    options = {"colors": colors, "color_label": "error (%)", "renderer": "matplotlib"}
+    rows = {"zero": frames, "five": frames, "plain": frames}
+    path = render_sequence(rows, faces, tmp_path / "a.png", **options)
+    *_, last = everything = shapes_on(path)  # the bar stands to the right of the last column
+    shapes = [shape for shape in everything if shape[1] < last[1] + 50]
+    zero, five, plain = (shapes[3 * r + 1][3] for r in range(3))
+    assert np.ptp(zero) < 10 and zero.min() > 130  # grey, light
+    assert five[0] > 2 * five[1] and five.max() < 100  # dark red
+    assert plain[2] > plain[0] + 20  # the colour of an in-between
+    plain_sheet = render_sequence(rows, faces, tmp_path / "b.png", renderer="matplotlib")
+    assert Image.open(path).width > Image.open(plain_sheet).width + 50  # room for the bar
+
+
+def test_automatic_camera():
+    """Which way is up, and from where a flat shape is seen, in three worlds."""
+    plate = np.asarray(trimesh.creation.box((4, 6, 0.5)).vertices)  # stands in a Y-up world, faces Z
+    right, up, front = picture.view_rotation(plate, None, None)
+    assert up[1] > 0.9 and right[1] == pytest.approx(0) and front[2] > 0.85
+    z_up = plate[:, [0, 2, 1]] * [1, -1, 1]  # the same in a Z-up world, where front is -Y
+    right, up, front = picture.view_rotation(z_up, None, None)
+    assert up[2] > 0.9 and front[1] < -0.85
+    from_side = plate[:, [2, 1, 0]]  # faces X: the camera walks round, and Y stays up
+    right, up, front = picture.view_rotation(from_side, None, None)
+    assert up[1] > 0.9 and abs(front[0]) > 0.85
+
+
+@pytest.mark.parametrize(
+    ("view", "up", "expected"),
+    [
+        ((0, 0), "y", np.eye(3)),
+        ((90, 0), "y", [[0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+        ((0, 90), "y", [[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+        ((0, 0), "z", [[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
+        ((90, 0), "z", [[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+    ],
+)
+def test_camera_directions(view, up, expected):
+    """Right, up and to the viewer, by hand."""
+    np.testing.assert_allclose(picture.view_rotation(np.eye(3), view, up), expected, atol=1e-12)
+
+
+def test_what_rests_stays_and_what_travels_is_followed():
+    ball = np.asarray(BALL.vertices)
+    rest = np.stack([ball, 1.2 * ball + np.array([0.2, 0, 0])])[None]
+    moved, _ = picture.centred(rest)
+    np.testing.assert_allclose(moved[0, 1] - moved[0, 0], rest[0, 1] - rest[0, 0], atol=1e-12)
+    far = np.stack([ball, ball + np.array([9, 0, 0])])[None]
+    both = np.concatenate([far, far + np.array([0, 0.3, 0])])
+    moved, half = picture.centred(both)
+    np.testing.assert_allclose(moved[:, 1], moved[:, 0], atol=1e-12)  # followed
+    np.testing.assert_allclose(moved[1] - moved[0], np.broadcast_to([0, 0.3, 0], moved[0].shape), atol=1e-12)
+    assert half[0] == pytest.approx(1.06 * 1, rel=0.03)
+    moved, half = picture.centred(np.concatenate([far, far + np.array([0, 7, 0])]))  # rows apart too: each by itself
+    assert np.abs(moved).max() <= 1.0 + 1e-12
+
+
+def test_a_crash_of_the_child_falls_back_to_matplotlib(tmp_path, monkeypatch):
+    monkeypatch.setattr(drawing, "_child_command", lambda folder: [sys.executable, "-c", CRASH])
+    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
+    with pytest.warns(UserWarning, match="signal 11.*matplotlib"):
+        path = render_sequence(rows, faces, tmp_path / "auto.png")
+    expected = render_sequence(rows, faces, tmp_path / "plain.png", renderer="matplotlib")
+    assert path.read_bytes() == expected.read_bytes() and len(shapes_on(path)) == 3
+    with pytest.raises(RuntimeError, match="signal 11"):
+        render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
+    assert not (tmp_path / "no.png").exists()
+
+
+def test_without_pyvista_matplotlib_draws_and_says_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(drawing.importlib.util, "find_spec", lambda name: None)
+    rows, faces = {"a": growing(3)}, np.asarray(BALL.faces)
+    path = render_sequence(rows, faces, tmp_path / "auto.png")
+    assert path.read_bytes() == render_sequence(rows, faces, tmp_path / "m.png", renderer="matplotlib").read_bytes()
+    with pytest.raises(RuntimeError, match=r"pip install torch_modal\[pictures\]"):
+        render_sequence(rows, faces, tmp_path / "no.png", renderer="pyvista")
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("raise ImportError('No module named pyvista')", "status 1.*No module named pyvista"),
+        ("import time; time.sleep(60)", "within 0.5 s"),
+        ("pass", "left no images"),
+        ("import numpy as np; np.save('images.npy', np.full((3, 2, 2, 3), 255, np.uint8))", "empty"),
+    ],
+)
+def test_other_failures_of_the_child_fall_back_too(tmp_path, monkeypatch, code, reason):
+    monkeypatch.setattr(drawing, "_child_command", lambda folder: [sys.executable, "-c", code])
+    if "sleep" in code:
+        monkeypatch.setattr(drawing, "CHILD_SECONDS", 0.5)
+    start = time.monotonic()
+    with pytest.warns(UserWarning, match=reason):
+        path = render_sequence({"a": growing(3)}, np.asarray(BALL.faces), tmp_path / "a.png")
+    assert len(shapes_on(path)) == 3 and time.monotonic() - start < 30
+
+
+def test_existing_pictures_stay_unless_asked_and_nothing_is_left_behind(tmp_path, monkeypatch):
+    rows, faces, out = {"a": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.png"
+    out.write_text("mine")
+    with pytest.raises(FileExistsError, match=r"a\.png exists.*--overwrite"):
+        render_sequence(rows, faces, out, renderer="matplotlib")
+
+    def refused(*_):
+        raise PermissionError("held by another program")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", refused)
+        with pytest.raises(PermissionError):
+            render_sequence(rows, faces, out, renderer="matplotlib", overwrite=True)
+    assert out.read_text() == "mine" and list(tmp_path.iterdir()) == [out]
+    render_sequence(rows, faces, out, renderer="matplotlib", overwrite=True)
+    assert Image.open(out).format == "PNG"
+
+
+def test_pdf(tmp_path):
+    path = render_sequence({"": growing(2)}, np.asarray(BALL.faces), tmp_path / "a.pdf", renderer="matplotlib")
+    assert path.read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames_by_row": {}}, "empty"),
+        ({"frames_by_row": {"a": growing(3), "b": growing(4)}}, r"'a' \(3, 162, 3\), 'b' \(4, 162, 3\)"),
+        ({"frames_by_row": {"a": growing(3)[0]}}, r"frames_by_row\['a'\].*frames\[None\]|\(162, 3\)"),
+        ({"out": "a.jpg"}, r"\.png or \.pdf.*a\.jpg"),
+        ({"renderer": "opengl"}, "opengl"),
+        ({"columns": 0}, "columns must be at least 1"),
+        ({"titles": ["first"]}, "titles stand above 3 columns, got 1"),
+        ({"columns": [0, 3]}, r"columns.*0 to 2.*\[0, 3\]"),
+        ({"columns": []}, "columns.*one or more"),
+        ({"keyframe_indices": [3]}, "keyframe_indices.*0 to 2"),
+        ({"view": (0,)}, "azimuth and elevation"),
+        ({"view": (0, float("inf"))}, "azimuth and elevation"),
+        ({"up": "x"}, "up must be"),
+        ({"colors": {"b": np.zeros((3, 162))}}, "'b'.*does not have"),
+        ({"colors": {"a": np.zeros((2, 162))}}, r"\(3, 162\).*\(2, 162\)"),
+        ({"colors": {"a": np.full((3, 162), np.nan)}}, "finite"),
+    ],
+)
+def test_wrong_input_is_refused(tmp_path, options, message):
+    arguments = {
+        "frames_by_row": {"a": growing(3)},
+        "faces": np.asarray(BALL.faces),
+        "out": "a.png",
+    } | options
+    arguments["out"] = tmp_path / arguments["out"]
+    with pytest.raises(ValueError, match=message):
+        render_sequence(**arguments)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("renderer", ["pyvista", "matplotlib"])
+def test_a_walking_woman_fills_her_cells(data_dir, tmp_path, renderer):
+    walk = sorted((data_dir / "mh-woman").glob("*walk*"))
+    a, b = (trimesh.load_mesh(path, process=False, maintain_order=True) for path in walk)
+    frames = np.stack([(1 - t) * a.vertices + t * b.vertices for t in (0, 0.5, 1)])
+    path = render_or_skip({"linear": frames}, a.faces, tmp_path / "a.png", renderer=renderer)
+    image = np.asarray(Image.open(path).convert("RGB"))
+    shapes = shapes_on(path)
+    assert len(shapes) == 3
+    warm = drawn(image) & (np.abs(image[..., 0].astype(int) - image[..., 2]) > 20)
+    rows = np.nonzero(warm.sum(axis=1) > 2)[0]
+    rows = rows[rows > 60]  # below the column labels
+    assert np.ptp(rows) > 0.9 * picture.CELL_PIXELS

@@ -1,0 +1,41 @@
+"""The energy of a modal solve, on the mesh that it is evaluated on."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor, nn
+
+from torch_modal import trees
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.modal_energy import ModalEnergy
+
+
+class CoarseEnergy(nn.Module):
+    """An energy of which a modal solve takes references between two shapes.
+
+    Args:
+        energy: Of some of the terms.
+    """
+
+    def __init__(self, energy: Energy) -> None:
+        super().__init__()
+        self.energy = energy
+
+    def modal(self, columns: Tensor) -> ModalEnergy:
+        """The energy in the amplitudes of columns. *Shape:* ``(n, V, 3)``."""
+        return ModalEnergy(self.energy, columns)
+
+    def between(
+        self, first: Tensor, second: Tensor, which: Tensor | None, t: Tensor, stiffness: Sequence[Tensor]
+    ) -> Any:
+        """What :meth:`modal` compares with, at times between two rest shapes.
+
+        Args:
+            first: Rest shapes of the weight ``1 - t``. *Shape:* ``(P, V, 3)``.
+            second: Rest shapes of the weight ``t``. *Shape:* ``(P, V, 3)``.
+            which: The pair of each sample; each its own where None. *Shape:* ``(B,)``.
+            t: *Shape:* ``(B,)``.
+            stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
+        """
+        one, other = trees.picked((self.energy.rest_of(first), self.energy.rest_of(second)), which)
+        return self.energy.between(one, other, t, stiffness)

@@ -1,0 +1,95 @@
+"""The parts of an in-between by kernels of NVIDIA Warp."""
+
+import importlib.util
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache
+
+from torch import Tensor
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.backends.torch.alignment import Alignment, Pair, PlacedPairs
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.warp import alignment
+from torch_modal.backends.warp.coarse_energy import WarpCoarseEnergy
+from torch_modal.backends.warp.crossings import WarpPairs
+from torch_modal.backends.warp.distortion import WarpDistortion
+from torch_modal.backends.warp.fine_energy import WarpFineEnergy
+from torch_modal.backends.warp.launch import kernels, load_kernels
+from torch_modal.backends.warp.poisson import WarpPoisson
+from torch_modal.backends.warp.rotations import WarpRotations
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.errors import MissingPackageError
+from torch_modal.geometry.connectivity import Connectivity
+
+
+class WarpBackend(TorchBackend):
+    """Parts that do in one pass over the elements what torch does in dozens, in float64.
+
+    Raises:
+        MissingPackageError: Warp is not installed.
+    """
+
+    def __init__(self) -> None:
+        if not _is_installed():
+            raise MissingPackageError("backend='warp' needs warp-lang, which is not installed: pip install warp-lang")
+
+    @staticmethod
+    def works() -> bool:
+        """Whether Warp is installed, and compiles."""
+        return _works()
+
+    def load(self) -> None:
+        """As in the base class: the kernels of in-betweens."""
+        load_kernels()
+
+    def place(self, frame: Alignment, x_a: Tensor, x_b: Tensor) -> PlacedPairs:
+        """As in the base class."""
+        placed = alignment.place(frame, x_a, x_b) if alignment.serves(x_a, x_b) else None
+        return super().place(frame, x_a, x_b) if placed is None else placed
+
+    def restore(self, frame: Alignment, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
+        """As in the base class."""
+        serves = alignment.serves(x, pair.first, t)
+        return alignment.restore(frame, x, pair, t) if serves else super().restore(frame, x, pair, t)
+
+    def rotations(self, mesh: Connectivity, references: Tensor) -> WarpRotations:
+        """As in the base class."""
+        return WarpRotations(mesh, references)
+
+    def poisson(self, mesh: Connectivity, weights: Tensor) -> WarpPoisson:
+        """As in the base class."""
+        return WarpPoisson(mesh, weights)
+
+    def coarse_energy(self, energy: Energy, mesh: Mesh) -> WarpCoarseEnergy:
+        """As in the base class."""
+        return WarpCoarseEnergy(energy, mesh)
+
+    def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> WarpFineEnergy:
+        """As in the base class."""
+        return WarpFineEnergy(mesh, terms)
+
+    def distortion(self, mesh: Mesh, further: Energy | None) -> WarpDistortion:
+        """As in the base class."""
+        return WarpDistortion(mesh, further)
+
+    def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
+        """As in the base class."""
+        return WarpPairs(mesh, shape[None])
+
+
+def _is_installed() -> bool:
+    return importlib.util.find_spec("warp") is not None
+
+
+@cache
+def _works() -> bool:
+    if not _is_installed():
+        return False
+    try:
+        kernels("shell")
+    except Exception as error:  # whatever keeps Warp from compiling: torch does the same, only slower
+        warnings.warn(f"Warp is installed, but its kernels cannot be used, so torch is: {error}", stacklevel=2)
+        return False
+    return True

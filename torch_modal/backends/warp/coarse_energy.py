@@ -1,0 +1,31 @@
+"""Eq. 5 of a modal solve by Warp kernels."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
+
+from torch_modal import trees
+from torch_modal.backends.torch.coarse_energy import CoarseEnergy
+from torch_modal.backends.warp.modal_energy import WarpModalEnergy, shell_reference
+from torch_modal.backends.warp.shell import WarpShell
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.term import Mesh
+
+
+class WarpCoarseEnergy(CoarseEnergy):
+    """:class:`CoarseEnergy` of the terms of Eq. 5."""
+
+    def __init__(self, energy: Energy, mesh: Mesh) -> None:
+        super().__init__(energy)
+        self.mesh, self.shell = mesh, WarpShell(energy, mesh)
+
+    def modal(self, columns: Tensor) -> WarpModalEnergy:
+        """As in the base class."""
+        return WarpModalEnergy(self.shell, self.mesh, columns)
+
+    def between(
+        self, first: Tensor, second: Tensor, which: Tensor | None, t: Tensor, stiffness: Sequence[Tensor]
+    ) -> Any:
+        """As in the base class."""
+        return shell_reference(self.shell, *trees.picked((first, second), which), t, *stiffness)

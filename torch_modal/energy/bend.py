@@ -1,0 +1,86 @@
+"""Dihedral angles, the second term of Eq. 5."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.geometry.vectors import cross, inverse, norm, tiny
+
+# Eq. 5 divides by rest areas: l^2 / A has this bound, for needles; an equilateral hinge has 1.15.
+MAX_BENDING_RATIO = 1e3
+
+# Altitude of a triangle over its edge below which the triangle has no normal worth the name.
+COLLAPSED = 1e-6
+
+
+class Bend(Term):
+    r"""Dihedral angles: :math:`\beta \sum_h (\theta_h - \bar\theta_h)^2 \bar l_h^2 / \bar A_h`, the second of Eq. 5."""
+
+    periodic = True
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        """All hinges."""
+        return mesh.hinges
+
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        """The angle."""
+        return dihedral_angle(edge_vectors)
+
+    measures = measure
+
+    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
+        """Square of the edge over the area of both triangles."""
+        e, a, b = edge_vectors
+        n1, n2 = cross(e, a), cross(b, e)
+        squared, area = (e * e).sum(0), 0.5 * (norm(n1) + norm(n2))
+        floored = torch.maximum(area, squared / MAX_BENDING_RATIO)
+        return squared * inverse(floored, collapsed(e, n1) | collapsed(e, n2))
+
+    def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
+        """The short way round."""
+        return wrap_angle(measures - rest)
+
+    def pairs(self, mesh: Mesh) -> Tensor:
+        """Without that of the two tips, which have no mixed derivative."""
+        i, j, k, m = mesh.hinges.unbind(1)
+        return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
+
+    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
+        """Those of all pairs, but for the tips'."""
+        ij, ik, im, jk, jm, _ = super().blocks(edge_vectors, slope)
+        return [ij, ik.transpose(0, 1), jk.transpose(0, 1), im.transpose(0, 1), jm.transpose(0, 1)]
+
+
+def dihedral_angle(edge_vectors: Tensor) -> Tensor:
+    """Signed angle between the normals of the two triangles of a hinge, 0 where flat, in ``(-pi, pi]``.
+
+    With the edge ``e``, ``n1 = e x a`` and ``n2 = b x e``, the sine is ``(n1 x n2).e/|e| = -|e| n1.b`` and the cosine
+    ``n1.n2``, both up to the factor ``|n1||n2|``.
+
+    Args:
+        edge_vectors: ``e = x_j - x_i``, ``a = x_k - x_i`` and ``b = x_l - x_i`` of a row of
+            :attr:`~torch_modal.geometry.connectivity.Connectivity.hinges`, components second. *Shape:* ``(3, 3, ...)``.
+    """
+    e, a, b = edge_vectors
+    n1 = cross(e, a)
+    n2 = cross(b, e)
+    sine = -norm(e) * (n1 * b).sum(0)
+    cosine = (n1 * n2).sum(0)
+    # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
+    flat = collapsed(e, n1) | collapsed(e, n2)
+    return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
+
+
+def collapsed(edge: Tensor, normal: Tensor) -> Tensor:
+    """Whether a triangle on this edge has no altitude. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
+    bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
+    base = (edge * edge).sum(0)
+    return (normal * normal).sum(0) <= (bound * base) ** 2 + tiny(edge)
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """The same angle in ``[-pi, pi)``, with derivative one."""
+    return angle - 2 * math.pi * torch.floor(angle.detach() / (2 * math.pi) + 0.5)

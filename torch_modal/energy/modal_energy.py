@@ -1,0 +1,317 @@
+"""An energy of a shape that moves in an affine space: value, gradient and both Hessians in the amplitudes.
+
+First derivatives are local (3 numbers of an edge, 9 of a hinge) and are gathered through the columns of the space,
+which are the same for a whole batch.
+"""
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal import trees
+from torch_modal.autograd import traced, transformed
+from torch_modal.energy.assembly import Curvature
+from torch_modal.energy.congruence import Congruence
+from torch_modal.energy.energy import Energy, Linearised, Reference
+from torch_modal.energy.shell import ShellEnergy
+
+
+class Derivatives(NamedTuple):
+    """Derivatives of an energy in the amplitudes ``a``."""
+
+    gradient: Tensor
+    """*Shape:* ``(B, n)``."""
+    gauss_newton: Tensor
+    """``2 J^T J``, always positive semi-definite. *Shape:* ``(B, n, n)``."""
+    second_order: Tensor | None
+    """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
+    resolution: Tensor
+    """Gradient norm that the rounding of the positions alone explains. *Shape:* ``(B,)``."""
+
+
+class Placement(NamedTuple):
+    """The affine space of each sample, ``x(a) = base + columns a[:n] (+ extra a[n])``, and its reference."""
+
+    base: Tensor
+    """Components before vertices, extended. *Shape:* ``(B, 3, V)``."""
+    extra: Tensor | None
+    """An additional column of each sample. *Shape:* ``(B, 3, V)``."""
+    reference: Reference
+
+
+class _Tables(nn.Module):
+    """The columns as elements and as pairs of vertices see them. *Shape:* ``(P, 2), (n, 3, V)``."""
+
+    def __init__(self, energy: Energy, pairs: Tensor, columns: Tensor) -> None:
+        super().__init__()
+        self.congruence = Congruence(pairs, columns.transpose(0, 1))
+        of_vertices = columns.permute(2, 1, 0).contiguous()
+        self.n_terms = len(energy.parts)
+        for i, part in enumerate(energy.parts):
+            edge_vectors = None if part.term.total else _edge_vectors_of_rows(of_vertices, part.corners)
+            self.register_buffer(f"edge_vectors_{i}", edge_vectors, persistent=False)
+
+    @property
+    def edge_vectors(self) -> list[Tensor | None]:
+        """Of each term's elements in each direction; None of a total. *Shape of each:* ``(M, 3(n-1), n)``."""
+        return [getattr(self, f"edge_vectors_{i}") for i in range(self.n_terms)]
+
+
+class ModalEnergy(nn.Module):
+    """An energy in the amplitudes of an affine space.
+
+    This is what :class:`torch_modal.GaussNewtonStep` steps on; see there for an example.
+
+    Args:
+        energy: The energy on the mesh that the columns live on.
+        columns: Directions of the space, for example vibration modes. *Shape:* ``(n, V, 3)``.
+    """
+
+    columns: Tensor
+
+    def __init__(self, energy: Energy | ShellEnergy, columns: Tensor) -> None:
+        super().__init__()
+        #: Whether the shapes are in the caller's coordinates, as the anchors of terms are.
+        self.unscaled = isinstance(energy, ShellEnergy)
+        self.energy = energy.energy if isinstance(energy, ShellEnergy) else energy
+        rows = self.energy.extend(columns.movedim(-1, 0))
+        self.curvature = Curvature(self.energy)
+        self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        self._tables = self._made_tables()
+
+    def _made_tables(self) -> "_Tables":
+        return _Tables(self.energy, self.curvature.pairs, self.columns)
+
+    @property
+    def tables(self) -> "_Tables":
+        """The tables through which derivatives are gathered."""
+        return self._tables
+
+    def place(
+        self, base: Tensor, reference: Reference, extra: Tensor | None = None, anchors: Tensor | None = None
+    ) -> Placement:
+        """The space of each sample.
+
+        Args:
+            base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
+            reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.against`.
+            extra: One more direction, of each sample's own. *Shape:* ``(B, V, 3)``.
+            anchors: Of the energy's terms, where there are some; by default those of a
+                :class:`torch_modal.ShellEnergy` as they are. *Shape:* ``(B, P, 3)``.
+        """
+        if anchors is None and self.unscaled and self.energy.anchors is not None:
+            anchors = self.energy.anchors.to(base)[None]
+        return Placement(self._extended(base, anchors), None if extra is None else self._extended(extra), reference)
+
+    def _extended(self, x: Tensor, anchors: Tensor | None = None) -> Tensor:
+        fixed = None if anchors is None else anchors.movedim(-1, 0)
+        return self.energy.extend(x.movedim(-1, 0), fixed).movedim(0, -2)
+
+    def rows(self, a: Tensor, placement: Placement) -> Tensor:
+        """The shape ``x(a)``, components first. *Shape:* ``(..., B, n) -> (3, ..., B, V)``."""
+        n = len(self.columns)
+        x = placement.base + (a[..., :n] @ self.columns.flatten(1)).unflatten(-1, (3, -1))
+        if placement.extra is not None:
+            x = x + a[..., n, None, None] * placement.extra
+        return x.movedim(-2, 0).contiguous()
+
+    def value(self, a: Tensor, placement: Placement) -> Tensor:
+        """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
+        return self.energy.value(self.rows(a, placement), placement.reference)
+
+    def base_value(self, placement: Placement) -> Tensor:
+        """Energy at amplitudes of zero. *Shape:* ``(..., B)``."""
+        return self.energy.value(placement.base.movedim(-2, 0).contiguous(), placement.reference)
+
+    def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
+        """Gradient and Hessians at ``a``.
+
+        Args:
+            a: Amplitudes. *Shape:* ``(B, n)``.
+            placement: The space of each sample and its reference.
+            second_order: Whether the term beyond Gauss-Newton is wanted.
+        """
+        energy = self.energy
+        x = self.rows(a, placement)
+        at = energy.linearise(x, placement.reference)
+        extra = None if placement.extra is None else placement.extra.transpose(0, 1)
+        gradient, gauss_newton = [], []
+        for part, one, columns in zip(energy.parts, at, self.tables.edge_vectors, strict=True):
+            if columns is None:
+                slope, product = self._of_total(one, extra)
+            else:
+                own = None if extra is None else part.edge_vectors(extra).flatten(0, 1)
+                slope, product = _normal_equations(one, columns, own)
+            gradient.append(slope)
+            gauss_newton.append(product)
+        inner = reduce(torch.add, gauss_newton)
+        stiffness = sum(one.curvature.sum(-1) for one in at)
+        stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
+        rounding = torch.finfo(x.dtype).eps * x.abs().amax((0, -1))
+        curved = self._curved(at, extra) if second_order else None
+        return Derivatives(reduce(torch.add, gradient), inner, curved, rounding * (stiffest * stiffness).sqrt())
+
+    def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        # Autograd computes the gradient in half of the time that the derivatives of all elements take.
+        given = a, *trees.leaves(placement)
+        if torch.is_inference_mode_enabled() or traced(a) or any(transformed(x) or x.is_inference() for x in given):
+            at = self.energy.linearise(self.rows(a, placement), placement.reference)
+            gradient = along_columns(self.energy.gradient(at).transpose(0, 1), self.columns, placement.extra)
+            return self.energy.value_at(at, placement.reference), gradient
+        with torch.enable_grad():
+            leaf = a.detach().requires_grad_()
+            value = self.value(leaf, placement)
+            (gradient,) = torch.autograd.grad(value.sum(), leaf)
+        return value.detach(), gradient
+
+    def second_order(self, a: Tensor, placement: Placement) -> Tensor:
+        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
+        at = self.energy.linearise(self.rows(a, placement), placement.reference)
+        return self._curved(at, None if placement.extra is None else placement.extra.transpose(0, 1))
+
+    def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
+        """Gradient of ``direction . dE/da`` in all that the placement holds, at amplitudes that stay.
+
+        Args:
+            a: Amplitudes. *Shape:* ``(B, n)``.
+            direction: In the amplitudes, of each sample. *Shape:* ``(B, n)``.
+            placement: The space of each sample and its reference.
+
+        Returns:
+            One gradient in the place of each tensor.
+        """
+        energy, n = self.energy, len(self.columns)
+        at = energy.linearise(self.rows(a, placement), placement.reference)
+        moved = self.rows(direction, placement._replace(base=torch.zeros_like(placement.base)))
+        rates = energy.rates(at, moved)
+        pushed = energy.gather(at, [one.curvature * rate for one, rate in zip(at, rates, strict=True)])
+        pushed = pushed + self.curvature.push(self.curvature.of(energy, at), moved)
+        to_base, to_extra = pushed.transpose(0, 1), None
+        if placement.extra is not None:
+            own = energy.gradient(at).transpose(0, 1)
+            to_extra = a[:, n, None, None] * to_base + direction[:, n, None, None] * own
+        rates = [rate[:, None] for rate in rates]
+        parts = zip(energy.parts, placement.reference.weights, at, rates, strict=True)
+        to_measures = [-2 * part.acting(weight, one.difference) * rate for part, weight, one, rate in parts]
+        to_weights = [2 * rate * one.difference for one, rate in zip(at, rates, strict=True)]
+        constant = placement.reference.constant
+        to_constant = torch.zeros_like(constant) if isinstance(constant, Tensor) else constant
+        return Placement(to_base, to_extra, Reference(tuple(to_measures), tuple(to_weights), to_constant))
+
+    def _of_total(self, one: Linearised, extra: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Contribution of a total to the gradient and to Gauss-Newton's Hessian."""
+        row = one.gradients.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
+        if extra is not None:
+            row = torch.cat([row, (one.gradients * extra).sum((0, -1))[:, None]], -1)
+        return one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
+
+    def _curved(self, at: Sequence[Linearised], extra: Tensor | None) -> Tensor:
+        """The second-order term. *Shape:* ``(B, n, n)``."""
+        blocks = self.curvature.of(self.energy, at)
+        inner = self.tables.congruence(blocks)
+        if extra is None:
+            return inner
+        pushed = self.curvature.push(blocks, extra)
+        border = pushed.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
+        return _bordered(inner, border, (extra * pushed).sum((0, -1)))
+
+
+def _edge_vectors_of_rows(values: Tensor, corners: Tensor) -> Tensor:
+    """:meth:`torch_modal.energy.energy.OnMesh.edge_vectors` of rows that lie together in memory.
+
+    *Shape:* ``(V, 3, n), (c, M) -> (M, 3 (c-1), n)``.
+    """
+    first, *others = (values.index_select(0, corner) for corner in corners)
+    return torch.cat([other - first for other in others], 1)
+
+
+def _normal_equations(one: Linearised, columns: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Contribution of one term to the gradient and to Gauss-Newton's Hessian.
+
+    Args:
+        one: The term.
+        columns: Edge vectors in each direction of the space. *Shape:* ``(M, c, n)``.
+        extra: Edge vectors in each sample's own direction. *Shape:* ``(c, B, M)``.
+
+    Returns:
+        *Shape:* ``(B, n)``, ``(B, n, n)``; with an own direction, one more of each.
+    """
+    # Rows of the Jacobian are scaled before they pass through the columns, where they are few numbers.
+    root = one.curvature.clamp_min(torch.finfo(one.curvature.dtype).tiny).sqrt()
+    local = root * one.gradients.flatten(0, 1)
+    # Products of tiny matrices are fast in one dense block only: any other layout is copied matrix by matrix.
+    jacobian = (local.permute(2, 1, 0).contiguous() @ columns).transpose(0, 1)
+    residual = one.slope / root
+    inner = jacobian.mT @ jacobian
+    if extra is None:
+        return (jacobian.mT @ residual[..., None]).squeeze(-1), inner
+    # The own direction is one row and column more; put beside the others, it would copy them all.
+    own = (local * extra).sum(0)
+    gradient, border = (jacobian.mT @ torch.stack([residual, own], -1)).unbind(-1)
+    last = (own * residual).sum(-1, keepdim=True)
+    return torch.cat([gradient, last], -1), _bordered(inner, border, (own * own).sum(-1))
+
+
+def along_columns(x: Tensor, columns: Tensor, extra: Tensor | None) -> Tensor:
+    """Inner products with columns and an extra one. *Shape:* ``(B, ...), (m, ...), (B, ...) -> (B, n)``."""
+    found = x.flatten(1) @ columns.flatten(1).mT
+    return found if extra is None else torch.cat([found, (x * extra).flatten(1).sum(-1, keepdim=True)], -1)
+
+
+def _bordered(inner: Tensor, border: Tensor, corner: Tensor) -> Tensor:
+    """A symmetric matrix with one row and column more. *Shape:* ``(B, n, n), (B, n), (B,) -> (B, n+1, n+1)``."""
+    upper = torch.cat([inner, border[..., None]], -1)
+    lower = torch.cat([border, corner[:, None]], -1)
+    return torch.cat([upper, lower[:, None]], 1)
+
+
+class SumOfEnergies(nn.Module):
+    """Several energies of the same amplitudes.
+
+    Args:
+        parts: The energies, of one precision or several; a placement of the sum has one of each.
+    """
+
+    def __init__(self, *parts: ModalEnergy) -> None:
+        super().__init__()
+        self.parts: Any = nn.ModuleList(parts)
+
+    def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
+        """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
+        return reduce(torch.add, [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)])
+
+    def base_value(self, placement: Sequence[Placement]) -> Tensor:
+        """Energy at amplitudes of zero. *Shape:* ``(..., B)``."""
+        return reduce(torch.add, [part.base_value(own) for part, own in self._each(placement)])
+
+    def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
+        """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
+        found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
+        sums = (None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True))
+        return Derivatives(*sums)  # type: ignore[arg-type]
+
+    def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        found = [part.value_and_gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        return reduce(torch.add, [value for value, _ in found]), reduce(torch.add, [gradient for _, gradient in found])
+
+    def second_order(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
+        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
+        return reduce(torch.add, [part.second_order(a.to(own.base.dtype), own) for part, own in self._each(placement)])
+
+    def pull_back(self, a: Tensor, direction: Tensor, placement: Sequence[Placement]) -> list[Placement]:
+        """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
+        return [
+            part.pull_back(a.to(own.base.dtype), direction.to(own.base.dtype), own)
+            for part, own in self._each(placement)
+        ]
+
+    def _each(self, placement: Sequence[Placement]) -> list[tuple[ModalEnergy, Placement]]:
+        return list(zip(self.parts, placement, strict=True))  # an iterator, torch 2.8 cannot compile

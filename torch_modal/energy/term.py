@@ -1,0 +1,186 @@
+r"""Terms of an energy: measures of the elements of a mesh, and their weights.
+
+A term has the energy :math:`\sum_m k_m w_m (q_m - \bar q_m)^2` over its elements ``m``, with a measure ``q`` of each,
+its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. All that a term must say is
+which elements it sees and what it measures on one of them: derivatives then come from ``torch.func``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import jacrev, vmap
+
+from torch_modal.geometry.connectivity import Connectivity
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """The vertices that elements may be made of.
+
+    Attributes:
+        connectivity: Of the faces.
+        n_anchors: How many :attr:`Term.anchors` other terms have before those of this one.
+    """
+
+    connectivity: Connectivity
+    n_anchors: int = 0
+
+    @property
+    def faces(self) -> Tensor:
+        """*Shape:* ``(F, 3)``."""
+        return torch.tensor(self.connectivity.faces)
+
+    @property
+    def edges(self) -> Tensor:
+        """*Shape:* ``(E, 2)``."""
+        return torch.tensor(self.connectivity.edges)
+
+    @property
+    def hinges(self) -> Tensor:
+        """Rows of :attr:`torch_modal.geometry.connectivity.Connectivity.hinges`. *Shape:* ``(H, 4)``."""
+        return torch.tensor(self.connectivity.hinges)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, V."""
+        return self.connectivity.n_vertices
+
+    @property
+    def centre(self) -> int:
+        """The number that the mean of all vertices of faces has as a vertex."""
+        return self.n_vertices
+
+    @property
+    def first_anchor(self) -> int:
+        """The number that the first of the term's own :attr:`Term.anchors` has as a vertex."""
+        return self.n_vertices + 1 + self.n_anchors
+
+    @classmethod
+    def of(cls, faces: Tensor, n_vertices: int) -> "Mesh":
+        """The mesh of these faces."""
+        return cls(Connectivity(faces.detach().cpu().long().numpy().copy(), n_vertices))
+
+
+class Term(nn.Module):
+    """One kind of measure on a mesh, as a term of an energy.
+
+    A term of your own is a class with two methods::
+
+        class Area(tm.Term):
+            def elements(self, mesh):
+                return mesh.faces
+
+            def measure(self, edge_vectors):
+                return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
+
+    and is passed as ``tm.Objective(terms=(Area(5.0),))``. Measures are taken at a size of 100, like
+    those of Eq. 5.
+
+    Args:
+        stiffness: ``k``: a number, or a tensor or parameter whose last dimension counts the elements, or is 1, and
+            whose others broadcast against the samples. *Shape:* ``()``, ``(..., M)`` or ``(..., 1)``.
+    """
+
+    total = False
+    """Whether the measures of all elements add up to one, such as a volume."""
+    periodic = False
+    """Whether measures come round, such as angles."""
+    one_sided = False
+    """Whether a difference of zero stands for all on one side of the rest, where nothing is stiff either."""
+    sampled = False
+    """Whether elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
+    stiffness: Any
+
+    def __init__(self, stiffness: float | Tensor = 1.0) -> None:
+        super().__init__()
+        if isinstance(stiffness, Tensor) and not isinstance(stiffness, nn.Parameter):
+            self.register_buffer("stiffness", stiffness)
+        else:
+            self.stiffness = stiffness
+
+    # ------------------------------------------------------------------------------------------- what a term must say
+    def elements(self, mesh: Mesh) -> Tensor:
+        """The vertices of each element. *Shape:* ``(M, n)``, with n of 2 or more."""
+        raise NotImplementedError
+
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        """The measure of one element, of the vectors from its first vertex to the others. *Shape:* ``(n-1, 3) -> ()``.
+
+        Only operations that ``torch.func`` can differentiate twice.
+        """
+        raise NotImplementedError
+
+    # -------------------------------------------------------------------------------------------- what a term may say
+    @property
+    def anchors(self) -> Tensor | None:
+        """Points of the caller's coordinates that elements may have as vertices, and that do not move.
+
+        *Shape:* ``(P, 3)``.
+        """
+        return None
+
+    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
+        """Weights ``w`` of elements at rest. *Shape:* ``(n-1, 3, ..., M), (..., M) -> (..., M)``; one if total."""
+        return torch.ones_like(measures)
+
+    def at_rest(self, measures: Tensor) -> Tensor:
+        """The measures that cost nothing, from those of a rest shape. *Shape:* ``(..., M) -> (..., M)``."""
+        return measures
+
+    def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
+        """How far measures are from others. *Shape:* ``(..., M), (..., M) -> (..., M)``."""
+        return measures - rest
+
+    # ---------------------------------------------- all elements at once; written out by the terms that have to be fast
+    def measures(self, edge_vectors: Tensor) -> Tensor:
+        """The measure of each element. *Shape:* ``(n-1, 3, ..., M) -> (..., M)``."""
+        return self._each(self.measure, edge_vectors)
+
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
+        """Gradients of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
+        return self._each(jacrev(self.measure), edge_vectors)
+
+    def pairs(self, mesh: Mesh) -> Tensor:
+        """Pairs of vertices that the second derivatives couple. *Shape:* ``(N, 2)``."""
+        corners = self.elements(mesh).unbind(1)
+        n = len(corners)
+        return torch.cat([torch.stack([corners[s], corners[t]], 1) for s in range(n) for t in range(s + 1, n)])
+
+    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
+        r"""The blocks of :math:`\sum_m s_m \nabla^2 q_m` between the two vertices of each of :meth:`pairs`.
+
+        Args:
+            edge_vectors: *Shape:* ``(n-1, 3, B, M)``.
+            slope: ``s``. *Shape:* ``(B, M)``, or ``(B, 1)``.
+
+        Returns:
+            By row and column, in parts that together have all pairs in their order. *Shape of each:* ``(3, 3, B, ·)``.
+        """
+        hessian = slope * self._each(jacrev(jacrev(self.measure)), edge_vectors)
+        # Translations change nothing: the first vertex has what is left.
+        first = -hessian.sum(0).movedim(1, 0)
+        n = len(edge_vectors)
+        others = [hessian[s, :, t] for s in range(n) for t in range(s + 1, n)]
+        return [*first, *others]
+
+    def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
+        """Stiffness that stretched elements of two vertices have across; None for elements of more.
+
+        Args:
+            edge_vectors: *Shape:* ``(1, 3, B, M)``.
+            slope: First derivative of the energy in each measure. *Shape:* ``(B, M)``.
+            curvature: Second derivative. *Shape:* ``(B, M)``.
+        """
+        return None
+
+    @staticmethod
+    def _each(function: Any, edge_vectors: Tensor) -> Tensor:
+        """A function of one element on all, which stay the last dimensions."""
+        flat = edge_vectors.flatten(2)
+        # vmap needs one element at least.
+        each = flat if flat.shape[-1] else flat.new_ones(*flat.shape[:2], 1)
+        out = vmap(function, in_dims=2, out_dims=-1)(each)[..., : flat.shape[-1]]
+        return out.unflatten(-1, edge_vectors.shape[2:])
