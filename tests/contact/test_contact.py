@@ -26,7 +26,6 @@ from torch_modal.contact.splines import splines, through
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.contact import Contact
 from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.position import Position
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
@@ -89,15 +88,15 @@ def test_term_has_the_derivatives_of_torch_func(generator: torch.Generator) -> N
     torch.testing.assert_close(term.gradients(edge_vectors), Term.gradients(term, edge_vectors), rtol=1e-12, atol=1e-12)
 
 
-def test_positions_pull_to_places(generator: torch.Generator) -> None:
-    x, places = torch.randn(2, 2, 3, 5, dtype=DOUBLE, generator=generator)
-    weights = torch.rand(2, 5, dtype=DOUBLE, generator=generator)
-    energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [2, 3, 4]]), 5), [Position(5)])
-    rows = x.transpose(0, 1).contiguous()
-    reference = Reference((places.flatten(1)[:, None],), (weights.repeat(1, 3)[:, None],), 0.0)
-    at = energy.linearise(energy.extend(rows), reference)
-    torch.testing.assert_close(energy.value_at(at, reference), (weights * ((x - places) ** 2).sum(1)).sum(1))
-    torch.testing.assert_close(energy.fold(energy.gradient(at)), (2 * weights[:, None] * (x - places)).transpose(0, 1))
+def test_a_pull_has_the_derivatives_of_its_value(generator: torch.Generator) -> None:
+    x, places, field = torch.randn(3, 2, 5, 3, dtype=DOUBLE, generator=generator)
+    pull = Pull(places, torch.rand(5, dtype=DOUBLE, generator=generator))
+    at = pull.at(x)
+    torch.testing.assert_close(at.value, (pull.weights * ((x - places) ** 2).sum(-1)).sum(-1))
+    gradient, product = torch.func.jvp(torch.func.grad(lambda x: pull.value(x).sum()), (x,), (field,))
+    torch.testing.assert_close((at.gradient, at.product(field)), (gradient, product))
+    unit = torch.tensor([1.0, 0, 0], dtype=DOUBLE).expand_as(x)
+    torch.testing.assert_close(at.diagonal[..., 0], at.product(unit)[..., 0])
 
 
 def test_term_is_one_sided(generator: torch.Generator) -> None:
