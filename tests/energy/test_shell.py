@@ -14,6 +14,9 @@ from torch.func import functional_call, grad, vmap
 
 from torch_modal.energy.bend import Bend, dihedral_angle, wrap_angle
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.energy.stretch import Stretch
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.energy.volume import Volume
 
 TRIANGLE = torch.tensor([[0, 1, 2]])
 HINGE = torch.tensor([[0, 1, 2], [1, 0, 3]])
@@ -234,6 +237,14 @@ def test_gradcheck_of_an_open_surface(pair: tuple[Tensor, Tensor, Tensor]) -> No
     x, rest, faces = (pair[0] * 0.1).requires_grad_(), (pair[1] * 0.1).requires_grad_(), pair[2][6:]
     shell = ShellEnergy(faces, 0.0, 0.0, 30.0)
     assert gradcheck(shell, (x, rest), atol=1e-6)
+
+
+@pytest.mark.parametrize("term", [Stretch(), Bend(), Volume()], ids=lambda term: type(term).__name__)
+def test_closed_forms_are_the_gradients(term: Term, generator: torch.Generator) -> None:
+    n = term.elements(Mesh.of(torch.tensor([[0, 1, 2], [0, 2, 3]]), 4)).shape[1] - 1
+    edge_vectors = torch.randn(n, 3, 50, dtype=torch.float64, generator=generator)
+    truth = Term.gradients(term, edge_vectors)
+    torch.testing.assert_close(term.gradients(edge_vectors), truth, atol=1e-10, rtol=1e-10)
 
 
 def test_gradcheck_of_the_angle_through_half_a_turn() -> None:

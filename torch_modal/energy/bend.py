@@ -43,6 +43,10 @@ class Bend(Term):
         """The short way round."""
         return wrap_angle(measures - rest)
 
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
+        """In closed form: by ``torch.func``, an in-between in torch takes 1.2 to 1.4 times as long."""
+        return dihedral_gradient(edge_vectors)
+
     def pairs(self, mesh: Mesh) -> Tensor:
         """Without that of the two tips, which have no mixed derivative."""
         i, j, k, m = mesh.hinges.unbind(1)
@@ -72,6 +76,26 @@ def dihedral_angle(edge_vectors: Tensor) -> Tensor:
     # atan2(0, 0) has a NaN gradient; a hinge with a collapsed triangle is flat by convention.
     flat = collapsed(e, n1) | collapsed(e, n2)
     return torch.atan2(torch.where(flat, 0, sine), torch.where(flat, 1, cosine))
+
+
+def dihedral_gradient(edge_vectors: Tensor) -> Tensor:
+    """Gradient of :func:`dihedral_angle` in closed form: ``-|e| n / |n|^2`` at either tip, the edge by balance.
+
+    Args:
+        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
+
+    Returns:
+        Zero where a triangle is collapsed. *Shape:* ``(3, 3, ...)``.
+    """
+    e, a, b = edge_vectors
+    n1 = cross(e, a)
+    n2 = cross(b, e)
+    flat = collapsed(e, n1) | collapsed(e, n2)
+    length = norm(e)
+    to_a = n1 * (-length * inverse((n1 * n1).sum(0), flat))
+    to_b = n2 * (-length * inverse((n2 * n2).sum(0), flat))
+    to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * inverse((e * e).sum(0), flat)
+    return torch.stack([to_e, to_a, to_b])
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:

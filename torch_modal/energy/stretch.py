@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.energy.term import Mesh, Term
-from torch_modal.geometry.vectors import inverse, norm
+from torch_modal.geometry.vectors import inverse, norm, tiny
 
 # Eq. 5 divides by rest lengths: edges without one, as a part of the mean, have no say.
 MIN_RELATIVE_LENGTH = 1e-6
@@ -29,6 +29,11 @@ class Stretch(Term):
     def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
         """One over the length."""
         return inverse(measures, measures <= MIN_RELATIVE_LENGTH * measures.mean(-1, keepdim=True))
+
+    def gradients(self, edge_vectors: Tensor) -> Tensor:
+        """Unit vectors, 0 where there is no length."""
+        squared = (edge_vectors * edge_vectors).sum(1, keepdim=True)
+        return edge_vectors * inverse(squared.sqrt(), squared <= tiny(edge_vectors))
 
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """Transverse stiffness of a stretched string; smoothly near zero under compression."""
