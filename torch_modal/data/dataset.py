@@ -149,14 +149,8 @@ class ShapeDataset(Dataset[Sample]):
         turn = self.epoch * self.samples_per_set
         start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
         drawn = [self.transform.forward_parameters(1, space, self._generator(index)) for index in indices]
-        batch = pool.rows(start)
-        alike: dict[tuple[int, ...], list[int]] = {}  # samples with the same transforms in the same order
-        for row, own in enumerate(drawn):
-            alike.setdefault(self.transform.order(own), []).append(row)
-        for rows in alike.values():
-            params = [_joined(each) for each in zip(*(drawn[row] for row in rows), strict=True)]
-            index = torch.tensor(rows)
-            batch = batch.put(index, self.transform.transform(batch.rows(index), params, space, pool))
+        params = [_joined(each) for each in zip(*drawn, strict=True)]
+        batch = self.transform.transform(pool.rows(start), params, space, pool)
         parts = {"vertices": batch.shapes}
         if self.with_normals:
             parts["normals"] = vertex_normals(batch.shapes, space.faces)

@@ -8,7 +8,6 @@ from kornia.geometry.conversions import quaternion_to_axis_angle
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torch_modal.autograd import lasting
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.rigid import RigidMotion
@@ -50,7 +49,6 @@ class RandomRigidMotion(ShapeAugmentation):
         if translation < 0:
             raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
         self.translation = translation
-        self._matrix: Tensor | None = None
 
     def extra_repr(self) -> str:
         """Settings."""
@@ -76,47 +74,6 @@ class RandomRigidMotion(ShapeAugmentation):
         """Move each shape."""
         given = None if batch.given is None else torch.zeros_like(batch.given)
         return batch._replace(shapes=_motion(batch.shapes, params).apply(batch.shapes), given=given)
-
-    def transform(
-        self,
-        batch: ShapeBatch,
-        params: Parameters,
-        space: ShapeSpace | None = None,
-        pool: ShapeBatch | None = None,
-    ) -> ShapeBatch:
-        """Move the shapes that the parameters select, and set :attr:`transform_matrix`."""
-        out = super().transform(batch, params, space, pool)
-        self._matrix = lasting(self.compute_transformation)(batch.shapes, params)
-        return out
-
-    @property
-    def transform_matrix(self) -> Tensor | None:
-        """The last call, ``y = R x + s``, as homogeneous matrices; None before. *Shape:* ``(B, 4, 4)``."""
-        return self._matrix
-
-    def compute_transformation(self, shapes: Tensor, params: Parameters) -> Tensor:
-        """Homogeneous matrices of the motions of shapes; identity for shapes that are not transformed.
-
-        Args:
-            shapes: *Shape:* ``(B, V, 3)``.
-            params: From :meth:`forward_parameters`, or :attr:`params`.
-
-        Returns:
-            *Shape:* ``(B, 4, 4)``.
-        """
-        own = self._own_rows(shapes, params)
-        motion = _motion(shapes, own)
-        stay = torch.eye(4, dtype=shapes.dtype, device=shapes.device).expand(len(shapes), 4, 4)
-        shift = motion.target - (motion.rotation @ motion.source[..., None])[..., 0]
-        moved = torch.cat([torch.cat([motion.rotation, shift[..., None]], -1), stay[:, 3:]], 1)
-        return torch.where(own["batch_prob"][:, None, None], moved, stay)
-
-    def undo(self, shapes: Tensor, params: Parameters) -> Tensor:
-        """Move back. The translation is in units of the rotated-back shape's diagonal."""
-        rotation = exp(params["rotation"])
-        centre = shapes.mean(1)
-        back = (shapes - centre[:, None]) @ rotation
-        return back + (centre - params["translation"] * _diagonal(back))[:, None]
 
 
 def _motion(x: Tensor, params: Parameters) -> RigidMotion:
