@@ -96,6 +96,20 @@ def add_common(
     add_debug(group)
 
 
+def caching(args: argparse.Namespace) -> dict[str, Any]:
+    """Options of computations that the group "files and messages" sets."""
+    return {
+        "cache_dir": args.cache_dir,
+        "cache": not args.no_cache,
+        "progress": False if args.quiet else None,
+    }
+
+
+def reporter(args: argparse.Namespace) -> Callable[[str], None]:
+    """Print a line at once, unless --quiet."""
+    return (lambda _: None) if args.quiet else (lambda line: print(line, flush=True))
+
+
 def add_debug(group: Any) -> None:
     """``--debug``, which every command has."""
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")

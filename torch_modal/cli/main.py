@@ -92,6 +92,12 @@ example:
   torch-modal cache --clear"""
 
 
+EXPECTED = (ValueError, OSError, MemoryError, ImportError)
+"""Errors of input, files and machine, which become one line; all others are bugs and show their traceback."""
+EXPECTED_NAMES = ("TetrahedralizationError", "ModalAnalysisError")
+"""Further ones, whose modules are heavy."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -125,24 +131,11 @@ def _run(args: argparse.Namespace) -> int:
     except BrokenPipeError:
         raise
     except Exception as error:
-        if args.debug or not isinstance(error, _expected_errors()):
+        expected = isinstance(error, EXPECTED) or type(error).__name__ in EXPECTED_NAMES
+        if args.debug or not expected:
             raise
         say(f"error: {_one_line(error)}")
         return 1
-
-
-def _expected_errors() -> tuple[type[Exception], ...]:
-    """Errors of input, files and machine; all others are bugs and show their traceback."""
-    expected: list[type[Exception]] = [ValueError, OSError, MemoryError, ImportError]
-    # Their modules are heavy; one that was not imported raised nothing.
-    for module, name in (
-        ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
-        ("torch_modal.precompute.eigen", "ModalAnalysisError"),
-        ("torch_modal.errors", "MissingPackageError"),
-    ):
-        if module in sys.modules:
-            expected.append(getattr(sys.modules[module], name))
-    return tuple(expected)
 
 
 def _one_line(error: BaseException) -> str:
