@@ -115,6 +115,8 @@ class ShapeAugmentation(nn.Module):
 
     uses_keyframes = True
     """Whether the transform uses the nearest key-frame of a shape."""
+    shown: tuple[str, ...] = ()
+    """Settings of a subclass that its ``repr`` shows."""
 
     @property
     def params(self) -> Parameters:
@@ -123,7 +125,7 @@ class ShapeAugmentation(nn.Module):
 
     def extra_repr(self) -> str:
         """Settings, as kornia shows them."""
-        return f"p={self.p}, same_on_batch={self.same_on_batch}, keepdim={self.keepdim}"
+        return ", ".join(f"{name}={getattr(self, name)}" for name in (*self.shown, "p", "same_on_batch", "keepdim"))
 
     # ------------------------------------------------------------------------------------------------ for subclasses
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:

@@ -5,7 +5,6 @@ from typing import Any
 
 import torch
 from kornia.geometry.conversions import quaternion_to_axis_angle
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
@@ -30,6 +29,7 @@ class RandomRigidMotion(ShapeAugmentation):
     """
 
     uses_keyframes = False
+    shown = ("degrees", "axis", "translation")
 
     def __init__(
         self,
@@ -50,10 +50,6 @@ class RandomRigidMotion(ShapeAugmentation):
             raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
         self.translation = translation
 
-    def extra_repr(self) -> str:
-        """Settings."""
-        return f"degrees={self.degrees}, axis={self.axis}, translation={self.translation}, {super().extra_repr()}"
-
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
         """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
         direction, angle = normal(n, generator, 4), uniform(n, generator)
@@ -72,16 +68,8 @@ class RandomRigidMotion(ShapeAugmentation):
         self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
     ) -> ShapeBatch:
         """Move each shape."""
+        x = batch.shapes
+        centre, diagonal = x.mean(1), (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
+        motion = RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * diagonal)
         given = None if batch.given is None else torch.zeros_like(batch.given)
-        return batch._replace(shapes=_motion(batch.shapes, params).apply(batch.shapes), given=given)
-
-
-def _motion(x: Tensor, params: Parameters) -> RigidMotion:
-    """The motion of each shape about the mean of its vertices. *Shape:* ``(B, V, 3)``."""
-    centre = x.mean(1)
-    return RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * _diagonal(x))
-
-
-def _diagonal(x: Tensor) -> Tensor:
-    """Of the bounding boxes, a constant. *Shape:* ``(B, 1)``."""
-    return (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
+        return batch._replace(shapes=motion.apply(x), given=given)
