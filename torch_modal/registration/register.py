@@ -193,7 +193,9 @@ class _RegistrationProblem:
         if not len(self.marks):
             return np.zeros((0, 2), dtype=np.int64)
         both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
-        return np.stack([shape.nearest(at, _normals(surface, at)) for shape, surface, at in both], axis=1)
+        return np.stack(
+            [shape.nearest(at, surface.face_normals[surface.closest(at).faces]) for shape, surface, at in both], axis=1
+        )
 
     def _agrees(self, found: Map) -> bool:
         """Whether a map agrees with all landmarks."""
@@ -210,7 +212,8 @@ class _RegistrationProblem:
         places = self.second.coarse.vertices
         kept = rated[:1]
         for found, distortion in rated[1:]:
-            difference = min(_difference(places[found.vertices], places[one.vertices]) for one, _ in kept)
+            apart = (np.linalg.norm(places[found.vertices] - places[one.vertices], axis=1) for one, _ in kept)
+            difference = min(np.percentile(distances, 98) for distances in apart)
             lead = (found.score - distortion) - (rated[0][0].score - rated[0][1])
             if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and difference > _SAME:
                 kept.append((found, distortion))
@@ -322,14 +325,6 @@ class _RegistrationProblem:
             target_corners=torch.from_numpy(corners),
             warnings=said,
         )
-
-
-def _difference(places: FloatArray, others: FloatArray) -> float:
-    return float(np.percentile(np.linalg.norm(places - others, axis=1), 98))
-
-
-def _normals(surface: MeshSurface, points: FloatArray) -> FloatArray:
-    return surface.face_normals[surface.closest(points).faces]
 
 
 def _placed(x: FloatArray, places: FloatArray, weights: FloatArray) -> FloatArray:
