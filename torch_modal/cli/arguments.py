@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 OVERWRITE = "replace files that exist (default: refuse)"
@@ -37,6 +38,11 @@ def times(text: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
+
+
+def add_out(sub: argparse.ArgumentParser, metavar: str, text: str) -> None:
+    """``--out``, which must be given."""
+    sub.add_argument("--out", type=Path, required=True, metavar=metavar, help=text)
 
 
 def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:

@@ -6,7 +6,6 @@ Each checks its output paths before any heavy import and any work.
 import argparse
 import re
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,6 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("subdivide needs two key-frames or more")
     if args.contact and args.preset == "paper":
         args.fail("--contact needs one shape for each in-between; --preset paper has two")
-    if args.mu is not None and args.preset != "paper":
-        args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
     check_name(args, "--picture", args.picture, PICTURES)
@@ -52,8 +49,6 @@ def subdivide(args: argparse.Namespace) -> None:
     welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
     bases = tm.extract_bases(welded.keyframes, welded.faces, args.modes, **_precompute_options(args))
-    objective, solver = tm.PRESETS[args.preset]
-    objective = objective if args.mu is None else replace(objective, mu=args.mu)
     solved = tm.subdivide(
         welded.keyframes,
         welded.faces,
@@ -62,8 +57,7 @@ def subdivide(args: argparse.Namespace) -> None:
         **spread,
         smooth=args.smooth,
         progress=progress,
-        objective=objective,
-        solver=replace(solver, polish=args.polish),
+        preset=args.preset,
         contact=args.contact,
     )
     frames = welded.scatter(solved)
@@ -112,7 +106,7 @@ def modes(args: argparse.Namespace) -> None:
     import torch_modal as tm
 
     keyframes, faces = tm.load_keyframes(args.meshes)
-    bases = tm.extract_bases(keyframes, faces, args.modes, form=args.form, **_precompute_options(args))
+    bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
     report = reporter(args)
     shown = min(8, args.modes)
     report(f"{'lowest elastic modes':24s}" + "".join(f"{i + 1:>10d}" for i in range(shown)))

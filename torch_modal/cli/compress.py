@@ -4,7 +4,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from torch_modal.cli.arguments import caching, number, reporter
+from torch_modal.cli.arguments import add_out, caching, number, reporter
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
@@ -45,7 +45,7 @@ def part(text: str) -> float:
 def add_compress(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``compress`` besides the common ones."""
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="frames, two or more, in their order")
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE.tms", help="the file")
+    add_out(sub, "FILE.tms", "the file")
     sub.add_argument(
         "--error",
         type=part,
@@ -63,13 +63,7 @@ def add_compress(sub: argparse.ArgumentParser) -> None:
 def add_expand(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``expand`` besides the common ones."""
     sub.add_argument("file", type=Path, metavar="FILE.tms", help="a file that compress wrote")
-    sub.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE_OR_FOLDER",
-        help=f"an animation ({', '.join(ANIMATION_FORMATS)}), or a folder for numbered frames",
-    )
+    add_out(sub, "FILE_OR_FOLDER", f"an animation ({', '.join(ANIMATION_FORMATS)}), or a folder for numbered frames")
     sub.add_argument(
         "--format",
         choices=[suffix[1:] for suffix in MESH_FORMATS],

@@ -4,7 +4,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from torch_modal.cli.arguments import caching, reporter
+from torch_modal.cli.arguments import add_out, caching, reporter
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import MESH_FORMATS
 
@@ -27,14 +27,7 @@ examples:
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``register`` besides the common ones."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
-    suffixes = ", ".join(MESH_FORMATS)
-    sub.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        required=True,
-        help=f"the template laid onto the target, {suffixes}",
-    )
+    add_out(sub, "FILE", f"the template laid onto the target, {', '.join(MESH_FORMATS)}")
     sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     add_options(sub)
 

@@ -76,7 +76,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help="frames a second (default: the GLB's, or 24)",
     )
     sub.add_argument("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
-    sub.add_argument("--title", metavar="TEXT", help="of the page (default: the name of the first sequence)")
     sub.add_argument(
         "--page", type=Path, metavar="FILE", help="write the page there, as .html (default: a temporary file, opened)"
     )
@@ -121,7 +120,7 @@ def run(args: argparse.Namespace) -> None:
         fps=args.fps or first.fps or 24.0,
         cyclic=args.cyclic or first.cyclic,
         up=args.up,
-        title=args.title or next(iter(sequences)),
+        title=next(iter(sequences)),
     )
     shapes = next(iter(sequences.values()))
     times = f"{len(sequences)} x " if len(sequences) > 1 else ""
@@ -130,7 +129,9 @@ def run(args: argparse.Namespace) -> None:
 
 def _open(page: Page, what: str, args: argparse.Namespace) -> None:
     """Write the page; open it unless --page names a file."""
-    written = page.save(args.page or _temporary_file(), args.overwrite)
+    # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
+    path = args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")
+    written = page.save(path, args.overwrite)
     if not args.quiet:
         print(f"{what}: {written}", flush=True)
     if not args.page and not webbrowser.open(written.absolute().as_uri()):
@@ -155,7 +156,7 @@ def _landmarks(args: argparse.Namespace) -> None:
     meshes = [read_mesh(path) for path in args.meshes]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
     named = _named(args.names or [path.name for path in args.meshes], meshes)
-    page = tm.show_landmarks(named, rows, title=args.title or "Landmarks")
+    page = tm.show_landmarks(named, rows, title="Landmarks")
     _open(page, f"{len(meshes)} meshes to pick landmarks on", args)
 
 
@@ -231,8 +232,3 @@ def _linear(frames: Any, keys: list[int], cyclic: bool) -> Any:
         raise ValueError(f"--linear needs {ends} among the key-frames, got {' '.join(map(str, keys))}")
     places = [*keys, len(frames)] if cyclic else keys
     return tm.linear_sequence(torch.from_numpy(frames[keys]), places).numpy()
-
-
-def _temporary_file() -> Path:
-    """The path of a page without --page; it stays, as the browser reads it after this process."""
-    return Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")

@@ -1,7 +1,5 @@
 """Shapes between two others, and a little beyond one of them."""
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
@@ -72,9 +70,8 @@ class _Pairwise(ShapeAugmentation):
         for number, (i, j, is_known) in enumerate(kinds.tolist()):
             rows = torch.nonzero(kind == number).flatten()
             here = rows.to(t.device)
-            given = x_a[here], x_b[here]
-            at = partial(space.keyframe_in_between, i, j) if is_known else partial(space.in_between, *given, i=i, j=j)
-            shapes.append(self.moved(at, given, times[here], space))
+            pair = _Pair(space, x_a[here], x_b[here], i, j, bool(is_known))
+            shapes.append(self.moved(pair, times[here]))
             order.append(rows)
         back = torch.argsort(torch.cat(order)).to(t.device)
         nearer = (t.detach() > 0.5).cpu()
@@ -86,18 +83,9 @@ class _Pairwise(ShapeAugmentation):
             self._labels("shape_labels", batch.shape_labels, other.shape_labels, t),
         )
 
-    def moved(
-        self, at: Callable[[Tensor], Tensor], ends: tuple[Tensor, Tensor], t: Tensor, space: ShapeSpace
-    ) -> Tensor:
-        """The shapes at the times ``t``.
-
-        Args:
-            at: Their in-betweens. *Shape:* ``(B,) -> (B, V, 3)``.
-            ends: The shapes and their partners. *Shape of each:* ``(B, V, 3)``.
-            t: *Shape:* ``(B,)``.
-            space: Key-frames and modes.
-        """
-        return at(t)
+    def moved(self, pair: "_Pair", t: Tensor) -> Tensor:
+        """The shapes at the times ``t``. *Shape:* ``(B,) -> (B, V, 3)``."""
+        raise NotImplementedError
 
     def _labels(self, name: str, own: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
         if own is None or others is None:
@@ -108,6 +96,19 @@ class _Pairwise(ShapeAugmentation):
         if not own.is_floating_point():
             raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {own.dtype}")
         return torch.lerp(own, others, t.clamp(0, 1).to(own.dtype))
+
+
+class _Pair:
+    """Shapes with their partners, all with the modes of the same two key-frames, ``i <= j``."""
+
+    def __init__(self, space: ShapeSpace, x_a: Tensor, x_b: Tensor, i: int, j: int, known: bool) -> None:
+        self.space, self.x_a, self.x_b, self.i, self.j, self.known = space, x_a, x_b, i, j, known
+
+    def at(self, t: Tensor) -> Tensor:
+        """In-betweens. *Shape:* ``(B,) -> (B, V, 3)``."""
+        if self.known:
+            return self.space.keyframe_in_between(self.i, self.j, t)
+        return self.space.in_between(self.x_a, self.x_b, t, self.i, self.j)
 
 
 class RandomInBetween(_Pairwise):
@@ -141,6 +142,10 @@ class RandomInBetween(_Pairwise):
     def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
         """Uniform in the range."""
         return self.t[0] + (self.t[1] - self.t[0]) * uniform(n, generator)
+
+    def moved(self, pair: _Pair, t: Tensor) -> Tensor:
+        """The in-betweens."""
+        return pair.at(t)
 
 
 class RandomExtrapolation(_Pairwise):
@@ -177,13 +182,12 @@ class RandomExtrapolation(_Pairwise):
         beyond = self.beyond[0] + (self.beyond[1] - self.beyond[0]) * draw[:, 0]
         return torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)
 
-    def moved(
-        self, at: Callable[[Tensor], Tensor], ends: tuple[Tensor, Tensor], t: Tensor, space: ShapeSpace
-    ) -> Tensor:
+    def moved(self, pair: _Pair, t: Tensor) -> Tensor:
         """The mirror images."""
         after = t > 0.5
-        centre = torch.where(after[:, None, None], ends[1], ends[0])
-        return mirror(centre, at(torch.where(after, 2 - t, -t)), space.reconstruction(t.device))
+        before_end = pair.at(torch.where(after, 2 - t, -t))
+        ends = torch.where(after[:, None, None], pair.x_b, pair.x_a)
+        return mirror(ends, before_end, pair.space.reconstruction(ends.device))
 
 
 def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:

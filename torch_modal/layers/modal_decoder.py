@@ -201,7 +201,7 @@ class ModalDecoder(nn.Module):
         segment, u = self.located(t.expand(lead).reshape(-1))
         order, parts = [], []
         for i in segment.unique().tolist():
-            interval = self._kept(i) if keyframes is None else self._interval(i, keyframes)
+            interval = self._interval(i, keyframes)
             for rows in torch.nonzero(segment == i).flatten().split(max(1, CHUNK // self.keyframes.shape[1])):
                 order.append(rows)
                 parts.append(self.alignment.restore(self.bent(i, interval, a[rows], u[rows]), interval.pair, u[rows]))
@@ -226,16 +226,15 @@ class ModalDecoder(nn.Module):
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
         return located(t, self.times, self.cyclic)
 
-    def interval(self, i: int, keyframes: Tensor | None = None) -> Interval:
-        """Data of an interval that does not depend on the time; cached for the decoder's own key-frames."""
+    def interval(self, i: int) -> Interval:
+        """Data of an interval that does not depend on the time; cached."""
         self._current()
-        return self._kept(i) if keyframes is None else self._interval(i, keyframes)
+        return self._interval(i, None)
 
-    def _kept(self, i: int) -> Interval:
-        found: Interval = self._known.get(i, lambda: self._interval(i, self._made_of[0]))
-        return found
-
-    def _interval(self, i: int, keyframes: Tensor) -> Interval:
+    def _interval(self, i: int, keyframes: Tensor | None) -> Interval:
+        if keyframes is None:
+            own: Interval = self._known.get(i, lambda: self._interval(i, self._made_of[0]))
+            return own
         pair = self._pair(i, keyframes)
         rotations = self.blend(i).rotations
         if pair.around is None:
