@@ -1,4 +1,4 @@
-"""Sculpting with bones: blended cones -> clean closed triangle mesh -> skinned poses -> PLY files.
+"""Sculpting with bones: blended cones -> clean closed triangle mesh -> skinned poses.
 
 The shape is the smooth union of the cones in a rest pose. Surface nets give its connectivity; relaxation on
 the surface and Delaunay flips make the triangles nearly equilateral. The mesh then follows its bones by dual
@@ -7,9 +7,7 @@ quaternions, and keeps its volume.
 Symbols: V vertices, F faces, B bones, N points.
 """
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -298,18 +296,3 @@ def restore_volume(vertices: Array, faces: IntArray, volume: float, radius: Arra
         move = radius[:, None] * normals
         vertices = vertices + missing / (gradient * move).sum() * move
     return vertices
-
-
-def write_ply(path: Path, vertices: Array, faces: IntArray) -> None:
-    """Binary little-endian PLY, float32; written beside ``path`` and moved: nobody sees half a file."""
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
-    rows["n"], rows["v"] = 3, faces
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(header.encode() + vertices.astype("<f4").tobytes() + rows.tobytes())
-    os.replace(temporary, path)

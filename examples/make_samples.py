@@ -24,10 +24,11 @@ from _sculpt import (
     restore_volume,
     sculpt,
     skin,
-    write_ply,
 )
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+
+from torch_modal.io.frames import save_mesh
 
 # -------------------------------------------------------------------------------------------- creature, shape
 # About 2 units long, Y up, facing +X; its right side is +Z. Left limbs are mirror images of the right ones.
@@ -315,7 +316,7 @@ def main() -> None:
         describe(name, rest, faces, frames)
         for kind, shapes in frames.items():
             for n, shape in enumerate(shapes, start=0 if kind == "key" or name == "creature" else 1):
-                write_ply(out / name / f"{kind}-{n}.ply", shape, faces)
+                save_mesh(shape, faces, out / name / f"{kind}-{n}.ply", overwrite=True)
 
 
 if __name__ == "__main__":

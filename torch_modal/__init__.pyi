@@ -66,10 +66,10 @@ from .solve.solver import Solution as Solution
 from .solve.solver import Status as Status
 from .view.animation import save_animation as save_animation
 from .view.document import Page as Page
-from .view.landmark_page import show_landmarks as show_landmarks
 from .view.live import LiveSession as LiveSession
 from .view.live import live as live
 from .view.page import show as show
+from .view.page import show_landmarks as show_landmarks
 from .view.page import write_page as write_page
 from .view.picture import render_sequence as render_sequence
 

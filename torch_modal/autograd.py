@@ -1,6 +1,8 @@
-"""Helpers for autograd functions, cached tensors and broadcasting, with less overhead than in torch."""
+"""Helpers for autograd functions, cached tensors, broadcasting and threads, with less overhead than in torch."""
 
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from itertools import zip_longest
 from typing import Any, ParamSpec, TypeVar
@@ -37,6 +39,41 @@ def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
             return make(*args, **kwargs)
 
     return run
+
+
+class Recent:
+    """The most recently used objects, up to a limit.
+
+    ``cachetools.LRUCache`` makes room after the new object is made; this before, so that large objects never exceed the
+    limit.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """The object of a key; computed if it is not in the cache, as by :func:`lasting`."""
+        if key not in self._kept:
+            while len(self._kept) >= self.limit:  # before making, so that there are never more
+                self._kept.popitem(last=False)
+            self._kept[key] = lasting(make)()
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread for torch: sums are then split the same way everywhere, and give the same bits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def outlasting(x: Tensor) -> Tensor:

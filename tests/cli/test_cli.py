@@ -137,9 +137,8 @@ def test_preset_and_mu_arrive(
 
     monkeypatch.setattr(tm, "subdivide", subdivide)
     argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
-    assert cli.main([*argv, "--preset", "paper", "--mu", "0.5", "--quiet"]) == 0
-    objective = seen["objective"]
-    assert (objective.space, objective.mu) == ("paired", 0.5)  # type: ignore[attr-defined]
+    assert cli.main([*argv, "--preset", "paper", "--quiet"]) == 0
+    assert seen["preset"] == "paper"
     assert len(seen["bases"]) == 2 and seen["bases"][0].n_modes == 6  # type: ignore[arg-type, index]
     assert capsys.readouterr() == ("", "")
 
@@ -256,7 +255,6 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
         assert ".glb, .mp4" in misused(capsys, "subdivide", *meshes, "--out", name)
     for option in ("--ping-pong", "--ease"):
         assert "begin and end" in misused(capsys, "subdivide", *meshes, *out, "--cyclic", option)
-    assert "--preset paper" in misused(capsys, "subdivide", *meshes, *out, "--mu", "1")
     assert "must end in .png or .pdf" in misused(capsys, "subdivide", *meshes, *out, "--picture", "a.jpg")
     assert "one file, but there are 2" in misused(capsys, "modes", *meshes, "--out", "a.safetensors")
     assert "the same file name" in misused(capsys, "modes", meshes[0], meshes[0], "--out", "a")
@@ -270,8 +268,6 @@ def test_wrong_usage(meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFi
         ("--fps", "nan"),
         ("--fps", "inf"),
         ("--modes", "0"),
-        ("--polish", "-1"),
-        ("--mu", "many"),
     ):
         assert f"argument {option}: {value!r} is not a" in misused(capsys, "subdivide", *meshes, *out, option, value)
 

@@ -132,18 +132,19 @@ def test_leading_dimensions_and_dtypes(decoder: tm.ModalDecoder, bars: Shapes) -
 def test_few_intervals_are_kept(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     """A long motion has many, and each holds a factorised system."""
     basis, times = bars.bases[0], torch.tensor([0.0, 1.0, 3.0, 4.0]).double()
-    decoders = [
-        tm.ModalDecoder(bars.keyframes, bars.faces, times, basis.reference, basis.modes).requires_grad_(False)
-        for _ in range(2)
-    ]
+
+    def make() -> tm.ModalDecoder:
+        return tm.ModalDecoder(bars.keyframes, bars.faces, times, basis.reference, basis.modes).requires_grad_(False)
+
+    many = make()
     a, t = torch.ones(6, 8).double(), torch.tensor([3.5, 0.2, 1.5, 0.7, 3.1, 2.0]).double()
-    wanted = decoders[0](a, t)
+    wanted = many(a, t)
     monkeypatch.setattr(modal_decoder, "KEPT", 0)
+    few = make()
     for _ in range(2):
-        assert torch.equal(decoders[1](a, t), wanted)
-    assert sum(each is not None for each in decoders[0]._blends) == 3
-    assert sum(each is not None for each in decoders[1]._blends) == 2
-    assert sum(each is not None for each in decoders[1]._known) == 2
+        assert torch.equal(few(a, t), wanted)
+    assert len(many._blends) == 3
+    assert len(few._blends) == len(few._known) == 2
 
 
 # --------------------------------------------------------------------------------------------------------------- encode

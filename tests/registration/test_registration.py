@@ -14,11 +14,10 @@ from torch_modal.extras import require
 from torch_modal.io.frames import save_mesh
 from torch_modal.registration import register as register_module
 from torch_modal.registration.elastic import ElasticSurface, PointTargets
-from torch_modal.registration.landmarks import read_landmarks
+from torch_modal.registration.landmarks import landmark_table, read_landmarks
 from torch_modal.registration.maps import FINE_FUNCTIONS, nearest_rows, rate, zoom_out
 from torch_modal.registration.register import register
 from torch_modal.registration.report import measure
-from torch_modal.registration.sequence import landmark_table
 from torch_modal.registration.spectrum import SpectralShape
 from torch_modal.registration.surface import MeshSurface, largest_piece, outward, referenced, sewn, without_dust
 

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 OVERWRITE = "replace files that exist (default: refuse)"
@@ -37,6 +38,11 @@ def times(text: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
+
+
+def add_out(sub: argparse.ArgumentParser, metavar: str, text: str) -> None:
+    """``--out``, which must be given."""
+    sub.add_argument("--out", type=Path, required=True, metavar=metavar, help=text)
 
 
 def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:
@@ -94,6 +100,20 @@ def add_common(
         group.add_argument("--verbose", action="store_true", help="also report each step")
     group.add_argument("--quiet", action="store_true", help="report warnings and errors only")
     add_debug(group)
+
+
+def caching(args: argparse.Namespace) -> dict[str, Any]:
+    """Options of computations that the group "files and messages" sets."""
+    return {
+        "cache_dir": args.cache_dir,
+        "cache": not args.no_cache,
+        "progress": False if args.quiet else None,
+    }
+
+
+def reporter(args: argparse.Namespace) -> Callable[[str], None]:
+    """Print a line at once, unless --quiet."""
+    return (lambda _: None) if args.quiet else (lambda line: print(line, flush=True))
 
 
 def add_debug(group: Any) -> None:

@@ -6,11 +6,10 @@ Each checks its output paths before any heavy import and any work.
 import argparse
 import re
 import warnings
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torch_modal.cli.arguments import caching, reporter
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import ANIMATION_FORMATS, PICTURES
 
@@ -21,8 +20,6 @@ def subdivide(args: argparse.Namespace) -> None:
         args.fail("subdivide needs two key-frames or more")
     if args.contact and args.preset == "paper":
         args.fail("--contact needs one shape for each in-between; --preset paper has two")
-    if args.mu is not None and args.preset != "paper":
-        args.fail("--mu is the similarity weight of --preset paper; the others have none")
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
     check_name(args, "--picture", args.picture, PICTURES)
@@ -45,13 +42,13 @@ def subdivide(args: argparse.Namespace) -> None:
     n, spread = len(args.meshes), {"cyclic": args.cyclic, "n_frames": args.frames, "times": args.times}
     places = tm.keyframe_places(n, args.levels, **spread)
     when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
-    keyframes, faces = tm.load_keyframes(args.meshes, **_registration(args))
+    report = reporter(args)
+    registration = {"register": args.register, "landmarks": args.landmarks, "same_subject": not args.across}
+    keyframes, faces = tm.load_keyframes(args.meshes, **registration, **caching(args), report=report)
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
     bases = tm.extract_bases(welded.keyframes, welded.faces, args.modes, **_precompute_options(args))
-    objective, solver = tm.PRESETS[args.preset]
-    objective = objective if args.mu is None else replace(objective, mu=args.mu)
     solved = tm.subdivide(
         welded.keyframes,
         welded.faces,
@@ -60,14 +57,12 @@ def subdivide(args: argparse.Namespace) -> None:
         **spread,
         smooth=args.smooth,
         progress=progress,
-        objective=objective,
-        solver=replace(solver, polish=args.polish),
+        preset=args.preset,
         contact=args.contact,
     )
     frames = welded.scatter(solved)
     keys = [place for place in places if place < len(frames)]
     frames[keys] = keyframes
-    report = _reporter(args)
     seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
     report(f"{len(keyframes)} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
     if not single:
@@ -111,14 +106,8 @@ def modes(args: argparse.Namespace) -> None:
     import torch_modal as tm
 
     keyframes, faces = tm.load_keyframes(args.meshes)
-    bases = tm.extract_bases(
-        keyframes,
-        faces,
-        args.modes,
-        form=args.form,
-        **_precompute_options(args),
-    )
-    report = _reporter(args)
+    bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
+    report = reporter(args)
     shown = min(8, args.modes)
     report(f"{'lowest elastic modes':24s}" + "".join(f"{i + 1:>10d}" for i in range(shown)))
     for file, mesh, basis in zip(files, args.meshes, bases, strict=True):
@@ -147,65 +136,31 @@ def demo(args: argparse.Namespace) -> None:
         levels=args.levels,
         n_modes=args.modes,
         precompute=_precompute_options(args),
-        report=_reporter(args),
+        report=reporter(args),
     )
 
 
 def cache(args: argparse.Namespace) -> None:
     """Run ``torch-modal cache``."""
-    from torch_modal.io.cache import (
-        cache_content,
-        clear_cache,
-        default_cache_dir,
-        parse_size,
-        shrink_cache,
-        size_limit,
-    )
+    from torch_modal.io import cache as cached
 
-    folder = args.cache_dir or default_cache_dir()
+    folder = args.cache_dir or cached.default_cache_dir()
+    removed = None
     if args.clear:
-        removed = clear_cache(folder)
+        removed = cached.clear_cache(folder)
     elif args.shrink is not None:
-        removed = shrink_cache(parse_size(args.shrink), folder)
-    else:
-        removed = None
-    n_entries, n_bytes = cache_content(folder) if removed is None else removed
+        removed = cached.shrink_cache(cached.parse_size(args.shrink), folder)
+    n_entries, n_bytes = removed or cached.cache_content(folder)
     size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
-    print(f"{size} removed from {folder}" if removed else f"{size} in {folder} (limit: {size_limit() / 2**20:g} MiB)")
-
-
-def _registration(args: argparse.Namespace) -> dict[str, Any]:
-    """Options of `load_keyframes` for meshes of different connectivity."""
-    if not args.register:
-        return {}
-    return {
-        "register": True,
-        "landmarks": args.landmarks,
-        "same_subject": not args.across,
-        "cache_dir": args.cache_dir,
-        "cache": not args.no_cache,
-        "progress": False if args.quiet else None,
-        "report": _reporter(args),
-    }
+    limit = f"{cached.size_limit() / 2**20:g} MiB"
+    print(f"{size} removed from {folder}" if removed else f"{size} in {folder} (limit: {limit})")
 
 
 def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of `extract_bases`."""
-    return {
-        "mesher": args.mesher,
-        "settings": args.quality,
-        "cache_dir": args.cache_dir,
-        "cache": not args.no_cache,
-        "progress": False if args.quiet else None,
-    }
+    return {"mesher": args.mesher, "settings": args.quality, **caching(args)}
 
 
-def _reporter(args: argparse.Namespace) -> Callable[[str], None]:
-    """Print a line at once, unless --quiet."""
-    return (lambda _: None) if args.quiet else (lambda line: print(line, flush=True))
-
-
-# ---------------------------------------------------------------------------------------------------- output
 def _is_file(args: argparse.Namespace, *suffixes: str) -> bool:
     """Whether --out names a file of one of these suffixes rather than a folder."""
     if args.out.suffix.lower() in suffixes:

@@ -4,7 +4,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from torch_modal.cli.arguments import number
+from torch_modal.cli.arguments import add_out, caching, number, reporter
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
 
@@ -45,7 +45,7 @@ def part(text: str) -> float:
 def add_compress(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``compress`` besides the common ones."""
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="frames, two or more, in their order")
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE.tms", help="the file")
+    add_out(sub, "FILE.tms", "the file")
     sub.add_argument(
         "--error",
         type=part,
@@ -63,13 +63,7 @@ def add_compress(sub: argparse.ArgumentParser) -> None:
 def add_expand(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``expand`` besides the common ones."""
     sub.add_argument("file", type=Path, metavar="FILE.tms", help="a file that compress wrote")
-    sub.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE_OR_FOLDER",
-        help=f"an animation ({', '.join(ANIMATION_FORMATS)}), or a folder for numbered frames",
-    )
+    add_out(sub, "FILE_OR_FOLDER", f"an animation ({', '.join(ANIMATION_FORMATS)}), or a folder for numbered frames")
     sub.add_argument(
         "--format",
         choices=[suffix[1:] for suffix in MESH_FORMATS],
@@ -98,29 +92,18 @@ def compress(args: argparse.Namespace) -> None:
             stacklevel=2,
         )
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    found = tm.compress(
-        frames,
-        faces,
-        args.out,
-        args.error,
-        args.modes,
-        cyclic=args.cyclic,
-        cache_dir=args.cache_dir,
-        cache=not args.no_cache,
-        progress=False if args.quiet else None,
+    found = tm.compress(frames, faces, args.out, args.error, args.modes, cyclic=args.cyclic, **caching(args))
+    report, (n, v) = reporter(args), frames.shape[:2]
+    worst = int(found.errors.argmax())
+    bits = 8 * (found.n_bytes - found.n_faces_bytes) / (n * v)
+    less = 12 * n * v / found.n_bytes
+    report(f"{n} frames of {v} vertices -> {args.out}, {found.n_bytes} bytes, 1/{less:.0f} of float32")
+    report(f"faces: {found.n_faces_bytes} bytes; all else: {bits:.3g} bits a vertex and frame")
+    report(f"key-frames: {', '.join(map(str, found.keyframes))}")
+    report(
+        f"distance, of the written file: mean {100 * float(found.errors.mean()):.3g} %, at most "
+        f"{100 * float(found.errors[worst]):.3g} % of the diagonal (frame {worst}; allowed: {100 * args.error:g} %)"
     )
-    if not args.quiet:
-        n, v = frames.shape[:2]
-        worst = int(found.errors.argmax())
-        bits = 8 * (found.n_bytes - found.n_faces_bytes) / (n * v)
-        less = 12 * n * v / found.n_bytes
-        print(f"{n} frames of {v} vertices -> {args.out}, {found.n_bytes} bytes, 1/{less:.0f} of float32")
-        print(f"faces: {found.n_faces_bytes} bytes; all else: {bits:.3g} bits a vertex and frame")
-        print(f"key-frames: {', '.join(map(str, found.keyframes))}")
-        print(
-            f"distance, of the written file: mean {100 * float(found.errors.mean()):.3g} %, at most "
-            f"{100 * float(found.errors[worst]):.3g} % of the diagonal (frame {worst}; allowed: {100 * args.error:g} %)"
-        )
 
 
 def expand(args: argparse.Namespace) -> None:
@@ -151,6 +134,5 @@ def expand(args: argparse.Namespace) -> None:
         written = [args.out]
     else:
         written = tm.save_frames(frames, motion.faces, args.out, args.format, overwrite=args.overwrite)
-    if not args.quiet:
-        print(f"{len(frames)} frames of {frames.shape[1]} vertices: {written[0]}", end="")
-        print(f" to {written[-1].name}" if len(written) > 1 else "")
+    last = f" to {written[-1].name}" if len(written) > 1 else ""
+    reporter(args)(f"{len(frames)} frames of {frames.shape[1]} vertices: {written[0]}{last}")

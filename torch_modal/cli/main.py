@@ -19,6 +19,7 @@ from torch_modal.cli.arguments import (
     add_debug,
     add_levels,
     add_modes,
+    add_out,
     number,
     times,
 )
@@ -92,6 +93,12 @@ example:
   torch-modal cache --clear"""
 
 
+EXPECTED = (ValueError, OSError, MemoryError, ImportError)
+"""Errors of input, files and machine, which become one line; all others are bugs and show their traceback."""
+EXPECTED_NAMES = ("TetrahedralizationError", "ModalAnalysisError")
+"""Further ones, whose modules are heavy."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -125,24 +132,11 @@ def _run(args: argparse.Namespace) -> int:
     except BrokenPipeError:
         raise
     except Exception as error:
-        if args.debug or not isinstance(error, _expected_errors()):
+        expected = isinstance(error, EXPECTED) or type(error).__name__ in EXPECTED_NAMES
+        if args.debug or not expected:
             raise
         say(f"error: {_one_line(error)}")
         return 1
-
-
-def _expected_errors() -> tuple[type[Exception], ...]:
-    """Errors of input, files and machine; all others are bugs and show their traceback."""
-    expected: list[type[Exception]] = [ValueError, OSError, MemoryError, ImportError]
-    # Their modules are heavy; one that was not imported raised nothing.
-    for module, name in (
-        ("torch_modal.precompute.tetrahedra", "TetrahedralizationError"),
-        ("torch_modal.precompute.eigen", "ModalAnalysisError"),
-        ("torch_modal.errors", "MissingPackageError"),
-    ):
-        if module in sys.modules:
-            expected.append(getattr(sys.modules[module], name))
-    return tuple(expected)
 
 
 def _one_line(error: BaseException) -> str:
@@ -170,13 +164,8 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("subdivide", commands.subdivide, "key-frames in, a dense sequence out", SUBDIVIDE, SUBDIVIDE_EXAMPLES)
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames, two or more, in their order")
-    sub.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE_OR_FOLDER",
-        help=f"the animation alone: {', '.join(ANIMATION_FORMATS)}; a folder: numbered frames and animation.glb",
-    )
+    animations = ", ".join(ANIMATION_FORMATS)
+    add_out(sub, "FILE_OR_FOLDER", f"the animation alone: {animations}; a folder: numbered frames and animation.glb")
     add_levels(sub, 0)
     sub.add_argument(
         "--frames",
@@ -206,19 +195,6 @@ def build_parser() -> argparse.ArgumentParser:
         choices=("accurate", "fast", "paper"),
         default="accurate",
         help="accurate; fast, without steps on the fine mesh; paper, its Eq. 4 as it stands (default: %(default)s)",
-    )
-    sub.add_argument(
-        "--mu",
-        type=number(float, 0, above=True),
-        metavar="X",
-        help="how strongly --preset paper pulls its two shapes together (default: 1)",
-    )
-    sub.add_argument(
-        "--polish",
-        type=number(int, 0),
-        metavar="N",
-        default=0,
-        help="further steps on the fine mesh, towards the optimum over all vertices (default: %(default)s)",
     )
     sub.add_argument(
         "--format",
@@ -262,19 +238,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("modes", commands.modes, "vibration modes of key-frames, as safetensors", MODES, MODES_EXAMPLES)
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")
-    sub.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE_OR_FOLDER",
-        help="FILE.safetensors for one mesh, or a folder for a file of each mesh's name",
-    )
-    sub.add_argument(
-        "--form",
-        choices=("edge", "element", "vertex"),
-        default="edge",
-        help="of the energy's Hessian; vertex is the paper's (default: %(default)s)",
-    )
+    add_out(sub, "FILE_OR_FOLDER", "FILE.safetensors for one mesh, or a folder for a file of each mesh's name")
     add_modes(sub)
     add_common(sub)
 

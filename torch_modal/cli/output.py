@@ -4,7 +4,6 @@ import argparse
 import os
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 
 def check_output(
@@ -35,17 +34,17 @@ def check_output(
         existing += sorted(folder.glob(pattern))
     for file in existing:
         if file.resolve() in read:
-            _refuse(f"{file} is one of the meshes that are read; choose another {option}")
+            raise ValueError(f"{file} is one of the meshes that are read; choose another {option}")
         if file.is_dir():
-            _refuse(f"{file} is a folder; a file is to be written there")
+            raise ValueError(f"{file} is a folder; a file is to be written there")
         if not overwrite:
-            _refuse(f"{file} exists; --overwrite replaces it")
+            raise ValueError(f"{file} exists; --overwrite replaces it")
     for above in dict.fromkeys(file.parent for file in files):
         there = next(parent for parent in (above, *above.absolute().parents) if parent.exists())
         if not there.is_dir():
-            _refuse(f"{there} is a file, so nothing can be written below it; choose another {option}")
+            raise ValueError(f"{there} is a file, so nothing can be written below it; choose another {option}")
         if not os.access(there, os.W_OK):
-            _refuse(f"the folder {there} cannot be written; choose another {option}")
+            raise ValueError(f"the folder {there} cannot be written; choose another {option}")
 
 
 def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixes: Collection[str]) -> None:
@@ -57,7 +56,3 @@ def check_name(args: argparse.Namespace, option: str, path: Path | None, suffixe
             check_suffix(path, suffixes, option)
     except ValueError as error:
         args.fail(str(error).removesuffix("."))
-
-
-def _refuse(reason: str) -> NoReturn:
-    raise ValueError(reason)

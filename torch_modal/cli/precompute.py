@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from torch_modal.cli.arguments import add_common, add_modes, number
+from torch_modal.cli.arguments import add_common, add_modes, add_out, number
 
 SUMMARY = "bases of every key-frame set of a folder tree, in several processes or machines"
 
@@ -39,7 +39,7 @@ INCOMPLETE = 3
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``precompute``."""
     sub.add_argument("root", type=Path, metavar="DIR", help="the folder tree with the key-frames")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the bases and the report go")
+    add_out(sub, "DIR", "where the bases and the report go")
     sub.add_argument(
         "--workers",
         type=number(int, 1),

@@ -1,8 +1,10 @@
 """``torch-modal register``: one mesh laid onto another."""
 
 import argparse
+import warnings
 from pathlib import Path
 
+from torch_modal.cli.arguments import add_out, caching, reporter
 from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import MESH_FORMATS
 
@@ -25,14 +27,7 @@ examples:
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``register`` besides the common ones."""
     sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
-    suffixes = ", ".join(MESH_FORMATS)
-    sub.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        required=True,
-        help=f"the template laid onto the target, {suffixes}",
-    )
+    add_out(sub, "FILE", f"the template laid onto the target, {', '.join(MESH_FORMATS)}")
     sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
     add_options(sub)
 
@@ -52,19 +47,18 @@ def add_options(sub: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run ``torch-modal register``."""
-    import warnings
-
     from torch_modal.io.frames import save_mesh
     from torch_modal.io.read import open_asset, read_mesh
+    from torch_modal.registration.landmarks import landmark_table
+    from torch_modal.registration.load import ADVICE
     from torch_modal.registration.register import register
-    from torch_modal.registration.sequence import ADVICE, landmark_table
 
     check_name(args, "--out", args.out, MESH_FORMATS)
     check_output([args.out], args.meshes, args.overwrite)
     asset = open_asset(args.meshes[0])
     vertices, faces = asset.positions, asset.faces
     there, there_faces = read_mesh(args.meshes[1])
-    marks = landmark_table(args.landmarks, [vertices, there])
+    marks = None if args.landmarks is None else landmark_table(args.landmarks, [vertices, there])
     found = register(
         vertices,
         faces,
@@ -72,17 +66,14 @@ def run(args: argparse.Namespace) -> None:
         there_faces,
         landmarks=None if marks is None else (marks[:, 0], marks[:, 1]),
         same_subject=not args.across,
-        cache_dir=args.cache_dir,
-        cache=not args.no_cache,
-        progress=False if args.quiet else None,
+        **caching(args),
     )
-    if not args.quiet:
-        print(found.summary())
+    report = reporter(args)
+    report(found.summary())
     if found.doubtful:
         why = f"the result is doubtful: {'; '.join(found.warnings)}"
         if not args.keep_doubtful:
             raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
         warnings.warn(why, stacklevel=2)
     save_mesh(found.positions, faces, args.out, args.overwrite, asset)
-    if not args.quiet:
-        print(f"written: {args.out}")
+    report(f"written: {args.out}")

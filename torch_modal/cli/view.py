@@ -76,7 +76,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help="frames a second (default: the GLB's, or 24)",
     )
     sub.add_argument("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
-    sub.add_argument("--title", metavar="TEXT", help="of the page (default: the name of the first sequence)")
     sub.add_argument(
         "--page", type=Path, metavar="FILE", help="write the page there, as .html (default: a temporary file, opened)"
     )
@@ -121,7 +120,7 @@ def run(args: argparse.Namespace) -> None:
         fps=args.fps or first.fps or 24.0,
         cyclic=args.cyclic or first.cyclic,
         up=args.up,
-        title=args.title or next(iter(sequences)),
+        title=next(iter(sequences)),
     )
     shapes = next(iter(sequences.values()))
     times = f"{len(sequences)} x " if len(sequences) > 1 else ""
@@ -130,7 +129,9 @@ def run(args: argparse.Namespace) -> None:
 
 def _open(page: Page, what: str, args: argparse.Namespace) -> None:
     """Write the page; open it unless --page names a file."""
-    written = page.save(args.page or _temporary_file(), args.overwrite)
+    # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
+    path = args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")
+    written = page.save(path, args.overwrite)
     if not args.quiet:
         print(f"{what}: {written}", flush=True)
     if not args.page and not webbrowser.open(written.absolute().as_uri()):
@@ -139,10 +140,7 @@ def _open(page: Page, what: str, args: argparse.Namespace) -> None:
 
 def _landmarks(args: argparse.Namespace) -> None:
     """Meshes of any connectivity, to pick landmarks on."""
-    of_sequences = {"--compare": args.compare, "--linear": args.linear, "--keyframes": args.keyframes}
-    given = [option for option, value in of_sequences.items() if value]
-    if given:
-        args.fail(f"{', '.join(given)} belong to sequences; --landmarks shows single meshes")
+    _refuse(args, ("compare", "linear", "keyframes"), "belong to sequences; --landmarks shows single meshes")
     if len(args.meshes) < 2:
         args.fail("--landmarks needs two meshes or more")
     if args.names and len(args.names) != len(args.meshes):
@@ -157,20 +155,15 @@ def _landmarks(args: argparse.Namespace) -> None:
 
     meshes = [read_mesh(path) for path in args.meshes]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
-    names = args.names or [path.name for path in args.meshes]
-    if len(set(names)) < len(names):
-        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
-    page = tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title=args.title or "Landmarks")
+    named = _named(args.names or [path.name for path in args.meshes], meshes)
+    page = tm.show_landmarks(named, rows, title="Landmarks")
     _open(page, f"{len(meshes)} meshes to pick landmarks on", args)
 
 
 def _live(args: argparse.Namespace) -> None:
     """Key-frames in a live session, until Ctrl-C."""
-    of_pages = {"--page": args.page, "--compare": args.compare, "--linear": args.linear, "--names": args.names}
-    of_pages["--landmarks"] = args.landmarks
-    given = [option for option, value in of_pages.items() if value]
-    if given:
-        args.fail(f"{', '.join(given)} belong to pages; --live shows what is computed now")
+    others = ("page", "compare", "linear", "names", "landmarks")
+    _refuse(args, others, "belong to pages; --live shows what is computed now")
     if len(args.meshes) < 2:
         args.fail("--live needs two key-frames or more")
 
@@ -182,6 +175,13 @@ def _live(args: argparse.Namespace) -> None:
     print(f"open {session.url} in a browser; Ctrl-C ends the session", flush=True)
     webbrowser.open(session.url)
     session.wait()
+
+
+def _refuse(args: argparse.Namespace, options: tuple[str, ...], why: str) -> None:
+    """Exit with the usage if options are given that mean nothing here."""
+    given = [f"--{option}" for option in options if getattr(args, option)]
+    if given:
+        args.fail(f"{', '.join(given)} {why}")
 
 
 def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[dict[str, Any], Any]:
@@ -204,10 +204,14 @@ def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[dict[
         keys = args.keyframes or first.keyframe_indices or [0, len(first.frames) - 1]
         shapes.append(_linear(first.frames, sorted(set(keys)), args.cyclic or first.cyclic))
         names.append("linear")
-    names = args.names or names
+    return _named(args.names or names, shapes), first
+
+
+def _named(names: list[str], values: list[Any]) -> dict[str, Any]:
+    """Values under their names, which get a number each if some are the same."""
     if len(set(names)) < len(names):
         names = [f"{name} {number}" for number, name in enumerate(names, 1)]
-    return dict(zip(names, shapes, strict=True)), first
+    return dict(zip(names, values, strict=True))
 
 
 def _name(paths: list[Path]) -> str:
@@ -228,8 +232,3 @@ def _linear(frames: Any, keys: list[int], cyclic: bool) -> Any:
         raise ValueError(f"--linear needs {ends} among the key-frames, got {' '.join(map(str, keys))}")
     places = [*keys, len(frames)] if cyclic else keys
     return tm.linear_sequence(torch.from_numpy(frames[keys]), places).numpy()
-
-
-def _temporary_file() -> Path:
-    """The path of a page without --page; it stays, as the browser reads it after this process."""
-    return Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import fft
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.codec.hierarchy import DEAD_ZONE
+from torch_modal.codec.hierarchy import whole
 from torch_modal.codec.range_coder import IntegerDecoder, IntegerEncoder
 
 MODE_BANDS, SINE_BANDS = (8, 24), (1, 2)
@@ -33,8 +33,7 @@ def to_sines(series: FloatArray, steps: FloatArray, between: list[slice]) -> Int
     """Columns over time, zero at key-frames, as rounded sines of each run. *Shape:* ``(T, n), (n,) -> (T, n)``."""
     found = np.zeros(series.shape, dtype=np.int64)
     for run in between:
-        parts = fft.dst(series[run], type=1, norm="ortho", axis=0) / steps
-        found[run] = (np.sign(parts) * np.floor(np.abs(parts) + 0.5 - DEAD_ZONE)).astype(np.int64)
+        found[run] = whole(fft.dst(series[run], type=1, norm="ortho", axis=0) / steps)
     return found
 
 

@@ -1,8 +1,7 @@
 """From frames to a small file with a guaranteed error."""
 
-import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from torch_modal.arrays import IntArray
+from torch_modal.autograd import one_thread
 from torch_modal.codec.amplitudes import column_steps, from_sines, runs, to_sines
 from torch_modal.codec.compact import pack, to_callers_units
 from torch_modal.codec.file import compact_bytes, read
@@ -101,7 +101,7 @@ def compress(
     require_installed(("constriction",), "compress", "a small file of a motion")
     motion = FrameSequence.checked(frames, faces, times, cyclic)
     caching = {"cache_dir": cache_dir, "cache": cache}
-    with _one_thread():
+    with one_thread(), threadpool_limits(1):
         keys = choose_keyframes(motion, keyframes, n_modes, SELECTION_SHARE * error, caching, progress)
         data, report = _Compression(motion, error, n_modes, caching, progress).run(keys)
     write_atomically(Path(path), data)
@@ -230,15 +230,3 @@ class _Compression:
 def _single(x: float) -> float:
     """A number in single precision, as in the file."""
     return float(np.float32(x))
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Sums do not depend on the number of threads inside."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(before)

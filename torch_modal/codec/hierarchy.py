@@ -34,6 +34,11 @@ DEAD_ZONE = 0.17
 """In steps: how far beyond the half a residual must be to be rounded away from zero."""
 
 
+def whole(steps: FloatArray) -> IntArray:
+    """Numbers of steps, rounded with the dead zone."""
+    return (np.sign(steps) * np.floor(np.abs(steps) + 0.5 - DEAD_ZONE)).astype(np.int64)
+
+
 class Level(NamedTuple):
     """Vertices that are predicted at the same time."""
 
@@ -86,9 +91,7 @@ class VertexHierarchy:
         numbers: list[IntArray] = []
 
         def rounded(i: int, predicted: FloatArray, width: float) -> IntArray:
-            residual = (x[self.levels[i].vertices] - predicted) / width
-            whole = np.sign(residual) * np.floor(np.abs(residual) + 0.5 - DEAD_ZONE)
-            numbers.append(whole.astype(np.int64))
+            numbers.append(whole((x[self.levels[i].vertices] - predicted) / width))
             return numbers[i]
 
         return numbers, self._decoded(rounded, step, guide)

@@ -115,6 +115,8 @@ class ShapeAugmentation(nn.Module):
 
     uses_keyframes = True
     """Whether the transform uses the nearest key-frame of a shape."""
+    shown: tuple[str, ...] = ()
+    """Settings of a subclass that its ``repr`` shows."""
 
     @property
     def params(self) -> Parameters:
@@ -123,7 +125,7 @@ class ShapeAugmentation(nn.Module):
 
     def extra_repr(self) -> str:
         """Settings, as kornia shows them."""
-        return f"p={self.p}, same_on_batch={self.same_on_batch}, keepdim={self.keepdim}"
+        return ", ".join(f"{name}={getattr(self, name)}" for name in (*self.shown, "p", "same_on_batch", "keepdim"))
 
     # ------------------------------------------------------------------------------------------------ for subclasses
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
@@ -142,17 +144,6 @@ class ShapeAugmentation(nn.Module):
             pool: The shapes that partners are drawn from.
         """
         raise NotImplementedError
-
-    def undo(self, shapes: Tensor, params: Parameters) -> Tensor:
-        """Undo the transform of all shapes of a batch; for :meth:`inverse`.
-
-        Args:
-            shapes: Transformed shapes. *Shape:* ``(B, V, 3)``.
-            params: Their parameters, on their device.
-        """
-        raise NotImplementedError(
-            f"{type(self).__name__} has no inverse: a deformation cannot be recovered from the shape"
-        )
 
     # -------------------------------------------------------------------------------------------------------- calls
     def forward_parameters(
@@ -248,31 +239,6 @@ class ShapeAugmentation(nn.Module):
         self._params = self.forward_parameters(len(batch.shapes), space) if params is None else params
         out = self.transform(batch, self._params, space, pool).shapes
         return out[0] if single and self.keepdim else out
-
-    def inverse(self, shapes: Tensor, params: Parameters | None = None) -> Tensor:
-        """Undo a call; rigid motions only.
-
-        Args:
-            shapes: The call's result, or other shapes with the same motion. *Shape:* ``(B, V, 3)`` or
-                ``(V, 3)``.
-            params: Parameters of the call; by default those of the last.
-
-        Returns:
-            *Shape:* that of ``shapes``.
-
-        Raises:
-            NotImplementedError: The transform has no inverse.
-            ValueError: There was no call yet, or the numbers of rows do not fit.
-        """
-        check_shapes(shapes, None)
-        batch = shapes[None] if shapes.dim() == 2 else shapes
-        params = self._params if params is None else params
-        if not params:
-            raise ValueError("there is no call to invert: make one first, or pass its params")
-        own = self._own_rows(batch, params)
-        moved = own["batch_prob"]
-        out = torch.where(moved[:, None, None], self.undo(batch, own), batch)
-        return out[0] if shapes.dim() == 2 else out
 
     @staticmethod
     def _own_rows(shapes: Tensor, params: Parameters) -> Parameters:

@@ -1,6 +1,5 @@
 """Random shapes from a folder of stored key-frame sets, for PyTorch's data loaders."""
 
-import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -11,9 +10,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
+from torch_modal.autograd import Recent, one_thread
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch
 from torch_modal.data.random_in_between import RandomInBetween
-from torch_modal.data.recent import Recent
 from torch_modal.data.sequential import AugmentationSequential
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets, open_set
@@ -138,7 +137,7 @@ class ShapeDataset(Dataset[Sample]):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index {index} of {len(self)} samples")
             by_set.setdefault(index % len(self) // self.samples_per_set, []).append(place)
-        with torch.no_grad(), _one_thread():
+        with torch.no_grad(), one_thread():
             for number, places in by_set.items():
                 made = self._make(number, [indices[place] % len(self) for place in places])
                 samples.update(zip(places, made, strict=True))
@@ -149,14 +148,8 @@ class ShapeDataset(Dataset[Sample]):
         turn = self.epoch * self.samples_per_set
         start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
         drawn = [self.transform.forward_parameters(1, space, self._generator(index)) for index in indices]
-        batch = pool.rows(start)
-        alike: dict[tuple[int, ...], list[int]] = {}  # samples with the same transforms in the same order
-        for row, own in enumerate(drawn):
-            alike.setdefault(self.transform.order(own), []).append(row)
-        for rows in alike.values():
-            params = [_joined(each) for each in zip(*(drawn[row] for row in rows), strict=True)]
-            index = torch.tensor(rows)
-            batch = batch.put(index, self.transform.transform(batch.rows(index), params, space, pool))
+        params = [_joined(each) for each in zip(*drawn, strict=True)]
+        batch = self.transform.transform(pool.rows(start), params, space, pool)
         parts = {"vertices": batch.shapes}
         if self.with_normals:
             parts["normals"] = vertex_normals(batch.shapes, space.faces)
@@ -241,17 +234,3 @@ class SetBatchSampler(Sampler[list[int]]):
 
 def _joined(rows: Sequence[Parameters]) -> Parameters:
     return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """As in a worker: sums are then split the same way, and give the same bits."""
-    threads = torch.get_num_threads()
-    if threads == 1:
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

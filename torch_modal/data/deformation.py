@@ -44,6 +44,8 @@ class RandomModalDeformation(ShapeAugmentation):
         ValueError: ``strain`` is no range of positive numbers, or ``max_strain`` is not between 0 and 1.
     """
 
+    shown = ("strain", "max_strain")
+
     def __init__(
         self,
         strain: float | tuple[float, float] = (0.0, 0.02),
@@ -57,10 +59,6 @@ class RandomModalDeformation(ShapeAugmentation):
         if not 0 < max_strain < 1:
             raise ValueError(f"max_strain is above 0 and below 1, got {max_strain}")
         self.max_strain = max_strain
-
-    def extra_repr(self) -> str:
-        """Settings."""
-        return f"strain={self.strain}, max_strain={self.max_strain}, {super().extra_repr()}"
 
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
         """``noise``, a standard normal number for each mode, and the ``strain``."""

@@ -131,6 +131,8 @@ class RandomInBetween(_Pairwise):
         ValueError: ``t`` is no range within [0, 1].
     """
 
+    shown = ("t", "blend_labels")
+
     def __init__(
         self, t: tuple[float, float] = (0.0, 1.0), blend_labels: bool = False, p: float = 0.5, **options: Any
     ) -> None:
@@ -144,10 +146,6 @@ class RandomInBetween(_Pairwise):
     def moved(self, pair: _Pair, t: Tensor) -> Tensor:
         """The in-betweens."""
         return pair.at(t)
-
-    def extra_repr(self) -> str:
-        """Settings."""
-        return f"t={self.t}, blend_labels={self.blend_labels}, {super().extra_repr()}"
 
 
 class RandomExtrapolation(_Pairwise):
@@ -170,6 +168,8 @@ class RandomExtrapolation(_Pairwise):
         ValueError: ``beyond`` is no range within [0, 1].
     """
 
+    shown = ("beyond", "blend_labels")
+
     def __init__(
         self, beyond: tuple[float, float] = (0.0, 0.2), blend_labels: bool = False, p: float = 0.5, **options: Any
     ) -> None:
@@ -188,10 +188,6 @@ class RandomExtrapolation(_Pairwise):
         before_end = pair.at(torch.where(after, 2 - t, -t))
         ends = torch.where(after[:, None, None], pair.x_b, pair.x_a)
         return mirror(ends, before_end, pair.space.reconstruction(ends.device))
-
-    def extra_repr(self) -> str:
-        """Settings."""
-        return f"beyond={self.beyond}, blend_labels={self.blend_labels}, {super().extra_repr()}"
 
 
 def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:

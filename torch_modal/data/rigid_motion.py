@@ -5,10 +5,8 @@ from typing import Any
 
 import torch
 from kornia.geometry.conversions import quaternion_to_axis_angle
-from torch import Tensor
 from torch.nn.functional import normalize
 
-from torch_modal.autograd import lasting
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.rigid import RigidMotion
@@ -31,6 +29,7 @@ class RandomRigidMotion(ShapeAugmentation):
     """
 
     uses_keyframes = False
+    shown = ("degrees", "axis", "translation")
 
     def __init__(
         self,
@@ -50,11 +49,6 @@ class RandomRigidMotion(ShapeAugmentation):
         if translation < 0:
             raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
         self.translation = translation
-        self._matrix: Tensor | None = None
-
-    def extra_repr(self) -> str:
-        """Settings."""
-        return f"degrees={self.degrees}, axis={self.axis}, translation={self.translation}, {super().extra_repr()}"
 
     def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
         """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
@@ -74,57 +68,8 @@ class RandomRigidMotion(ShapeAugmentation):
         self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
     ) -> ShapeBatch:
         """Move each shape."""
+        x = batch.shapes
+        centre, diagonal = x.mean(1), (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
+        motion = RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * diagonal)
         given = None if batch.given is None else torch.zeros_like(batch.given)
-        return batch._replace(shapes=_motion(batch.shapes, params).apply(batch.shapes), given=given)
-
-    def transform(
-        self,
-        batch: ShapeBatch,
-        params: Parameters,
-        space: ShapeSpace | None = None,
-        pool: ShapeBatch | None = None,
-    ) -> ShapeBatch:
-        """Move the shapes that the parameters select, and set :attr:`transform_matrix`."""
-        out = super().transform(batch, params, space, pool)
-        self._matrix = lasting(self.compute_transformation)(batch.shapes, params)
-        return out
-
-    @property
-    def transform_matrix(self) -> Tensor | None:
-        """The last call, ``y = R x + s``, as homogeneous matrices; None before. *Shape:* ``(B, 4, 4)``."""
-        return self._matrix
-
-    def compute_transformation(self, shapes: Tensor, params: Parameters) -> Tensor:
-        """Homogeneous matrices of the motions of shapes; identity for shapes that are not transformed.
-
-        Args:
-            shapes: *Shape:* ``(B, V, 3)``.
-            params: From :meth:`forward_parameters`, or :attr:`params`.
-
-        Returns:
-            *Shape:* ``(B, 4, 4)``.
-        """
-        own = self._own_rows(shapes, params)
-        motion = _motion(shapes, own)
-        stay = torch.eye(4, dtype=shapes.dtype, device=shapes.device).expand(len(shapes), 4, 4)
-        shift = motion.target - (motion.rotation @ motion.source[..., None])[..., 0]
-        moved = torch.cat([torch.cat([motion.rotation, shift[..., None]], -1), stay[:, 3:]], 1)
-        return torch.where(own["batch_prob"][:, None, None], moved, stay)
-
-    def undo(self, shapes: Tensor, params: Parameters) -> Tensor:
-        """Move back. The translation is in units of the rotated-back shape's diagonal."""
-        rotation = exp(params["rotation"])
-        centre = shapes.mean(1)
-        back = (shapes - centre[:, None]) @ rotation
-        return back + (centre - params["translation"] * _diagonal(back))[:, None]
-
-
-def _motion(x: Tensor, params: Parameters) -> RigidMotion:
-    """The motion of each shape about the mean of its vertices. *Shape:* ``(B, V, 3)``."""
-    centre = x.mean(1)
-    return RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * _diagonal(x))
-
-
-def _diagonal(x: Tensor) -> Tensor:
-    """Of the bounding boxes, a constant. *Shape:* ``(B, 1)``."""
-    return (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
+        return batch._replace(shapes=motion.apply(x), given=given)

@@ -1,7 +1,7 @@
 """The sample key-frames that come with the package; ``examples/make_samples.py`` made them."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -10,19 +10,16 @@ from torch_modal.registration.load import load_keyframes
 FOLDER = Path(__file__).parents[1] / "samples"
 
 
-class _Description(NamedTuple):
-    n_keyframes: int
-    cyclic: bool
-    true_times: tuple[float, ...]
-    first_true: int
-    seconds: float
-    view: tuple[float, float]
-
-
-SAMPLES = {
-    "creature": _Description(6, True, (0.5, 1.5, 2.5, 3.5, 4.5, 5.5), 0, 1.0, (22.0, 9.0)),
-    "hand": _Description(2, False, (0.25, 0.5, 0.75), 1, 1.5, (-55.0, 12.0)),
+SAMPLES: dict[str, dict[str, Any]] = {
+    "creature": {
+        "true_times": (0.5, 1.5, 2.5, 3.5, 4.5, 5.5),
+        "cyclic": True,
+        "seconds": 1.0,
+        "view": (22.0, 9.0),
+    },
+    "hand": {"true_times": (0.25, 0.5, 0.75), "cyclic": False, "seconds": 1.5, "view": (-55.0, 12.0)},
 }
+"""Further fields of each :class:`Sample`."""
 
 
 class Sample(NamedTuple):
@@ -52,13 +49,11 @@ def load_sample(name: str) -> Sample:
     """
     if name not in SAMPLES:
         raise ValueError(f"there is no sample {name!r}; there are {', '.join(SAMPLES)}")
-    given = SAMPLES[name]
     keyframes, faces = load_keyframes(sample_files(name))
-    true_files = [FOLDER / name / f"true-{given.first_true + i}.ply" for i in range(len(given.true_times))]
-    truth = load_keyframes(true_files).keyframes
-    return Sample(keyframes, faces, truth, given.true_times, given.cyclic, given.seconds, given.view)
+    truth = load_keyframes(sample_files(name, "true")).keyframes
+    return Sample(keyframes, faces, truth, **SAMPLES[name])
 
 
-def sample_files(name: str) -> list[Path]:
-    """The files of a sample's key-frames."""
-    return [FOLDER / name / f"key-{i}.ply" for i in range(SAMPLES[name].n_keyframes)]
+def sample_files(name: str, kind: str = "key") -> list[Path]:
+    """The files of a sample's key-frames, or of its ``"true"`` frames between them."""
+    return sorted((FOLDER / name).glob(f"{kind}-*.ply"))

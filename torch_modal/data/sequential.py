@@ -1,6 +1,6 @@
 """Several random transforms as one, with labels and normals."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -33,15 +33,9 @@ class AugmentationSequential(nn.Module):
         keepdim: Whether one shape gives one shape rather than a batch of one.
         generator: Source of random numbers of all transforms; by default each has its own.
         space: Key-frames and modes, for all transforms; by default each has its own.
-        random_apply: Which transforms a call applies, drawn at each call. False: all, in order. True: all, in random
-            order. A number: so many of them, in random order. ``(a,)`` or ``(a, b)``: a number from a to b (to all).
-        random_apply_weights: How likely each is drawn; by default all the same.
-
-    Indexing gives a transform, a slice a container of some of them with the same settings; ``len`` and iteration work
-    as for a list.
 
     Raises:
-        ValueError: An unknown or doubled data key, no shapes, or an invalid ``random_apply``.
+        ValueError: An unknown or doubled data key, or no shapes.
     """
 
     def __init__(
@@ -52,8 +46,6 @@ class AugmentationSequential(nn.Module):
         keepdim: bool = False,
         generator: torch.Generator | None = None,
         space: ShapeSpace | None = None,
-        random_apply: bool | int | tuple[int] | tuple[int, int] = False,
-        random_apply_weights: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         self.transforms = nn.ModuleList(transforms)
@@ -66,105 +58,20 @@ class AugmentationSequential(nn.Module):
         self.keepdim = keepdim
         self.generator = generator
         self.space = space
-        self.random_apply = random_apply
-        self.random_apply_weights = random_apply_weights
-        self._range = _range_of(random_apply, len(transforms))
-        self._weights = torch.ones(len(transforms), dtype=torch.float64)
-        if random_apply_weights is not None:
-            self._weights = torch.as_tensor(random_apply_weights, dtype=torch.float64)
-            if self._weights.shape != (len(transforms),) or not (self._weights > 0).all():
-                raise ValueError(
-                    f"{len(transforms)} transforms need as many positive weights; got {random_apply_weights}"
-                )
-        self._params: list[Parameters] | None = None
-
-    def __len__(self) -> int:
-        return len(self.transforms)
-
-    def __iter__(self) -> Iterator[ShapeAugmentation]:
-        return iter(self._each())
-
-    def __getitem__(self, index: int | slice) -> Any:
-        if isinstance(index, int):
-            return self.transforms[index]
-        options = {
-            name: getattr(self, name) for name in ("data_keys", "same_on_batch", "keepdim", "generator", "space")
-        }
-        # A number of transforms refers to all of them; a slice draws all of its own, or none at random.
-        weights = None if self.random_apply_weights is None else list(self.random_apply_weights)[index]
-        chosen = self._each()[index]
-        return AugmentationSequential(
-            *chosen, **options, random_apply=self.random_apply is not False, random_apply_weights=weights
-        )
+        self._params: list[Parameters] = []
 
     @property
     def params(self) -> list[Parameters]:
-        """Parameters of the last call, of each transform that it applied, in their order.
-
-        With ``random_apply``, ``transform`` says in each row which one it is.
-        """
-        return self._params or []
-
-    @property
-    def transform_matrix(self) -> Tensor:
-        """The matrix of the last call, if it applied rigid motions only. *Shape:* ``(B, 4, 4)``.
-
-        Raises:
-            ValueError: There was no call yet, or one of its transforms is no rigid motion.
-        """
-        if not self._params:
-            raise ValueError("there is no call with a transform_matrix: make one first")
-        matrix: Tensor | None = None
-        for index in self.order(self._params):
-            own = getattr(self.transforms[index], "transform_matrix", None)
-            if own is None:
-                raise ValueError(f"{type(self.transforms[index]).__name__} is no rigid motion, so it has no matrix")
-            matrix = own if matrix is None else own @ matrix
-        assert matrix is not None
-        return matrix
-
-    def inverse(self, shapes: Tensor, params: Sequence[Parameters] | None = None) -> Tensor:
-        """Undo a call, last transform first; as :meth:`ShapeAugmentation.inverse`."""
-        params = self._params if params is None else params
-        if params is None:
-            raise ValueError("there is no call to invert: make one first, or pass its params")
-        for index, own in reversed(list(zip(self.order(params), params, strict=True))):
-            shapes = self.transforms[index].inverse(shapes, own)  # type: ignore[operator]
-        return shapes
-
-    def order(self, params: Sequence[Parameters]) -> tuple[int, ...]:
-        """Which transforms parameters belong to."""
-        drawn = all("transform" in own and len(own["transform"]) for own in params)
-        if drawn and (params or self._range is not None):
-            return tuple(int(own["transform"][0]) for own in params)
-        if len(params) != len(self.transforms):
-            raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
-        return tuple(range(len(params)))
+        """Parameters of the last call, of each transform."""
+        return self._params
 
     def forward_parameters(
         self, n: int, space: ShapeSpace | None = None, generator: torch.Generator | None = None
     ) -> list[Parameters]:
-        """Draw parameters for ``n`` shapes, of all transforms or of those that ``random_apply`` chooses."""
+        """Draw parameters for ``n`` shapes, of each transform."""
         space = self.space if space is None else space
         generator = self.generator if generator is None else generator
-        each = self._each()
-        if self._range is None:
-            return [one.forward_parameters(n, space, generator, self.same_on_batch) for one in each]
-        drawn: list[Parameters] = []
-        for index in self._draw(generator):
-            own = each[index].forward_parameters(n, space, generator, self.same_on_batch)
-            drawn.append({"transform": torch.full((n,), index), **own})
-        return drawn
-
-    def _draw(self, generator: torch.Generator | None) -> list[int]:
-        """Which transforms a call applies, in random order."""
-        assert self._range is not None
-        device = torch.device("cpu") if generator is None else generator.device
-        low, high = self._range
-        count = int(torch.randint(low, high + 1, (1,), generator=generator, device=device))
-        if not count:
-            return []
-        return torch.multinomial(self._weights.to(device), count, generator=generator).tolist()
+        return [one.forward_parameters(n, space, generator, self.same_on_batch) for one in self._each()]
 
     def transform(
         self,
@@ -173,11 +80,16 @@ class AugmentationSequential(nn.Module):
         space: ShapeSpace | None = None,
         pool: ShapeBatch | None = None,
     ) -> ShapeBatch:
-        """Transform a batch with given parameters; arguments as for :meth:`ShapeAugmentation.transform`."""
+        """Transform a batch with given parameters; arguments as for :meth:`ShapeAugmentation.transform`.
+
+        Raises:
+            ValueError: As there, or as many sets of parameters as transforms are not given.
+        """
         space = self.space if space is None else space
-        each = self._each()
-        for index, own in zip(self.order(params), params, strict=True):
-            batch = each[index].transform(batch, own, space, pool)
+        if len(params) != len(self.transforms):
+            raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
+        for one, own in zip(self._each(), params, strict=True):
+            batch = one.transform(batch, own, space, pool)
         return batch
 
     def forward(
@@ -234,23 +146,6 @@ class AugmentationSequential(nn.Module):
         if known is None:
             raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
         return vertex_normals(x, known.faces)
-
-
-def _range_of(given: Any, n: int) -> tuple[int, int] | None:
-    """Least and greatest number of transforms that are applied; None for all in order.
-
-    Raises:
-        ValueError: It is invalid.
-    """
-    if given is False:
-        return None
-    ends = (n, n) if given is True else (given, given) if isinstance(given, int) else given
-    if isinstance(ends, tuple) and len(ends) == 1:
-        ends = (ends[0], n)
-    fits = isinstance(ends, tuple) and len(ends) == 2 and all(isinstance(end, int) for end in ends)
-    if not fits or not 0 <= ends[0] <= ends[1] <= n:
-        raise ValueError(f"random_apply is a bool, a number, (a,) or (a, b), from 0 to the {n} transforms; got {given}")
-    return ends
 
 
 def _as_batch(named: dict[str, Tensor | None], single: bool) -> ShapeBatch:

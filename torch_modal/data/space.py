@@ -3,16 +3,15 @@
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import Recent, lasting
 from torch_modal.data.motion import Motion, Span
-from torch_modal.data.recent import Recent
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
 from torch_modal.geometry.crossings import require_contact
@@ -35,10 +34,27 @@ from torch_modal.version import __version__
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8
 
-# Sizes of the caches of a space. Smaller ones than a batch needs would be recomputed for each batch.
-_N_LAYERS, _N_TABLES, _N_REFERENCES = 32, 64, 16
-# Dtypes and devices of cached key-frames.
-_N_PLACES = 4
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def kept(limit: int) -> Callable[[Method], Method]:
+    """Decorate a method of a space whose most recent results are kept, for each dtype and device of a tensor.
+
+    Args:
+        limit: How many. Fewer than a batch needs would be computed again for each batch.
+    """
+
+    def decorate(method: Any) -> Any:
+        @wraps(method)
+        def run(self: "ShapeSpace", *args: Any, **named: Any) -> Any:
+            given = [*enumerate(args), *sorted(named.items())]
+            key = tuple((name, (x.dtype, x.device) if isinstance(x, Tensor) else x) for name, x in given)
+            recent = self._made.setdefault(method.__name__, Recent(limit))
+            return recent.get(key, lambda: method(self, *args, **named))
+
+        return run
+
+    return decorate
 
 
 class KeyframeReference(NamedTuple):
@@ -113,7 +129,7 @@ class ShapeSpace:
         self.dtype = dtype
         self.folder = None if folder is None else Path(folder)
         self.motion = Motion.of(keyframe_times, len(self.bases), cyclic)
-        self._forget()
+        self._made: dict[str, Recent] = {}
 
     @classmethod
     def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
@@ -124,17 +140,8 @@ class ShapeSpace:
         own = {"folder": stored.folder, "keyframe_times": stored.times, "cyclic": stored.cyclic}
         return cls(stored.bases, stored.faces, **{**own, **options})
 
-    def _forget(self) -> None:
-        self._layers, self._tables, self._references = Recent(_N_LAYERS), Recent(_N_TABLES), Recent(_N_REFERENCES)
-        self._keyframes, self._reconstructions = Recent(_N_PLACES), Recent(_N_PLACES)
-
     def __getstate__(self) -> dict[str, Any]:
-        made = ("_layers", "_tables", "_references", "_reconstructions", "_keyframes")
-        return {name: value for name, value in self.__dict__.items() if name not in made}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._forget()
+        return {**self.__dict__, "_made": {}}
 
     def __len__(self) -> int:
         """Number of key-frames, K."""
@@ -159,11 +166,9 @@ class ShapeSpace:
         """A copy of the key-frames, in the dtype and on the device of another tensor. *Shape:* ``(K, V, 3)``."""
         return self._keyframes_like(torch.empty(0, dtype=self.dtype) if like is None else like).clone()
 
+    @kept(4)
     def _keyframes_like(self, like: Tensor) -> Tensor:
-        def make() -> Tensor:
-            return torch.stack([basis.reference for basis in self.bases]).to(like)
-
-        return self._keyframes.get((like.dtype, like.device), make)
+        return torch.stack([basis.reference for basis in self.bases]).to(like)
 
     def nearest(self, x: Tensor) -> Tensor:
         """Index of the closest key-frame, up to a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
@@ -188,43 +193,37 @@ class ShapeSpace:
     # ------------------------------------------------------------------------------------------- computed at first use
     def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
         """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
+        return self._reconstruction(torch.device(device))
 
-        def make() -> Reconstruction:
-            return Reconstruction(self.bases[0].reference, self.faces).to(device)
+    @kept(4)
+    def _reconstruction(self, device: torch.device) -> Reconstruction:
+        return Reconstruction(self.bases[0].reference, self.faces).to(device)
 
-        return self._reconstructions.get(torch.device(device), make)
-
+    @kept(16)
     def reference(self, index: int, like: Tensor) -> KeyframeReference:
         """A key-frame for modal deformation, in the dtype and on the device of another tensor."""
+        basis = self.bases[index]
+        x = basis.reference.double()
+        values = basis.eigenvalues.double()
+        elastic = values > _NOT_ELASTIC * values.amax()
+        scale = torch.where(elastic, values, torch.inf).rsqrt()
+        modes = basis.modes.double() * scale[:, None, None]
+        i, j = self.edges.unbind(1)
+        side = x[j] - x[i]
+        slopes = ((modes[:, j] - modes[:, i]) * side).sum(-1) / side.square().sum(-1).clamp_min(1e-300)
+        expected = slopes.square().mean(1).sum().sqrt()
+        modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
+        own = frames(sides(x.mT[:, None], self.faces))
+        return KeyframeReference(x.to(like), modes.mT.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
 
-        def make() -> KeyframeReference:
-            basis = self.bases[index]
-            x = basis.reference.double()
-            values = basis.eigenvalues.double()
-            elastic = values > _NOT_ELASTIC * values.amax()
-            scale = torch.where(elastic, values, torch.inf).rsqrt()
-            modes = basis.modes.double() * scale[:, None, None]
-            i, j = self.edges.unbind(1)
-            side = x[j] - x[i]
-            slopes = ((modes[:, j] - modes[:, i]) * side).sum(-1) / side.square().sum(-1).clamp_min(1e-300)
-            expected = slopes.square().mean(1).sum().sqrt()
-            modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
-            own = frames(sides(x.mT[:, None], self.faces))
-            return KeyframeReference(x.to(like), modes.mT.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
-
-        return self._references.get((index, like.dtype, like.device), make)
-
+    @kept(32)
     def layer(self, i: int, j: int, like: Tensor) -> InBetween:
         """The in-between layer of two key-frames' modes; ``i`` and ``j`` may be the same."""
+        return self._layer(i, j, like)
 
-        def make() -> InBetween:
-            return self._layer(i, j).to(like)
-
-        return self._layers.get((i, j, like.dtype, like.device), make)
-
-    def _layer(self, i: int, j: int) -> InBetween:
+    def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
         objective, solver = self.settings
-        return InBetween([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver)
+        return InBetween([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver).to(like)
 
     def _span(self, i: int, j: int) -> Span | None:
         return None if self.motion is None else self.motion.span(i, j)
@@ -238,32 +237,29 @@ class ShapeSpace:
             pair = MotionPath([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver).to(like)
             return partial(pair.solve, self._keyframes_like(like)[[i, j]])
         if span is None:
-            return partial(self._layer(i, j).to(like).solve, *self._keyframes_like(like)[[i, j]])
+            return partial(self._layer(i, j, like).solve, *self._keyframes_like(like)[[i, j]])
         bases = [self.bases[key] for key in span.keyframes]
         # The shapes depend on the neighbours only; a path of all key-frames would be computed for each table.
         path = MotionPath(bases, self.faces, span.times, objective=objective, solver=solver).to(like)
         return partial(path.solve, self._keyframes_like(like)[span.keyframes])
 
+    @kept(64)
     def table(self, i: int, j: int) -> Tensor:
         """In-betweens of two key-frames at even times, from disk if stored. *Shape:* ``(T, V, 3)``."""
         if self.times is None:
             raise ValueError("a space of times=None solves each in-between: it has no tables")
-
-        def make() -> Tensor:
-            path, key = self._place(i, j)
-            kept = None if path is None else read_table(path, key)
-            if kept is not None:
-                return kept
-            t = torch.linspace(0, 1, self.times, dtype=torch.float64)
-            with torch.no_grad():
-                result = self._between(i, j, t)(t)
-            table = _shapes(result, i, j).to(self.dtype)
-            # Tables that did not converge are not stored, so that each run warns.
-            if path is not None and bool(result.solution.usable.all()):
-                write_table(path, table, key)
-            return table
-
-        return self._tables.get((i, j), make)
+        path, key = self._place(i, j)
+        stored = None if path is None else read_table(path, key)
+        if stored is not None:
+            return stored
+        t = torch.linspace(0, 1, self.times, dtype=torch.float64)
+        with torch.no_grad():
+            result = self._between(i, j, t)(t)
+        table = _shapes(result, i, j).to(self.dtype)
+        # Tables that did not converge are not stored, so that each run warns.
+        if path is not None and bool(result.solution.usable.all()):
+            write_table(path, table, key)
+        return table
 
     def _place(self, i: int, j: int) -> tuple[Path | None, dict[str, str]]:
         """The file of a table and its key; None where it is not stored.
@@ -303,10 +299,17 @@ class ShapeSpace:
         if i > j:
             return self.keyframe_in_between(j, i, 1 - t)  # one table serves both ways
         if self.times is None:
-            between = self._layers.get(("keyframes", i, j, t.dtype, t.device), lambda: self._between(i, j, t))
-            return _shapes(between(t), i, j)
-        table = self._tables.get((i, j, t.device), lambda: self.table(i, j).to(t.device))
+            return _shapes(self._kept_between(i, j, t)(t), i, j)
+        table = self._table_on(i, j, t.device)
         return interpolate(table, t.to(table.dtype)).to(t.dtype)
+
+    @kept(32)
+    def _kept_between(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
+        return self._between(i, j, like)
+
+    @kept(64)
+    def _table_on(self, i: int, j: int, device: torch.device) -> Tensor:
+        return self.table(i, j).to(device)
 
     def in_between(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: int, j: int) -> Tensor:
         """Between any shapes, with the modes of two key-frames. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``."""

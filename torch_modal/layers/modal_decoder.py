@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, lasting, outlasting
+from torch_modal.autograd import Recent, broadcast_shapes, lasting, outlasting
 from torch_modal.backends.torch.alignment import Alignment, Pair, vertex_tangent_offset
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.shell import DIAGONAL
@@ -133,10 +133,9 @@ class ModalDecoder(nn.Module):
 
     def _forget(self) -> None:
         self._made_of = [x.detach().clone() for x in (self.keyframes, self.times, self.reference)]
-        self._known: list[Interval | None] = [None] * self.n_intervals
         self._shared = Blends(self._mesh, self._made_of[0].double().cpu(), (0, 1), TorchBackend())
-        self._blends: list[RotationBlend | None] = [None] * self.n_intervals
-        self._made: list[int] = []
+        n_kept = max(2, KEPT // self.keyframes.shape[1])
+        self._blends, self._known = Recent(n_kept), Recent(n_kept)
 
     @lasting
     def through(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
@@ -151,17 +150,10 @@ class ModalDecoder(nn.Module):
 
     def blend(self, i: int) -> RotationBlend:
         """Of an interval; made at the first use, and again if many others were made since."""
-        known = self._blends[i]
-        if known is None:
-            known = self._blends[i] = lasting(self._blend)(i)
-            self._made.append(i)
-            while len(self._made) > max(2, KEPT // self.keyframes.shape[1]):
-                oldest = self._made.pop(0)
-                self._blends[oldest] = self._known[oldest] = None
-        return known
-
-    def _blend(self, i: int) -> RotationBlend:
-        return self._shared.of(i, (i + 1) % len(self.keyframes)).to(self.keyframes)
+        found: RotationBlend = self._blends.get(
+            i, lambda: self._shared.of(i, (i + 1) % len(self.keyframes)).to(self.keyframes)
+        )
+        return found
 
     @property
     def n_intervals(self) -> int:
@@ -210,7 +202,7 @@ class ModalDecoder(nn.Module):
         segment, u = self.located(t.expand(lead).reshape(-1))
         order, parts = [], []
         for i in segment.unique().tolist():
-            interval = self._kept(i) if keyframes is None else self._interval(i, keyframes)
+            interval = self._interval(i, keyframes)
             for rows in torch.nonzero(segment == i).flatten().split(max(1, CHUNK // self.keyframes.shape[1])):
                 order.append(rows)
                 parts.append(self.alignment.restore(self.bent(i, interval, a[rows], u[rows]), interval.pair, u[rows]))
@@ -235,18 +227,15 @@ class ModalDecoder(nn.Module):
         """The interval of each time, and how far along it is. *Shape:* ``(B,)``."""
         return located(t, self.times, self.cyclic)
 
-    def interval(self, i: int, keyframes: Tensor | None = None) -> Interval:
-        """Data of an interval that does not depend on the time; cached for the decoder's own key-frames."""
+    def interval(self, i: int) -> Interval:
+        """Data of an interval that does not depend on the time; cached."""
         self._current()
-        return self._kept(i) if keyframes is None else self._interval(i, keyframes)
+        return self._interval(i, None)
 
-    def _kept(self, i: int) -> Interval:
-        known = self._known[i]
-        if known is None:
-            known = self._known[i] = lasting(self._interval)(i, self._made_of[0])
-        return known
-
-    def _interval(self, i: int, keyframes: Tensor) -> Interval:
+    def _interval(self, i: int, keyframes: Tensor | None) -> Interval:
+        if keyframes is None:
+            own: Interval = self._known.get(i, lambda: self._interval(i, self._made_of[0]))
+            return own
         pair = self._pair(i, keyframes)
         rotations = self.blend(i).rotations
         if pair.around is None:

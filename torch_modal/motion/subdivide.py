@@ -117,9 +117,9 @@ def subdivide(
         else:
             parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar, contacts)
         for i, shapes in enumerate(parts):
-            sequence[places[i] : places[i + 1] + 1] = shapes
-            sequence[places[i]], sequence[places[i + 1]] = keyframes[i], keyframes[(i + 1) % n_keys]
+            sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
             bar.update(smooth)
+        sequence[-1] = keyframes[-1]
     if contacts is not None:
         contacts.report(keyframes, working_faces)
     return sequence[:-1] if cyclic else sequence
@@ -135,7 +135,7 @@ def _along_path(
     chosen: Settings,
     contacts: "_ContactReport | None",
 ) -> Iterator[Tensor]:
-    """Shapes of each interval, smooth in time."""
+    """Shapes between the key-frames of each interval, smooth in time."""
     path = Path(bases, faces.cpu(), times, cyclic, objective=chosen.objective, solver=chosen.solver)
     path.to(keyframes.device)
     for i, when in enumerate(_times_of_intervals(path.times, places)):
@@ -144,8 +144,7 @@ def _along_path(
             u = (when[1:-1] - when[0]) / (when[-1] - when[0])
             samples = path.samples(keyframes[None], i, torch.zeros_like(u, dtype=torch.int64), u)
             shapes = contacts(path.layer.members[path.members[i]], samples, shapes)
-        ends = keyframes[:1]  # the key-frames are put there by the caller
-        yield torch.cat([ends, shapes, ends])
+        yield shapes
 
 
 def _by_recursion(
@@ -159,19 +158,20 @@ def _by_recursion(
     bar: ProgressReport,
     contacts: "_ContactReport | None",
 ) -> Iterator[Tensor]:
-    """Shapes of each interval, of the pair alone."""
+    """Shapes between the key-frames of each interval, of the pair alone."""
     weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         j = (i + 1) % len(keyframes)
         segment = _Segment((bases[i], bases[j]), faces, chosen, keyframes.device)
         shapes = torch.stack([keyframes[i], keyframes[j]])
         for _ in range(levels):
-            shapes = _interleave(shapes, segment.mid_shapes(shapes))
+            pairs = torch.stack([shapes[:-1], segment.mid_shapes(shapes)], 1)
+            shapes = torch.cat([pairs.flatten(0, 1), shapes[-1:]])
             bar.update()
         shapes = shapes if n_frames is None else _resample(shapes, n, weights)
         if contacts is not None and len(shapes) > 2:
             shapes[1:-1] = contacts(*segment.samples(shapes), shapes[1:-1])
-        yield shapes
+        yield shapes[1:-1]
 
 
 def keyframe_places(
@@ -336,12 +336,6 @@ class _Segment:
         lengths = torch.linalg.norm(shapes[:, self.edges[:, 0]] - shapes[:, self.edges[:, 1]], dim=-1)
         to_first, to_last = ((lengths - lengths[end]).norm(dim=-1) for end in (0, -1))
         return (to_last < to_first).long().tolist()
-
-
-def _interleave(shapes: Tensor, between: Tensor) -> Tensor:
-    """*Shape:* ``(n + 1, V, 3), (n, V, 3) -> (2 n + 1, V, 3)``."""
-    pairs = torch.stack([shapes[:-1], between], 1).flatten(0, 1)
-    return torch.cat([pairs, shapes[-1:]])
 
 
 def _resample(shapes: Tensor, intervals: int, weights: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch_modal.geometry.connectivity import half_cotangents
 from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
 from torch_modal.registration.surface import MeshSurface
 
-# Cotangent weights of obtuse triangles are negative, those of slivers huge.
+# Bounds of cotangent weights: those of obtuse triangles are negative, those of slivers huge.
 _WEIGHTS = (0.05, 10.0)
 # Smoothing of rotations over neighbours resists bending (Levi and Gotsman 2015).
 _SMOOTHING, _SMOOTHING_ROUNDS = 0.5, 2
@@ -42,7 +42,8 @@ class ElasticSurface:
     def __init__(self, rest: MeshSurface, *, stretchable: bool = False) -> None:
         self.rest, self.stretchable = rest, stretchable
         n, edges = len(rest.vertices), rest.edges
-        weights = _cotangent_weights(rest)
+        opposite = half_cotangents(rest.vertices, rest.connectivity)
+        weights: FloatArray = np.clip(np.bincount(rest.connectivity.sides, opposite, minlength=len(edges)), *_WEIGHTS)
         self.laplacian = graph_laplacian(edges, weights, n)
         self._i, self._j = np.concatenate([edges, edges[:, ::-1]]).T
         self._weights = np.tile(weights, 2)
@@ -91,11 +92,3 @@ class ElasticSurface:
             wanted = 0.5 * np.einsum("eij,ej->ei", frames[self._i] + frames[self._j], self._sides)
             x = solver.solve(self._gather @ (self._weights[:, None] * wanted) + pulled)
         return x
-
-
-def _cotangent_weights(surface: MeshSurface) -> FloatArray:
-    """Half the cotangents opposite to each edge, summed, within bounds. *Shape:* ``(E,)``."""
-    mesh = surface.connectivity
-    return np.clip(
-        np.bincount(mesh.sides, half_cotangents(surface.vertices, mesh), minlength=len(mesh.edges)), *_WEIGHTS
-    )

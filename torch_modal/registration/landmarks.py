@@ -3,14 +3,14 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
+from torch_modal.io.write import to_numpy
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.registration.consistency import farthest_points
 from torch_modal.registration.spectrum import SpectralShape
@@ -21,15 +21,8 @@ N_SUGGESTED = 14
 _TIP_RADIUS = 0.12
 
 
-class LandmarkPoints(NamedTuple):
-    """Positions on both meshes, each in its own coordinates. *Shape of each:* ``(n, 3)``."""
-
-    template: FloatArray
-    target: FloatArray
-
-
-def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) -> LandmarkPoints:
-    """Landmarks of `register` as points.
+def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) -> FloatArray:
+    """Landmarks of `register` as points, the template's and the target's. *Shape:* ``(n, 2, 3)``.
 
     Args:
         landmarks: None, pairs of vertex indices ``(n, 2)``, or two arrays of points ``(n, 3)``.
@@ -40,45 +33,63 @@ def landmark_points(landmarks: Any, template: FloatArray, target: FloatArray) ->
         MeshError: The shapes are wrong, or a vertex does not exist.
     """
     if landmarks is None:
-        return LandmarkPoints(np.zeros((0, 3)), np.zeros((0, 3)))
+        return np.zeros((0, 2, 3))
     if isinstance(landmarks, (tuple, list)) and len(landmarks) == 2 and all(np.ndim(part) == 2 for part in landmarks):
-        here, there = (_array(part).astype(np.float64) for part in landmarks)
+        here, there = (to_numpy(part).astype(np.float64) for part in landmarks)
         if here.shape != there.shape or here.shape[1] != 3 or not np.isfinite([here, there]).all():
             raise MeshError(
                 f"landmarks are arrays of shapes {here.shape} and {there.shape}; two arrays of finite points (n, 3) "
                 "are needed, the template's and the target's"
             )
-        return LandmarkPoints(here, there)
-    pairs = _array(landmarks)
+        return np.stack([here, there], axis=1)
+    pairs = to_numpy(landmarks)
     if pairs.size == 0:
-        return LandmarkPoints(np.zeros((0, 3)), np.zeros((0, 3)))
+        return np.zeros((0, 2, 3))
     if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
         raise MeshError(
             f"landmarks have shape {pairs.shape} and dtype {pairs.dtype}; pairs of vertex indices (n, 2) are needed, "
             "template first, or two arrays of points (n, 3)"
         )
-    return LandmarkPoints(
-        vertices_named(pairs[:, 0], template, "the template"), vertices_named(pairs[:, 1], target, "the target")
-    )
+    return _named_vertices(pairs, (template, target), ("the template", "the target"))
 
 
-def vertices_named(numbers: IntArray, vertices: FloatArray, mesh: str) -> FloatArray:
-    """Positions of numbered vertices. *Shape:* ``(n,), (V, 3) -> (n, 3)``.
+def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
+    """Landmarks of all meshes as points. *Shape:* ``(n, K, 3)``.
+
+    Args:
+        landmarks: A landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``.
+        shapes: Vertices of the K meshes.
 
     Raises:
-        MeshError: A vertex does not exist; ``mesh`` is the name in the message.
+        FileNotFoundError: There is no such file.
+        MeshError: Landmarks do not match the meshes.
     """
-    wrong = np.flatnonzero((numbers < 0) | (numbers >= len(vertices)))
-    if len(wrong):
+    n = len(shapes)
+    table: Any = read_landmarks(landmarks, n) if isinstance(landmarks, (str, os.PathLike)) else to_numpy(landmarks)
+    if table.ndim == 3 and table.shape[1:] == (n, 3):
+        return table.astype(np.float64)
+    if table.ndim != 2 or table.shape[1] != n or table.dtype.kind not in "iu":
         raise MeshError(
-            f"landmark {wrong[0]} names vertex {numbers[wrong[0]]} of {mesh}, which has {len(vertices)} vertices, "
-            "counted from 0"
+            f"landmarks have shape {table.shape} and dtype {table.dtype}; for {n} meshes they are vertex numbers (n, "
+            f"{n}) or points (n, {n}, 3)"
         )
-    return vertices[numbers]
+    return _named_vertices(table, shapes, [f"mesh {k}" for k in range(n)])
 
 
-def _array(values: Any) -> Any:
-    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+def _named_vertices(numbers: IntArray, shapes: Sequence[FloatArray], names: Sequence[str]) -> FloatArray:
+    """Positions of numbered vertices, a column for each mesh. *Shape:* ``(n, K) -> (n, K, 3)``.
+
+    Raises:
+        MeshError: A vertex does not exist; the message names the mesh.
+    """
+    for own, vertices, name in zip(numbers.T, shapes, names, strict=True):
+        wrong = np.flatnonzero((own < 0) | (own >= len(vertices)))
+        if len(wrong):
+            raise MeshError(
+                f"landmark {wrong[0]} names vertex {own[wrong[0]]} of {name}, which has {len(vertices)} vertices, "
+                "counted from 0"
+            )
+    return np.stack([vertices[own] for own, vertices in zip(numbers.T, shapes, strict=True)], axis=1)
 
 
 def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | FloatArray:
@@ -139,11 +150,10 @@ def landmark_vertices(path: str | os.PathLike[str], shapes: Sequence[FloatArray]
         MeshError: A line cannot be used, or a mesh has no such vertex.
     """
     table: Any = read_landmarks(path, len(shapes))
-    if table.ndim == 3:
-        return np.stack([cKDTree(shape).query(table[:, k])[1] for k, shape in enumerate(shapes)], axis=1)
-    for k, shape in enumerate(shapes):
-        vertices_named(table[:, k], shape, f"mesh {k}")
-    return np.asarray(table, dtype=np.int64)
+    points = landmark_table(table, shapes)
+    if table.ndim == 2:
+        return np.asarray(table, dtype=np.int64)
+    return np.stack([cKDTree(shape).query(points[:, k])[1] for k, shape in enumerate(shapes)], axis=1)
 
 
 def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArray:

@@ -12,6 +12,11 @@ from torch_modal.io.read import read_mesh, require_same_mesh
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.progress import Progress
 
+ADVICE = (
+    "give landmarks, five or more: a text file with a line for each, which names one vertex of each mesh, counted from "
+    "0 (--landmarks FILE, landmarks=...); `torch-modal view MESH MESH --landmarks` opens a page to pick them on"
+)
+
 
 def load_keyframes(
     paths: Sequence[str | os.PathLike[str]],
@@ -57,24 +62,36 @@ def load_keyframes(
     paths = list(paths)
     if not paths:
         raise MeshError("paths is empty; pass one file per key-frame")
-    if register:
-        from torch_modal.registration.sequence import register_files
-
-        return register_files(
-            paths,
-            landmarks=landmarks,
-            same_subject=same_subject,
-            cache_dir=cache_dir,
-            cache=cache,
-            progress=progress,
-            report=report,
-        )
-    if landmarks is not None:
+    if landmarks is not None and not register:
         raise MeshError("landmarks are for registration; pass register=True too")
-    vertices, faces = read_mesh(paths[0])
+    meshes = [read_mesh(path) for path in paths]
+    marks = None
+    if landmarks is not None:
+        from torch_modal.registration.landmarks import landmark_table
+
+        marks = landmark_table(landmarks, [vertices for vertices, _ in meshes])
+    vertices, faces = meshes[0]
     shapes = [vertices]
-    for path in paths[1:]:
-        other_vertices, other_faces = read_mesh(path)
-        require_same_mesh(paths[0], vertices, faces, path, other_vertices, other_faces)
-        shapes.append(other_vertices)
+    for k, (there, there_faces) in enumerate(meshes[1:], 1):
+        try:
+            require_same_mesh(paths[0], vertices, faces, paths[k], there, there_faces)
+        except MeshError:
+            if not register:
+                raise
+        else:
+            shapes.append(there)
+            continue
+        from torch_modal.registration.register import register as registered
+
+        pair = None if marks is None else (marks[:, k - 1], marks[:, k])
+        caching: dict[str, Any] = {"cache_dir": cache_dir, "cache": cache, "progress": progress}
+        found = registered(shapes[-1], faces, there, there_faces, landmarks=pair, same_subject=same_subject, **caching)
+        name, origin = os.fspath(paths[k]), os.fspath(paths[k - 1])
+        report(f"{name} registered from {origin}: {found.summary()}")
+        if found.doubtful:
+            raise MeshError(
+                f"the registration of {name} from {origin} is doubtful: {found.summary()}; "
+                f"{'; '.join(found.warnings)}. To help it, {ADVICE}"
+            )
+        shapes.append(found.positions.numpy())
     return Keyframes(torch.from_numpy(np.stack(shapes)), torch.from_numpy(faces))

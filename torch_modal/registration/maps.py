@@ -17,6 +17,8 @@ COARSE_FUNCTIONS = 20
 FINE_FUNCTIONS = 50
 N_OTHER_STARTS = 6
 """Number of initial maps besides the sign patterns."""
+N_REFINED = 4
+"""Number of fully refined maps."""
 _STEP = 3
 
 # Weight of the round-trip error, for a surface of unit area, relative to the oriented area.
@@ -124,7 +126,6 @@ def spectral_maps(
     first: SpectralShape,
     second: SpectralShape,
     n_signs: int = 4,
-    keep: int = 4,
     tick: Callable[[], None] = lambda: None,
 ) -> list[Map]:
     """The best maps from spectra, best first; the last is the best map to the mirrored target.
@@ -136,7 +137,6 @@ def spectral_maps(
         first: The first shape.
         second: The second.
         n_signs: Number of eigenfunctions with both signs: ``2**n_signs`` initial maps.
-        keep: Number of fully refined maps.
         tick: Called after each initial map.
     """
     coarse = []
@@ -146,7 +146,7 @@ def spectral_maps(
         tick()
     coarse.sort(key=lambda found: -found.score)
     fine = []
-    for found in [*coarse[:keep], max(coarse, key=lambda found: found.mirrored_score)]:
+    for found in [*coarse[:N_REFINED], max(coarse, key=lambda found: found.mirrored_score)]:
         vertices = zoom_out(first, second, found.vertices, COARSE_FUNCTIONS, FINE_FUNCTIONS)
         fine.append(Map(vertices, *rates(first, second, vertices, FINE_FUNCTIONS)))
     return [*sorted(fine[:-1], key=lambda found: -found.score), fine[-1]]

@@ -18,7 +18,7 @@ from torch_modal.keyframes.seams import weld_seams
 from torch_modal.progress import Progress, ProgressReport
 from torch_modal.registration.consistency import Consistency
 from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Gate, TemplateFit
-from torch_modal.registration.landmarks import LandmarkPoints, landmark_points
+from torch_modal.registration.landmarks import landmark_points
 from torch_modal.registration.maps import (
     FINE_FUNCTIONS,
     N_OTHER_STARTS,
@@ -108,9 +108,9 @@ def register(
     welded, welded_goal = (
         weld_seams(x[None], mesh.faces.cpu()) for x, mesh in zip(shapes, (checked, goal), strict=True)
     )
-    if not same_subject and len(points.template) < MIN_LANDMARKS:
+    if not same_subject and len(points) < MIN_LANDMARKS:
         raise MeshError(
-            f"two different subjects need {MIN_LANDMARKS} landmarks or more, got {len(points.template)}: spectra alone "
+            f"two different subjects need {MIN_LANDMARKS} landmarks or more, got {len(points)}: spectra alone "
             "do not determine the map; give pairs of vertices, template first"
         )
     own, other = ((one.keyframes[0].numpy(), one.faces.numpy()) for one in (welded, welded_goal))
@@ -121,7 +121,7 @@ def register(
             return _RegistrationProblem(own, other, points, same_subject, report).solve().arrays()
 
     inputs = {"template": own[0], "faces": own[1], "target": other[0], "target_faces": other[1]}
-    marks = {"here": points.template, "there": points.target}
+    marks = {"here": points[:, 0], "there": points[:, 1]}
     parameters = {"same_subject": same_subject, "version": VERSION}
     kept = Cache.at(cache_dir, enabled=cache).get("registration", {**inputs, **marks}, parameters, compute)
     found = Registration.from_arrays(kept)
@@ -141,7 +141,7 @@ class _RegistrationProblem:
         self,
         template: tuple[FloatArray, IntArray],
         target: tuple[FloatArray, IntArray],
-        points: LandmarkPoints,
+        points: FloatArray,
         same_subject: bool,
         progress: ProgressReport,
     ) -> None:
@@ -159,8 +159,8 @@ class _RegistrationProblem:
         self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
         self.gate = Gate(self.second)
         self.consistency = Consistency(self.first, self.second)
-        self.marks = points.template * self.size
-        self.mark_places = (points.target - self.origin) / self.unit
+        self.marks = points[:, 0] * self.size
+        self.mark_places = (points[:, 1] - self.origin) / self.unit
         #: Score minus distortion of the best map onto the mirrored target.
         self.mirrored = -np.inf
 
@@ -193,7 +193,9 @@ class _RegistrationProblem:
         if not len(self.marks):
             return np.zeros((0, 2), dtype=np.int64)
         both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
-        return np.stack([shape.nearest(at, _normals(surface, at)) for shape, surface, at in both], axis=1)
+        return np.stack(
+            [shape.nearest(at, surface.face_normals[surface.closest(at).faces]) for shape, surface, at in both], axis=1
+        )
 
     def _agrees(self, found: Map) -> bool:
         """Whether a map agrees with all landmarks."""
@@ -210,7 +212,8 @@ class _RegistrationProblem:
         places = self.second.coarse.vertices
         kept = rated[:1]
         for found, distortion in rated[1:]:
-            difference = min(_difference(places[found.vertices], places[one.vertices]) for one, _ in kept)
+            apart = (np.linalg.norm(places[found.vertices] - places[one.vertices], axis=1) for one, _ in kept)
+            difference = min(np.percentile(distances, 98) for distances in apart)
             lead = (found.score - distortion) - (rated[0][0].score - rated[0][1])
             if len(kept) < _RIVALS and lead > -_RIVAL_SCORE and difference > _SAME:
                 kept.append((found, distortion))
@@ -322,14 +325,6 @@ class _RegistrationProblem:
             target_corners=torch.from_numpy(corners),
             warnings=said,
         )
-
-
-def _difference(places: FloatArray, others: FloatArray) -> float:
-    return float(np.percentile(np.linalg.norm(places - others, axis=1), 98))
-
-
-def _normals(surface: MeshSurface, points: FloatArray) -> FloatArray:
-    return surface.face_normals[surface.closest(points).faces]
 
 
 def _placed(x: FloatArray, places: FloatArray, weights: FloatArray) -> FloatArray:

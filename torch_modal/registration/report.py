@@ -40,18 +40,14 @@ class Distances(NamedTuple):
 
 
 class Quality(NamedTuple):
-    """Quality measures of a fitted template, without ground truth."""
+    """Quality measures of a fitted template, without ground truth: the fields of these names of `Registration`."""
 
     to_target: Distances
     from_target: Distances
     stretch: float
-    """Root mean square of ``log(length / rest length)`` over the edges, relative to its median."""
     flipped_area: float
-    """Fraction of the template's area with normals opposed to the target."""
     folds: int
-    """Edges at which the angle between the normals grew from below 90 to above 120 degrees."""
     unsupported_area: float
-    """Fraction of the template's area without a counterpart on the target."""
 
     @property
     def cost(self) -> float:
@@ -126,7 +122,7 @@ class Registration(NamedTuple):
     flipped_area: float
     """Fraction of the template's area with normals opposed to the target."""
     folds: int
-    """Edges at which the template is folded over itself."""
+    """Edges at which the angle between the normals grew from below 90 to above 120 degrees."""
     unsupported_area: float
     """Fraction of the template's area without a counterpart, such as a limb missing on the target."""
     mirrored_lead: float

@@ -21,7 +21,7 @@ from torch_modal.registration.surface import (
 )
 
 N_COARSE = 2000
-"""Vertices of the coarse copies."""
+"""Approximate number of vertices of the coarse copies."""
 CUT = 0.04
 """Widest cut through a surface that is closed, in diagonals."""
 N_FUNCTIONS = 60
@@ -33,12 +33,10 @@ class SpectralShape:
 
     Args:
         surface: The fine surface.
-        n_vertices: Approximate number of coarse vertices.
     """
 
-    def __init__(self, surface: MeshSurface, n_vertices: int = N_COARSE) -> None:
-        self.fine = surface
-        coarse = decimated(surface, n_vertices)
+    def __init__(self, surface: MeshSurface) -> None:
+        coarse = decimated(surface, N_COARSE)
         self.scale = np.sqrt(coarse.area)
         """Unit of length of the coarse copy, in units of the fine surface."""
         self.coarse = MeshSurface(coarse.vertices / self.scale, coarse.faces)

@@ -4,8 +4,6 @@ pyvista renders in a child process, because it takes its process down (a segment
 neither EGL nor OSMesa exists; then matplotlib draws.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import subprocess

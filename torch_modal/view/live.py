@@ -26,8 +26,6 @@ from torch_modal.view.picture import BETWEEN_COLOR, KEYFRAME_COLOR, up_axis, vie
 if TYPE_CHECKING:
     from torch_modal.precompute.basis import ModalBasis
 
-__all__ = ["LiveSession", "live"]
-
 IDLE_SECONDS = 0.25  # without a change, before the accurate shape is computed
 STIFFNESS_RANGE = 2.0  # powers of ten, both ways
 

@@ -1,7 +1,5 @@
 """Key-frames that handles and modes deform, and their in-betweens: the model of a live session."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A page that plays sequences of shapes, packed by page_data.py, in one HTML file."""
+"""Pages that play sequences of shapes, or on which landmarks are picked, packed by page_data.py into one HTML file."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.write import check_frames, check_indices, to_numpy
 from torch_modal.view.document import Page, checked_path, document
 from torch_modal.view.page_data import grid_of, pack_faces, pack_frames, quantise
-from torch_modal.view.picture import check_view, up_axis, view_rotation
+from torch_modal.view.picture import check_sequences, check_view, up_axis, view_rotation
 
-__all__ = ["show", "write_page"]
-
-SCRIPTS = ("dom.js", "decode.js", "measure.js", "stage.js", "timeline.js", "page.js")
+COMMON_SCRIPTS = ("dom.js", "decode.js", "measure.js", "stage.js")
+SCRIPTS = (*COMMON_SCRIPTS, "timeline.js", "page.js")
+LANDMARK_SCRIPTS = (*COMMON_SCRIPTS, "landmarks.js")
 
 
 def show(
@@ -59,21 +59,14 @@ def show(
         ValueError: An argument cannot be used; the message says why.
     """
     check_view(view, up)
-    named = sequences if isinstance(sequences, Mapping) else {"shapes": sequences}
-    if not named:
-        raise ValueError("sequences is empty; it needs at least one sequence of shapes.")
+    given = sequences if isinstance(sequences, Mapping) else {"shapes": sequences}
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps must be a positive number, got {fps}.")
-    checked: dict[str, FloatArray] = {}
-    for name, frames in named.items():
-        checked[str(name)], triangles = check_frames(frames, faces, f"sequences[{name!r}]")
+    checked, triangles = check_sequences({str(name): frames for name, frames in given.items()}, faces, "sequences")
     shapes = list(checked.values())
-    if len({frames.shape for frames in shapes}) > 1:
-        sizes = ", ".join(f"{name!r} {frames.shape}" for name, frames in checked.items())
-        raise ValueError(f"all sequences must have the same shape (N, V, 3), got {sizes}.")
     n_frames = len(shapes[0])
-    given = [0, n_frames - 1] if keyframe_indices is None else keyframe_indices
-    keyframes = check_indices(given, n_frames, "keyframe_indices")
+    ends = [0, n_frames - 1]
+    keyframes = check_indices(ends if keyframe_indices is None else keyframe_indices, n_frames, "keyframe_indices")
     stamps = np.arange(n_frames, dtype=np.float64) if times is None else _checked_times(times, n_frames)
     closed = cyclic and n_frames > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes)
     data = {
@@ -82,7 +75,7 @@ def show(
         "fps": float(fps),
         "closed": closed,
         "keyframes": keyframes,
-        **packed(checked, triangles, view, up),
+        **_packed(checked, triangles, view, up),
     }
     return Page(document("page.html", SCRIPTS, title, data), height)
 
@@ -117,6 +110,52 @@ def write_page(
     return show(sequences, faces, title=path.stem if title is None else title, **options).save(path, overwrite)
 
 
+def show_landmarks(
+    meshes: Mapping[str, tuple[Array, Array]],
+    landmarks: Array | None = None,
+    *,
+    title: str = "landmarks",
+    height: int = 600,
+) -> Page:
+    """A page to pick landmarks for :func:`torch_modal.register`: vertices of several meshes that belong together.
+
+    Each mesh has its own camera. The first click on each gives the first landmark, and so on. The page copies or saves
+    the text file for ``landmarks=`` of :func:`torch_modal.load_keyframes` and for ``--landmarks``.
+
+    Args:
+        meshes: Name, vertices ``(V, 3)`` and faces ``(F, 3)`` of two or more meshes of any connectivity.
+        landmarks: Landmarks to start from: vertex indices, a column for each mesh. *Shape:* ``(n, K)``.
+        title: Of the page.
+        height: In pixels, in a notebook.
+
+    Returns:
+        The page. Notebooks show it; ``save(path)`` writes it.
+
+    Raises:
+        ValueError: An argument cannot be used; the message says why.
+    """
+    if len(meshes) < 2:
+        raise ValueError(f"landmarks belong to two meshes or more, got {len(meshes)}.")
+    checked = [
+        (str(name), *check_frames(to_numpy(vertices)[None], faces, f"meshes[{name!r}][0][None]"))
+        for name, (vertices, faces) in meshes.items()
+    ]
+    rows = np.zeros((0, len(checked)), dtype=np.int64) if landmarks is None else to_numpy(landmarks)
+    if rows.ndim != 2 or rows.shape[1] != len(checked) or rows.dtype.kind not in "iu":
+        raise ValueError(
+            f"landmarks must be vertex indices, a column for each of the {len(checked)} meshes, got shape {rows.shape} "
+            f"and dtype {rows.dtype}."
+        )
+    counts = np.array([shape.shape[1] for _, shape, _ in checked])
+    if ((rows < 0) | (rows >= counts)).any():
+        raise ValueError(f"landmarks must index the {counts.tolist()} vertices of the meshes from 0.")
+    data: dict[str, Any] = {
+        "meshes": [_packed({name: shape}, faces) for name, shape, faces in checked],
+        "landmarks": rows.tolist(),
+    }
+    return Page(document("landmarks.html", LANDMARK_SCRIPTS, title, data), height)
+
+
 def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
     stamps: FloatArray = np.asarray(to_numpy(times), dtype=np.float64)  # type: ignore[arg-type]
     if stamps.shape != (n_frames,) or not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
@@ -127,7 +166,7 @@ def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
     return stamps
 
 
-def packed(
+def _packed(
     sequences: dict[str, FloatArray],
     faces: IntArray,
     view: tuple[float, float] | None = None,

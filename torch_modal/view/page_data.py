@@ -11,8 +11,6 @@ with r_1 = q_1 - q_0, small numbers around zero. They are folded to positive num
 3, ...), split into planes of low and of high bytes (almost all zeros), and deflated.
 """
 
-from __future__ import annotations
-
 import base64
 import zlib
 from collections.abc import Sequence

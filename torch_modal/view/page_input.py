@@ -1,9 +1,6 @@
 """Shapes read back from files: numbered meshes, a folder of them, or an animated GLB that `save_animation` wrote."""
 
-from __future__ import annotations
-
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.data.batch.tree import natural
 from torch_modal.errors import MeshError
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.read import open_asset
@@ -70,7 +68,7 @@ def _numbered(folder: Path) -> list[Path]:
         raise MeshError(f"{folder}: no meshes in this folder ({', '.join(FRAME_SUFFIXES)}); name files instead")
     if len(kinds) > 1:
         raise MeshError(f"{folder}: meshes of several kinds ({', '.join(kinds)}); name the files instead")
-    return sorted(found, key=lambda path: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.name)])
+    return sorted(found, key=lambda path: natural(path.name))
 
 
 def _read_animation(path: Path) -> Shapes | None:

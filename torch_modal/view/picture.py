@@ -13,13 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from torch_modal.arrays import Array, FloatArray
+from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.io.files import write_file
 from torch_modal.io.formats import PICTURES
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
 from torch_modal.view.drawing import ByteArray, Scene, draw
-
-__all__ = ["render_sequence"]
 
 KEYFRAME_COLOR = (0.91, 0.60, 0.36)  # warm: given
 BETWEEN_COLOR = (0.62, 0.71, 0.82)  # cool: computed
@@ -34,6 +32,28 @@ def check_view(view: tuple[float, float] | None, up: str | None) -> None:
         raise ValueError(f"view must be two numbers of degrees, azimuth and elevation, got {view}.")
     if up not in (None, "y", "z"):
         raise ValueError(f"up must be 'y' or 'z', got {up!r}.")
+
+
+def check_sequences(sequences: Mapping[str, Array], faces: Array, name: str) -> tuple[dict[str, FloatArray], IntArray]:
+    """Sequences of shapes that are shown together, and their faces, as NumPy arrays.
+
+    Args:
+        sequences: *Shape of each:* ``(N, V, 3)``, the same for all.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        name: Of ``sequences``, for messages.
+
+    Raises:
+        ValueError: There are none, their shapes differ, or :func:`check_frames` refuses one.
+    """
+    if not sequences:
+        raise ValueError(f"{name} is empty; it needs at least one sequence of shapes.")
+    checked: dict[str, FloatArray] = {}
+    for key, frames in sequences.items():
+        checked[key], triangles = check_frames(frames, faces, f"{name}[{key!r}]")
+    if len({frames.shape for frames in checked.values()}) > 1:
+        sizes = ", ".join(f"{key!r} {frames.shape}" for key, frames in checked.items())
+        raise ValueError(f"all {name} must have the same shape (N, V, 3), got {sizes}.")
+    return checked, triangles
 
 
 def up_axis(shape: FloatArray, up: Literal["y", "z"] | None = None) -> Literal["y", "z"]:
@@ -184,8 +204,6 @@ def render_sequence(
         FileExistsError: The file exists and ``overwrite`` is off.
         RuntimeError: ``renderer="pyvista"`` and pyvista cannot render here.
     """
-    if not frames_by_row:
-        raise ValueError("frames_by_row is empty; it needs at least one row of shapes.")
     path = Path(out)
     fmt = check_suffix(path, PICTURES)[1:]
     if renderer not in ("auto", "pyvista", "matplotlib"):
@@ -193,12 +211,8 @@ def render_sequence(
     check_view(view, up)
     refuse_existing(path, overwrite)
 
-    rows = list(frames_by_row)
-    checked = [check_frames(frames_by_row[row], faces, f"frames_by_row[{row!r}]") for row in rows]
-    shapes = [frames for frames, _ in checked]
-    if len({frames.shape for frames in shapes}) > 1:
-        sizes = ", ".join(f"{row!r} {frames.shape}" for row, frames in zip(rows, shapes, strict=True))
-        raise ValueError(f"all rows must have the same shape (N, V, 3), got {sizes}.")
+    checked, triangles = check_sequences(frames_by_row, faces, "frames_by_row")
+    rows, shapes = list(checked), list(checked.values())
     n_frames = len(shapes[0])
     if columns is None:
         # Equal steps if at all possible: 5 of 9 or 17 frames, 7 of 25.
@@ -232,7 +246,7 @@ def render_sequence(
     scene = Scene(
         points.reshape(-1, *shown.shape[2:]),
         (paint * 255).round().astype(np.uint8).reshape(-1, *shown.shape[2:]),
-        checked[0][1],
+        triangles,
         half,
         np.maximum((CELL_PIXELS * half / half.max()).round(), 1).astype(np.int64),
     )

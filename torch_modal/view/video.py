@@ -1,7 +1,5 @@
 """A sequence as a video, by imageio and its ffmpeg (``pip install torch_modal[video]``), or as a GIF, by Pillow."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
