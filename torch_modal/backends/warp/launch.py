@@ -22,12 +22,12 @@ from torch_modal.progress import ProgressReport
 Module = Literal[
     "alignment",
     "shell",
-    "shell_adjoint",
     "modal",
     "steps",
     "steps_adjoint",
     "rotations",
     "rotations_adjoint",
+    "adjoints",
     "crossings",
     "distortion",
 ]

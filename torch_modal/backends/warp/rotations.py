@@ -108,7 +108,7 @@ class WarpRotations(LocalRotations):
         found = [torch.zeros_like(value) for value in given]
         adjoints = [found[0], None, found[1], *[None] * 3, to_total]
         taken = self._on_trajectory(given[0], which, given[1], total)
-        launch(kernels("rotations").trajectory_edges, (len(which), len(self.faces)), taken, adjoints)
+        launch(kernels("adjoints").trajectory_edges, (len(which), len(self.faces)), taken, adjoints)
         return found
 
     def _on_trajectory(self, packed: Tensor, which: Tensor, t: Tensor, total: Tensor) -> list[Any]:

@@ -101,11 +101,15 @@ class WarpShell(nn.Module):
         """
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
         pull, shortest, whole, volume, constant = self._weighed(t, gamma, self.sizes(first, second))
-        (b, n), n_edges = first.shape[:2], len(self.record)
+        b, n_edges = len(t), len(self.record)
         stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 4)
-        given = [first, second, self.record, self.hinge, pull, shortest, alpha, beta, n, alpha.shape[-1]]
-        launch(kernels("shell").rest, (b, n_edges), [*given, beta.shape[-1], stretch, bend, constant])
+        given = self._rest(first, second, pull, shortest, alpha, beta)
+        launch(kernels("shell").rest, (b, n_edges), [*given, stretch, bend, constant])
         return ShellReference(stretch, bend, whole, volume, constant)
+
+    def _rest(self, first: Tensor, second: Tensor, pull: Tensor, shortest: Tensor, *stiffness: Tensor) -> list[Any]:
+        given = [first, second, self.record, self.hinge, pull, shortest, *stiffness, first.shape[1]]
+        return [*given, *(value.shape[-1] for value in stiffness)]
 
     def _weighed(self, t: Tensor, gamma: Tensor, sizes: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Pulls and shortest lengths of both ends, *shape* ``(B, 2)``; of volumes stiffness, value, constant."""
@@ -117,7 +121,7 @@ class WarpShell(nn.Module):
         self, received: ShellReference, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor
     ) -> tuple[Tensor, ...]:
         """Adjoint of :meth:`reference`: gradients of its arguments, from those of its result without the constant."""
-        (b, n), n_edges = first.shape[:2], len(self.record)
+        module, b, n_edges = kernels("adjoints"), len(t), len(self.record)
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
         sizes = self.sizes(first, second)
         weighed = self._weighed(t, gamma, sizes)
@@ -125,22 +129,17 @@ class WarpShell(nn.Module):
         to_t, to_gamma, to_constant = t.new_zeros(3, b)
         adjoints = [to_t, to_gamma, None, to_volumes, to_areas, None, to_pull, None]
         adjoints += [received.stiffness.clone(), received.volume.clone(), to_constant]
-        launch(kernels("shell").weigh, (b,), [t, gamma, *sizes, n_edges, *weighed], adjoints)
+        launch(module.weigh, (b,), [t, gamma, *sizes, n_edges, *weighed], adjoints)
         to_first, to_second = torch.zeros(2, *first.shape, dtype=first.dtype, device=first.device)
         to_alpha, to_beta = torch.zeros_like(alpha), torch.zeros_like(beta)
+        given = [*self._rest(first, second, *weighed[:2], alpha, beta), received.stretch, received.bend, weighed[-1]]
+        adjoints = [to_first, to_second, None, None, to_pull, None, to_alpha, to_beta, *[None] * 3]
+        adjoints += [received.stretch.clone(), received.bend.clone(), None]
+        launch(module.rest, (b, n_edges), given, adjoints)
         centres = (None, None) if self.closed else first.new_zeros(2, b, 3).unbind()
-        given: list[Any] = [
-            first,
-            second,
-            self.centre(first),
-            self.centre(second),
-            self.record,
-            self.hinge,
-            self.capped_faces,
-        ]
-        given += [*weighed[:2], alpha, beta, n, alpha.shape[-1], beta.shape[-1], received.stretch, received.bend]
-        given += [to_volumes, to_areas, to_first, to_second, *centres, to_pull, to_alpha, to_beta]
-        launch(kernels("shell_adjoint").from_reference, (b, n_edges + len(self.capped_faces)), given)
+        given = [*self._sized(first, second, self.record), *sizes]
+        adjoints = [to_first, to_second, *centres, None, None, None, None, to_volumes, to_areas]
+        launch(module.sizes, (b, n_edges + len(self.capped_faces)), given, adjoints)
         for found, centre in zip((to_first, to_second), centres, strict=True):
             self._spread(centre, found)
         to_t += to_pull[:, 1] - to_pull[:, 0]
@@ -179,18 +178,13 @@ class WarpShell(nn.Module):
 
     def _sizes(self, first: Tensor, second: Tensor, record: Tensor) -> tuple[Tensor, ...]:
         found = first.new_zeros(3, len(first), 2).unbind()
-        given = [
-            first,
-            second,
-            self.centre(first),
-            self.centre(second),
-            record,
-            self.capped_faces,
-            self.n_vertices,
-            *found,
-        ]
-        launch(kernels("shell").sizes, (len(first), len(record) + len(self.capped_faces)), given)
+        dim = len(first), len(record) + len(self.capped_faces)
+        launch(kernels("shell").sizes, dim, [*self._sized(first, second, record), *found])
         return found
+
+    def _sized(self, first: Tensor, second: Tensor, record: Tensor) -> list[Any]:
+        centres = self.centre(first), self.centre(second)
+        return [first, second, *centres, record, self.capped_faces, self.n_vertices]
 
     def centre(self, x: Tensor) -> Tensor | None:
         """The origin of volumes: the mean; None, for any vertex, where the surface is closed. *Shape:* ``(B, 3)``."""
@@ -266,9 +260,14 @@ class WarpShell(nn.Module):
             to_normal = to_normal - self.mean(to_normal)[:, None]
         centre = self.centre(x)
         to_centre = None if centre is None else torch.zeros_like(centre)
-        given = [x, self.record, to.stretch, to.bend, centre, self.capped_faces, self.n_vertices, to_gradient, *others]
-        given += [to_volume, to_normal, to_x, to_reference.stretch, to_reference.bend, to_centre]
-        launch(kernels("shell_adjoint").from_point, (len(x), len(self.record) + len(self.capped_faces)), given)
+        given = [x, self.record, to.stretch, to.bend, centre, self.capped_faces, self.n_vertices, None]
+        # Where nothing is received, nothing is computed.
+        taken = [None if other is None else own for own, other in zip(at[2:5], others, strict=True)]
+        given += [at.gradient, *taken, at.energy, torch.empty_like(at.normal)]  # functions of kernels add once more
+        adjoints = [to_x, None, to_reference.stretch, to_reference.bend, to_centre, None, None, None]
+        adjoints += [to_gradient, *others, to_volume, to_normal]
+        dim = len(x), len(self.record) + len(self.capped_faces)
+        launch(kernels("adjoints").linearise, dim, given, adjoints)
         self._spread(to_centre, to_x)
         off = torch.where(to.stiffness > 0, at.moment / torch.where(to.stiffness > 0, to.stiffness, 1), 0)
         to_reference.stiffness.add_(to_moment * off)

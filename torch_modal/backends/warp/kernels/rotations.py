@@ -306,7 +306,7 @@ def part_turned(
         add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], areas[at], x * one, y * one + z * two)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def trajectory_edges(
     trajectory: wp.array(dtype=packed_trajectory),
     which: wp.array(dtype=wp.int32),

@@ -81,7 +81,7 @@ def own_size(volume: real, area: real):
     return wp.max(wp.abs(volume), THIN * wp.pow(area, real(1.5)))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def weigh(
     time: wp.array(dtype=real),
     gamma: wp.array(dtype=real),
