@@ -54,6 +54,24 @@ def test_gradients_do_not_change_the_result_on_a_hand(hands: Shapes, name: str, 
     assert (plain - recorded).abs().max() < 1e-9 * diagonal
 
 
+@pytest.mark.parametrize("kind", ["side", "line", "point"])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_gradients_at_a_triangle_without_area_have_a_bound(hands: Shapes, kind: str, backend: str) -> None:
+    layer = tm.InBetween([hands.bases[0], hands.bases[4]], hands.faces, solver=tm.Solver(backend=backend))
+    a, b, c = hands.faces[50]
+
+    def gradient(x: Tensor) -> Tensor:
+        x = x.clone().requires_grad_()
+        return torch.autograd.grad(layer(x[0], x[1], 0.4).square().sum(), x)[0]
+
+    x = hands.keyframes[[0, 4]]
+    truth = gradient(x)
+    x[1, a] = 0.5 * (x[1, b] + x[1, c]) if kind == "line" else x[1, b]
+    if kind == "point":
+        x[1, c] = x[1, b]
+    assert gradient(x).norm() < 1.2 * truth.norm()
+
+
 class TestFallBack:
     """A result that is worse than its start."""
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.geometry.rotations import turned
-from torch_modal.geometry.vectors import cross, norm, pick, tiny
+from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
 # Smallest height relative to the sides; below, it is rounding, and the division amplifies noise.
 FLAT = 1e-6
@@ -72,14 +72,18 @@ def sides(x: Tensor, faces: Tensor) -> Sides:
 
 
 def frames(given: Sides) -> Frames:
-    """The frame of each triangle; finite but arbitrary for one without area."""
+    """The frame of each triangle; finite but arbitrary, and a constant, for one without area."""
     first, second = given
     length = norm(first)
-    e1 = first / length
+    e1 = first * inverse(length, _dot(first, first) <= tiny(first))
     along = _dot(second, e1)
     across = second - along * e1
-    height = torch.maximum(norm(across), FLAT * (length + along.abs()))
+    rise, least = norm(across), FLAT * (length + along.abs())
+    height = torch.maximum(rise, least)
     e2 = across / height
+    # Derivatives of what is arbitrary have no bound.
+    flat = (rise <= least) | (_dot(across, across) <= tiny(across))
+    e1, e2, height = (torch.where(flat, value.detach(), value) for value in (e1, e2, height))
     return Frames(e1, e2, cross(e1, e2), length, along, height)
 
 
