@@ -7,6 +7,8 @@ from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev
 
 from torch_modal.backends.torch.alignment import Pair
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.fine_energy import FineEnergy
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.stretch import Stretch
@@ -15,7 +17,7 @@ from torch_modal.energy.volume import Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.frame import Frame
-from torch_modal.inbetween.levels import Levels, Stiffness
+from torch_modal.inbetween.levels import Levels
 from torch_modal.inbetween.paired import PairedPlacement, PairedProblem, PairedSpace
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
@@ -33,13 +35,14 @@ class Setting:
         self.frame = Frame(bars.keyframes[:2], bars.faces, coarse_faces)
         self.shell = ShellEnergy(self.frame.coarse.faces)
         terms = [Stretch(500.0), Bend(10.0), Volume(1000.0)]
-        levels = Levels(self.frame, Mesh.of(bars.faces, bars.keyframes.shape[1]), terms)
+        self.fine = FineEnergy(Mesh.of(bars.faces, bars.keyframes.shape[1]), terms)
+        levels = Levels(self.frame, self.fine, TorchBackend())
         self.space = PairedSpace(self.frame, levels, [basis.modes for basis in bars.bases[:2]])
         self.pair: Pair = self.frame.place(bars.keyframes[:2], bars.keyframes[1:3])
         half = torch.full((2,), 0.5, dtype=torch.float64)
         each = [torch.full((2, 1), term.stiffness, dtype=torch.float64) for term in terms]
         mus = torch.as_tensor(mu, dtype=torch.float64).expand(2)
-        self.problem: PairedProblem = self.space.problem(self.pair, None, half, Stiffness(each, [each]), mus, None)
+        self.problem: PairedProblem = self.space.problem(self.pair, None, half, [each], mus, None)
         self.placement: PairedPlacement = self.problem.placement
         generator = torch.Generator().manual_seed(3)
         self.a = torch.randn(2, self.space.n_unknowns, dtype=torch.float64, generator=generator)

@@ -53,9 +53,8 @@ class Bend(Term):
         return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
 
     def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
-        """Those of all pairs, but for the tips'."""
-        ij, ik, im, jk, jm, _ = super().blocks(edge_vectors, slope)
-        return [ij, ik.transpose(0, 1), jk.transpose(0, 1), im.transpose(0, 1), jm.transpose(0, 1)]
+        """In closed form: ``torch.func`` knows neither checkpoints, whose tensors have hooks, nor ``torch.export``."""
+        return (slope * dihedral_hessian(edge_vectors)).unbind()
 
 
 def dihedral_angle(edge_vectors: Tensor) -> Tensor:
@@ -96,6 +95,43 @@ def dihedral_gradient(edge_vectors: Tensor) -> Tensor:
     to_b = n2 * (-length * inverse((n2 * n2).sum(0), flat))
     to_e = -((a * e).sum(0) * to_a + (b * e).sum(0) * to_b) * inverse((e * e).sum(0), flat)
     return torch.stack([to_e, to_a, to_b])
+
+
+def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
+    r"""Hessian of :func:`dihedral_angle` in closed form, as its blocks between different vertices.
+
+    Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude ``h``
+    and ``w = n x e``: with :math:`S = (n w^T + w n^T)\, |e| / |n_1|^2` and :math:`U = e n^T / (|e| |n_1|)`, a tip
+    whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with ``j``. The edge's own,
+    between ``e`` and ``e``, is :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)`. The two tips have none. What is left
+    follows because translations change nothing.
+
+    Args:
+        edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
+
+    Returns:
+        The blocks of the vertices ``ij, ki, kj, li, lj`` of a hinge, indexed by row, then column; zero where a triangle
+        is collapsed. *Shape:* ``(5, 3, 3, ...)``.
+    """
+    e, a, b = edge_vectors
+    n1, n2 = cross(e, a), cross(b, e)
+    flat = collapsed(e, n1) | collapsed(e, n2)
+    length = norm(e)
+    per_length = inverse(length, flat)
+    own = e.new_zeros(())
+    blocks = []
+    for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
+        area = (normal * normal).sum(0)
+        per_area = inverse(area, flat)
+        # n and w are not of length one here: their factors are in front.
+        half = (normal * (length * per_area * per_area))[:, None] * w
+        s = half + half.transpose(0, 1)
+        u = e[:, None] * (normal * (per_length * per_area))
+        r = (tip * e).sum(0) * per_length * per_length
+        across = u - r * s
+        own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1)) + across
+        blocks += [-s - across, across]
+    return torch.stack([-own, *blocks])
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:

@@ -3,7 +3,7 @@ r"""Terms of an energy: measures of the elements of a mesh, and their weights.
 A term has the energy :math:`\sum_m k_m w_m (q_m - \bar q_m)^2` over its elements ``m``, with a measure ``q`` of each,
 its value at rest, weights ``w`` that depend on the rest shape, and the stiffness ``k``. All that a term must say is
 which elements it sees and what it measures on one of them: derivatives then come from ``torch.func``. The terms of
-Eq. 5 write their gradients out.
+Eq. 5 write theirs out.
 """
 
 from collections.abc import Sequence

@@ -10,6 +10,8 @@ from torch import Tensor
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.backends.torch.alignment import Alignment, Pair, PlacedPairs
 from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.coarse_energy import CoarseEnergy
+from torch_modal.backends.torch.fine_energy import FineEnergy
 from torch_modal.backends.warp import alignment
 from torch_modal.backends.warp.coarse_energy import WarpCoarseEnergy
 from torch_modal.backends.warp.crossings import WarpPairs
@@ -18,8 +20,12 @@ from torch_modal.backends.warp.fine_energy import WarpFineEnergy
 from torch_modal.backends.warp.launch import kernels, load_kernels
 from torch_modal.backends.warp.poisson import WarpPoisson
 from torch_modal.backends.warp.rotations import WarpRotations
+from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, Term
+from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 
@@ -62,13 +68,14 @@ class WarpBackend(TorchBackend):
         """As in the base class."""
         return WarpPoisson(mesh, weights)
 
-    def coarse_energy(self, energy: Energy, mesh: Mesh) -> WarpCoarseEnergy:
+    def coarse_energy(self, energy: Energy, mesh: Mesh) -> CoarseEnergy:
         """As in the base class."""
-        return WarpCoarseEnergy(energy, mesh)
+        serves = _are_of_shell([part.term for part in energy.parts])
+        return WarpCoarseEnergy(energy, mesh) if serves else super().coarse_energy(energy, mesh)
 
-    def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> WarpFineEnergy:
+    def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """As in the base class."""
-        return WarpFineEnergy(mesh, terms)
+        return WarpFineEnergy(mesh, terms) if _are_of_shell(terms) else super().fine_energy(mesh, terms)
 
     def distortion(self, mesh: Mesh, further: Energy | None) -> WarpDistortion:
         """As in the base class."""
@@ -77,6 +84,11 @@ class WarpBackend(TorchBackend):
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
         """As in the base class."""
         return WarpPairs(mesh, shape[None])
+
+
+def _are_of_shell(terms: Sequence[Term]) -> bool:
+    """Whether the first terms are those of Eq. 5 themselves, and not classes that inherit from them."""
+    return [type(term) for term in terms[:N_SHELL_TERMS]] == [Stretch, Bend, Volume]
 
 
 def _is_installed() -> bool:

@@ -121,7 +121,7 @@ def jacobian(
 
 @wp.func
 def half_of_hinge(e: vec3, tip: vec3, normal: vec3, w: vec3, length: real):
-    """One triangle's part of the dihedral angle's Hessian: that of energy/bend.py."""
+    """One triangle's part of the dihedral angle's Hessian: bend.dihedral_hessian."""
     area = wp.dot(normal, normal)
     half = wp.outer((length / (area * area)) * normal, w)
     s = half + wp.transpose(half)
