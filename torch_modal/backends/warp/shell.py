@@ -108,6 +108,7 @@ class WarpShell(nn.Module):
         return ShellReference(stretch, bend, whole, volume, constant)
 
     def _rest(self, first: Tensor, second: Tensor, pull: Tensor, shortest: Tensor, *stiffness: Tensor) -> list[Any]:
+        """What ``shell.rest`` takes, without its results."""
         given = [first, second, self.record, self.hinge, pull, shortest, *stiffness, first.shape[1]]
         return [*given, *(value.shape[-1] for value in stiffness)]
 
@@ -183,6 +184,7 @@ class WarpShell(nn.Module):
         return found
 
     def _sized(self, first: Tensor, second: Tensor, record: Tensor) -> list[Any]:
+        """What ``shell.sizes`` takes, without its results."""
         centres = self.centre(first), self.centre(second)
         return [first, second, *centres, record, self.capped_faces, self.n_vertices]
 
