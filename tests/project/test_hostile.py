@@ -138,7 +138,7 @@ def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
         process.communicate()
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
-    assert cache_content(tmp_path / "cache").n_entries == 0
+    assert cache_content(tmp_path / "cache").n_entries == 0, errors
 
 
 @pytest.mark.slow

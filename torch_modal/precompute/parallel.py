@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -60,8 +60,12 @@ def run_all(
                 futures.append(pool.submit(alone, index))
             if meanwhile is not None:
                 futures.append(pool.submit(meanwhile))
-            for future in as_completed(futures):
-                future.result()
+            pending = set(futures)
+            while pending:
+                # A signal that another thread receives ends no wait of this one, which then looks for it by itself.
+                done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in done:
+                    future.result()
         except BaseException:
             stop.set()
             for future in futures:
