@@ -133,7 +133,7 @@ def assert_member_runs(member: Any, x: Tensor, t: Tensor, stiffness: list[Tensor
     derivatives = member.space.energy.derivatives(a, problem.placement)
     shapes = member.space.lift(a, problem)
     assert_there([problem, derivatives, shapes, member.frame.restore(shapes, pair, t)])
-    reference = member.fine.reference(member.rests(samples, pair, None))
+    reference = member.rests(samples, pair, None).reference(member.fine.energy)
     assert_there([reference, member.anchors(pair, t) or []])
     steps(member.fine.energy, shapes, reference)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.backends.torch.distortion import Distortion, _weights
-from torch_modal.backends.torch.fine_energy import Rests
+from torch_modal.backends.torch.rests import Rests
 from torch_modal.backends.warp.backend import WarpBackend
 from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.energy.term import Mesh

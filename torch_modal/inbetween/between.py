@@ -13,7 +13,8 @@ from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.backends.torch.fine_energy import FineEnergy, Rests
+from torch_modal.backends.torch.fine_energy import FineEnergy
+from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term

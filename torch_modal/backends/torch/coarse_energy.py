@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from torch_modal import trees
+from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy
 
@@ -37,5 +37,4 @@ class CoarseEnergy(nn.Module):
             t: *Shape:* ``(B,)``.
             stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
-        one, other = trees.picked((self.energy.rest_of(first), self.energy.rest_of(second)), which)
-        return self.energy.between(one, other, t, stiffness)
+        return Rests((first, second), which, t, stiffness).reference(self.energy)

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.backends.torch.fine_energy import Rests
+from torch_modal.backends.torch.fine_steps import FurtherTerms
+from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.bend import collapsed, dihedral_angle, wrap_angle
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.shell import DIAGONAL, N_SHELL_TERMS
+from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.vectors import cross, inverse, norm
 
@@ -67,11 +68,8 @@ class Distortion(nn.Module):
         """The distortion of S shapes of each sample. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         total = self.of_shell(shapes, rests)
         if self.further is not None:
-            first, second = trees.picked([self.further.rest_of(end) for end in rests.shapes], rests.which)
-            reference = self.further.between(first, second, rests.t, rests.stiffness[N_SHELL_TERMS:])
-            fixed = None if rests.anchors is None else rests.anchors.movedim(-1, 0)
-            each = [self.further.extend(x.movedim(-1, 0).contiguous(), fixed) for x in shapes]
-            total = total + torch.stack([self.further.value(x, reference) for x in each])
+            terms = FurtherTerms(self.further, rests.further())
+            total = total + torch.stack([terms.value(x) for x in shapes])
         return total
 
     def of_shell(self, shapes: Sequence[Tensor], rests: Rests) -> Tensor:

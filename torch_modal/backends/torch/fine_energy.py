@@ -1,14 +1,14 @@
 """The energy on the caller's mesh, and steps of all its vertices."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.backends.torch.fine_steps import FurtherEnergy, relax
-from torch_modal.energy.energy import Energy, Reference
+from torch_modal.backends.torch.rests import Rests
+from torch_modal.energy.energy import Energy
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import cross, pick
 
@@ -19,21 +19,6 @@ CHUNK_OF_GPU = 1_000_000
 
 Beside = Callable[[slice, Tensor], Sequence[FurtherEnergy]]
 """Makes energies beside that of the terms, for some of the samples, in the dtype of a tensor."""
-
-
-class Rests(NamedTuple):
-    """The rest shapes of the samples of a batch, with their times and stiffnesses."""
-
-    shapes: tuple[Tensor, ...]
-    """Those of the weights ``1 - t`` and ``t``, or one of each sample. *Shape of each:* ``(P, V, 3)``."""
-    which: Tensor | None
-    """The pair of each sample; each its own where None. *Shape:* ``(B,)``."""
-    t: Tensor
-    """*Shape:* ``(B,)``."""
-    stiffness: Sequence[Tensor]
-    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
-    anchors: Tensor | None
-    """Of the terms, where there are some. *Shape:* ``(B, P, 3)``."""
 
 
 class FineEnergy(nn.Module):
@@ -58,17 +43,10 @@ class FineEnergy(nn.Module):
         return tuple(part.term for part in self.energy.parts)
 
     def volumes(self, first: Tensor, second: Tensor) -> Tensor:
-        """Six times the signed volume of pairs of shapes. *Shape:* ``(P, V, 3), (P, V, 3) -> (P, 2)``."""
+        """Signed volumes of pairs of closed shapes. *Shape:* ``(P, V, 3), (P, V, 3) -> (P, 2)``."""
         rows = [x.detach().movedim(-1, 0).contiguous() for x in (first, second)]
         corners = ([pick(x, corner) for corner in self.faces.unbind(1)] for x in rows)
-        return torch.stack([(a * cross(b, c)).sum((0, -1)) for a, b, c in corners], -1)
-
-    def reference(self, rests: Rests) -> Reference:
-        """What shapes are compared with, of all terms."""
-        first, *others = trees.picked([self.energy.rest_of(x) for x in rests.shapes], rests.which)
-        if not others:
-            return Energy.against(first, rests.stiffness)
-        return self.energy.between(first, others[0], rests.t, rests.stiffness)
+        return torch.stack([(a * cross(b, c)).sum((0, -1)) for a, b, c in corners], -1) / 6
 
     def relax(self, x: Tensor, rests: Rests, stages: Sequence[tuple[int, int]], beside: Beside | None = None) -> Tensor:
         """Steps of all vertices, never uphill (:func:`~torch_modal.backends.torch.fine_steps.relax`).
@@ -84,7 +62,7 @@ class FineEnergy(nn.Module):
         """
         parts = []
         for own, some in self.chunks(rests):
-            moved, reference = x[own], self.reference(some)
+            moved, reference = x[own], some.reference(self.energy)
             further = () if beside is None else beside(own, moved)
             for n_steps, n_products in stages:
                 moved = relax(self.energy, moved, reference, n_steps, n_products, some.anchors, further)

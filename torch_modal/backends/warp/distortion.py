@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.backends.torch.fine_energy import Rests
+from torch_modal.backends.torch.rests import Rests
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.term import Mesh

@@ -7,10 +7,11 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.autograd import traced, transformed
-from torch_modal.backends.torch.fine_energy import Beside, FineEnergy, Rests, chunk_of
-from torch_modal.backends.torch.fine_steps import ConvexHessian, FurtherDerivatives, FurtherEnergy
+from torch_modal.backends.torch.fine_energy import Beside, FineEnergy, chunk_of
+from torch_modal.backends.torch.fine_steps import FurtherTerms
+from torch_modal.backends.torch.rests import Rests
 from torch_modal.backends.warp.fine_steps import WarpSteps
-from torch_modal.energy.energy import Energy, Reference
+from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
 
@@ -44,50 +45,13 @@ class WarpFineEnergy(FineEnergy):
             return super().relax(x, rests, stages, beside)
         parts = []
         for own, some in self.chunks(rests):
-            shapes, _, t, stiffness, anchors = trees.mapped(some, lambda value: value.double().contiguous())
-            first, second, moved = shapes[0], shapes[-1], x[own].double().contiguous()
+            some = trees.mapped(some, lambda value: value.double().contiguous())
+            moved = x[own].double().contiguous()
             others = [] if beside is None else list(beside(own, moved))
             if self.further is not None:
-                one, other = (self.further.rest_of(x) for x in (first, second))
-                reference = self.further.between(one, other, t, stiffness[N_SHELL_TERMS:])
-                others.append(FurtherTerms(self.further, reference, anchors))
-            to = self.steps.reference(first, second, t, *stiffness[:N_SHELL_TERMS])
+                others.append(FurtherTerms(self.further, some.further()))
+            to = self.steps.reference(some.shapes[0], some.shapes[-1], some.t, *some.stiffness[:N_SHELL_TERMS])
             for n_steps, n_products in stages:
                 moved = self.steps.descend(moved, to, others, n_steps, n_products)
             parts.append(moved)
         return torch.cat(parts).to(x)
-
-
-class FurtherTerms(FurtherEnergy):
-    """Terms in torch as an energy beside Eq. 5.
-
-    Args:
-        energy: Of these terms.
-        reference: What shapes are compared with.
-        anchors: Of the terms, where there are some. *Shape:* ``(B, P, 3)``.
-    """
-
-    def __init__(self, energy: Energy, reference: Reference, anchors: Tensor | None) -> None:
-        self.energy, self.reference = energy, reference
-        self.anchors = None if anchors is None else anchors.movedim(-1, 0)
-
-    def _extended(self, x: Tensor) -> Tensor:
-        return self.energy.extend(x.movedim(-1, 0).contiguous(), self.anchors)
-
-    def value(self, x: Tensor) -> Tensor:
-        """*Shape:* ``(B, V, 3) -> (B,)``."""
-        return self.energy.value(self._extended(x), self.reference)
-
-    def at(self, x: Tensor) -> FurtherDerivatives:
-        """*Shape:* ``(B, V, 3)``."""
-        energy, n = self.energy, x.shape[1]
-        at = energy.linearise(self._extended(x), self.reference)
-        hessian = ConvexHessian(energy, at)
-        packed = hessian.diagonal().flatten(0, 1)[[0, 1, 2, 4, 5, 8], ..., :n].movedim(0, -1)
-
-        def product(field: Tensor) -> Tensor:
-            rows = energy.extend(field.movedim(-1, 0).contiguous())
-            return energy.fold(hessian(rows)).movedim(0, -1)
-
-        gradient = energy.fold(energy.gradient(at)).movedim(0, -1)
-        return FurtherDerivatives(energy.value_at(at, self.reference), gradient, packed, product)

@@ -1,0 +1,36 @@
+"""The rest shapes of a batch, which energies compare with."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from torch import Tensor
+
+from torch_modal import trees
+from torch_modal.energy.energy import Energy, Reference
+from torch_modal.energy.shell import N_SHELL_TERMS
+
+
+class Rests(NamedTuple):
+    """The rest shapes of the samples of a batch, with their times and stiffnesses."""
+
+    shapes: tuple[Tensor, ...]
+    """Those of the weights ``1 - t`` and ``t``, or one of each sample. *Shape of each:* ``(P, V, 3)``."""
+    which: Tensor | None
+    """The pair of each sample; each its own where None. *Shape:* ``(B,)``."""
+    t: Tensor
+    """*Shape:* ``(B,)``."""
+    stiffness: Sequence[Tensor]
+    """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    anchors: Tensor | None = None
+    """Of the terms, where there are some. *Shape:* ``(B, P, 3)``."""
+
+    def reference(self, energy: Energy) -> Reference:
+        """What shapes are compared with, of the terms that the stiffnesses belong to."""
+        first, *others = trees.picked([energy.rest_of(x) for x in self.shapes], self.which)
+        if not others:
+            return Energy.against(first, self.stiffness)
+        return energy.between(first, others[0], self.t, self.stiffness)
+
+    def further(self) -> "Rests":
+        """The same for the terms beyond Eq. 5 alone."""
+        return self._replace(stiffness=self.stiffness[N_SHELL_TERMS:])
