@@ -21,6 +21,7 @@ from torch_modal.progress import ProgressReport
 
 Module = Literal[
     "alignment",
+    "references",
     "shell",
     "modal",
     "steps",
@@ -32,7 +33,7 @@ Module = Literal[
     "distortion",
 ]
 PACKAGE = "torch_modal.backends.warp.kernels"
-IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "shell", "modal", "steps", "distortion")
+IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "references", "shell", "modal", "steps", "distortion")
 """The modules for in-betweens without gradients."""
 MOST_ENTRIES = 2**31 - 1
 """Kernels index with 32 bits: no array of theirs, and no launch, may be longer."""

@@ -104,18 +104,18 @@ class WarpShell(nn.Module):
         b, n_edges = len(t), len(self.record)
         stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 4)
         given = self._rest(first, second, pull, shortest, alpha, beta)
-        launch(kernels("shell").rest, (b, n_edges), [*given, stretch, bend, constant])
+        launch(kernels("references").rest, (b, n_edges), [*given, stretch, bend, constant])
         return ShellReference(stretch, bend, whole, volume, constant)
 
     def _rest(self, first: Tensor, second: Tensor, pull: Tensor, shortest: Tensor, *stiffness: Tensor) -> list[Any]:
-        """What ``shell.rest`` takes, without its results."""
+        """What ``references.rest`` takes, without its results."""
         given = [first, second, self.record, self.hinge, pull, shortest, *stiffness, first.shape[1]]
         return [*given, *(value.shape[-1] for value in stiffness)]
 
     def _weighed(self, t: Tensor, gamma: Tensor, sizes: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Pulls and shortest lengths of both ends, *shape* ``(B, 2)``; of volumes stiffness, value, constant."""
         found = (*t.new_empty(2, len(t), 2).unbind(), *t.new_empty(3, len(t)).unbind())
-        launch(kernels("shell").weigh, (len(t),), [t, gamma, *sizes, len(self.record), *found])
+        launch(kernels("references").weigh, (len(t),), [t, gamma, *sizes, len(self.record), *found])
         return found
 
     def from_reference(
@@ -180,11 +180,11 @@ class WarpShell(nn.Module):
     def _sizes(self, first: Tensor, second: Tensor, record: Tensor) -> tuple[Tensor, ...]:
         found = first.new_zeros(3, len(first), 2).unbind()
         dim = len(first), len(record) + len(self.capped_faces)
-        launch(kernels("shell").sizes, dim, [*self._sized(first, second, record), *found])
+        launch(kernels("references").sizes, dim, [*self._sized(first, second, record), *found])
         return found
 
     def _sized(self, first: Tensor, second: Tensor, record: Tensor) -> list[Any]:
-        """What ``shell.sizes`` takes, without its results."""
+        """What ``references.sizes`` takes, without its results."""
         centres = self.centre(first), self.centre(second)
         return [first, second, *centres, record, self.capped_faces, self.n_vertices]
 

@@ -6,7 +6,7 @@ function that it calls does (``add_sides``, ``enclosed``) is done once more: suc
 
 import warp as wp
 
-from torch_modal.backends.warp.kernels import rotations, shell
+from torch_modal.backends.warp.kernels import references, rotations, shell
 
 
 def _with_adjoint(kernel: wp.Kernel) -> wp.Kernel:
@@ -14,7 +14,7 @@ def _with_adjoint(kernel: wp.Kernel) -> wp.Kernel:
 
 
 trajectory_edges = _with_adjoint(rotations.trajectory_edges)
-weigh = _with_adjoint(shell.weigh)
-sizes = _with_adjoint(shell.sizes)
-rest = _with_adjoint(shell.rest)
+weigh = _with_adjoint(references.weigh)
+sizes = _with_adjoint(references.sizes)
+rest = _with_adjoint(references.rest)
 linearise = _with_adjoint(shell.linearise)
