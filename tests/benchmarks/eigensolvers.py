@@ -8,7 +8,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from torch_modal.precompute.eigen import GUARD, N_RIGID, SHIFT, relative_residual
+from torch_modal.precompute.eigen import GUARD, N_RIGID, relative_residual, solid_scale
 from torch_modal.precompute.lanczos import factored, lowest_spans
 from torch_modal.precompute.lattice import lattice
 from torch_modal.precompute.stiffness import Mass, arap_hessian, mass_matrix
@@ -28,7 +28,7 @@ def eigensolvers(name: str, vertices: FloatArray, faces: IntArray) -> None:
     for cell in CELLS:
         solid = lattice(surface, cell)
         k, mass = arap_hessian(solid), Mass(mass_matrix(solid))
-        shift = SHIFT / float((np.ptp(solid.vertices, axis=0) ** 2).sum())
+        shift = solid_scale(solid.vertices).shift
         for n_modes in MODES:
             n_pairs = n_modes + N_RIGID + GUARD
             ways = (

@@ -1,7 +1,8 @@
 """Bodies of all kinds, each bent and twisted by 60 degrees with a known middle: what comes back, and what it says.
 
     python tests/benchmarks/wild.py [--kinds KIND ...] [--only TEXT ...] [--presets NAME ...] [--contact none|few|all]
-                                    [--bodies N] [--jobs N] [--patience FACTOR] [--out FILE.json]
+                                    [--method auto|solid|shell] [--bodies N] [--jobs N] [--patience FACTOR]
+                                    [--out FILE.json]
     python tests/benchmarks/wild.py --list
 
 More than a hundred bodies (tests/benchmarks/wild_bodies.py): with thin limbs, of many pieces, thin, open, not
@@ -60,6 +61,7 @@ from wild_making import BODIES, WildBody
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
+from torch_modal.precompute.method import METHODS, Method
 from torch_modal.solve.solver import Status
 
 N_MODES = 30
@@ -110,7 +112,9 @@ class Row:
 # ------------------------------------------------------------------------------------------------- in the child process
 
 
-def attempt(body: WildBody, ways: Sequence[tuple[str, bool]], say: Callable[[Any], None]) -> None:
+def attempt(
+    body: WildBody, ways: Sequence[tuple[str, bool]], say: Callable[[Any], None], method: Method = "auto"
+) -> None:
     """Try a body: a step's name is said before it starts, and a row after each way."""
     say("modes")
     rows = [Row(body.name, body.kind, preset, contact) for preset, contact in ways]
@@ -123,7 +127,9 @@ def attempt(body: WildBody, ways: Sequence[tuple[str, bool]], say: Callable[[Any
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         start = time.perf_counter()
-        bases, failed = guarded(lambda: tm.extract_bases(torch.stack(poses[::2]), surface, N_MODES, progress=False))
+        bases, failed = guarded(
+            lambda: tm.extract_bases(torch.stack(poses[::2]), surface, N_MODES, method=method, progress=False)
+        )
         spent = time.perf_counter() - start
     for row in rows:
         say("contact" if row.contact else "in-between")
@@ -220,10 +226,10 @@ def serve(pipe: Connection) -> None:
     limit_threads()
     while True:
         try:
-            name, ways = pipe.recv()
+            name, ways, method = pipe.recv()
         except EOFError:
             return
-        attempt(BODIES[name], ways, pipe.send)
+        attempt(BODIES[name], ways, pipe.send, method)
         pipe.send("done")
 
 
@@ -233,8 +239,14 @@ def serve(pipe: Connection) -> None:
 class Worker:
     """A child process that tries bodies, started when it is needed."""
 
-    def __init__(self, patience: float, serve: Callable[[Connection], None] = serve, method: str = "spawn") -> None:
-        self.patience, self.serve, self.method = patience, serve, method
+    def __init__(
+        self,
+        patience: float,
+        serve: Callable[[Connection], None] = serve,
+        start: str = "spawn",
+        method: Method = "auto",
+    ) -> None:
+        self.patience, self.serve, self.start_method, self.method = patience, serve, start, method
         self.process: Any = None
 
     def try_body(self, body: WildBody, ways: Sequence[tuple[str, bool]]) -> Iterator[Row]:
@@ -242,7 +254,7 @@ class Worker:
         left = list(ways)
         while left:
             self._start()
-            self.pipe.send((body.name, left))
+            self.pipe.send((body.name, left, self.method))
             step, outcome = "start", ""
             while not outcome:
                 limit = self.patience * LIMITS[step] if step in LIMITS else START
@@ -269,7 +281,7 @@ class Worker:
 
     def _start(self) -> None:
         if self.process is None:
-            context = multiprocessing.get_context(self.method)
+            context = multiprocessing.get_context(self.start_method)
             self.pipe, other = context.Pipe()
             self.process = context.Process(target=self.serve, args=(other,))
             self.process.start()
@@ -289,7 +301,7 @@ class Worker:
 
 def run(chosen: list[WildBody], arguments: argparse.Namespace) -> Iterator[list[Row]]:
     """All bodies, the rows of each as it is done."""
-    workers: list[Worker] = [Worker(arguments.patience) for _ in range(arguments.jobs)]
+    workers: list[Worker] = [Worker(arguments.patience, method=arguments.method) for _ in range(arguments.jobs)]
 
     def one(body: WildBody) -> list[Row]:
         worker = workers.pop()
@@ -390,6 +402,7 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--contact", choices=("none", "few", "all"), default="few", help="bodies to try with contact, too"
     )
+    parser.add_argument("--method", choices=METHODS, default="auto", help="of the modes (default: %(default)s)")
     parser.add_argument("--bodies", type=int, metavar="N", help="so many at most, of each kind about as many")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="child processes")
     parser.add_argument("--patience", type=float, default=1.0, metavar="FACTOR", help=f"of the limits, {LIMITS} s")

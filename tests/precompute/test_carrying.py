@@ -12,7 +12,7 @@ from torch_modal.precompute.carrying import Carried, Carrier, nearest_rotations,
 from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
 from torch_modal.precompute.proximity import clearances, self_proximity, separation
-from torch_modal.precompute.solving import Solved
+from torch_modal.precompute.solving import Solid, Solved
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
@@ -200,8 +200,8 @@ def test_what_is_known_to_tear_is_not_carried(monkeypatch: pytest.MonkeyPatch) -
     poses = np.stack([bent(POINTS, 1.995 * np.pi), bent(POINTS, 0.5)])
     filled: list[Filling] = []
 
-    def solve(n_vertices: int, filling: Filling, n_modes: int, *_: object) -> Solved:
-        filled.append(filling)
+    def solve(n_vertices: int, body: Solid, n_modes: int, *_: object) -> Solved:
+        filled.append(body.filling)
         return Solved(np.zeros(n_modes), np.zeros((n_modes, n_vertices, 3)), np.zeros(6), 6)
 
     monkeypatch.setattr(solving, "solve", solve)
@@ -257,10 +257,10 @@ def test_carried_tetrahedra_that_are_too_distorted_for_modes(
     """The key-frame has its own then, and progress counts it once."""
     solve, counted = solving.solve, []
 
-    def fails_if_carried(n_vertices: int, filling: Filling, *others: object) -> Solved:
-        if filling.surface is not filling.body.surface:
+    def fails_if_carried(n_vertices: int, body: Solid, *others: object) -> Solved:
+        if body.surface is not body.filling.body.surface:
             raise ModalAnalysisError("the stiffness is indefinite")
-        return solve(n_vertices, filling, *others)
+        return solve(n_vertices, body, *others)
 
     monkeypatch.setattr(solving, "solve", fails_if_carried)
     poses = np.stack([POINTS, POINTS + 1.0])

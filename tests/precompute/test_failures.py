@@ -45,7 +45,7 @@ def worker(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyP
 
 
 def modes_of(mesh: Mesh, folder: Path, **chosen: object) -> object:
-    return extract_modes(*mesh, 4, cache_dir=str(folder), **{"mesher": "tetwild", **chosen})  # type: ignore[arg-type]
+    return extract_modes(*mesh, 4, cache_dir=str(folder), **{"mesher": "tetwild", "method": "solid", **chosen})  # type: ignore[arg-type]
 
 
 CRASH = "os.kill(os.getpid(), signal.SIGSEGV)"

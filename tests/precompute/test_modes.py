@@ -18,7 +18,7 @@ from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.precompute import lanczos, parallel, solving, tetwild
 from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.eigen import ENOUGH, EXACT, ModalAnalysisError, VolumeModes, lowest_modes
+from torch_modal.precompute.eigen import ENOUGH, EXACT, ElasticModes, ModalAnalysisError, lowest_modes
 from torch_modal.precompute.modes import extract_bases, extract_modes
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
@@ -28,7 +28,7 @@ Mesh = tuple[np.ndarray, np.ndarray]
 BOX = box((6, 3, 2), (3.0, 1.5, 1.0), jitter=0.1)
 
 
-def solve(solid: Tetrahedra, n_modes: int, form: str = "edge") -> VolumeModes:
+def solve(solid: Tetrahedra, n_modes: int, form: str = "edge") -> ElasticModes:
     return lowest_modes(arap_hessian(solid, form), mass_matrix(solid), solid.vertices, n_modes)
 
 
@@ -105,7 +105,7 @@ def test_agrees_with_dense_eigh(form: str, cells: tuple[int, int, int]) -> None:
         assert_same_modes(result, values, vectors, m)
 
 
-def assert_same_modes(result: VolumeModes, values: np.ndarray, vectors: np.ndarray, m: np.ndarray) -> None:
+def assert_same_modes(result: ElasticModes, values: np.ndarray, vectors: np.ndarray, m: np.ndarray) -> None:
     np.testing.assert_allclose(result.eigenvalues, values[6:31], rtol=1e-9)
     # The same space, up to the last eigenvalue that stands alone.
     last = int(np.flatnonzero(values[7:31] - values[6:30] > 1e-3 * values[30])[-1])
@@ -204,7 +204,7 @@ def test_pieces_add_zero_modes() -> None:
 
 
 def test_more_modes_than_there_are() -> None:
-    with pytest.raises(ValueError, match="50 modes requested, but 8 tetrahedral vertices have 18 elastic modes"):
+    with pytest.raises(ValueError, match="50 modes requested, but a mesh of 8 vertices has 18 elastic modes"):
         solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 50)
     assert solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 18).modes.shape == (24, 18)
 
@@ -383,7 +383,7 @@ def test_errors_of_libraries_become_own_ones(boxed: Mesh, monkeypatch: pytest.Mo
         with monkeypatch.context() as patch:
             patch.setattr(solving, name, fail)
             with pytest.raises(ModalAnalysisError, match=f"{error}.*check the surface"):
-                extract_modes(*boxed, 4, cache=False)
+                extract_modes(*boxed, 4, method="solid", cache=False)
 
 
 def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -393,12 +393,12 @@ def test_errors_name_the_keyframe(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) 
         raise TetrahedralizationError("no luck")
 
     with pytest.raises(MeshError, match=r"key-frame 1: the surface is flat"):
-        extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, cache=False)
+        extract_bases(np.stack([vertices, vertices * (1, 1, 0)]), faces, 4, method="solid", cache=False)
     monkeypatch.setattr(tetwild, "tetrahedralize", fail)
     with pytest.raises(TetrahedralizationError, match=r"key-frame [01]: no luck"):
-        extract_bases(np.stack([vertices, vertices]), faces, 4, mesher="tetwild", cache=False)
+        extract_bases(np.stack([vertices, vertices]), faces, 4, method="solid", mesher="tetwild", cache=False)
     with pytest.raises(TetrahedralizationError, match=r"^no luck"):
-        extract_modes(vertices, faces, 4, mesher="tetwild", cache=False)
+        extract_modes(vertices, faces, 4, method="solid", mesher="tetwild", cache=False)
 
 
 def test_threads_change_nothing(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -446,7 +446,7 @@ def test_one_failure_ends_the_other_workers(boxed: Mesh, monkeypatch: pytest.Mon
     monkeypatch.setattr(tetwild, "tetrahedralize", fill)
     keyframes = np.stack([vertices, vertices * (1, 1, 5)])
     with pytest.raises(TetrahedralizationError, match="key-frame 1: no luck"):
-        extract_bases(keyframes, faces, 4, mesher="tetwild", carry=False, cache=False)
+        extract_bases(keyframes, faces, 4, method="solid", mesher="tetwild", carry=False, cache=False)
     assert stopped == [True]
 
 

@@ -66,11 +66,18 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
         help="elastic modes of each key-frame; 20 to 100 are usual (default: %(default)s)",
     )
     sub.add_argument(
+        "--method",
+        choices=("auto", "solid", "shell"),
+        default="auto",
+        help="modes of the solid inside, of the surface itself (sheets, thin and open bodies), or what fits (default: "
+        "%(default)s)",
+    )
+    sub.add_argument(
         "--mesher",
         choices=("lattice", "tetwild"),
         default="lattice",
-        help="what fills the surfaces: a lattice of cubes (deterministic, takes every surface), or fTetWild (default: "
-        "%(default)s)",
+        help="what fills surfaces for solids: a lattice of cubes (deterministic, takes every surface), or fTetWild "
+        "(default: %(default)s)",
     )
     sub.add_argument(
         "--quality",

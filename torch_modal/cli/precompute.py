@@ -96,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
     say: Callable[[str], None] = (lambda _: None) if args.quiet else _say
     options = Options(
         n_modes=args.modes,
+        method=args.method,
         mesher=args.mesher,
         quality=args.quality,
         cache_dir=args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir)),

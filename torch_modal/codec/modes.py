@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.errors import MeshWarning
-from torch_modal.precompute.eigen import EXACT
+from torch_modal.errors import MeshError, MeshWarning
+from torch_modal.precompute.eigen import EXACT, ModalAnalysisError
 from torch_modal.precompute.modes import extract_modes
+from torch_modal.precompute.tetrahedra import TetrahedralizationError
 
 GAP = 1e-3
 """Relative gap between neighbouring eigenvalues that ends a cluster."""
@@ -75,7 +76,11 @@ def reproducible_modes(
     with warnings.catch_warnings():
         # Rounding makes faces without area of small ones.
         warnings.simplefilter("ignore", MeshWarning)
-        basis = extract_modes(reference, faces, min(n_modes + SPARE, available), **options)  # type: ignore[arg-type]
+        count = min(n_modes + SPARE, available)
+        try:
+            basis = extract_modes(reference, faces, count, method="solid", **options)  # type: ignore[arg-type]
+        except (MeshError, TetrahedralizationError, ModalAnalysisError):  # a sheet has modes, too
+            basis = extract_modes(reference, faces, count, method="shell", **options)  # type: ignore[arg-type]
     if clusters is None:
         clusters = _clusters(basis.eigenvalues, n_modes)
     sizes = clusters.tolist()

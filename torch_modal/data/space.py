@@ -14,11 +14,14 @@ from torch_modal.autograd import Recent, lasting
 from torch_modal.data.motion import Motion, Span
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
+from torch_modal.energy.bend import dihedral_gradient
+from torch_modal.geometry.canonical import size
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import Frames, frames, sides
-from torch_modal.geometry.vectors import norm, pick
+from torch_modal.geometry.vectors import cross, norm, pick
 from torch_modal.inbetween.samples import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.io.cache import CacheWarning
@@ -27,6 +30,7 @@ from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.path import Path as MotionPath
 from torch_modal.precompute.basis import ModalBasis
+from torch_modal.precompute.shell import THICKNESS
 from torch_modal.solve.adjoint import ConvergenceWarning
 from torch_modal.solve.solver import Status
 from torch_modal.version import __version__
@@ -64,7 +68,8 @@ class KeyframeReference(NamedTuple):
     """*Shape:* ``(V, 3)``."""
     modes: Tensor
     """Modes over the roots of their eigenvalues, so scaled that independent standard normal amplitudes give an expected
-    root mean square edge strain of one, components first. *Shape:* ``(k, 3V)``."""
+    root mean square strain of one, components first. *Shape:* ``(k, 3V)``. It is that of the edges; of sheets, where
+    bending strains their sides more than that, it is the strain of their sides."""
     frames: Frames
     """Of its triangles, for a batch of one."""
 
@@ -211,7 +216,11 @@ class ShapeSpace:
         i, j = self.edges.unbind(1)
         side = x[j] - x[i]
         slopes = ((modes[:, j] - modes[:, i]) * side).sum(-1) / side.square().sum(-1).clamp_min(1e-300)
-        expected = slopes.square().mean(1).sum().sqrt()
+        expected = _expected(slopes)
+        bending, areas = _bending_strains(modes, x, self.faces)
+        bending = _expected(bending, areas)
+        if bending > _expected(slopes, side.square().sum(-1)):  # a sheet, which bends without a change of length
+            expected = bending
         modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
         own = frames(sides(x.mT[:, None], self.faces))
         return KeyframeReference(x.to(like), modes.mT.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
@@ -316,6 +325,31 @@ class ShapeSpace:
         if i > j:
             return self.in_between(x_b, x_a, 1 - t, j, i)
         return _shapes(self.layer(i, j, x_a).solve(x_a, x_b, t), i, j)
+
+
+def _expected(strains: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Expected root mean square for standard normal amplitudes. *Shape:* ``(k, n), (n,) -> ()``."""
+    squares = strains.square()
+    means = squares.mean(1) if weights is None else squares @ weights / weights.sum()
+    return means.sum().sqrt()
+
+
+def _bending_strains(modes: Tensor, x: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Strain of the sides of a sheet across each hinge, for the thickness that shell modes have, and the hinges' areas.
+
+    *Shape:* ``(k, V, 3), (V, 3), (F, 3) -> (k, H), (H,)``, to first order.
+    """
+    hinges = torch.tensor(Connectivity(faces.numpy(), len(x)).hinges)
+    first, *others = (torch.cat([x[None], modes])[:, corner] for corner in hinges.unbind(1))
+    vectors = torch.stack([other - first for other in others]).movedim(-1, 1)
+    rest, moves = vectors[:, :, 0], vectors[:, :, 1:]
+    angles = (dihedral_gradient(rest)[:, :, None] * moves).sum((0, 1))
+    e, a, b = rest
+    tiny = torch.finfo(x.dtype).tiny
+    areas = 0.5 * (norm(cross(e, a)) + norm(cross(e, b)))
+    apart = 2 * areas / (3 * norm(e)).clamp_min(tiny)  # of the centroids
+    thickness = THICKNESS * size(x.numpy(), faces.numpy())
+    return 0.5 * thickness * angles / apart.clamp_min(tiny), areas
 
 
 def _shapes(result: InBetweenResult, i: int, j: int) -> Tensor:

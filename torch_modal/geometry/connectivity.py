@@ -117,14 +117,19 @@ class Connectivity:
         return _shared(np.stack([*ends, self.opposite[first], self.opposite[second]], axis=1))
 
     @cached_property
+    def adjacent_sides(self) -> IntArray:
+        """Pairs of sides of the same edge; at non-manifold edges each with the next. *Shape:* ``(n, 2)``."""
+        order = self._runs[0]
+        same = np.diff(self.sides[order]) == 0
+        return _shared(np.stack([order[:-1][same], order[1:][same]], axis=1))
+
+    @cached_property
     def face_neighbours(self) -> IntArray:
         """Pairs of adjacent faces, the smaller first; at non-manifold edges each face with the next.
 
         *Shape:* ``(n, 2)``.
         """
-        order = self._runs[0]
-        same = np.diff(self.sides[order]) == 0
-        return _shared(np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(self.faces), axis=1))
+        return _shared(np.sort(self.adjacent_sides % len(self.faces), axis=1))
 
     @cached_property
     def boundary_edges(self) -> IntArray:

@@ -17,7 +17,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
-__all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_solid"]
+__all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_area", "require_solid"]
 
 # Rounding of a length, relative to the coordinates.
 _RESOLUTION = {torch.float32: 1e-6, torch.float64: 1e-12}
@@ -99,18 +99,41 @@ def require_solid(vertices: Any, faces: Any) -> None:
     Raises:
         MeshError: The extent across the plane that fits best is below 1e-6 of the largest extent.
     """
+    extents = _principal_extents(vertices, faces)
+    if extents[2] <= _FLATNESS * extents[0]:
+        raise MeshError(
+            f"the surface is flat: its extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}, so it "
+            'encloses nothing that could be filled with tetrahedra; take the modes of the surface (method="shell"), or '
+            "give it a thickness"
+        )
+
+
+def require_area(vertices: Any, faces: Any) -> None:
+    """Reject a surface on a line, which has no area.
+
+    Args:
+        vertices: Positions of one shape. *Shape:* ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+
+    Raises:
+        MeshError: The second extent is below 1e-6 of the largest.
+    """
+    extents = _principal_extents(vertices, faces)
+    if extents[1] <= _FLATNESS * extents[0]:
+        raise MeshError(
+            f"all vertices lie on a line: the extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}; a "
+            "surface has an area"
+        )
+
+
+def _principal_extents(vertices: Any, faces: Any) -> FloatArray:
+    """Extents of the referenced vertices along their principal axes, descending. *Shape:* ``(3,)``."""
     points = torch.as_tensor(vertices).detach().cpu().double().numpy()
     points = points[np.unique(torch.as_tensor(faces).cpu().numpy())]
     points = points - points.mean(axis=0)
     scale = np.abs(points).max()
     _, axes = np.linalg.eigh((points / scale).T @ (points / scale)) if scale > 0 else (None, np.eye(3))
-    extent = np.sort(np.ptp(points @ axes, axis=0))
-    if extent[0] <= _FLATNESS * extent[2]:
-        raise MeshError(
-            f"the surface is flat: its extents are {extent[2]:.3g}, {extent[1]:.3g} and {extent[0]:.3g}, so "
-            "it encloses nothing that could be filled with tetrahedra and has no vibration modes of a "
-            "solid; give it a thickness"
-        )
+    return np.sort(np.ptp(points @ axes, axis=0))[::-1]
 
 
 def _check_shapes(positions: torch.Tensor, faces: IntArray, min_keyframes: int) -> None:
@@ -271,8 +294,7 @@ def _check_surface(
     if len(boundary):
         note(
             f"the surface is open: {len(boundary)} edges belong to one face only, the first is edge "
-            f"{boundary[0].tolist()}; its volume is measured from the centroid, and the tetrahedra close the "
-            "holes" + _seam_hint(scaled[0], boundary)
+            f"{boundary[0].tolist()}" + _seam_hint(scaled[0], boundary)
         )
     elif orientable and not (counts % 2).any():
         volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])

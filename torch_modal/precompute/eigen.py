@@ -25,19 +25,23 @@ ENOUGH = 1e-3
 rounding of ``K phi``."""
 INVERTED = 0.3
 """Residual of the inverted problem, relative to the tolerance, at which the residuals of the modes are checked."""
-SHIFT = 1.0
-"""Negative shift, in 1 / (bounding-box diagonal)²; near the lowest modes of slender bodies."""
-ZERO = 1e-9
-"""Largest eigenvalue that counts as zero, in the same units: rounding is 1e-13 to 1e-12, and the first mode of a rod
-of aspect ratio 10,000 is near 1e-6."""
+
+
+class Scale(NamedTuple):
+    """Orders of eigenvalues."""
+
+    shift: float
+    """Lanczos is shifted by minus this: it is near the lowest modes of slender bodies."""
+    zero: float
+    """Largest eigenvalue that counts as zero."""
 
 
 class ModalAnalysisError(RuntimeError):
     """The eigenproblem has no trustworthy solution; the message says which check failed."""
 
 
-class VolumeModes(NamedTuple):
-    """Lowest elastic modes of a tetrahedral mesh.
+class ElasticModes(NamedTuple):
+    """Lowest elastic modes of a mesh.
 
     Attributes:
         eigenvalues: Ascending. *Shape:* ``(k,)``.
@@ -80,7 +84,8 @@ def lowest_modes(
     positions: FloatArray,
     n_modes: int,
     tolerance: float = EXACT,
-) -> VolumeModes:
+    scale: Scale | None = None,
+) -> ElasticModes:
     """Lowest elastic modes of ``K phi = lambda M phi``.
 
     Shift-invert block Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are those of
@@ -94,6 +99,7 @@ def lowest_modes(
         positions: Rest positions. *Shape:* ``(N, 3)``.
         n_modes: Number of elastic modes.
         tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` at which Lanczos ends.
+        scale: Orders of eigenvalues; by default those of a solid.
 
     Returns:
         The modes. Further zero modes, of loose components, come first.
@@ -106,30 +112,31 @@ def lowest_modes(
     possible = 3 * len(positions) - N_RIGID
     if not 1 <= n_modes <= possible:
         raise ValueError(
-            f"{n_modes} modes requested, but {len(positions)} tetrahedral vertices have {possible} elastic modes; "
+            f"{n_modes} modes requested, but a mesh of {len(positions)} vertices has {possible} elastic modes; "
             f"give 1 to {possible}"
         )
     inertia = Mass(sp.csr_matrix(mass))
     if not (has_mass := inertia.lumped() > 0).all():
         raise ModalAnalysisError(f"{int((~has_mass).sum())} vertices have no mass; remove unused vertices first")
     n_pairs = min(n_modes + N_RIGID + GUARD, k.shape[0])
-    spans = lowest_spans(k, inertia, n_pairs, SHIFT / _squared_diagonal(positions), INVERTED * tolerance)
+    scale = scale or solid_scale(positions)
+    spans = lowest_spans(k, inertia, n_pairs, scale.shift, INVERTED * tolerance)
     rigid = rigid_motions(positions, inertia)
     while (span := _next_of(spans)) is not None:
-        found, first_elastic = _modes_in_span(k, inertia, positions, span, rigid, n_modes)
+        found, first_elastic = _modes_in_span(k, inertia, scale.zero, span, rigid, n_modes)
         not_rigid = float(np.abs(found.rigid_eigenvalues).max())
         if found.residual < tolerance and not_rigid < RIGID_TOLERANCE * first_elastic:
             return found
     if not not_rigid < RIGID_TOLERANCE * first_elastic:
         raise ModalAnalysisError(
             f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero beside the first elastic "
-            f"one, {first_elastic:.2e}; the tetrahedra are degenerate"
+            f"one, {first_elastic:.2e}; the mesh is degenerate"
         )
     if found.residual < ENOUGH:
         return found
     raise ModalAnalysisError(
         f"the modes leave a relative residual of {found.residual:.2e} (allowed: {ENOUGH:g}), and further "
-        "steps do not help; the tetrahedra are likely degenerate"
+        "steps do not help; the mesh is likely degenerate"
     )
 
 
@@ -142,8 +149,8 @@ def _next_of(spans: Iterator[FloatArray]) -> FloatArray | None:
 
 
 def _modes_in_span(
-    k: sp.csc_matrix, mass: Mass, positions: FloatArray, span: FloatArray, rigid: FloatArray, n_modes: int
-) -> tuple[VolumeModes, float]:
+    k: sp.csc_matrix, mass: Mass, zero: float, span: FloatArray, rigid: FloatArray, n_modes: int
+) -> tuple[ElasticModes, float]:
     """Lowest elastic modes in a span, and the first non-zero eigenvalue."""
     rigid_eigenvalues = _rayleigh_ritz(span, k @ span)[0][:N_RIGID]
 
@@ -158,12 +165,12 @@ def _modes_in_span(
     forces = k @ elastic
     eigenvalues, rotation = _rayleigh_ritz(elastic, forces)
 
-    first_elastic, n_zero = _count_zeros(eigenvalues, positions)
+    first_elastic, n_zero = _count_zeros(eigenvalues, zero)
     eigenvalues, rotation = eigenvalues[:n_modes], rotation[:, :n_modes]
     modes = elastic @ rotation
     residual = relative_residual(forces @ rotation, mass @ modes, eigenvalues, first_elastic)
     # Zero eigenvalues of loose pieces may be -1e-13; their roots must exist.
-    found = VolumeModes(np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, n_zero, residual)
+    found = ElasticModes(np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, n_zero, residual)
     return found, first_elastic
 
 
@@ -182,13 +189,11 @@ def relative_residual(forces: FloatArray, inertia: FloatArray, eigenvalues: Floa
     return float((difference / (np.maximum(eigenvalues, smallest) * np.linalg.norm(inertia, axis=0))).max())
 
 
-def _count_zeros(eigenvalues: FloatArray, positions: FloatArray) -> tuple[float, int]:
+def _count_zeros(eigenvalues: FloatArray, zero: float) -> tuple[float, int]:
     """The first non-zero eigenvalue, and the number of zero ones, including the rigid ones."""
-    zero = ZERO / _squared_diagonal(positions)
     if eigenvalues[0] < -zero:
         raise ModalAnalysisError(
-            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; "
-            "the tetrahedra are likely degenerate"
+            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; the mesh is likely degenerate"
         )
     n_extra = int((eigenvalues < zero).sum())
     if n_extra == len(eigenvalues):
@@ -210,9 +215,13 @@ def _signs(modes: FloatArray) -> FloatArray:
     return np.where(np.take_along_axis(modes, first[None], axis=0)[0] < 0, -1.0, 1.0)
 
 
-def _squared_diagonal(positions: FloatArray) -> float:
-    """Squared diagonal of the bounding box: eigenvalues are proportional to its inverse."""
-    return float(((positions.max(axis=0) - positions.min(axis=0)) ** 2).sum())
+def solid_scale(positions: FloatArray) -> Scale:
+    """Orders of eigenvalues of a solid: proportional to the inverse square of the diagonal of its bounding box.
+
+    Rounding is 1e-13 to 1e-12 in these units, and the first mode of a rod of aspect ratio 10,000 near 1e-6.
+    """
+    unit = 1 / float(((positions.max(axis=0) - positions.min(axis=0)) ** 2).sum())
+    return Scale(shift=unit, zero=1e-9 * unit)
 
 
 def _rayleigh_ritz(basis: FloatArray, forces: FloatArray) -> tuple[FloatArray, FloatArray]:

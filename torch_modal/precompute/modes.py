@@ -8,16 +8,17 @@ import numpy as np
 import torch
 
 from torch_modal.io.cache import Cache
-from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_solid
+from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_area, require_solid
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.eigen import ENOUGH, N_RIGID
+from torch_modal.precompute.eigen import ENOUGH, N_RIGID, ModalAnalysisError
 from torch_modal.precompute.filling import MESHERS, Filler
+from torch_modal.precompute.method import METHODS, Method, why_shell
 from torch_modal.precompute.solving import KeyframeSet, Solved, naming_keyframe
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
 from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Mesher
+from torch_modal.precompute.tetrahedra import Mesher, TetrahedralizationError
 from torch_modal.precompute.tetwild import TetrahedraSettings
-from torch_modal.progress import Progress, ProgressReport
+from torch_modal.progress import Progress, ProgressReport, logger
 
 QUALITIES = {
     "fast": TetrahedraSettings(),
@@ -34,6 +35,7 @@ def extract_modes(
     faces: Any,
     n_modes: int = 30,
     *,
+    method: Method = "auto",
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
     mesher: Mesher | str = "lattice",
@@ -48,7 +50,8 @@ def extract_modes(
         vertices: Positions, tensor or array, any units. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes, k.
-        form: Form of the Hessian.
+        method: ``"auto"``, ``"solid"`` or ``"shell"``.
+        form: Form of the solid's Hessian.
         settings: ``"fast"``, ``"fine"``, or numbers.
         mesher: ``"lattice"``, ``"tetwild"``, or an object.
         tolerance: Largest relative residual of a mode.
@@ -69,6 +72,7 @@ def extract_modes(
         [vertices],
         faces,
         n_modes,
+        method=method,
         form=form,
         settings=settings,
         mesher=mesher,
@@ -85,6 +89,7 @@ def extract_bases(
     faces: Any,
     n_modes: int = 30,
     *,
+    method: Method = "auto",
     form: HessianForm = "edge",
     settings: TetrahedraSettings | str = "fast",
     mesher: Mesher | str = "lattice",
@@ -97,17 +102,23 @@ def extract_bases(
 ) -> list[ModalBasis]:
     """Lowest vibration modes of each key-frame.
 
-    The key-frame of least self-proximity is filled with tetrahedra, which are carried to the others. The
-    as-rigid-as-possible stiffness and a mass of density 1 give ``K phi = lambda M phi``, and the lowest elastic modes
-    are restricted to the surface. Small loose pieces follow the nearest part of the body. Modes contain no relative
-    rigid motions of larger pieces: these have no energy, and in-betweens take them from the interpolation of the
-    key-frames. Nothing is differentiated.
+    They are the lowest elastic solutions of ``K phi = lambda M phi``, of the solid inside the surface or of the surface
+    itself. For the solid, the key-frame of least self-proximity is filled with tetrahedra, which are carried to the
+    others; ``K`` is the as-rigid-as-possible stiffness and the density 1. For the surface, ``K`` is the Gauss-Newton
+    Hessian of edge lengths and dihedral angles in Eq. 5 at rest, and ``M`` the mass of a sheet whose thickness is a
+    hundredth of its size (:func:`~torch_modal.geometry.canonical.size`) at a density of 1. Small loose pieces follow
+    the nearest part of the body. Modes contain no relative rigid motions of larger pieces: these have no energy, and
+    in-betweens take them from the interpolation of the key-frames. Nothing is differentiated.
 
     Args:
         keyframes: Positions, tensor or array, any units. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes of each, k.
-        form: Form of the Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
+        method: ``"solid"``; ``"shell"``, for the surface itself, which may be open, flat or not manifold; or
+            ``"auto"``: the solid, but the shell where a key-frame is open or thin or the solid fails
+            (:func:`~torch_modal.precompute.method.why_shell`), which a line of the log says. All key-frames have the
+            same.
+        form: Form of the solid's Hessian, see :func:`~torch_modal.precompute.stiffness.arap_hessian`.
         settings: How fine the tetrahedra are: ``"fast"``, ``"fine"``, or numbers.
         mesher: What fills the surface: ``"lattice"``, which is deterministic, finer where the body is thin, and accepts
             every surface; ``"tetwild"``, fTetWild in a child process; or a
@@ -133,6 +144,8 @@ def extract_bases(
     Warns:
         MeshWarning: The warnings of `check_keyframes`; a shape of several loose pieces.
     """
+    if method not in METHODS:
+        raise ValueError(f"the method is {method!r}; give one of {METHODS}")
     if form not in HESSIAN_FORMS:
         raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
     if not 0 < tolerance < np.inf:
@@ -140,7 +153,15 @@ def extract_bases(
     filler = Filler(_mesher(mesher, settings), timeout, Cache.at(cache_dir, enabled=cache))
     positions, working_faces = check_keyframes(keyframes, faces)
     return bases_of_checked(
-        positions, working_faces, n_modes, filler, form=form, tolerance=tolerance, carry=carry, progress=progress
+        positions,
+        working_faces,
+        n_modes,
+        filler,
+        method=method,
+        form=form,
+        tolerance=tolerance,
+        carry=carry,
+        progress=progress,
     )
 
 
@@ -150,6 +171,7 @@ def bases_of_checked(
     n_modes: int,
     filler: Filler | None = None,
     *,
+    method: Method = "auto",
     form: HessianForm = "edge",
     tolerance: float = ENOUGH,
     carry: bool = True,
@@ -167,12 +189,12 @@ def bases_of_checked(
     surfaces: list[CanonicalSurface] = []
     for index, shape in enumerate(shapes):
         with naming_keyframe(index, len(shapes)):
-            require_solid(shape, triangles)
+            (require_solid if method == "solid" else require_area)(shape, triangles)
             surfaces.append(CanonicalSurface.of(shape, triangles))
 
     with ProgressReport(2 * len(shapes), "vibration modes", progress) as bar:
-        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, form, tolerance, bar, meanwhile)
-        solved = work.solve(carry)
+        work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, tolerance, bar, meanwhile)
+        solved = _solved(work, method, lambda: work.solids(form, carry))
     _warn_of_pieces(solved)
     return [
         ModalBasis(
@@ -183,6 +205,25 @@ def bases_of_checked(
         )
         for shape, one in zip(shapes, solved, strict=True)
     ]
+
+
+def _solved(work: KeyframeSet, method: Method, solids: Callable[[], list[Solved]]) -> list[Solved]:
+    """The modes by a method; if one that was chosen here fails, by the other."""
+    if method != "auto":
+        return solids() if method == "solid" else work.shells()
+    reason = why_shell(work.surfaces)
+    if reason:
+        logger.info("modes of the surface itself, not of a solid: %s", reason)
+    first, second = (work.shells, solids) if reason else (solids, work.shells)
+    try:
+        return first()
+    except (TetrahedralizationError, ModalAnalysisError) as error:
+        if isinstance(error, TetrahedralizationError) and np.isfinite(error.fails_until):
+            raise  # another attempt may succeed, and the same call should give the same modes
+        work.filler.stop.clear()
+        logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
+        work.bar.expect(2 * len(work.surfaces))
+        return second()
 
 
 def _mesher(mesher: Mesher | str, settings: TetrahedraSettings | str) -> Mesher:

@@ -3,7 +3,8 @@
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,12 +12,13 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray
 from torch_modal.errors import MeshError
-from torch_modal.io.cache import Cache
-from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, VolumeModes, lowest_modes
+from torch_modal.io.cache import Arrays, Cache
+from torch_modal.precompute.eigen import N_RIGID, ModalAnalysisError, Scale, lowest_modes
 from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
-from torch_modal.precompute.following import deforming, larger_pieces
+from torch_modal.precompute.following import Larger, deforming, larger_pieces
 from torch_modal.precompute.parallel import Budget, StoppedError, run_all
 from torch_modal.precompute.proximity import separation
+from torch_modal.precompute.shell import Sheet
 from torch_modal.precompute.stiffness import HessianForm, arap_hessian
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError, loose_pieces
@@ -27,7 +29,7 @@ MAX_SEPARATION = 0.014
 (:func:`~torch_modal.precompute.proximity.separation`). On the samples and five data sets carrying worked up to 0.0105,
 never from 0.0127 on."""
 VERTICES_AT_ONCE = 30_000
-"""Total size of concurrent eigenproblems, in tetrahedral vertices: about 2 GiB."""
+"""Total size of concurrent eigenproblems: about 2 GiB."""
 
 
 class Solved(NamedTuple):
@@ -38,7 +40,7 @@ class Solved(NamedTuple):
         modes: Displacements of all vertices, zero at unreferenced ones. *Shape:* ``(k, V, 3)``.
         rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
         n_zero: Number of zero eigenvalues, including the six rigid ones.
-        n_pieces: Number of loose pieces of the tetrahedra, without small ones.
+        n_pieces: Number of loose pieces, without small ones.
     """
 
     eigenvalues: FloatArray
@@ -46,6 +48,106 @@ class Solved(NamedTuple):
     rigid_eigenvalues: FloatArray
     n_zero: int
     n_pieces: int = 1
+
+
+class Elastic(Protocol):
+    """An elastic body whose modes are computed, with ``N`` vertices."""
+
+    @property
+    def surface(self) -> CanonicalSurface:
+        """The key-frame."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """About the number of vertices."""
+        ...
+
+    def inputs(self) -> tuple[Arrays, dict[str, Any]]:
+        """Everything that the modes depend on."""
+        ...
+
+    @property
+    def points(self) -> FloatArray:
+        """Vertices. *Shape:* ``(N, 3)``."""
+        ...
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of loose pieces."""
+        ...
+
+    @property
+    def scale(self) -> Scale | None:
+        """Orders of eigenvalues, as for :func:`~torch_modal.precompute.eigen.lowest_modes`."""
+        ...
+
+    def stiffness(self) -> sp.csc_matrix:
+        """*Shape:* ``(3N, 3N)``."""
+        ...
+
+    def mass(self) -> sp.csr_matrix:
+        """*Shape:* ``(N, N)``."""
+        ...
+
+    def carried(self, motions: FloatArray) -> FloatArray:
+        """Motions at the points of the surface. *Shape:* ``(N, 3, k) -> (U, 3, k)``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Solid:
+    """The solid inside a surface, see :class:`Elastic`.
+
+    Attributes:
+        filling: Its tetrahedra.
+        form: Form of the Hessian.
+    """
+
+    filling: Filling
+    form: HessianForm
+    scale: Scale | None = None
+
+    @property
+    def surface(self) -> CanonicalSurface:
+        """The key-frame."""
+        return self.filling.surface
+
+    @property
+    def size(self) -> int:
+        """Number of vertices of the tetrahedra."""
+        return len(self.filling.tetrahedra.vertices)
+
+    def inputs(self) -> tuple[Arrays, dict[str, Any]]:
+        """Everything that the modes depend on."""
+        return self.filling.content(), {"form": self.form}
+
+    @cached_property
+    def _larger(self) -> Larger:
+        return larger_pieces(self.filling.tetrahedra)
+
+    @property
+    def points(self) -> FloatArray:
+        """Vertices of the larger pieces. *Shape:* ``(N, 3)``."""
+        return self._larger.tetrahedra.vertices
+
+    @cached_property
+    def n_pieces(self) -> int:
+        """Number of larger pieces."""
+        return int(loose_pieces(self._larger.tetrahedra).max()) + 1
+
+    def stiffness(self) -> sp.csc_matrix:
+        """As-rigid-as-possible stiffness. *Shape:* ``(3N, 3N)``."""
+        return arap_hessian(self._larger.tetrahedra, self.form)
+
+    def mass(self) -> sp.csr_matrix:
+        """Mass of a density of 1. *Shape:* ``(N, N)``."""
+        return self.filling.mass()[self._larger.vertices][:, self._larger.vertices]
+
+    def carried(self, motions: FloatArray) -> FloatArray:
+        """Motions at the points of the surface, embedded in the tetrahedra. *Shape:* ``(N, 3, k) -> (U, 3, k)``."""
+        weights = sp.csr_matrix(self.filling.weights() @ self._larger.weights)
+        return (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -57,9 +159,8 @@ class KeyframeSet:
         n_vertices: Number of vertices of each, including unreferenced ones.
         filler: Mesher and cache.
         n_modes: Number of elastic modes of each.
-        form: Form of the Hessian.
         tolerance: Residual of the modes.
-        bar: Updated twice for each key-frame: after meshing and after the modes.
+        bar: Updated twice for each key-frame.
         meanwhile: Background task, see :func:`~torch_modal.precompute.parallel.run_all`.
     """
 
@@ -67,16 +168,26 @@ class KeyframeSet:
     n_vertices: int
     filler: Filler
     n_modes: int
-    form: HessianForm
     tolerance: float
     bar: ProgressReport
     meanwhile: Callable[[], object] | None = None
     _memory: Budget = field(default_factory=lambda: Budget(VERTICES_AT_ONCE))
 
-    def solve(self, carry: bool) -> list[Solved]:
-        """Modes of all key-frames, with separate tetrahedra, or with carried ones where possible.
+    def shells(self) -> list[Solved]:
+        """Modes of all surfaces themselves."""
+
+        def solve_one(index: int) -> Solved:
+            sheet = Sheet(self.surfaces[index], self.n_modes)
+            self.bar.update()
+            return self._solved(index, sheet)
+
+        return run_all(solve_one, len(self.surfaces), self.filler.stop, self.meanwhile)
+
+    def solids(self, form: HessianForm, carry: bool) -> list[Solved]:
+        """Modes of the solids inside, with separate tetrahedra, or with carried ones where possible.
 
         Args:
+            form: Form of the Hessian.
             carry: Whether the tetrahedra of the key-frame of least self-proximity are carried to the others.
         """
         own: dict[int, Filling] = {}
@@ -90,12 +201,12 @@ class KeyframeSet:
 
         def solve_one(index: int) -> Solved:
             if index in own:
-                return self._solved(index, own[index])
+                return self._solved(index, Solid(own[index], form))
             carried = self._carried(own[first].body, index) if own else None
             if carried is not None:
                 with contextlib.suppress(ModalAnalysisError):  # too distorted: mesh separately
-                    return self._solved(index, carried)
-            return self._solved(index, self._own(index, counted=carried is None))
+                    return self._solved(index, Solid(carried, form))
+            return self._solved(index, Solid(self._own(index, counted=carried is None), form))
 
         return run_all(solve_one, len(self.surfaces), self.filler.stop, self.meanwhile)
 
@@ -115,10 +226,10 @@ class KeyframeSet:
             self.bar.update()
         return filling
 
-    def _solved(self, index: int, filling: Filling) -> Solved:
+    def _solved(self, index: int, body: Elastic) -> Solved:
         """The modes of a key-frame."""
-        with self._memory.part(len(filling.tetrahedra.vertices)), self._stage(index, "modes"):
-            solved = solve(self.n_vertices, filling, self.n_modes, self.form, self.tolerance, self.filler.cache)
+        with self._memory.part(body.size), self._stage(index, "modes"):
+            solved = solve(self.n_vertices, body, self.n_modes, self.tolerance, self.filler.cache)
         self.bar.update()
         return solved
 
@@ -144,56 +255,52 @@ def naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
         raise type(error)(f"key-frame {index}: {error}") from error
 
 
-def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, tolerance: float, cache: Cache) -> Solved:
-    """Modes of the tetrahedra, restricted to the surface, in the caller's units.
+def solve(n_vertices: int, body: Elastic, n_modes: int, tolerance: float, cache: Cache) -> Solved:
+    """Modes of a body at the points of its surface, in the caller's units.
 
     Args:
         n_vertices: Number of vertices of the key-frame, including unreferenced ones.
-        filling: The tetrahedra.
+        body: The body.
         n_modes: Number of elastic modes.
-        form: Form of the Hessian.
         tolerance: Residual of the modes, see :func:`~torch_modal.precompute.eigen.lowest_modes`.
         cache: Storage of modes.
 
     Raises:
         ModalAnalysisError: The modes failed a check.
     """
-    tetrahedra, surface = filling.tetrahedra, filling.surface
+    surface = body.surface
 
     def compute() -> dict[str, NDArray[Any]]:
         try:
-            larger, vertices, weights = larger_pieces(tetrahedra)
-            mass = filling.mass()[vertices][:, vertices]
-            n_pieces = loose_pieces(larger).max() + 1
-            n_wanted = min(n_modes + N_RIGID * (n_pieces - 1), max(n_modes, larger.vertices.size - N_RIGID))
-            solid = lowest_modes(arap_hessian(larger, form), mass, larger.vertices, n_wanted, tolerance)
-            modes = _restrict(sp.csr_matrix(filling.weights() @ weights), solid)
-            n_zero = min(solid.n_zero - N_RIGID, len(modes))
+            n_wanted = min(n_modes + N_RIGID * (body.n_pieces - 1), max(n_modes, body.points.size - N_RIGID))
+            found = lowest_modes(body.stiffness(), body.mass(), body.points, n_wanted, tolerance, body.scale)
+            columns = found.modes.reshape(len(body.points), 3, -1)
+            modes = np.ascontiguousarray(body.carried(columns).transpose(2, 0, 1))
+            n_zero = min(found.n_zero - N_RIGID, len(modes))
             modes = np.concatenate([deforming(modes[:n_zero], surface), modes[n_zero:]])
             if len(modes) < n_modes:
                 raise ModalAnalysisError(
-                    f"only {len(modes)} modes deform the {n_pieces} loose pieces of the tetrahedra, {n_modes} are "
-                    "requested; request fewer, or give a smaller edge_length_fac"
+                    f"only {len(modes)} modes deform the {body.n_pieces} loose pieces, {n_modes} are requested; "
+                    "request fewer, or give a smaller edge_length_fac"
                 )
-            eigenvalues = solid.eigenvalues[len(solid.eigenvalues) - len(modes) :]
+            eigenvalues = found.eigenvalues[len(found.eigenvalues) - len(modes) :]
         except ModalAnalysisError:
             raise
         except (RuntimeError, np.linalg.LinAlgError) as error:
             raise ModalAnalysisError(
-                f"the modes cannot be computed: {error}; the tetrahedra are likely degenerate: check the surface for "
-                "parts without thickness, or try another mesher"
+                f"the modes cannot be computed: {error}; the mesh is likely degenerate: check the surface, or try "
+                "another method or mesher"
             ) from error
         return {
             "eigenvalues": eigenvalues[:n_modes],
             "modes": modes[:n_modes],
-            "rigid_eigenvalues": solid.rigid_eigenvalues,
-            "n_zero": np.array([solid.n_zero]),
-            "n_pieces": np.array([n_pieces]),
+            "rigid_eigenvalues": found.rigid_eigenvalues,
+            "n_zero": np.array([found.n_zero]),
+            "n_pieces": np.array([body.n_pieces]),
         }
 
-    result = cache.get(
-        "modes", filling.content(), {"n_modes": int(n_modes), "form": form, "tolerance": float(tolerance)}, compute
-    )
+    inputs, parameters = body.inputs()
+    result = cache.get("modes", inputs, {"n_modes": int(n_modes), "tolerance": float(tolerance), **parameters}, compute)
     modes = np.zeros((n_modes, n_vertices, 3))
     # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
     modes[:, surface.used] = result["modes"] @ surface.axes * surface.scale**1.5
@@ -204,9 +311,3 @@ def solve(n_vertices: int, filling: Filling, n_modes: int, form: HessianForm, to
         int(result["n_zero"][0]),
         int(result["n_pieces"][0]),
     )
-
-
-def _restrict(weights: sp.csr_matrix, solid: VolumeModes) -> FloatArray:
-    """Modes at the surface points, ``(k, U, 3)``, from columns with interleaved coordinates."""
-    n, k = solid.modes.shape[0] // 3, solid.modes.shape[1]
-    return (weights @ solid.modes.reshape(n, 3 * k)).reshape(-1, 3, k).transpose(2, 0, 1)

@@ -27,6 +27,7 @@ from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, RECORD_FILE, ope
 from torch_modal.io.cache import CACHE_VERSION
 from torch_modal.io.files import write_atomically
 from torch_modal.io.processes import describe_exit, end_process, last_line
+from torch_modal.precompute.method import Method
 from torch_modal.precompute.modes import QUALITIES
 
 BOOT = """\
@@ -51,6 +52,7 @@ class Options:
     """Options of `extract_bases`, and whether to retry failed sets or to replace sets of other origin."""
 
     n_modes: int = 30
+    method: Method = "auto"
     mesher: str = "lattice"
     quality: str = "fast"
     cache_dir: str | None = None
@@ -65,8 +67,9 @@ class Options:
     def parameters(self) -> dict[str, Any]:
         """All that the result depends on besides the files."""
         settings = asdict(QUALITIES[self.quality])
-        made = {"n_modes": self.n_modes, "mesher": self.mesher, "settings": settings, "algorithm": CACHE_VERSION}
-        return {**made, "sequence": self.sequence or None}  # as in records from before there was this option
+        made = {"n_modes": self.n_modes, "method": self.method, "mesher": self.mesher, "settings": settings}
+        # No sequence is None: as in records from before there was this option.
+        return {**made, "algorithm": CACHE_VERSION, "sequence": self.sequence or None}
 
     def beside(self, source: Path) -> list[Path]:
         """Files of a set besides its meshes: the times of a motion, if there are any."""

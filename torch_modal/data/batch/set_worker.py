@@ -70,6 +70,7 @@ def compute(job: dict[str, Any]) -> Record:
                 keyframes,
                 faces,
                 options.n_modes,
+                method=options.method,
                 mesher=options.mesher,  # type: ignore[arg-type]
                 settings=options.quality,
                 timeout=options.timeout / 2,  # leaves time to report its failure, or for a second mesher
