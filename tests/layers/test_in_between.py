@@ -9,14 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from bodies import twisted_plate
+import trimesh
+from bodies import bend, twisted_plate
 from conftest import Shapes, bent_bar, modal, placement_of, random_rotation
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
 
+import torch_modal as tm
 from torch_modal import trees
 from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
@@ -707,3 +710,18 @@ class TestExceptions:
             layer(x_a.expand(3, -1, -1), x_b, torch.rand(4))
         with pytest.raises(ValueError, match="needs two bases, got 1"):
             InBetween(bars.bases[:1], bars.faces, **modal())
+
+
+def test_modes_that_span_all_shapes() -> None:
+    """Nothing is left of the difference then: its column was rounding, another on the fine mesh than on the coarse."""
+    ball = trimesh.creation.icosahedron()
+    first = torch.from_numpy(np.array(ball.vertices))
+    second = torch.from_numpy(bend(first.numpy() * 0.9 + np.array([1.0, 0.0, 0.0]), 1.0, 1.0, 0.0, 2.0))
+    faces = torch.from_numpy(np.array(ball.faces))
+    found = []
+    for method in ("solid", "shell"):
+        bases = tm.extract_bases(torch.stack([first, second]), faces, 30, method=method, cache=False)
+        for preset in ("accurate", "fast"):
+            found.append(tm.InBetween(bases, faces, preset)(first, second, 0.5))
+    for one in found:
+        torch.testing.assert_close(one, found[0], rtol=0, atol=1e-5)

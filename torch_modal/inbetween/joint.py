@@ -232,9 +232,10 @@ class JointSpace(nn.Module):
         rigid, coarse = self.frame.split(coarse, self.frame.rigid)
         modal, coarse = self.frame.split(coarse, self.columns)
         squared = (coarse**2 * self.frame.coarse.weights[:, None]).sum((-1, -2))
-        # Coincident key-frames leave no difference: its column is then zero, not a quotient of rounding errors.
+        # Coincident key-frames leave no difference, nor do modes that span all shapes: its column is then zero, not a
+        # quotient of rounding errors, which are others on the coarse mesh than on the fine one.
         rounding = 1e3 * torch.finfo(coarse.dtype).eps * pair.first.abs().amax((-1, -2))
-        scale = (squared + rounding**2).rsqrt()
+        scale = torch.where(squared > rounding**2, (squared + rounding**2).rsqrt(), 0)
         return Difference(pair.second - pair.first, rigid, modal, scale), coarse * scale[:, None, None]
 
     def column(self, own: Difference) -> Tensor:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torch_modal.io.cache import Cache
-from torch_modal.keyframes.check import MeshWarning, check_keyframes, require_area, require_solid
+from torch_modal.keyframes.check import MeshError, MeshWarning, check_keyframes, require_area, require_solid
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import ENOUGH, N_RIGID, ModalAnalysisError
 from torch_modal.precompute.filling import MESHERS, Filler
@@ -189,12 +189,19 @@ def bases_of_checked(
     surfaces: list[CanonicalSurface] = []
     for index, shape in enumerate(shapes):
         with naming_keyframe(index, len(shapes)):
-            (require_solid if method == "solid" else require_area)(shape, triangles)
+            require_area(shape, triangles)
             surfaces.append(CanonicalSurface.of(shape, triangles))
 
     with ProgressReport(2 * len(shapes), "vibration modes", progress) as bar:
         work = KeyframeSet(surfaces, shapes.shape[1], filler, n_modes, tolerance, bar, meanwhile)
-        solved = _solved(work, method, lambda: work.solids(form, carry))
+
+        def solids() -> list[Solved]:
+            for index, shape in enumerate(shapes):
+                with naming_keyframe(index, len(shapes)):
+                    require_solid(shape, triangles)
+            return work.solids(form, carry)
+
+        solved = _solved(work, method, solids)
     _warn_of_pieces(solved)
     return [
         ModalBasis(
@@ -223,7 +230,10 @@ def _solved(work: KeyframeSet, method: Method, solids: Callable[[], list[Solved]
         work.filler.stop.clear()
         logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
         work.bar.expect(2 * len(work.surfaces))
-        return second()
+        try:
+            return second()
+        except (MeshError, TetrahedralizationError, ModalAnalysisError):
+            raise error from None
 
 
 def _mesher(mesher: Mesher | str, settings: TetrahedraSettings | str) -> Mesher:
