@@ -90,9 +90,10 @@ def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -
 def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each."""
     n = len(parents)
-    tree = coo_matrix((np.ones(n), (np.arange(n), parents)), shape=(n + 1, n + 1)).tolil()
-    tree[n, middles] = 1
-    order, before = breadth_first_order(tree.tocsr(), n, directed=False)
+    # An extra node above the middles: one traversal visits all pieces.
+    ends = np.append(np.arange(n), np.full(len(middles), n)), np.append(parents, middles)
+    tree = coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
+    order, before = breadth_first_order(tree, n, directed=False)
     cluster = np.empty(n, dtype=np.int64)
     roots: list[int] = []
     above: list[int] = []
