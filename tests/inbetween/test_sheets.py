@@ -180,3 +180,28 @@ def test_the_coarse_mesh_is_that_of_the_curved_key_frame() -> None:
     np.testing.assert_array_equal(found.clusters, curved.clusters)
     both_flat = resolving(shapes[:1].repeat(2, 1, 1), faces(), 100, None, None)
     np.testing.assert_array_equal(both_flat.clusters, coarsen(shapes[:1].numpy(), strip()[1], 1000).clusters)
+
+
+def test_a_path_goes_through_a_roll() -> None:
+    """By one and a half turns from key-frame to key-frame, where triangles turn evenly."""
+    keyframes = torch.stack([roll(0), roll(0.5), roll(1)])
+    path = tm.Path(bases(*keyframes), faces())
+    found = path(keyframes, torch.tensor([0.5, 1.5]))
+    for x, time in zip(found, (0.25, 0.75), strict=True):
+        assert edge_error(x, roll(time)) < 0.01
+
+
+def test_layers_of_a_sheet_that_are_close_are_no_contact() -> None:
+    """Neighbours in a narrow fold are not held apart, and nothing becomes NaN."""
+    pytest.importorskip("ipctk")
+    flat, end = fold(0), fold(1, 175, 0.4)
+    made = [tm.InBetween(bases(flat, end), faces(), contact=contact) for contact in (False, True)]
+    free, held = (layer.solve(flat, end, torch.tensor([0.5, 0.9])) for layer in made)
+    torch.testing.assert_close(held.shapes, free.shapes, rtol=0, atol=1e-12)
+    assert (held.solution.n_crossing == 0).all()
+
+
+def test_flat_key_frames_pass_the_checks() -> None:
+    with pytest.warns(tm.MeshWarning, match="is open") as caught:
+        tm.check_keyframes(torch.stack([roll(0), roll(0)]), faces())
+    assert len(caught) == 1
