@@ -18,7 +18,7 @@ from cases import HALF, Case, KeyframeSet
 from measures import Yardstick
 from methods import METHODS, UnavailableError
 from sheets import SHEETS, sheet
-from tables import number, percent
+from tables import number
 from threads import limit_threads
 from timing import untimed
 
@@ -69,11 +69,9 @@ def sheet_rows(only: Sequence[str]) -> Iterator[list[str]]:
             yield [
                 case.name,
                 preset,
-                *(percent(error) for error in mine),
+                *(f"{100 * error:.3f} %" for error in mine),
                 *(number(ratio, ".3f") for ratio in ratios),
-                "; ".join(
-                    [f"MISSED over {other}" for other in missed] + [notes[n] for n in (name, *OTHERS) if n in notes]
-                ),
+                "; ".join([*missed, *(notes[n] for n in (name, *OTHERS) if n in notes)]),
             ]
 
 

@@ -13,8 +13,9 @@ from torch_modal.geometry.vectors import pick
 # Rotation of the triangles of a cluster relative to its root, in radians. Above half a turn, the direction is unknown.
 WIDEST = 2 * np.pi / 3
 
-# Clusters are needed where more than this part of the area of a piece turns by more than half a turn from its mean,
-# which is a full turn from side to side. Fists have 1 %, most of it noise.
+# Clusters are needed where more than this part of the area of a piece turns by more than this angle, in radians, from
+# its mean. Half a turn would be a full one from side to side; the rest is noise. Of fists, 1 % turns by half a turn.
+BEYOND = np.radians(200)
 PART_BEYOND = 0.05
 
 
@@ -73,7 +74,7 @@ class Clusters(nn.Module):
 def beyond_a_turn(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> bool:
     """Whether parts of a piece turn by more than a full turn from each other. Arguments as for :class:`Clusters`."""
     areas, off = areas.double(), _from_mean(turns, areas, ancestors, piece)
-    beyond = torch.bincount(piece, areas * (off > np.pi)) > PART_BEYOND * torch.bincount(piece, areas)
+    beyond = torch.bincount(piece, areas * (off > BEYOND)) > PART_BEYOND * torch.bincount(piece, areas)
     return bool(beyond.any())
 
 

@@ -82,7 +82,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges = len(mesh.edges)
-        wound = self._wound(*references[:2])
+        wound = self._wound(a, b)
         #: For rotations beyond a full turn; None where there are none.
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
 
@@ -106,11 +106,10 @@ class LocalRotations(nn.Module):
 
     def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
         """Whether parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
-        return beyond_a_turn(*self._wound(first, second))
+        return beyond_a_turn(*self._wound(*(_frames(x[None], self.faces) for x in (first, second))))
 
-    def _wound(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What :class:`Clusters` are made of. *Shape of each:* ``(V, 3)``."""
-        a, b = (_frames(x[None], self.faces) for x in (first, second))
+    def _wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What :class:`Clusters` are made of."""
         areas = (a.doubled_areas + b.doubled_areas).squeeze(0)
         return _turn_between(a, b).squeeze(1), areas, self.ancestors, self.piece
 
