@@ -57,8 +57,8 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> Decimation:
     points, triangles, collapses = simplified(sorted_points)
     if len(triangles) > _STUCK * n_faces:
         shifts = _SHIFT * np.random.default_rng(0).standard_normal(sorted_points.shape)
-        points, triangles, collapses = min(
-            (points, triangles, collapses), simplified(sorted_points + shifts), key=lambda found: len(found[1])
-        )
+        shifted = simplified(sorted_points + shifts)
+        if len(shifted[1]) <= _STUCK * n_faces:
+            points, triangles, collapses = shifted
     points = points.astype(np.float64) @ shape.axes / shape.scale + shape.centre
     return Decimation(points, triangles.astype(np.int64), order[collapses].reshape(-1, 2))
