@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
+from sheets import cylinder, folded, rectangle
 
 import torch_modal as tm
 from torch_modal.geometry.canonical import ROUNDING, ordered_faces, placed, size
@@ -100,3 +101,12 @@ def test_bases_and_in_betweens_do_not_depend_on_axes_and_order(hand: Mesh) -> No
     diagonal = np.linalg.norm(np.ptp(shapes[0], axis=0))
     for found in (half_way(shapes, shuffled(faces)), half_way(shapes @ TURN.T, faces) @ torch.from_numpy(TURN)):
         assert (found - expected).norm(dim=-1).max() < 1e-6 * diagonal
+
+
+def test_decimation_of_flat_parts_that_lie_obliquely() -> None:
+    """The optimal positions of exactly flat parts are those of rounding errors."""
+    flat, faces = rectangle(1.4, 1.0, 0.05)
+    page = cylinder(flat, 1.0, lambda s: folded(s, 0.7, 0.2, np.radians(170)))
+    found = decimate(page, faces, 200)
+    assert len(found.faces) <= 200
+    np.testing.assert_array_equal(decimate(page, faces, 200).collapses, found.collapses)

@@ -10,11 +10,16 @@ import fast_simplification
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.canonical import ordered_faces, placed, vertex_order
+from torch_modal.geometry.canonical import SIZE, ordered_faces, placed, vertex_order
 
 # The library keeps its mesh in static memory.
 _NOT_THREAD_SAFE = threading.Lock()
 _AGGRESSIVENESS = 7.0
+
+# Where this many times the wanted faces are left, the vertices are shifted a little, and the collapses start anew: in
+# exactly flat parts that lie obliquely, the optimal positions are those of rounding errors, and nothing collapses.
+_STUCK = 1.5
+_SHIFT = 1e-5 * SIZE
 
 
 class Decimation(NamedTuple):
@@ -39,13 +44,21 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> Decimation:
     shape = placed(vertices, faces)
     order = vertex_order(shape.points)
     rank = np.argsort(order)
-    with _NOT_THREAD_SAFE:
-        points, triangles, collapses = fast_simplification.simplify(
-            np.ascontiguousarray(shape.points[order]),
-            np.ascontiguousarray(rank[ordered_faces(shape.points, faces)], dtype=np.int32),
-            target_count=n_faces,
-            agg=_AGGRESSIVENESS,
-            return_collapses=True,
-        )
+    sorted_points = np.ascontiguousarray(shape.points[order])
+    sorted_faces = np.ascontiguousarray(rank[ordered_faces(shape.points, faces)], dtype=np.int32)
+
+    def simplified(points: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
+        with _NOT_THREAD_SAFE:
+            found: tuple[FloatArray, IntArray, IntArray] = fast_simplification.simplify(
+                points, sorted_faces, target_count=n_faces, agg=_AGGRESSIVENESS, return_collapses=True
+            )
+        return found
+
+    points, triangles, collapses = simplified(sorted_points)
+    if len(triangles) > _STUCK * n_faces:
+        shifts = _SHIFT * np.random.default_rng(0).standard_normal(sorted_points.shape)
+        shifted = simplified(sorted_points + shifts)
+        if len(shifted[1]) <= _STUCK * n_faces:
+            points, triangles, collapses = shifted
     points = points.astype(np.float64) @ shape.axes / shape.scale + shape.centre
     return Decimation(points, triangles.astype(np.int64), order[collapses].reshape(-1, 2))

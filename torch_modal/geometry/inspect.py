@@ -88,6 +88,13 @@ def flat_faces(vertices: FloatArray, faces: IntArray, tolerance: float) -> BoolA
     return double_areas(vertices, faces) <= tolerance * longest
 
 
+def is_flat(vertices: FloatArray, tolerance: float = 1e-6) -> bool:
+    """Whether points lie in a plane, within a part of their largest extent. *Shape:* ``(V, 3)``."""
+    centred = vertices - vertices.mean(axis=0)
+    extents = np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0)
+    return bool(extents.min() <= tolerance * extents.max())
+
+
 def signed_volume(vertices: FloatArray, faces: IntArray) -> float:
     """Enclosed volume of a closed mesh, positive for outward normals."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, tangent_offset
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
@@ -49,7 +50,8 @@ class LocalRotations(nn.Module):
     Between the key-frames a triangle turns by ``R`` and is sheared by the rest. At the time ``t`` its sides are
     :math:`R^t\, ((1-t) S_a + t R^T S_b)`; an edge takes the mean of its triangles by area. Where linear interpolation
     shrinks what turns, this does not. ``R`` alone does not tell a turn of 200 degrees from one of -160. But neighbours
-    turn alike: the signs of quaternions are passed on along a spanning tree, which tells up to a full turn.
+    turn alike: the signs of quaternions are passed on along a spanning tree, which tells up to a full turn. Where the
+    references turn by more from side to side, as a sheet that rolls up does, :class:`Clusters` take over.
 
     Args:
         mesh: The connectivity.
@@ -80,6 +82,9 @@ class LocalRotations(nn.Module):
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges = len(mesh.edges)
+        wound = self._wound(a, b)
+        #: For rotations beyond a full turn; None where there are none.
+        self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
 
     @staticmethod
     def _tree(turns: Tensor, slenderness: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
@@ -96,8 +101,17 @@ class LocalRotations(nn.Module):
         a, b = (_frames(x, self.faces) for x in (first, second))
         areas, t = a.doubled_areas + b.doubled_areas, t[:, None]
         length, along, height = (torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))
-        turn = power(self._signed(a, b), t)
+        turn = power(self._signed(a, b), t) if self.clusters is None else self.clusters(_turn_between(a, b), t)
         return self._edges(Sides(rotate(turn, length * a.e1), rotate(turn, a.world(along, height))), areas)
+
+    def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
+        """Whether parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
+        return beyond_a_turn(*self._wound(*(_frames(x[None], self.faces) for x in (first, second))))
+
+    def _wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What :class:`Clusters` are made of."""
+        areas = (a.doubled_areas + b.doubled_areas).squeeze(0)
+        return _turn_between(a, b).squeeze(1), areas, self.ancestors, self.piece
 
     def trajectory(
         self, before: Tensor | None, first: Tensor, second: Tensor, after: Tensor | None, spacing: Spacing

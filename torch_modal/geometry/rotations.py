@@ -70,6 +70,17 @@ def power(q: Tensor, t: Tensor) -> Tensor:
     return _about(t * _arc(q))
 
 
+def product(p: Tensor, q: Tensor) -> Tensor:
+    """The quaternion of the rotation ``q`` followed by ``p``. *Shape:* ``(4, ...), (4, ...) -> (4, ...)``."""
+    real = p[0] * q[0] - (p[1:] * q[1:]).sum(0)
+    return torch.cat([real[None], p[0] * q[1:] + q[0] * p[1:] + cross(p[1:], q[1:])])
+
+
+def conjugate(q: Tensor) -> Tensor:
+    """The quaternion of the inverse rotation. *Shape:* ``(4, ...)``."""
+    return torch.cat([q[:1], -q[1:]])
+
+
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """Vectors turned by quaternions. *Shape:* ``(4, ...), (3, ...) -> (3, ...)``."""
     twice = 2 * cross(q[1:], v)

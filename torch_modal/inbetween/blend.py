@@ -68,7 +68,7 @@ class Blends:
     """The blends of pairs of shapes. One Poisson system serves all, so that velocities go on where two of them meet.
 
     So does the tree of the first pair, wherever turns have the same senses by every tree: where neighbours have the
-    same one by this. Other pairs have one of their own.
+    same one by this, and nothing goes beyond a full turn. Other pairs have one of their own.
 
     Args:
         mesh: The connectivity.
@@ -96,9 +96,11 @@ class Blends:
         return RotationBlend(self.mesh, self.shapes[[i, j]], self.backend, self.first.poisson)
 
     def _is_plain(self, i: int, j: int) -> bool:
-        """Whether neighbours have the same quaternion sign by the first tree, and so by every other."""
+        """Whether neighbours have the same quaternion sign by the first tree, and so by every other, below a turn."""
         rotations = self.first.rotations
         pair = self.shapes[[i, j]].to(rotations.piece.device)
+        if rotations.clusters is not None or rotations.is_beyond_a_turn(*pair):
+            return False
         turns = rotations.turns(pair[:1], pair[1:])[:, 0]
         one, other = torch.tensor(self.mesh.face_neighbours, device=turns.device).unbind(1)
         return bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())

@@ -202,6 +202,10 @@ class JointSpace(nn.Module):
         straight = torch.lerp(first, second, u) + beyond(bend, u)
         if self.blend is None:
             return (straight,)
+        if self.blend.rotations.clusters is not None:
+            # Beyond a full turn, no single axis tells how a triangle goes on: it turns evenly from one to the other.
+            ends = (x.expand(len(t), -1, -1) for x in (first, second))
+            return self.blend(*ends, t, straight), straight
         trajectory = self.blend.rotations.trajectory(
             around.before, pair.first, pair.second, around.after, around.spacing
         )

@@ -8,7 +8,8 @@ from torch import Tensor
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
-from torch_modal.precompute.coarsening import Coarsening, coarsen
+from torch_modal.geometry.inspect import is_flat
+from torch_modal.precompute.coarsening import Coarsening, Collapses, coarsen
 
 ENOUGH_FACES = 1000
 """Up to so many are tried; coarse meshes of more are not checked."""
@@ -31,6 +32,9 @@ def resolving(
 ) -> Coarsening:
     """A coarse mesh of so many faces, or of more, where those do not resolve the modes.
 
+    A flat shape does not tell where the other one bends: the collapses are then those of the other, and there are
+    ``ENOUGH_FACES`` or more.
+
     Args:
         shapes: Float64 on the CPU. *Shape:* ``(2, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
@@ -38,8 +42,16 @@ def resolving(
         collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`.
         modes: Of the first shape; None if it does not matter. *Shape:* ``(k, V, 3)``.
     """
-    found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
     enough = min(ENOUGH_FACES, len(faces))
+    flat = [is_flat(x[faces.unique()].numpy()) for x in shapes]
+    if any(flat):
+        n_faces, curved = max(n_faces, enough), flat.index(False) if False in flat else 0
+        given = collapses or Collapses(faces.numpy()).of(range(len(shapes)), shapes.numpy())
+
+        def collapses(keyframe: int, n: int) -> Coarsening:
+            return given(curved if flat[keyframe] else keyframe, n)
+
+    found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
     if modes is None or len(modes) == 0 or n_faces >= enough:
         return found
     fine = stretching(Mesh.of(faces, shapes.shape[1]), shapes[0], modes)

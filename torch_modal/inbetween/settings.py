@@ -35,7 +35,7 @@ class Objective:
         alpha: Stretching stiffness of Eq. 5: a number, or a tensor or parameter whose last dimension counts the edges,
             or is 1, and whose others broadcast against the samples. *Shape:* ``()``, ``(..., E)`` or ``(..., 1)``.
         beta: Bending stiffness, likewise with the hinges. *Shape:* ``()``, ``(..., H)`` or ``(..., 1)``.
-        gamma: Volume stiffness. *Shape:* ``()`` or ``(..., 1)``.
+        gamma: Volume stiffness; of no effect on open surfaces, such as sheets. *Shape:* ``()`` or ``(..., 1)``.
         mu: Weight of the similarity of Eq. 4, of no effect in the joint space: a number, or a tensor or parameter that
             broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch_modal.autograd import broadcast_shapes, lasting, outlasting
 from torch_modal.contact.rounds import ContactRounds
 from torch_modal.energy.term import Mesh
+from torch_modal.energy.volume import Volume, encloses
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.between import Between, Shared
 from torch_modal.inbetween.samples import InBetweenResult, Samples, report
@@ -98,6 +99,8 @@ class InBetween(nn.Module):
         connectivity = checked_surface(shapes, self.faces.cpu())[1]
         self.faces = torch.tensor(connectivity.faces)
         ends = [[part.double().cpu() for part in (basis.reference, basis.modes)] for basis in self.bases]
+        #: Whether there is a volume to be kept: not in sheets, whose energy has two terms.
+        self.encloses = all(encloses(x, connectivity) for x in shapes)
         mesh = Mesh(connectivity)
         kind = ContactRounds if self.objective.contact else Between
         shared = Shared.of(mesh, torch.stack(shapes), self.pairs, list(self.terms), self.solver)
@@ -274,6 +277,7 @@ class InBetween(nn.Module):
         for term, part in zip(self.terms, self.members[0].fine.energy.parts, strict=True):
             values = torch.as_tensor(term.stiffness, dtype=times.dtype, device=times.device)
             values = values[None] if values.dim() == 0 else values
+            values = values if self.encloses or not isinstance(term, Volume) else 0 * values
             n = 1 if term.total else part.corners.shape[1]
             try:
                 if values.shape[-1] not in (1, n):

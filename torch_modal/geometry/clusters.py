@@ -1,0 +1,109 @@
+"""Rotations of more than a full turn: triangles follow the rotations of clusters, each relative to the one before."""
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import breadth_first_order
+from torch import Tensor, nn
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.rotations import conjugate, power, product, turn_of
+from torch_modal.geometry.vectors import pick
+
+# Rotation of the triangles of a cluster relative to its root, in radians. Above half a turn, the direction is unknown.
+WIDEST = 2 * np.pi / 3
+
+# Clusters are needed where more than this part of the area of a piece turns by more than this angle, in radians, from
+# its mean. Half a turn would be a full one from side to side; the rest is noise. Of fists, 1 % turns by half a turn.
+BEYOND = np.radians(200)
+PART_BEYOND = 0.05
+
+
+class Clusters(nn.Module):
+    r"""Fractions of rotations that go beyond a full turn.
+
+    A triangle of the cluster ``c`` turns by :math:`T_c(t)\, (R_c^T R)^t` with the rotation :math:`R_c` of the root of
+    the cluster, and a cluster by :math:`T_c(t) = T_p(t)\, (R_p^T R_c)^t` with its parent ``p``. No power is one of a
+    rotation of half a turn or more.
+
+    Args:
+        turns: Quaternions of the triangles, of any signs. *Shape:* ``(4, F)``.
+        areas: Of the triangles. *Shape:* ``(F,)``.
+        ancestors: Those of the triangles in a spanning forest, by 1, 2, 4, ... generations; a root is its own parent.
+            *Shape:* ``(J, F)``.
+        piece: The tree of each triangle. *Shape:* ``(F,)``.
+    """
+
+    cluster: Tensor
+    roots: Tensor
+    ancestors: Tensor
+
+    def __init__(self, turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> None:
+        super().__init__()
+        # From the middle of each piece, so that as much turns one way as the other.
+        order = np.lexsort((_from_mean(turns, areas, ancestors, piece), piece))
+        middles = order[np.unique(piece[order], return_index=True)[1]]
+        cluster, roots, parent = _clusters(turns.T.numpy(), middles, ancestors[0].numpy())
+        # One more cluster, which does not turn, is the parent of those without.
+        generations = [np.append(parent, len(parent))]
+        while (generations[-1] != len(parent)).any():
+            generations.append(generations[-1][generations[-1]])
+        self.register_buffer("cluster", torch.from_numpy(cluster), persistent=False)
+        self.register_buffer("roots", torch.from_numpy(roots), persistent=False)
+        #: By 1, 2, 4, ... generations. *Shape:* ``(J, C + 1)``.
+        self.register_buffer("ancestors", torch.from_numpy(np.stack(generations)), persistent=False)
+
+    def forward(self, turns: Tensor, t: Tensor) -> Tensor:
+        """The rotations at the time ``t``, of those at 1. *Shape:* ``(4, B, F), (B, 1) -> (4, B, F)``."""
+        roots = pick(turns, self.roots)
+        still = torch.zeros_like(roots[..., :1])
+        still[0] = 1
+        roots = torch.cat([roots, still], -1)
+        followed = self._fraction(pick(roots, self.ancestors[0]), roots, t)
+        for ancestors in self.ancestors:
+            followed = product(pick(followed, ancestors), followed)
+        return product(pick(followed, self.cluster), self._fraction(pick(roots, self.cluster), turns, t))
+
+    @staticmethod
+    def _fraction(start: Tensor, end: Tensor, t: Tensor) -> Tensor:
+        """A part of the way from one rotation to another, the short way round."""
+        between = product(conjugate(start), end)
+        return power(torch.where(between[0] < 0, -between, between), t)
+
+
+def beyond_a_turn(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> bool:
+    """Whether parts of a piece turn by more than a full turn from each other. Arguments as for :class:`Clusters`."""
+    areas, off = areas.double(), _from_mean(turns, areas, ancestors, piece)
+    beyond = torch.bincount(piece, areas * (off > BEYOND)) > PART_BEYOND * torch.bincount(piece, areas)
+    return bool(beyond.any())
+
+
+def _from_mean(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> Tensor:
+    """Angles between triangles and the mean of their piece, added up along the tree. *Shape:* ``(F,)``."""
+    step = product(conjugate(pick(turns, ancestors[0])), turns)
+    winding = turn_of(torch.where(step[0] < 0, -step, step))
+    for generation in ancestors:
+        winding = winding + pick(winding, generation)
+    means = torch.stack([torch.bincount(piece, areas * row) for row in winding]) / torch.bincount(piece, areas)
+    return (winding - pick(means, piece)).norm(dim=0)
+
+
+def _clusters(turns: FloatArray, middles: IntArray, parents: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """The cluster of each triangle, ``(F,)``; the root of each cluster, and its parent, C where none, ``(C,)`` each."""
+    n = len(parents)
+    # An extra node above the middles: one traversal visits all pieces.
+    ends = np.append(np.arange(n), np.full(len(middles), n)), np.append(parents, middles)
+    tree = coo_matrix((np.ones(len(ends[0])), ends), shape=(n + 1, n + 1)).tocsr()
+    order, before = breadth_first_order(tree, n, directed=False)
+    cluster = np.empty(n, dtype=np.int64)
+    roots: list[int] = []
+    above: list[int] = []
+    for f in order[1:]:
+        own = -1 if before[f] == n else cluster[before[f]]
+        if own < 0 or abs(turns[f] @ turns[roots[own]]) < np.cos(WIDEST / 2):
+            above.append(own)
+            own = len(roots)
+            roots.append(f)
+        cluster[f] = own
+    parent = np.array(above)
+    return cluster, np.array(roots, dtype=np.int64), np.where(parent < 0, len(roots), parent)
