@@ -2,21 +2,17 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity, double_areas
-from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.inspect import OPEN, open_part, signed_volume
 from torch_modal.geometry.vectors import cross, norm
 
 # Eq. 5 divides by the rest volume, which has this bound for flat bodies, as a part of (surface area)^(3/2); a sphere
 # has 0.094.
 MIN_RELATIVE_VOLUME = 1e-6
-
-# The squared length of all boundaries, as a part of the area, above which a surface is open: one round hole of 8 %.
-MAX_RELATIVE_BOUNDARY = 1.0
 
 
 class Volume(Term):
@@ -68,9 +64,8 @@ class Volume(Term):
 def encloses(x: Tensor, mesh: Connectivity) -> bool:
     """Whether a shape encloses a volume: it has small holes at most, and is not flat. *Shape:* ``(V, 3)``."""
     points = x.detach().cpu().double().numpy()
-    area = double_areas(points, mesh.faces).sum() / 2
-    start, end = points[mesh.boundary_chain.T]
-    if np.linalg.norm(end - start, axis=1).sum() ** 2 > MAX_RELATIVE_BOUNDARY * area:
+    if open_part(points, mesh) > OPEN:
         return False
+    area = double_areas(points, mesh.faces).sum() / 2
     volume = signed_volume(points - points[mesh.used].mean(0), mesh.faces)
     return bool(abs(volume) > MIN_RELATIVE_VOLUME * area**1.5)

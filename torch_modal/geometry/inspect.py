@@ -10,6 +10,11 @@ import numpy as np
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
 
+FLATNESS = 1e-6
+"""Extent across a plane, over the largest, up to which a surface is flat."""
+OPEN = 0.08
+"""Part of its area that holes have (:func:`open_part`) above which a surface is open, rather than a body with holes."""
+
 
 class Winding(NamedTuple):
     """Faces with consistent winding in each orientable component."""
@@ -88,11 +93,25 @@ def flat_faces(vertices: FloatArray, faces: IntArray, tolerance: float) -> BoolA
     return double_areas(vertices, faces) <= tolerance * longest
 
 
-def is_flat(vertices: FloatArray, tolerance: float = 1e-6) -> bool:
-    """Whether points lie in a plane, within a part of their largest extent. *Shape:* ``(V, 3)``."""
-    centred = vertices - vertices.mean(axis=0)
-    extents = np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0)
-    return bool(extents.min() <= tolerance * extents.max())
+def principal_extents(points: FloatArray) -> FloatArray:
+    """Extents along the principal axes, descending. *Shape:* ``(V, 3) -> (3,)``."""
+    centred = points - points.mean(axis=0)
+    scale = np.abs(centred).max() or 1.0
+    extents: FloatArray = np.ptp(centred @ np.linalg.eigh((centred / scale).T @ (centred / scale))[1], axis=0)
+    return np.sort(extents)[::-1]
+
+
+def is_flat(points: FloatArray) -> bool:
+    """Whether points lie in a plane. *Shape:* ``(V, 3)``."""
+    extents = principal_extents(points)
+    return bool(extents[2] <= FLATNESS * extents[0])
+
+
+def open_part(points: FloatArray, mesh: Connectivity) -> float:
+    """Area of round holes as long as all boundaries, as a part of that of the surface. *Shape:* ``(V, 3)``."""
+    start, end = points[mesh.boundary_edges.T]
+    length = np.linalg.norm(end - start, axis=1).sum()
+    return float(length**2 / (2 * np.pi * double_areas(points, mesh.faces).sum()))
 
 
 def signed_volume(vertices: FloatArray, faces: IntArray) -> float:

@@ -24,7 +24,6 @@ _RESOLUTION = {torch.float32: 1e-6, torch.float64: 1e-12}
 # Range of diagonals that can be scaled to 100 without overflow.
 _DIAGONAL_RANGE = {torch.float32: (1e-30, 1e30), torch.float64: (1e-250, 1e250)}
 _LARGEST_SIZE_RATIO = 100.0
-_FLATNESS = 1e-6
 # Visible rounding of the coordinates, relative to the diagonal.
 _COARSE_ROUNDING = 1e-4
 
@@ -99,8 +98,8 @@ def require_solid(vertices: Any, faces: Any) -> None:
     Raises:
         MeshError: The extent across the plane that fits best is below 1e-6 of the largest extent.
     """
-    extents = _principal_extents(vertices, faces)
-    if extents[2] <= _FLATNESS * extents[0]:
+    extents = _extents(vertices, faces)
+    if extents[2] <= inspect.FLATNESS * extents[0]:
         raise MeshError(
             f"the surface is flat: its extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}, so it "
             'encloses nothing that could be filled with tetrahedra; take the modes of the surface (method="shell"), or '
@@ -118,22 +117,18 @@ def require_area(vertices: Any, faces: Any) -> None:
     Raises:
         MeshError: The second extent is below 1e-6 of the largest.
     """
-    extents = _principal_extents(vertices, faces)
-    if extents[1] <= _FLATNESS * extents[0]:
+    extents = _extents(vertices, faces)
+    if extents[1] <= inspect.FLATNESS * extents[0]:
         raise MeshError(
             f"all vertices lie on a line: the extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}; a "
             "surface has an area"
         )
 
 
-def _principal_extents(vertices: Any, faces: Any) -> FloatArray:
+def _extents(vertices: Any, faces: Any) -> FloatArray:
     """Extents of the referenced vertices along their principal axes, descending. *Shape:* ``(3,)``."""
     points = torch.as_tensor(vertices).detach().cpu().double().numpy()
-    points = points[np.unique(torch.as_tensor(faces).cpu().numpy())]
-    points = points - points.mean(axis=0)
-    scale = np.abs(points).max()
-    _, axes = np.linalg.eigh((points / scale).T @ (points / scale)) if scale > 0 else (None, np.eye(3))
-    return np.sort(np.ptp(points @ axes, axis=0))[::-1]
+    return inspect.principal_extents(points[np.unique(torch.as_tensor(faces).cpu().numpy())])
 
 
 def _check_shapes(positions: torch.Tensor, faces: IntArray, min_keyframes: int) -> None:
@@ -298,8 +293,8 @@ def _check_surface(
         )
     elif orientable and not (counts % 2).any():
         volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
-        positive, turned = int(volumes.argmax()), np.flatnonzero(volumes < -_FLATNESS)
-        if volumes[positive] > _FLATNESS and len(turned):
+        positive, turned = int(volumes.argmax()), np.flatnonzero(volumes < -inspect.FLATNESS)
+        if volumes[positive] > inspect.FLATNESS and len(turned):
             first, others = (torch.from_numpy(scaled[rows]) for rows in ([positive] * len(turned), turned))
             turned = turned[looks_mirrored(first, others, torch.tensor(faces)).numpy()]
             if len(turned):
