@@ -22,8 +22,8 @@ class ModalBasis:
     The modes are constants of the autograd graph: all tensors are detached.
 
     Modes have unit mass at a density of 1, of the solid or of a sheet with a thickness of a hundredth of the size:
-    ``phi`` scales as ``length^-3/2`` and eigenvalues as ``length^-2`` with the units of the shape. Eigenvalues of solids
-    and sheets have different units of stiffness. Signs are arbitrary but fixed.
+    ``phi`` scales as ``length^-3/2`` and eigenvalues as ``length^-2`` with the units of the shape. Eigenvalues of
+    solids and sheets have different units of stiffness. Signs are arbitrary but fixed.
 
     Attributes:
         reference: The shape that the modes belong to, in the caller's coordinates. *Shape:* ``(V, 3)``.
