@@ -1,6 +1,7 @@
 """In-betweens of sheets: flat, open, and rolled up."""
 
 import math
+import warnings
 from collections.abc import Callable
 from functools import cache
 
@@ -41,17 +42,10 @@ def faces() -> Tensor:
     return torch.tensor(strip()[1])
 
 
-def bases(*shapes: Tensor, k: int = 8) -> list[tm.ModalBasis]:
-    """Smooth fields in the place of modes: low eigenvectors of the Laplacian of the graph, along three axes."""
-    edges = torch.tensor(Connectivity(strip()[1]).edges)
-    n = len(shapes[0])
-    laplacian = torch.zeros(n, n, dtype=torch.float64)
-    laplacian[edges[:, 0], edges[:, 1]] = laplacian[edges[:, 1], edges[:, 0]] = -1
-    laplacian -= torch.diag(laplacian.sum(1))
-    values, fields = torch.linalg.eigh(laplacian)
-    axes = torch.eye(3, dtype=torch.float64)
-    modes = (fields.T[1 : k + 1, None, :, None] * axes[:, None]).flatten(0, 1)
-    return [tm.ModalBasis(x, values[1 : k + 1].repeat_interleave(3), modes, torch.zeros(6).double()) for x in shapes]
+def bases(*shapes: Tensor, k: int = 20) -> list[tm.ModalBasis]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", tm.MeshWarning)
+        return tm.extract_bases(torch.stack(shapes), faces(), k, method="shell", cache=False, progress=False)
 
 
 def lengths(x: Tensor) -> Tensor:

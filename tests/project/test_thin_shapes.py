@@ -1,0 +1,127 @@
+"""Sheets all the way: modes of the surface, and everything that is made of them."""
+
+import json
+import logging
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from sheets import cylinder, rectangle, rolled
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.cli import main as cli
+from torch_modal.data.batch.precompute import Shard
+from torch_modal.data.stored import open_set
+from torch_modal.geometry.canonical import size
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.io.frames import save_frames
+from torch_modal.precompute.shell import THICKNESS
+
+pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.keyframes.check.MeshWarning")
+
+LENGTH = 4.0
+STRIP, TRIANGLES = rectangle(LENGTH, 1.0, 0.13)
+FACES = torch.from_numpy(TRIANGLES)
+
+
+def roll(time: float, turns: float = 0.8) -> Tensor:
+    """A flat strip, which rolls up."""
+    return torch.from_numpy(cylinder(STRIP, time, partial(rolled, length=LENGTH, turns=turns)))
+
+
+def lengths(x: Tensor) -> Tensor:
+    i, j = torch.tensor(Connectivity(TRIANGLES).edges).T
+    return (x[..., j, :] - x[..., i, :]).norm(dim=-1)
+
+
+def strain(x: Tensor) -> float:
+    rest = lengths(roll(0.0))
+    return float(((lengths(x) - rest) / rest).abs().mean())
+
+
+@pytest.fixture(scope="module")
+def bases() -> list[tm.ModalBasis]:
+    return tm.extract_bases(torch.stack([roll(0.0), roll(1.0)]), FACES, 20, cache=False, progress=False)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_and_dtypes(bases: list[tm.ModalBasis], dtype: torch.dtype) -> None:
+    layer = tm.InBetween(bases, FACES, solver=tm.Solver(tolerance=1e-7 if dtype == torch.float32 else 1e-11)).to(dtype)
+    first, second = roll(0.0).to(dtype), roll(1.0).to(dtype).requires_grad_()
+    direction = torch.randn(second.shape, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    target = roll(0.5).to(dtype)
+
+    def loss(x: Tensor) -> Tensor:
+        return (layer(first, x, 0.5) * target).sum()
+
+    found = loss(second)
+    assert found.dtype == dtype and strain(layer(first, second, 0.5).double()) < 2e-3
+    (gradient,) = torch.autograd.grad(found, second)
+    if dtype == torch.float64:
+        step = 1e-7
+        with torch.no_grad():
+            change = (loss(second + step * direction) - loss(second - step * direction)) / (2 * step)
+        torch.testing.assert_close((gradient * direction).sum(), change, rtol=1e-5, atol=1e-5)
+
+
+def test_encoded_and_decoded(tmp_path: Path) -> None:
+    frames = torch.stack([roll(t) for t in np.linspace(0, 1, 9)])
+    encoded = tm.encode(frames, FACES, [0, 8], n_modes=20)
+    encoded.save(tmp_path / "roll.tms")
+    decoded = tm.ModalSequence.load(tmp_path / "roll.tms").decode()
+    assert (decoded - frames).norm(dim=-1).mean() < 0.01 * LENGTH
+    basis = tm.extract_modes(frames[0], FACES, 20, cache=False)
+    decoder = tm.ModalDecoder(frames[[0, 8]], FACES, [0.0, 1.0], frames[0], basis.modes)
+    amplitudes = 0.3 * torch.eye(20, dtype=frames.dtype)
+    assert all(strain(shape) < 0.02 for shape in decoder(amplitudes, torch.full((20,), 0.5)))
+
+
+def test_draws_have_the_strain_of_the_sides(bases: list[tm.ModalBasis]) -> None:
+    """Edges keep their lengths to first order: what is given is the strain of a sheet of a certain thickness."""
+    space = tm.ShapeSpace(bases[0], FACES)
+    flat = roll(0.0)
+    for given in (0.005, 0.02):
+        transform = tm.RandomModalDeformation(
+            given, p=1.0, space=space, generator=torch.Generator().manual_seed(0), max_strain=0.5
+        )
+        drawn = transform(flat.expand(64, -1, -1))
+        mesh = Connectivity(TRIANGLES)
+        normals = torch.linalg.cross(
+            drawn[:, FACES[:, 1]] - drawn[:, FACES[:, 0]], drawn[:, FACES[:, 2]] - drawn[:, FACES[:, 0]]
+        )
+        normals = normals / normals.norm(dim=-1, keepdim=True)
+        i, j = torch.tensor(mesh.hinge_sides % len(FACES)).T
+        angles = 2 * torch.asin((0.5 * (normals[:, i] - normals[:, j]).norm(dim=-1)).clamp(max=1))
+        centres = flat[FACES].mean(1)
+        curvature = angles / (centres[i] - centres[j]).norm(dim=-1)
+        sides = 0.5 * THICKNESS * size(flat.numpy(), TRIANGLES) * curvature
+        assert float(sides.square().mean().sqrt()) == pytest.approx(given, rel=0.4)
+        assert float((lengths(drawn) / lengths(flat) - 1).abs().mean()) < given
+
+
+def test_commands_and_trees(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    shapes = torch.stack([roll(0.0), roll(1.0)])
+    files = save_frames(shapes.numpy(), TRIANGLES, tmp_path / "in" / "roll", fmt="obj")
+    out = ["--out", str(tmp_path / "frames"), "--modes", "8", "--levels", "1", "--no-cache"]
+    with caplog.at_level(logging.INFO, "torch_modal"):
+        assert cli.main(["subdivide", *map(str, files), *out, "--format", "obj"]) == 0
+    assert "modes of the surface itself, not of a solid: key-frame 0 is open" in caplog.text
+    frames, _ = tm.load_keyframes(sorted((tmp_path / "frames").glob("*.obj")))
+    assert strain(frames[1]) < 2e-3
+    asked = ["--method", "solid", "--overwrite"]
+    assert cli.main(["subdivide", *map(str, files), *out, "--format", "obj", *asked]) == 1
+    assert "the surface is flat" in capsys.readouterr().err
+
+    tree = ["precompute", str(tmp_path / "in"), "--out", str(tmp_path / "bases"), "--modes", "8"]
+    assert cli.main([*tree, "--method", "solid"]) == 3
+    assert cli.main([*tree, "--method", "shell"]) == 0
+    (record,) = map(json.loads, (tmp_path / "bases" / Shard().report).read_text().splitlines())
+    assert record["parameters"]["method"] == "shell"
+    here = tm.extract_bases(shapes, FACES, 8, method="shell", cache=False)
+    for mine, its in zip(here, open_set(tmp_path / "bases" / "roll").bases, strict=True):
+        torch.testing.assert_close(its.eigenvalues, mine.eigenvalues)
