@@ -1,8 +1,8 @@
 """Vibration modes of a surface itself: those of Eq. 5 at rest, without tetrahedra.
 
 The stiffness is the Gauss-Newton Hessian of edge lengths and dihedral angles at rest, the mass that of a sheet. Sheets,
-thin and open bodies have such modes, as all surfaces do. The enclosed volume is left out: with it, in-betweens of
-closed bodies differ by less than a thousandth of their error (docs/precompute.md).
+thin and open bodies have such modes, as all surfaces do. The enclosed volume is left out: it hardly
+changes in-betweens (docs/precompute.md).
 """
 
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from torch_modal.io.cache import Arrays
 from torch_modal.precompute.coarsening import coarsen
 from torch_modal.precompute.eigen import Scale
 from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import small_pieces
 
 THICKNESS = 0.01
 """Thickness of the sheet whose mass the modes have, in sizes of the surface."""
@@ -31,9 +32,6 @@ FACES_PER_MODE = 50
 """Where many modes are asked for, there are more faces."""
 LEAST_MASS = 1e-3
 """Smallest mass of a vertex over the mean."""
-SMALL_AREA = 0.01
-SMALL_EXTENT = 0.1
-"""Largest area and extent of small pieces, as fractions of the whole."""
 SPREAD = 1.5
 """Averages over neighbours that carry displacements from clusters to vertices, per radius of a cluster in edges."""
 
@@ -71,11 +69,6 @@ class Sheet:
         return Connectivity(self.surface.faces, len(self.surface.points))
 
     @cached_property
-    def _piece(self) -> IntArray:
-        """Connected component of each vertex. *Shape:* ``(U,)``."""
-        return self._fine.vertex_pieces
-
-    @cached_property
     def _clusters(self) -> IntArray:
         """Coarse vertex of each vertex, -1 in small pieces. *Shape:* ``(U,)``."""
         return self._coarse[0]
@@ -84,7 +77,9 @@ class Sheet:
     def _coarse(self) -> tuple[IntArray, FloatArray, Connectivity]:
         """Clusters, and the mesh that they make."""
         points, faces = self.surface.points, self.surface.faces
-        own = faces[~_is_small(points, faces, self._piece)[self._piece[faces[:, 0]]]]
+        piece = self._fine.vertex_pieces[faces[:, 0]]
+        small = small_pieces(np.bincount(piece, double_areas(points, faces)), points[faces], piece)
+        own = faces[~small[piece]]
         coarse = coarsen(points[None], own, self._n_faces)
         return coarse.clusters, coarse.restrict(points), Connectivity(coarse.faces, coarse.n_vertices)
 
@@ -171,26 +166,13 @@ class Sheet:
             return found
         tree, averages = cKDTree(self.points), _averages(self.mesh)
         follows = np.zeros(len(points), dtype=np.int64)
-        for index in np.unique(self._piece[loose]):
-            own = np.flatnonzero(loose & (self._piece == index))
+        piece = self._fine.vertex_pieces
+        for index in np.unique(piece[loose]):
+            own = np.flatnonzero(loose & (piece == index))
             follows[own] = tree.query(points[own].mean(axis=0))[1]
         rows = np.flatnonzero(loose)
         nearest = sp.csr_matrix((np.ones(len(rows)), (rows, follows[rows])), shape=found.shape)
         return sp.csr_matrix(nearest @ averages)
-
-
-def _is_small(points: FloatArray, faces: IntArray, piece: IntArray) -> BoolArray:
-    """Whether pieces have little area and extent; false for the largest. *Shape:* ``(U, 3), (F, 3), (U,) -> (P,)``."""
-    n = int(piece.max()) + 1
-    areas = np.bincount(piece[faces[:, 0]], double_areas(points, faces), minlength=n)
-    low, high = (np.full((n, 3), bound) for bound in (np.inf, -np.inf))
-    np.minimum.at(low, piece, points)
-    np.maximum.at(high, piece, points)
-    extents = np.linalg.norm(high - low, axis=1)
-    whole = np.linalg.norm(np.ptp(points, axis=0))
-    small: BoolArray = (areas < SMALL_AREA * areas.sum()) & (extents < SMALL_EXTENT * whole)
-    small[areas.argmax()] = False
-    return small
 
 
 def _mean_length(points: FloatArray, mesh: Connectivity) -> float:

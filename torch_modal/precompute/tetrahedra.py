@@ -4,13 +4,14 @@ import threading
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
 from torch_modal.precompute.surface import CanonicalSurface
 
-SMALL_VOLUME = 0.01
-"""Largest volume of a small piece, as a fraction of the whole."""
+SMALL_AMOUNT = 0.01
+"""Largest volume (or area, of a surface) of a small piece, as a fraction of the whole."""
 SMALL_SIZE = 0.1
 """Largest extent of a small piece, as a fraction of the diagonal; longer thin pieces are limbs or wires."""
 MOST_DEBRIS = 0.2
@@ -107,7 +108,7 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     vertex, user = np.divmod(np.unique(tets.reshape(-1) * n + np.repeat(piece, 4)), n)
     hinge = np.bincount(vertex)[vertex] > 1  # a vertex of two pieces or more
     volumes = np.bincount(piece, np.abs(tet_volumes(tetrahedra)))
-    debris = (volumes < SMALL_VOLUME * volumes.sum()) & (np.bincount(user, hinge, n) > 0)
+    debris = (volumes < SMALL_AMOUNT * volumes.sum()) & (np.bincount(user, hinge, n) > 0)
     if volumes[debris].sum() > MOST_DEBRIS * volumes.sum():
         return tetrahedra
     return kept_tetrahedra(tetrahedra, ~debris[piece])
@@ -123,16 +124,28 @@ def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> BoolArray:
     Returns:
         *Shape:* ``(P,)``.
     """
-    volumes = np.bincount(piece, solid_volumes(tetrahedra))
-    low, high = (np.full((len(volumes), 3), bound) for bound in (np.inf, -np.inf))
-    corners = tetrahedra.vertices[tetrahedra.tets]
+    return small_pieces(np.bincount(piece, solid_volumes(tetrahedra)), tetrahedra.vertices[tetrahedra.tets], piece)
+
+
+def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) -> BoolArray:
+    """Whether pieces have little volume or area, and little extent; false for the largest.
+
+    Args:
+        amounts: Volume or area of each piece. *Shape:* ``(P,)``.
+        corners: Of elements. *Shape:* ``(M, n, 3)``.
+        piece: Piece of each element. *Shape:* ``(M,)``.
+
+    Returns:
+        *Shape:* ``(P,)``.
+    """
+    low, high = (np.full((len(amounts), 3), bound) for bound in (np.inf, -np.inf))
     np.minimum.at(low, piece, corners.min(axis=1))
     np.maximum.at(high, piece, corners.max(axis=1))
     extent = np.linalg.norm(high - low, axis=1)
-    small = (volumes < SMALL_VOLUME * volumes.sum()) & (
+    small: BoolArray = (amounts < SMALL_AMOUNT * amounts.sum()) & (
         extent < SMALL_SIZE * np.linalg.norm(high.max(axis=0) - low.min(axis=0))
     )
-    small[volumes.argmax()] = False
+    small[amounts.argmax()] = False
     return small
 
 
