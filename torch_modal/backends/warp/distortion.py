@@ -34,7 +34,7 @@ class WarpDistortion(Distortion):
     def of_shell(self, shapes: Sequence[Tensor], rests: Rests) -> Tensor:
         """As in the base class."""
         t, stiffness = rests.t, rests.stiffness[:2]
-        if traced(t) or any(transformed(x) for x in (*shapes, *rests.shapes, t, *stiffness)):
+        if t.dim() > 1 or traced(t) or any(transformed(x) for x in (*shapes, *rests.shapes, t, *stiffness)):
             return super().of_shell(shapes, rests)
         b, n = shapes[0].shape[:2]
         x = torch.stack([*shapes]).double()
