@@ -233,8 +233,8 @@ class Energy(nn.Module):
         """
         measures, wholes, constant = [], [], torch.zeros_like(weights[..., 0])
         for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
-            pulls = weights[..., None] * torch.stack([rest.weights[i].expand_as(rest.measures[i]) for rest in rests], -2)
             values = torch.stack([rest.measures[i] for rest in rests], -2)
+            pulls = weights[..., None] * torch.stack([rest.weights[i] for rest in rests], -2).expand_as(values)
             whole, value, spread = merged(pulls, on_one_branch(values, pulls) if part.term.periodic else values)
             measures.append(value[..., None, :])
             wholes.append((factor * whole)[..., None, :])

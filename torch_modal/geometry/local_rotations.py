@@ -81,7 +81,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
         #: Twice the sums of those of the references. *Shape:* ``(F,)``.
-        self.register_buffer("areas", sum(x.doubled_areas.squeeze(0) for x in every), persistent=False)
+        self.register_buffer("areas", torch.cat([x.doubled_areas for x in every]).sum(0), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
@@ -127,7 +127,7 @@ class LocalRotations(nn.Module):
         start = Frames(*(x[..., rows, weights.argmax(1), :] for x in own))
         turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
         areas = own.doubled_areas.detach().flatten(0, 1)
-        signs = self._sign_votes(turns.detach().flatten(1, 2), areas).view(turns.shape[1:])
+        signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), areas).view(turns.shape[1:])
         turn = mean(signs * turns, weights[..., None])
         length, along, height = ((weights[..., None] * x).sum(-2) for x in own[3:])
         wanted = Sides(rotate(turn, length * start.e1), rotate(turn, start.world(along, height)))
@@ -232,6 +232,10 @@ class LocalRotations(nn.Module):
         quaternions = _turn_between(a, b)
         areas = (a.doubled_areas + b.doubled_areas).detach()
         return self._sign_votes(quaternions.detach(), areas) * quaternions
+
+    def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
+        """A sign for the quaternion of each triangle. *Shape:* ``(B, F, 4), (B, F) -> (B, F)``."""
+        return self._sign_votes(quaternions.movedim(-1, 0), areas)
 
     def _sign_votes(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """A sign for each quaternion. *Shape:* ``(4, B, F), (B, F) -> (B, F)``."""

@@ -20,8 +20,9 @@ from torch_modal.inbetween.samples import InBetweenResult, warn_of_starts
 from torch_modal.solve.adjoint import Minimisation, solve_implicit, solve_unrolled
 from torch_modal.solve.solver import Solution, Status
 
-# Rounds in which all key-frames are turned on to their mean: between poses of a body, each leaves a tenth or less.
-ROUNDS = 12
+# Rounds in which all key-frames are turned on to their mean, and the last of them, which have derivatives: of the poses
+# of a gallop, each leaves a tenth.
+ROUNDS, LAST_ROUNDS = 6, 5
 
 # Principal components whose variances differ by less than this part have no first one to differentiate.
 GAP = 1e-6
@@ -150,8 +151,11 @@ def _aligned(frame: Frame, keyframes: Tensor, weights: Tensor) -> Group:
     products = (rows @ rows.mT).unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)  # (B, 1 + K, 1 + K, 3, 3)
     to_reference, among = products[:, 0, 1:], products[:, 1:, 1:]
     pulls = weights[..., None, None]
-    turns = best_rotation(to_reference)
-    for _ in range(ROUNDS):
+    with torch.no_grad():
+        turns = best_rotation(to_reference)
+        for _ in range(ROUNDS):
+            turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
+    for _ in range(LAST_ROUNDS):
         turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
     turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
     # Seen from the heaviest, the poses are less than half a turn away.
@@ -175,24 +179,25 @@ def _largest_difference(off: Tensor, masses: Tensor, weights: Tensor) -> Tensor:
     Returns:
         They add up to zero. *Shape:* ``(B, K)``.
     """
-    pulls = weights.clamp_min(0)
     gram = (off * masses[:, None]).flatten(2) @ off.flatten(2).mT
-    product = gram * pulls[:, None]  # (B, K, K): its first eigenvector
+    product = gram * weights[:, None]
     with torch.no_grad():
-        roots = pulls.sqrt()
-        values, vectors = torch.linalg.eigh(roots[..., None] * gram * roots[:, None])
-        largest, second = values[:, -1], values[:, -2] if values.shape[-1] > 1 else 0 * values[:, -1]
-        exists = largest > torch.finfo(values.dtype).tiny
-        found = (gram @ (roots * vectors[..., -1])[..., None]).squeeze(-1)
-        found = found / torch.where(exists, largest, 1)[:, None]
-        left = pulls * found
-        outer = found[..., None] * left[:, None]
-        eye = torch.eye(weights.shape[1]).to(weights)
+        # The eigenvectors of the product are those of a symmetric matrix, times the root.
+        values, vectors = torch.linalg.eigh(gram)
+        root = (vectors * values.clamp_min(0).sqrt()[:, None]) @ vectors.mT
+        values, vectors = torch.linalg.eigh(root @ (weights[..., None] * root))
+        largest, second = values[:, -1], values[:, -2:-1].sum(-1)
+        # Key-frames that are the same, to rounding, have none.
+        exists = largest > (1e3 * torch.finfo(values.dtype).eps * DIAGONAL) ** 2
         apart = (exists & (largest - second > GAP * largest))[:, None, None]
-        system = torch.where(apart, largest[:, None, None] * eye - product + outer, eye)
-        resolvent = torch.where(apart, torch.linalg.inv(system) - outer, 0)
+        largest = torch.where(exists, largest, 1)
+        found = (root @ vectors[..., -1:]).squeeze(-1) / largest.sqrt()[:, None]
+        projection = found[..., None] * (weights * found)[:, None]
+        eye = torch.eye(weights.shape[1]).to(weights)
+        system = torch.where(apart, largest[:, None, None] * eye - product + projection, eye)
+        resolvent = torch.where(apart, torch.linalg.inv_ex(system).inverse - projection, 0)
     # One Newton step, which changes nothing, has the derivatives of the eigenvector.
     found = found + (resolvent @ product @ found[..., None]).squeeze(-1)
-    parts = pulls * found
+    parts = torch.where(exists[:, None], weights * found, 0)
     parts = parts - parts.sum(1, keepdim=True) * weights
     return parts / parts.detach().abs().sum(1, keepdim=True).clamp_min(torch.finfo(parts.dtype).tiny)

@@ -69,7 +69,7 @@ class Blend(nn.Module):
         super().__init__()
         objective, solver = settings(preset, objective, solver)
         if objective.space == "paired" or objective.contact:
-            raise ValueError("contact and space='paired' are for two key-frames; a blend needs Objective() without them")
+            raise ValueError("contact and space='paired' are of two key-frames; a blend has space='joint' alone")
         several = [bases, bases] if isinstance(bases, ModalBasis) else list(bases)
         several = several * 2 if len(several) == 1 else several
         self.layer = _OfAll(several, faces, objective=objective, solver=solver, pairs=[(0, 1)])

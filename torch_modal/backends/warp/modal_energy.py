@@ -50,7 +50,7 @@ def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffne
     volumes = merged(weights * hard[..., None], volume[..., None])
     none = torch.zeros_like(angles[0])
     # Weights are doubled, for derivatives.
-    constant = 0.5 * sum(part[2].sum(-1) for part in (lengths, angles, volumes))
+    constant = 0.5 * torch.cat([part[2] for part in (lengths, angles, volumes)], -1).sum(-1)
     return ShellReference(
         torch.stack(lengths[:2], -1),
         torch.stack([*angles[:2], none, none], -1),
