@@ -11,6 +11,7 @@ from torch import Tensor
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.energy.energy import merged, on_one_branch
+from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotation_means import mean
 from torch_modal.geometry.rotations import about, arc, conjugate, power, product
 from torch_modal.geometry.triangle_frames import sides
@@ -196,6 +197,24 @@ class TestResults:
         best, found = (energy(one(bars.keyframes, w)) for one in (polished, layer))
         linear = energy((w[:, None, None] * bars.keyframes).sum(0))
         assert best <= found < best + 0.1 * (linear - best)
+
+    @pytest.mark.filterwarnings("ignore::torch_modal.MeshWarning")
+    @pytest.mark.parametrize("first", [1.6, 0.1])
+    def test_strips_of_several_curvatures_have_the_mean_one(self, first: float) -> None:
+        """Of 1.6 and -1.2 the ends turn by more than a full turn from each other."""
+        u, v = (x.flatten() for x in torch.meshgrid(torch.linspace(0, 3, 30), torch.linspace(0, 1, 10), indexing="ij"))
+        index = torch.arange(300).view(30, 10)
+        a, b, c, d = (x.flatten() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+        faces = torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
+
+        def rolled(k: float) -> Tensor:
+            return torch.stack([torch.sin(k * u) / k, v, (1 - torch.cos(k * u)) / k], -1).double()
+
+        x = torch.stack([rolled(first), rolled(-1.2), rolled(0.7)])
+        blend = Blend(tm.extract_bases(x, faces, 10, progress=False), faces)
+        found, truth = blend(x, pulls(0.5, 0.4, 0.1)), rolled(0.5 * first - 0.48 + 0.07)
+        found = best_fit(found, truth, torch.ones(300, dtype=DOUBLE)).apply(found)
+        assert far(found, truth) < 1e-3
 
     @pytest.mark.parametrize("base", ["rotations", "linear"])
     def test_terms_with_anchors_pull(self, bars: Shapes, base: str) -> None:

@@ -115,7 +115,8 @@ class LocalRotations(nn.Module):
         this is :meth:`forward` at the time of the second weight.
 
         Args:
-            shapes: They turn by less than a full turn from each other. *Shape:* ``(B, K, V, 3)``.
+            shapes: They turn by less than a full turn from each other, unless the references do. *Shape:*
+                ``(B, K, V, 3)``.
             weights: They add up to one. *Shape:* ``(B, K)``.
 
         Returns:
@@ -126,9 +127,12 @@ class LocalRotations(nn.Module):
         rows = torch.arange(len(weights), device=weights.device)
         start = Frames(*(x[..., rows, weights.argmax(1), :] for x in own))
         turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
-        areas = own.doubled_areas.detach().flatten(0, 1)
-        signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), areas).view(turns.shape[1:])
-        turn = mean(signs * turns, weights[..., None])
+        if self.clusters is None:
+            areas = own.doubled_areas.detach().flatten(0, 1)
+            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), areas).view(turns.shape[1:])
+            turn = mean(signs * turns, weights[..., None])
+        else:
+            turn = self.clusters.among(turns, weights[..., None])
         length, along, height = ((weights[..., None] * x).sum(-2) for x in own[3:])
         wanted = Sides(rotate(turn, length * start.e1), rotate(turn, start.world(along, height)))
         return self._edges(wanted, self.areas.expand(len(weights), -1))
