@@ -108,7 +108,7 @@ def folds(name: str, x: Tensor, faces: Tensor, bases: list[tm.ModalBasis]) -> It
 def middle(x: Tensor, faces: Tensor, bases: list[tm.ModalBasis]) -> Iterator[Row]:
     """The mean of all frames of the closing hand against the one in the middle."""
     w = torch.full((len(x),), 1 / len(x), dtype=torch.float64)
-    edges = Connectivity(faces.numpy(), x.shape[1]).edges
+    edges = torch.tensor(Connectivity(faces.numpy(), x.shape[1]).edges)
 
     def error(shape: Tensor) -> float:
         lengths, true = ((one[edges[:, 0]] - one[edges[:, 1]]).norm(dim=-1) for one in (shape, x[len(x) // 2]))
