@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import lasting
+from torch_modal.energy.bend import wrap_angle
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import inverse, pick
 
@@ -222,6 +223,24 @@ class Energy(nn.Module):
             constant = constant + (factor * pull_a * share * difference**2).sum(-1)
         return Reference(tuple(measures), tuple(weights), constant)
 
+    def among(self, rests: Sequence[Rest], weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
+        r"""K rest shapes as one: :math:`\sum_k s_k \sum w_k (q - q_k)^2`, for any number of them Eq. 8.
+
+        Args:
+            rests: The rest shapes.
+            weights: ``s``. *Shape:* ``(..., K)``.
+            stiffness: As for :meth:`between`.
+        """
+        measures, wholes, constant = [], [], torch.zeros_like(weights[..., 0])
+        for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
+            values = torch.stack([rest.measures[i] for rest in rests], -2)
+            pulls = weights[..., None] * torch.stack([rest.weights[i] for rest in rests], -2).expand_as(values)
+            whole, value, spread = merged(pulls, on_one_branch(values, pulls) if part.term.periodic else values)
+            measures.append(value[..., None, :])
+            wholes.append((factor * whole)[..., None, :])
+            constant = constant + (factor * spread).sum(-1)
+        return Reference(tuple(measures), tuple(wholes), constant)
+
     @staticmethod
     def against(rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
@@ -303,3 +322,29 @@ class Energy(nn.Module):
     def gradient(self, at: Sequence[Linearised]) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
         return self.gather(at, [one.slope for one in at])
+
+
+def merged(pulls: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """K parabolas as one: its weight, its minimum, and the sum of all there.
+
+    Weights below zero may outweigh the others: then there is no minimum, and no weight.
+
+    Args:
+        pulls: Their weights. *Shape:* ``(..., K, M)``.
+        values: Their minima. *Shape:* ``(..., K, M)``.
+
+    Returns:
+        *Shape of each:* ``(..., M)``.
+    """
+    whole = pulls.sum(-2)
+    shares = pulls * inverse(whole, whole <= 0)[..., None, :]
+    first = values[..., :1, :]
+    value = first.squeeze(-2) + (shares * (values - first)).sum(-2)
+    return torch.where(whole > 0, whole, 0), value, (pulls * (values - value[..., None, :]) ** 2).sum(-2)
+
+
+def on_one_branch(angles: Tensor, pulls: Tensor) -> Tensor:
+    """The same angles, within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
+    with torch.no_grad():
+        mean = torch.atan2((pulls * angles.sin()).sum(-2, True), (pulls * angles.cos()).sum(-2, True))
+    return mean + wrap_angle(angles - mean)

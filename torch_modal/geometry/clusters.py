@@ -1,5 +1,7 @@
 """Rotations of more than a full turn: triangles follow the rotations of clusters, each relative to the one before."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from scipy.sparse import coo_matrix
@@ -7,6 +9,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.rotation_means import mean
 from torch_modal.geometry.rotations import conjugate, power, product, turn_of
 from torch_modal.geometry.vectors import pick
 
@@ -55,20 +58,28 @@ class Clusters(nn.Module):
 
     def forward(self, turns: Tensor, t: Tensor) -> Tensor:
         """The rotations at the time ``t``, of those at 1. *Shape:* ``(4, B, F), (B, 1) -> (4, B, F)``."""
+        return self._followed(turns, lambda between: power(between, t))
+
+    def among(self, turns: Tensor, weights: Tensor) -> Tensor:
+        """The weighted means of K rotations. *Shape:* ``(4, B, K, F), (B, K, 1) -> (4, B, F)``."""
+        return self._followed(turns, lambda between: mean(between, weights))
+
+    def _followed(self, turns: Tensor, part: Callable[[Tensor], Tensor]) -> Tensor:
+        """Rotations of which each takes a part of the way from the cluster, or its parent."""
         roots = pick(turns, self.roots)
         still = torch.zeros_like(roots[..., :1])
         still[0] = 1
         roots = torch.cat([roots, still], -1)
-        followed = self._fraction(pick(roots, self.ancestors[0]), roots, t)
+        followed = part(self._between(pick(roots, self.ancestors[0]), roots))
         for ancestors in self.ancestors:
             followed = product(pick(followed, ancestors), followed)
-        return product(pick(followed, self.cluster), self._fraction(pick(roots, self.cluster), turns, t))
+        return product(pick(followed, self.cluster), part(self._between(pick(roots, self.cluster), turns)))
 
     @staticmethod
-    def _fraction(start: Tensor, end: Tensor, t: Tensor) -> Tensor:
-        """A part of the way from one rotation to another, the short way round."""
+    def _between(start: Tensor, end: Tensor) -> Tensor:
+        """The way from one rotation to another, the short way round."""
         between = product(conjugate(start), end)
-        return power(torch.where(between[0] < 0, -between, between), t)
+        return torch.where(between[0] < 0, -between, between)
 
 
 def beyond_a_turn(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> bool:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, tangent_offset
+from torch_modal.geometry.rotation_means import mean
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import Frames, Sides, edge_means, frames, sides, stretched
 from torch_modal.geometry.vectors import pick
@@ -62,6 +63,7 @@ class LocalRotations(nn.Module):
     faces: Tensor
     sides: Tensor
     side_signs: Tensor
+    areas: Tensor
     ancestors: Tensor
     piece: Tensor
 
@@ -69,8 +71,8 @@ class LocalRotations(nn.Module):
         super().__init__()
         faces = torch.tensor(mesh.faces)
         a, b = (_frames(x[None], faces) for x in references[:2])
-        others = (_frames(x[None], faces).slenderness for x in references[2:])
-        slenderness = reduce(torch.minimum, [a.slenderness, b.slenderness, *others]).squeeze(0)
+        every = [a, b, *(_frames(x[None], faces) for x in references[2:])]
+        slenderness = reduce(torch.minimum, [x.slenderness for x in every]).squeeze(0)
         parents, piece = self._tree(_turn_between(a, b).squeeze(1), slenderness, mesh)
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
@@ -78,6 +80,8 @@ class LocalRotations(nn.Module):
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
+        #: Twice the sums of those of the references. *Shape:* ``(F,)``.
+        self.register_buffer("areas", torch.cat([x.doubled_areas for x in every]).sum(0), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
@@ -103,6 +107,35 @@ class LocalRotations(nn.Module):
         length, along, height = (torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))
         turn = power(self._signed(a, b), t) if self.clusters is None else self.clusters(_turn_between(a, b), t)
         return self._edges(Sides(rotate(turn, length * a.e1), rotate(turn, a.world(along, height))), areas)
+
+    def among(self, shapes: Tensor, weights: Tensor) -> Tensor:
+        """Edge vectors of the weighted mean of K shapes, components first.
+
+        The rotation of a triangle is the mean of those of the shapes, its size the weighted sum. Of two references,
+        this is :meth:`forward` at the time of the second weight.
+
+        Args:
+            shapes: They turn by less than a full turn from each other, unless the references do. *Shape:*
+                ``(B, K, V, 3)``.
+            weights: They add up to one. *Shape:* ``(B, K)``.
+
+        Returns:
+            *Shape:* ``(3, B, E)``.
+        """
+        own = Frames(*(x.unflatten(-2, weights.shape) for x in _frames(shapes.flatten(0, 1), self.faces)))
+        # Turns are those from the heaviest, which no order of the shapes changes.
+        rows = torch.arange(len(weights), device=weights.device)
+        start = Frames(*(x[..., rows, weights.argmax(1), :] for x in own))
+        turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
+        if self.clusters is None:
+            areas = own.doubled_areas.detach().flatten(0, 1)
+            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), areas).view(turns.shape[1:])
+            turn = mean(signs * turns, weights[..., None])
+        else:
+            turn = self.clusters.among(turns, weights[..., None])
+        length, along, height = ((weights[..., None] * x).sum(-2) for x in own[3:])
+        wanted = Sides(rotate(turn, length * start.e1), rotate(turn, start.world(along, height)))
+        return self._edges(wanted, self.areas.expand(len(weights), -1))
 
     def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
         """Whether parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
@@ -203,6 +236,10 @@ class LocalRotations(nn.Module):
         quaternions = _turn_between(a, b)
         areas = (a.doubled_areas + b.doubled_areas).detach()
         return self._sign_votes(quaternions.detach(), areas) * quaternions
+
+    def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
+        """A sign for the quaternion of each triangle. *Shape:* ``(B, F, 4), (B, F) -> (B, F)``."""
+        return self._sign_votes(quaternions.movedim(-1, 0), areas)
 
     def _sign_votes(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """A sign for each quaternion. *Shape:* ``(4, B, F), (B, F) -> (B, F)``."""

@@ -44,7 +44,7 @@ def log(rotation: Tensor) -> Tensor:
     side = sum(factor * part for factor, part in zip(HALF_TURN_SIDE, q[1:], strict=True))
     half_turn = q[0].abs() <= HALF_TURN * torch.finfo(q.dtype).eps
     q = torch.where(torch.where(half_turn, side, q[0]) < 0, -q, q)
-    return 2 * _arc(q).movedim(0, -1)
+    return 2 * arc(q).movedim(0, -1)
 
 
 def quaternion(rotation: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ def power(q: Tensor, t: Tensor) -> Tensor:
     The sign of a quaternion tells the way round: with a real part below zero it is the long one.
     *Shape:* ``(4, ...), (...) -> (4, ...)``.
     """
-    return _about(t * _arc(q))
+    return about(t * arc(q))
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:
@@ -89,7 +89,7 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 
 def turned(turn: Tensor, v: Tensor) -> Tensor:
     """Vectors turned about axes by their lengths. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
-    return rotate(_about(0.5 * turn), v)
+    return rotate(about(0.5 * turn), v)
 
 
 def turn_of(q: Tensor) -> Tensor:
@@ -97,10 +97,10 @@ def turn_of(q: Tensor) -> Tensor:
 
     *Shape:* ``(4, ...) -> (3, ...)``.
     """
-    return 2 * _arc(q)
+    return 2 * arc(q)
 
 
-def _arc(q: Tensor) -> Tensor:
+def arc(q: Tensor) -> Tensor:
     """Axis times half the angle: the logarithm of a quaternion of any size. *Shape:* ``(4, ...) -> (3, ...)``."""
     real, imaginary = q[0], q[1:]
     squared = (imaginary * imaginary).sum(0)
@@ -111,8 +111,8 @@ def _arc(q: Tensor) -> Tensor:
     return torch.where(small, near, torch.atan2(sine, real) / sine * imaginary)
 
 
-def _about(half: Tensor) -> Tensor:
-    """The quaternion of axis times half the angle: the inverse of :func:`_arc`. *Shape:* ``(3, ...) -> (4, ...)``."""
+def about(half: Tensor) -> Tensor:
+    """The quaternion of axis times half the angle: the inverse of :func:`arc`. *Shape:* ``(3, ...) -> (4, ...)``."""
     cosine, sinc = _cos_and_sinc((half * half).sum(0))
     return torch.cat([cosine[None], sinc * half])
 

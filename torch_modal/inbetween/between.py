@@ -83,8 +83,8 @@ class Between(nn.Module):
     """In-betweens of one pair of bases.
 
     Args:
-        shapes: The references of both bases, float64 on the CPU. *Shape:* ``(2, V, 3)``.
-        places: Of both among those that all pairs have.
+        shapes: The references of both bases, float64 on the CPU. *Shape:* ``(2, V, 3)``. More give further modes.
+        places: Of these among those that all pairs have.
         modes: Their modes, likewise. *Shape of each:* ``(k, V, 3)``.
         mesh: The caller's mesh.
         objective: What is minimised.
@@ -95,7 +95,7 @@ class Between(nn.Module):
     def __init__(
         self,
         shapes: Tensor,
-        places: tuple[int, int],
+        places: Sequence[int],
         modes: Sequence[Tensor],
         mesh: Mesh,
         objective: Objective,
@@ -115,9 +115,9 @@ class Between(nn.Module):
         modal = objective.space == "joint" and solver.gradient == "implicit"
         levels = partial(Levels, self.frame, self.fine, self.backend if modal else TorchBackend())
         if objective.space == "joint":
-            ends = self.frame.place(*shapes[:, None])
+            ends = self.frame.place(*shapes[:2, None])
             references = torch.cat([ends.first, ends.second])
-            blend = shared.blends.of(*places) if objective.base == "rotations" else None
+            blend = shared.blends.of(*places[:2]) if objective.base == "rotations" else None
             self.space: Any = JointSpace(self.frame, levels, modes, references, blend)
         else:
             self.space = PairedSpace(self.frame, levels(), modes)
@@ -174,8 +174,7 @@ class Between(nn.Module):
     def solved(self, batch: Batch) -> tuple[Tensor, Solution]:
         """Fine shapes in the frame, and their solutions. *Shape:* ``(B, V, 3)``."""
         x, solution = self.modal(batch)
-        if len(x) and (self.solver.local_steps or self.solver.polish):
-            x = self._refine(x, batch)
+        x = self.refined(x, self.rests_of(batch))
         return self.compared(x, batch.problem.starts, solution, batch.pair, batch.samples, batch.anchors)
 
     def compared(
@@ -188,13 +187,18 @@ class Between(nn.Module):
         anchors: Tensor | None,
     ) -> tuple[Tensor, Solution]:
         """Replace shapes that are worse than their starts, and mark their solutions."""
+        ends = Rests((pair.first, pair.second), samples.which, samples.t, samples.stiffness, anchors)
+        return self.judged(x, starts, solution, ends, SLACK if pair.around is None else SLACK_OF_PATHS)
+
+    def judged(
+        self, x: Tensor, starts: Sequence[Tensor], solution: Solution, rests: Rests, slack: float
+    ) -> tuple[Tensor, Solution]:
+        """The same with what shapes are compared with."""
         if not starts or not len(x):
             return x, solution
         with torch.no_grad():
-            ends = Rests((pair.first, pair.second), samples.which, samples.t, samples.stiffness, anchors)
-            distortion = self.distortion([x, *starts], ends)
-        rounding = self.distortion.rounding(samples.stiffness, x)
-        slack = SLACK if pair.around is None else SLACK_OF_PATHS
+            distortion = self.distortion([x, *starts], rests)
+        rounding = self.distortion.rounding(rests.stiffness, x)
         x, worse = no_worse(x, starts, distortion, rounding, slack)
         fell = worse & (solution.status != Status.INVALID)
         return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
@@ -252,10 +256,12 @@ class Between(nn.Module):
         """The Gauss-Newton step. It has no state: registered, it would name all buffers of the energy twice."""
         return GaussNewtonStep(self.space.energy)
 
-    def _refine(self, x: Tensor, batch: Batch) -> Tensor:
+    def refined(self, x: Tensor, rests: Rests) -> Tensor:
         """Local interpolation and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
+        if not len(x) or not (self.solver.local_steps or self.solver.polish):
+            return x
         stages = (self.solver.local_steps, LOCAL_PRODUCTS), (self.solver.polish, POLISH_PRODUCTS)
-        return self.fine.relax(x, self.rests_of(batch), stages)
+        return self.fine.relax(x, rests, stages)
 
     def anchors(self, placed: Pair, t: Tensor) -> Tensor | None:
         """Those of all terms, in the frame. *Shape:* ``(B, P, 3)``."""

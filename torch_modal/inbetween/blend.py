@@ -45,6 +45,16 @@ class RotationBlend(nn.Module):
         near = torch.lerp(first, second, t[:, None, None]) if straight is None else straight
         return self._reached(self.rotations(first, second, t), near)
 
+    def among(self, shapes: Tensor, weights: Tensor, straight: Tensor) -> Tensor:
+        """The weighted mean of K shapes.
+
+        Args:
+            shapes: *Shape:* ``(B, K, V, 3)``.
+            weights: *Shape:* ``(B, K)``.
+            straight: Their weighted sum. *Shape:* ``(B, V, 3)``.
+        """
+        return self._reached(self.rotations.among(shapes, weights), straight)
+
     def along(self, trajectory: Trajectory, which: Tensor, straight: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t`` of a trajectory.
 

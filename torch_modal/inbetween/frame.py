@@ -29,7 +29,7 @@ class Coarse(nn.Module):
     """The coarse mesh on which the energy is evaluated, and the restriction to it.
 
     Args:
-        shapes: Two shapes in the frame, float64 on the CPU. *Shape:* ``(2, V, 3)``.
+        shapes: In the frame, float64 on the CPU. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: Of the coarse mesh, or more, where that does not resolve the modes or pieces.
         weights: Of the vertices. *Shape:* ``(V,)``.
@@ -69,7 +69,7 @@ class Coarse(nn.Module):
         sizes = torch.bincount(clusters, minlength=self.n_vertices)
         self.register_buffer("first_member", sizes.cumsum(0) - sizes, persistent=False)
         self.register_buffer("shares_of_members", shares[self.members], persistent=False)
-        #: Rigid motions of the shape half-way between the two, to first order.
+        #: Rigid motions of the mean of the shapes, to first order.
         fields = _rigid_fields(shapes.mean(0))
         coarse = self.restrict(fields)
         mix = self.orthonormal(coarse)
@@ -81,19 +81,24 @@ class Coarse(nn.Module):
         means = applied(_ClusterMeans, flat, self.members, self.first_member, self.shares_of_members, self.clusters)
         return means.reshape(*x.shape[:-2], self.n_vertices, 3)
 
-    def orthonormal(self, coarse: Tensor) -> Tensor:
-        """Combinations of coarse directions that are orthonormal; dependent ones are dropped. *Shape:* ``(n, m)``."""
+    def orthonormal(self, coarse: Tensor, most: int | None = None) -> Tensor:
+        """Combinations of coarse directions that are orthonormal; dependent ones are dropped. *Shape:* ``(n, m)``.
+
+        Args:
+            coarse: *Shape:* ``(m, V_coarse, 3)``.
+            most: How many at most: those that the directions have most in common.
+        """
         weighted = (coarse * self.weights[:, None]).flatten(1)
         values, vectors = torch.linalg.eigh(weighted @ coarse.flatten(1).mT)
         keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
-        return (vectors[:, keep] / values[keep].sqrt()).mT
+        return (vectors[:, keep] / values[keep].sqrt()).mT[-most if most else None :]
 
 
 class Frame(Alignment):
-    """The scale of 100, the alignment of two bases, and the coarse mesh that the energy is evaluated on.
+    """The scale of 100, the alignment of two bases or more, and the coarse mesh that the energy is evaluated on.
 
     Args:
-        shapes: The reference of the basis at each end, float64 on the CPU, checked. *Shape:* ``(2, V, 3)``.
+        shapes: The references of the bases, float64 on the CPU, checked. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices, likewise. *Shape:* ``(F, 3)``.
         coarse_faces: Number of faces of the coarse mesh.
         weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
@@ -102,7 +107,7 @@ class Frame(Alignment):
     """
 
     faces: Tensor
-    turn: Tensor
+    turns: Tensor
 
     def __init__(
         self,
@@ -115,11 +120,14 @@ class Frame(Alignment):
     ) -> None:
         scale = torch.tensor(DIAGONAL / size(shapes[0].numpy(), faces.numpy()), dtype=shapes.dtype)
         weights = mean_areas(shapes, faces) if weights is None else weights
-        turn = best_fit(shapes[1], shapes[0], weights)
-        references = torch.stack([shapes[0] - turn.target, turn.apply(shapes[1]) - turn.target]) * scale
+        turns = [best_fit(x, shapes[0], weights) for x in shapes[1:]]
+        centre = turns[0].target
+        turned = [turn.apply(x) - centre for turn, x in zip(turns, shapes[1:], strict=True)]
+        references = torch.stack([shapes[0] - centre, *turned]) * scale
         super().__init__(references[0].clone(), scale, weights)
         self.register_buffer("faces", faces, persistent=False)
-        self.register_buffer("turn", turn.rotation, persistent=False)
+        #: From the bases after the first to the frame. *Shape:* ``(K - 1, 3, 3)``.
+        self.register_buffer("turns", torch.stack([turn.rotation for turn in turns]), persistent=False)
         own = None if collapses is None else collapses(references.numpy())
         self._coarse: Any = None
         self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, own, modes)
@@ -140,12 +148,12 @@ class Frame(Alignment):
 
     @property
     def rigid(self) -> Columns:
-        """Rigid motions of the shape half-way between the references, to first order."""
+        """Rigid motions of the mean of the references, to first order."""
         return self.coarse.rigid
 
-    def modes(self, first: Tensor, second: Tensor) -> list[Directions]:
-        """Modes of both ends, in this frame; their scale does not matter. *Shape of each:* ``(k, V, 3)``."""
-        return [Directions(first), Directions(second, self.turn)]
+    def modes(self, first: Tensor, *others: Tensor) -> list[Directions]:
+        """Modes of the bases, in this frame; their scale does not matter. *Shape of each:* ``(k, V, 3)``."""
+        return [Directions(first), *(Directions(x, turn) for x, turn in zip(others, self.turns, strict=True))]
 
     def coarsen(self, x: Tensor) -> Tensor:
         """Cluster averages, linear in ``x``. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
@@ -166,12 +174,13 @@ class Frame(Alignment):
             directions: Of any scale.
 
         Returns:
-            No more columns than there are directions.
+            No more columns than two of the parts have directions: of more parts, what most of them have in common.
         """
+        counts = sorted(len(part.given) for part in directions)
         restricted = torch.cat([part.turned(self.coarsen(part.given)) for part in directions])
         rigid, coarse = self.split(restricted, self.rigid)
         sizes = torch.linalg.norm(coarse.flatten(1), dim=1)[:, None].clamp_min(torch.finfo(coarse.dtype).tiny)
-        mix = self.coarse.orthonormal(coarse / sizes[:, None]) / sizes.T
+        mix = self.coarse.orthonormal(coarse / sizes[:, None], sum(counts[-2:])) / sizes.T
         mixes = [*mix.split([len(part.given) for part in directions], 1), -(mix @ rigid)]
         parts = [*directions, Directions(self.rigid.fine)]
         return Columns(mixes, parts, torch.tensordot(mix, coarse, 1), self.coarse.weights)

@@ -145,7 +145,7 @@ class JointSpace(nn.Module):
         """
         levels = self.levels
         coarse_first, coarse_second = self.frame.coarsen(pair.first), self.frame.coarsen(pair.second)
-        difference, column = self._difference(pair, coarse_second - coarse_first)
+        difference, column = self.difference(pair.second - pair.first, coarse_second - coarse_first, pair.first)
         # The fine column is not needed before the end, unless terms look at vertices.
         extras = levels.seen(self.column(difference), column) if levels.sampled else [column] * len(levels.energies)
         difference, extras = trees.picked((difference, extras), index)
@@ -166,27 +166,37 @@ class JointSpace(nn.Module):
         starts = (straight,)
         coarse = torch.lerp(coarse_first, coarse_second, t[:, None, None])
         placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
-        energy = None
         if self.modal.guess is not None:
             with torch.no_grad():
                 start = self.modal.guess(coarse_first, coarse_second, extras[0], t)
-        if self.blend is not None:
-            blend = self.blend(first, second, t, base)
-            starts = (blend, straight)
-            seen = levels.seen(blend, self.frame.coarsen(blend))
-            turned = levels.place(self.energy, seen, references, extras, anchors)
-            with torch.no_grad():
-                pairs = zip(turned, placement, strict=True)
-                both = [bent._replace(base=torch.stack([bent.base, straight.base])) for bent, straight in pairs]
-                energies = self.energy.base_value(both)
-                better = energies[0] < energies[1]
-                energy = torch.where(better, energies[0], energies[1])
-            base = torch.where(better[:, None, None], blend, base)
-            placement = tuple(
-                straight._replace(base=torch.where(better[:, None, None], bent.base, straight.base))
-                for bent, straight in zip(turned, placement, strict=True)
-            )
-        return JointProblem(placement, start, base, starts, difference, energy)
+        problem = JointProblem(placement, start, base, starts, difference)
+        if self.blend is None:
+            return problem
+        blend = self.blend(first, second, t, base)
+        seen = levels.seen(blend, self.frame.coarsen(blend))
+        return self.bent(problem, blend, levels.place(self.energy, seen, references, extras, anchors))
+
+    def bent(self, problem: JointProblem, blend: Tensor, turned: tuple[Placement, ...]) -> JointProblem:
+        """The problem with a blend by local rotations as its base, where that has less energy.
+
+        Args:
+            problem: With linear interpolation as the base.
+            blend: *Shape:* ``(B, V, 3)``.
+            turned: The placement there.
+        """
+        placement, straight = problem.placement, problem.base
+        with torch.no_grad():
+            pairs = zip(turned, placement, strict=True)
+            both = [bent._replace(base=torch.stack([bent.base, straight.base])) for bent, straight in pairs]
+            energies = self.energy.base_value(both)
+            better = energies[0] < energies[1]
+            energy = torch.where(better, energies[0], energies[1])
+        base = torch.where(better[:, None, None], blend, straight)
+        placement = tuple(
+            own._replace(base=torch.where(better[:, None, None], bent.base, own.base))
+            for bent, own in zip(turned, placement, strict=True)
+        )
+        return problem._replace(placement=placement, base=base, starts=(blend, straight), energy=energy)
 
     def on_trajectory(self, pair: Pair, index: Tensor | None, t: Tensor) -> tuple[Tensor, ...]:
         """The shape on the smooth path through the neighbours in time, then the shapes that it is compared with.
@@ -231,16 +241,22 @@ class JointSpace(nn.Module):
         found = torch.addmm(found.flatten(1), scale * own.rigid, self.frame.rigid.fine.flatten(1), alpha=-1)
         return torch.addcmul(found, scale, own.whole.flatten(1)).view_as(base)
 
-    def _difference(self, pair: Pair, coarse: Tensor) -> tuple[Difference, Tensor]:
-        """The difference of the key-frames as a column, and that on the coarse mesh. *Shape:* ``(B, V_coarse, 3)``."""
+    def difference(self, whole: Tensor, coarse: Tensor, like: Tensor) -> tuple[Difference, Tensor]:
+        """The difference of the key-frames as a column, and that on the coarse mesh. *Shape:* ``(B, V_coarse, 3)``.
+
+        Args:
+            whole: *Shape:* ``(B, V, 3)``.
+            coarse: The same on the coarse mesh. *Shape:* ``(B, V_coarse, 3)``.
+            like: A shape as large as the key-frames, which tells their rounding. *Shape:* ``(B, V, 3)``.
+        """
         rigid, coarse = self.frame.split(coarse, self.frame.rigid)
         modal, coarse = self.frame.split(coarse, self.columns)
         squared = (coarse**2 * self.frame.coarse.weights[:, None]).sum((-1, -2))
         # Coincident key-frames leave no difference, nor do modes that span all shapes: its column is then zero, not a
         # quotient of rounding errors, which are others on the coarse mesh than on the fine one.
-        rounding = 1e3 * torch.finfo(coarse.dtype).eps * pair.first.abs().amax((-1, -2))
+        rounding = 1e3 * torch.finfo(coarse.dtype).eps * like.abs().amax((-1, -2))
         scale = torch.where(squared > rounding**2, (squared + rounding**2).rsqrt(), 0)
-        return Difference(pair.second - pair.first, rigid, modal, scale), coarse * scale[:, None, None]
+        return Difference(whole, rigid, modal, scale), coarse * scale[:, None, None]
 
     def column(self, own: Difference) -> Tensor:
         """The difference as a column on the fine mesh. *Shape:* ``(B, V, 3)``."""

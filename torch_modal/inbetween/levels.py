@@ -106,6 +106,16 @@ class Levels(nn.Module):
         parts = zip(self.parts, first, second, stiffness, strict=True)
         return [part.between(a, b, index, t, own) for part, a, b, own in parts]
 
+    def among(self, shapes: Sequence[Tensor], weights: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Any]:
+        """References towards K shapes of each sample.
+
+        Args:
+            shapes: As each energy sees them. *Shape of each:* ``(B, K, V, 3)``.
+            weights: *Shape:* ``(B, K)``.
+            stiffness: Of :meth:`stiffness`.
+        """
+        return [part.among(x, weights, own) for part, x, own in zip(self.parts, shapes, stiffness, strict=True)]
+
     def against(self, x: Tensor, coarse: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Reference]:
         """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
         parts = zip(self.energies, self.seen(x, coarse), stiffness, strict=True)

@@ -41,10 +41,10 @@ class Placing:
         Those have not that are not finite, a point, or, where the surface is closed, mirror images. *Shape:* ``(P,)``.
         """
         pair, usable, sizes = self.backend.place(self.frame, samples.x_a, samples.x_b)
-        self._warn_of_size(sizes)
+        self.warn_of_size(sizes)
         usable = usable & (sizes > SMALLEST_SIZE * DIAGONAL)
         if self.closed:
-            usable = usable & ~self._mirrored(pair)
+            usable = usable & ~self.mirrored(pair.first, pair.second)
         if samples.spacing is None:
             return pair, usable
         before, after = samples.before, samples.after
@@ -56,7 +56,7 @@ class Placing:
             usable = usable & finite
         return self.frame.surround(pair, before, after, samples.spacing), usable
 
-    def _warn_of_size(self, sizes: Tensor) -> None:
+    def warn_of_size(self, sizes: Tensor) -> None:
         """Say, once for a layer, that key-frames and bases seem to be in different units. *Shape:* ``(P,)``."""
         if self.size_warned or traced(sizes) or transformed(sizes):
             return
@@ -74,9 +74,9 @@ class Placing:
             stacklevel=2,
         )
 
-    def _mirrored(self, pair: Pair) -> Tensor:
-        """Pairs with a mirrored key-frame, among those whose volumes differ in sign. *Shape:* ``(P,)``."""
-        turned = self.fine.volumes(pair.first, pair.second).prod(-1) < 0
+    def mirrored(self, first: Tensor, second: Tensor) -> Tensor:
+        """Pairs with a mirrored key-frame, among those whose volumes differ in sign. *Shape:* ``(P, V, 3) -> (P,)``."""
+        turned = self.fine.volumes(first, second).prod(-1) < 0
         if not traced(turned) and not transformed(turned) and not turned.any():
             return turned
-        return turned & looks_mirrored(pair.first, pair.second, self.frame.faces)
+        return turned & looks_mirrored(first, second, self.frame.faces)

@@ -102,23 +102,32 @@ class InBetween(nn.Module):
         #: Whether there is a volume to be kept: not in sheets, whose energy has two terms.
         self.encloses = all(encloses(x, connectivity) for x in shapes)
         mesh = Mesh(connectivity)
-        kind = ContactRounds if self.objective.contact else Between
         shared = Shared.of(mesh, torch.stack(shapes), self.pairs, list(self.terms), self.solver)
         made = [
-            kind(
-                torch.stack([ends[i][0], ends[j][0]]),
-                (i, j),
-                [ends[i][1], ends[j][1]],
+            self.kind(
+                torch.stack([ends[i][0] for i in places]),
+                places,
+                [ends[i][1] for i in places],
                 mesh,
                 self.objective,
                 self.solver,
                 shared,
             )
-            for i, j in self.pairs
+            for places in self.places
         ]
         self.members = nn.ModuleList(made)
         self.prepare()
         self.members.to(like)
+
+    @property
+    def kind(self) -> type[Between]:
+        """What the members are."""
+        return ContactRounds if self.objective.contact else Between
+
+    @property
+    def places(self) -> Sequence[Sequence[int]]:
+        """The bases of each member."""
+        return self.pairs
 
     def prepare(self) -> None:
         """Build the tables of the minimisations."""

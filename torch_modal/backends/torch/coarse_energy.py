@@ -38,3 +38,13 @@ class CoarseEnergy(nn.Module):
             stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
         """
         return Rests((first, second), which, t, stiffness).reference(self.energy)
+
+    def among(self, shapes: Tensor, weights: Tensor, stiffness: Sequence[Tensor]) -> Any:
+        """The same towards K rest shapes of each sample.
+
+        Args:
+            shapes: *Shape:* ``(B, K, V, 3)``.
+            weights: *Shape:* ``(B, K)``.
+            stiffness: As there.
+        """
+        return Rests(shapes.unbind(1), None, weights, stiffness).reference(self.energy)

@@ -31,7 +31,7 @@ class Distortion(nn.Module):
     .. math:: \sum_e \alpha\, |l_e - \bar l_e| \min(|l_e - \bar l_e| / \bar l_e,\, 1)
         + \sum_h \beta \min(\bar l_h^2 / \bar A_h,\, 8)\, (\theta_h - \bar\theta_h)^2
 
-    The key-frames have the weights ``1 - t`` and ``t``. Further terms of the energy count in full.
+    The key-frames have the weights ``1 - t`` and ``t``, or those given. Further terms of the energy count in full.
 
     Args:
         mesh: The mesh.
@@ -86,7 +86,7 @@ class Distortion(nn.Module):
             for values, own in zip(rests.stiffness[:2], (self.edge, self.hinge), strict=True)
         )
         total: Any = 0.0
-        for end, pull in zip(rests.shapes, (1 - rests.t, rests.t), strict=True):
+        for end, pull in zip(rests.shapes, rests.pulls(), strict=True):
             length, angle, weight = trees.picked(measures(end), rests.which)
             off = (lengths - length).abs()
             stretching = (alpha * off * (off / length).clamp_max(1)).sum(-1)

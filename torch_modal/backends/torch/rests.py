@@ -11,14 +11,14 @@ from torch_modal.energy.shell import N_SHELL_TERMS
 
 
 class Rests(NamedTuple):
-    """The rest shapes of the samples of a batch, with their times and stiffnesses."""
+    """The rest shapes of the samples of a batch, with their times or weights, and stiffnesses."""
 
     shapes: tuple[Tensor, ...]
-    """Those of the weights ``1 - t`` and ``t``, or one of each sample. *Shape of each:* ``(P, V, 3)``."""
+    """Those of the weights ``1 - t`` and ``t``, or one of each sample, or K. *Shape of each:* ``(P, V, 3)``."""
     which: Tensor | None
     """The pair of each sample; each its own where None. *Shape:* ``(B,)``."""
     t: Tensor
-    """*Shape:* ``(B,)``."""
+    """*Shape:* ``(B,)``; of K shapes their weights, *shape* ``(B, K)``."""
     stiffness: Sequence[Tensor]
     """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
     anchors: Tensor | None = None
@@ -26,10 +26,17 @@ class Rests(NamedTuple):
 
     def reference(self, energy: Energy) -> Reference:
         """What shapes are compared with, of the terms that the stiffnesses belong to."""
-        first, *others = trees.picked([energy.rest_of(x) for x in self.shapes], self.which)
+        found = trees.picked([energy.rest_of(x) for x in self.shapes], self.which)
+        if self.t.dim() > 1:
+            return energy.among(found, self.t, self.stiffness)
+        first, *others = found
         if not others:
             return Energy.against(first, self.stiffness)
         return energy.between(first, others[0], self.t, self.stiffness)
+
+    def pulls(self) -> tuple[Tensor, ...]:
+        """The weight of each of the shapes. *Shape of each:* ``(B,)``."""
+        return (1 - self.t, self.t) if self.t.dim() == 1 else self.t.unbind(-1)
 
     def further(self) -> "Rests":
         """The same for the terms beyond Eq. 5 alone."""

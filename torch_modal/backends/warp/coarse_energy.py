@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.backends.torch.coarse_energy import CoarseEnergy
-from torch_modal.backends.warp.modal_energy import WarpModalEnergy, shell_reference
+from torch_modal.backends.warp.modal_energy import WarpModalEnergy, merged_reference, shell_reference
 from torch_modal.backends.warp.shell import WarpShell
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.term import Mesh
@@ -29,3 +29,7 @@ class WarpCoarseEnergy(CoarseEnergy):
     ) -> Any:
         """As in the base class."""
         return shell_reference(self.shell, *trees.picked((first, second), which), t, *stiffness)
+
+    def among(self, shapes: Tensor, weights: Tensor, stiffness: Sequence[Tensor]) -> Any:
+        """As in the base class."""
+        return merged_reference(self.shell, shapes, weights, *stiffness)

@@ -36,6 +36,12 @@ class WarpDistortion(Distortion):
         t, stiffness = rests.t, rests.stiffness[:2]
         if traced(t) or any(transformed(x) for x in (*shapes, *rests.shapes, t, *stiffness)):
             return super().of_shell(shapes, rests)
+        if t.dim() > 1:
+            # From each of the rest shapes alone, then weighted.
+            n, flat = t.shape[1], torch.stack(rests.shapes, 1).flatten(0, 1)
+            each = [value.repeat_interleave(n, 0) for value in (*stiffness, *shapes)]
+            alone = Rests((flat, flat), None, flat.new_zeros(len(flat)), each[:2])
+            return (self.of_shell(each[2:], alone).unflatten(1, t.shape) * t).sum(-1)
         b, n = shapes[0].shape[:2]
         x = torch.stack([*shapes]).double()
         which = torch.arange(b, device=t.device) if rests.which is None else rests.which

@@ -11,6 +11,7 @@ from torch_modal.backends.torch.fine_energy import Beside, FineEnergy, chunk_of
 from torch_modal.backends.torch.fine_steps import FurtherTerms
 from torch_modal.backends.torch.rests import Rests
 from torch_modal.backends.warp.fine_steps import WarpSteps
+from torch_modal.backends.warp.modal_energy import merged_reference
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
@@ -36,8 +37,13 @@ class WarpFineEnergy(FineEnergy):
     def relax(self, x: Tensor, rests: Rests, stages: Sequence[tuple[int, int]], beside: Beside | None = None) -> Tensor:
         """As in the base class. With further terms or energies, gradients are left to torch."""
         if self.further is None and beside is None:
-            ends = trees.picked((rests.shapes[0], rests.shapes[-1]), rests.which)
             chunk = chunk_of(x.shape[-2], x.device)
+            if rests.t.dim() > 1:
+                to = merged_reference(self.steps, torch.stack(rests.shapes, 1), rests.t, *rests.stiffness)
+                for n_steps, n_products in stages:
+                    x = self.steps.towards(x, to, n_steps, n_products, chunk)
+                return x
+            ends = trees.picked((rests.shapes[0], rests.shapes[-1]), rests.which)
             for n_steps, n_products in stages:
                 x = self.steps(x, *ends, rests.t, rests.stiffness, n_steps, n_products, chunk)
             return x
@@ -50,7 +56,11 @@ class WarpFineEnergy(FineEnergy):
             others = [] if beside is None else list(beside(own, moved))
             if self.further is not None:
                 others.append(FurtherTerms(self.further, some.further()))
-            to = self.steps.reference(some.shapes[0], some.shapes[-1], some.t, *some.stiffness[:N_SHELL_TERMS])
+            shell = some.stiffness[:N_SHELL_TERMS]
+            if some.t.dim() > 1:
+                to = merged_reference(self.steps, torch.stack(some.shapes, 1), some.t, *shell)
+            else:
+                to = self.steps.reference(some.shapes[0], some.shapes[-1], some.t, *shell)
             for n_steps, n_products in stages:
                 moved = self.steps.descend(moved, to, others, n_steps, n_products)
             parts.append(moved)

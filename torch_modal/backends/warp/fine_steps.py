@@ -45,11 +45,15 @@ class WarpSteps(WarpShell):
         Returns:
             *Shape:* ``(B, V, 3)``.
         """
+        return self.towards(x, (first, second, t, *stiffness), n_steps, n_products, chunk)
+
+    def towards(self, x: Tensor, rest: Sequence[Tensor], n_steps: int, n_products: int, chunk: int) -> Tensor:
+        """The same towards what :meth:`reference` takes, or a :class:`ShellReference`."""
         if not n_steps:
             return x
         if traced(x):
-            return self.oracle(n_steps, n_products, x, first, second, t, *stiffness)
-        given = [value.double() for value in (x, first, second, t, *stiffness)]
+            return self.oracle(n_steps, n_products, x, *rest)
+        given = [value.double() for value in (x, *rest)]
         # What fits into a cache is kept for the way back; of more, the steps are taken once more.
         if len(x) <= chunk:
             keep = torch.is_grad_enabled() and any(value.requires_grad for value in given)
@@ -58,9 +62,15 @@ class WarpSteps(WarpShell):
         parts = [applied(_Relaxed, self, n_steps, n_products, None, *(v[i : i + chunk] for v in given)) for i in every]
         return torch.cat([moved for moved, _ in parts]).to(x)
 
-    def oracle(self, n_steps: int, n_products: int, x: Tensor, first: Tensor, second: Tensor, *rest: Tensor) -> Tensor:
+    def _referred(self, rest: Sequence[Tensor]) -> ShellReference:
+        """The reference of what :meth:`reference` takes, or that is one."""
+        return ShellReference(*rest) if len(rest) == len(ShellReference._fields) else self.reference(*rest)
+
+    def oracle(self, n_steps: int, n_products: int, x: Tensor, *rest: Tensor) -> Tensor:
         """The same by torch."""
-        t, *stiffness = rest
+        if len(rest) == len(ShellReference._fields):
+            return relax(self.energy, x, self.unpacked(ShellReference(*rest)), n_steps, n_products)
+        first, second, t, *stiffness = rest
         one, other = (self.energy.rest_of(x) for x in (first, second))
         return relax(self.energy, x, self.energy.between(one, other, t, stiffness), n_steps, n_products)
 
@@ -115,10 +125,10 @@ class WarpSteps(WarpShell):
             n_steps: How many.
             n_products: Of each.
             x: Where they start. *Shape:* ``(B, V, 3)``.
-            rest: What :meth:`reference` takes.
+            rest: What :meth:`reference` takes, or a :class:`ShellReference`.
             kept: Receives what the way back needs.
         """
-        to = self.reference(*rest)
+        to = self._referred(rest)
         lengths = x.new_ones(n_steps, len(x))
         at = self.at(x, to)
         for k in range(n_steps):
@@ -206,11 +216,11 @@ class WarpSteps(WarpShell):
             lengths: *Shape:* ``(n_steps, B)``.
             to_x: Gradient in the result. *Shape:* ``(B, V, 3)``.
             x: Where the steps started. *Shape:* ``(B, V, 3)``.
-            rest: What :meth:`reference` takes.
+            rest: As for :meth:`steps`.
             needed: Which of all these need a gradient.
             kept: What :meth:`steps` kept; if nothing, they are taken once more.
         """
-        to = kept[0].to if kept else self.reference(*rest)
+        to = kept[0].to if kept else self._referred(rest)
         for length in [] if kept else lengths:
             at = self.at(x, to)
             kept = [*kept, _Taken(x, to, at, self.solved(x, at, to, n_products, keep=True))]
@@ -218,6 +228,8 @@ class WarpSteps(WarpShell):
         to_reference = ShellReference(*(torch.zeros_like(value) for value in to))
         for length, taken in zip(lengths.flip(0), reversed(kept), strict=True):
             to_x = self._step_back(taken, to_x, length, to_reference)
+        if len(rest) == len(ShellReference._fields):
+            return to_x, *to_reference
         return to_x, *(self.from_reference(to_reference, *rest) if any(needed[1:]) else [None] * len(rest))
 
     def _step_back(

@@ -10,6 +10,7 @@ from torch_modal import trees
 from torch_modal.autograd import applied, flattened, made_outside, traced, transformed
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
+from torch_modal.energy.energy import merged, on_one_branch
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
 from torch_modal.energy.term import Mesh
 
@@ -27,6 +28,36 @@ def shell_reference(shell: WarpShell, first: Tensor, second: Tensor, t: Tensor, 
     """:meth:`WarpShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
     given = [value.double() for value in (first, second, t, *stiffness)]
     return shell.reference_by_torch(*given) if traced(t) else ShellReference(*applied(_Referred, shell, *given))
+
+
+def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffness: Tensor) -> ShellReference:
+    """The reference towards K rest shapes of each sample: Eq. 8 for any number of them.
+
+    Args:
+        shell: The energy.
+        shapes: *Shape:* ``(B, K, V, 3)``.
+        weights: *Shape:* ``(B, K)``.
+        stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
+    """
+    flat, n = shapes.flatten(0, 1), shapes.shape[1]
+    alone = (value.repeat_interleave(n, 0) for value in stiffness)
+    own = shell_reference(shell, flat, flat, flat.new_zeros(len(flat)), *alone)
+    stretch, bend, hard, volume, _ = (value.unflatten(0, weights.shape) for value in own)
+    weights = weights.to(stretch)[..., None]
+    pulls = weights * bend[..., 0]
+    lengths = merged(weights * stretch[..., 0], stretch[..., 1])
+    angles = merged(pulls, on_one_branch(bend[..., 1], pulls))
+    volumes = merged(weights * hard[..., None], volume[..., None])
+    none = torch.zeros_like(angles[0])
+    # Weights are doubled, for derivatives.
+    constant = 0.5 * torch.cat([part[2] for part in (lengths, angles, volumes)], -1).sum(-1)
+    return ShellReference(
+        torch.stack(lengths[:2], -1),
+        torch.stack([*angles[:2], none, none], -1),
+        volumes[0].squeeze(-1),
+        volumes[1].squeeze(-1),
+        constant,
+    )
 
 
 class _Referred(torch.autograd.Function):

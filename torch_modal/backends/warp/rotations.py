@@ -60,10 +60,11 @@ class WarpRotations(LocalRotations):
         if areas.device.type != "cpu":  # the walk down the tree is one thread's
             return self._sign_votes(quaternions.movedim(-1, 0), areas)
         n_pieces = self._n_pieces
-        sign, vote = torch.empty_like(areas), areas.new_zeros(b, n_pieces)
-        given = [quaternions, areas, self._order, self._parent, self._piece_of, n_pieces, sign, vote]
+        quaternions, weights = quaternions.double().contiguous(), areas.double()
+        sign, vote = torch.empty_like(weights), weights.new_zeros(b, n_pieces)
+        given = [quaternions, weights, self._order, self._parent, self._piece_of, n_pieces, sign, vote]
         launch(module.sign_votes, (b,), given)
-        return sign
+        return sign.to(areas)
 
     def sums(self, turns: tuple[Tensor, ...], sign: Tensor, t: Tensor) -> Tensor:
         """Sides by area, summed on the edges, and areas, where the senses are known. *Shape:* ``(B, E, 4)``."""

@@ -162,7 +162,7 @@ def sinc(squared_angle: real):
 
 @wp.func
 def half_turn(q: vec4):
-    """Axis times half the angle: rotations._arc."""
+    """Axis times half the angle: rotations.arc."""
     axis = vec3(q[1], q[2], q[3])
     sine = wp.dot(axis, axis)
     factor = real(0.0)

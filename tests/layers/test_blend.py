@@ -1,0 +1,346 @@
+"""Weighted in-betweens of several key-frames: invariances, gradients, what goes in and comes out."""
+
+import warnings
+from collections.abc import Iterator
+
+import pytest
+import torch
+from conftest import Shapes, modal
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+from torch_modal.energy.energy import merged, on_one_branch
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rotation_means import mean
+from torch_modal.geometry.rotations import about, arc, conjugate, power, product
+from torch_modal.geometry.triangle_frames import sides
+from torch_modal.geometry.vectors import cross
+from torch_modal.inbetween.among import WeightedSamples
+from torch_modal.layers.blend import Blend
+from torch_modal.layers.in_between import InBetween
+from torch_modal.solve.solver import Status
+
+DOUBLE = torch.float64
+PRESETS = ("accurate", "fast")
+
+
+def pulls(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=DOUBLE)
+
+
+def far(x: Tensor, y: Tensor) -> float:
+    """Largest distance, as a part of the diagonal."""
+    return float((x - y).norm(dim=-1).max() / (y.amax(-2) - y.amin(-2)).norm(dim=-1).max())
+
+
+@pytest.fixture(autouse=True)
+def quiet_is_converged() -> Iterator[None]:
+    """A minimisation that does not converge fails the test, unless the test expects it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", tm.ConvergenceWarning)
+        yield
+
+
+@pytest.fixture(scope="module")
+def layer(bars: Shapes) -> Blend:
+    return Blend(bars.bases, bars.faces, **modal(coarse_faces=200, rotations=True, local=True))
+
+
+@pytest.fixture(scope="module")
+def poses(bars: Shapes) -> Tensor:
+    """Key-frames that are none of the bases', each with a rigid motion. *Shape:* ``(3, V, 3)``."""
+    generator = torch.Generator().manual_seed(3)
+    x = bars.keyframes + 0.02 * torch.randn(bars.keyframes.shape, generator=generator, dtype=DOUBLE)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.4, 0.1], [0.4, 0, 0.2], [-0.1, -0.2, 0]], dtype=DOUBLE))
+    return torch.stack([x[0], x[1] @ turn.mT + 3, x[2] @ turn - 1])
+
+
+class TestTwo:
+    @pytest.mark.parametrize("preset", PRESETS)
+    def test_two_key_frames_are_an_in_between(self, bars: Shapes, preset: str) -> None:
+        blend, between = (kind(bars.bases[1:], bars.faces, preset) for kind in (Blend, InBetween))
+        for t in (0.0, 0.3, 0.5, 1.0):
+            x = between(*bars.keyframes[1:], t)
+            assert far(blend(bars.keyframes[1:], pulls(1 - t, t)), x) < 1e-9
+
+    @pytest.mark.parametrize("backend", ["torch", "auto"])
+    @pytest.mark.parametrize("preset", PRESETS)
+    def test_the_code_for_any_number_is_that_for_two(self, bars: Shapes, preset: str, backend: str) -> None:
+        settings = tm.PRESETS[preset]
+        solver = tm.Solver(tolerance=1e-11, local_steps=settings.solver.local_steps, backend=backend)
+        blend = Blend(bars.bases[1:], bars.faces, objective=settings.objective, solver=solver)
+        layer, w = blend.layer, pulls(0.7, 0.3)[None]
+        samples = WeightedSamples(bars.keyframes[None, 1:], w, layer.stiffness_of(w[:, 0], torch.Size([1])))
+        found = layer.members[0].weighted(samples, None)
+        assert far(found.shapes[0], blend(bars.keyframes[1:], w[0])) < 1e-9
+
+
+class TestInvariances:
+    def test_all_the_weight_gives_the_key_frame_bit_for_bit(self, layer: Blend, poses: Tensor) -> None:
+        for dtype in (DOUBLE, torch.float32):
+            x = layer(poses.to(dtype), torch.eye(3, dtype=dtype))
+            assert x.dtype == dtype
+            assert torch.equal(x, poses.to(dtype))
+
+    def test_a_key_frame_without_weight_does_not_count(self, layer: Blend, poses: Tensor) -> None:
+        for some in ([0, 1], [1, 2], [0, 2]):
+            w = torch.zeros(3, dtype=DOUBLE)
+            w[some] = pulls(0.35, 0.65)
+            assert far(layer(poses, w), layer(poses[some], w[some])) < 1e-6
+
+    def test_their_order_does_not_count(self, layer: Blend, poses: Tensor) -> None:
+        w = pulls(0.5, 0.2, 0.3)
+        order = [2, 0, 1]
+        assert far(layer(poses[order], w[order]), layer(poses, w)) < 1e-6
+
+    def test_one_twice_has_both_weights(self, layer: Blend, poses: Tensor) -> None:
+        x = layer(poses, pulls(0.5, 0.2, 0.3))
+        assert far(layer(poses[[0, 1, 1, 2]], pulls(0.5, 0.15, 0.05, 0.3)), x) < 1e-6
+        assert far(layer(poses[[0, 0]], pulls(0.6, 0.4)), poses[0]) < 1e-6
+
+    def test_rigid_motions_have_a_mean(self, layer: Blend, bars: Shapes) -> None:
+        x = bars.keyframes[0]
+        angles = torch.tensor([0.0, 0.8, -0.5, 1.1], dtype=DOUBLE)
+        c, s, zero = angles.cos(), angles.sin(), torch.zeros(4, dtype=DOUBLE)
+        turns = torch.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1], -1).view(4, 3, 3)
+        w = pulls(0.1, 0.2, 0.3, 0.4)
+        angle = (w * angles).sum()
+        expected = x @ torch.linalg.matrix_exp(angle * torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 0.0]]).double()).mT
+        found = layer(x @ turns.mT + torch.arange(4)[:, None, None], w)
+        area_centre = layer.layer.members[0].frame.weights @ x / layer.layer.members[0].frame.weights.sum()
+        moves = torch.arange(4) + 0.0
+        centre = (w[:, None] * (area_centre @ turns.mT + moves[:, None])).sum(0)
+        expected = expected - expected.mean(0)
+        assert far(found - found.mean(0), expected) < 1e-9
+        centres = layer.layer.members[0].frame.weights @ found / layer.layer.members[0].frame.weights.sum()
+        torch.testing.assert_close(centres, centre, rtol=0, atol=1e-9)
+
+    def test_a_common_rigid_motion_moves_the_result_along(self, layer: Blend, poses: Tensor) -> None:
+        turn = torch.linalg.matrix_exp(torch.tensor([[0, -1, 0.3], [1, 0, 0.2], [-0.3, -0.2, 0]], dtype=DOUBLE))
+        w = pulls(0.5, 0.2, 0.3)
+        assert far(layer(poses @ turn.mT + 7, w), layer(poses, w) @ turn.mT + 7) < 1e-6
+
+    def test_batch_equals_single(self, layer: Blend, poses: Tensor) -> None:
+        w = torch.softmax(torch.randn(4, 3, generator=torch.Generator().manual_seed(0), dtype=DOUBLE), -1)
+        together = layer(poses, w)
+        assert together.shape == (4, *poses.shape[1:])
+        assert far(together, torch.stack([layer(poses, own) for own in w])) < 1e-9
+        both = torch.stack([poses, poses.flip(0)])[:, None]
+        assert layer(both, w).shape == (2, 4, *poses.shape[1:])
+        assert layer(poses, torch.zeros(0, 3, dtype=DOUBLE)).shape == (0, *poses.shape[1:])
+
+    def test_weights_a_little_below_zero_go_on(self, layer: Blend, poses: Tensor) -> None:
+        near, on, beyond = (layer(poses, pulls(0.6 - d, 0.4, d)) for d in (1e-3, 0.0, -1e-3))
+        assert far(near + beyond, 2 * on) < 1e-4  # no kink at zero
+        result = layer.solve(poses, pulls(1.2, -0.1, -0.1))
+        assert int(result.solution.status) == Status.CONVERGED
+        assert far(result.shapes, poses[0]) < 0.5
+
+
+class TestGradients:
+    @pytest.mark.parametrize("backend", ["torch", "auto"])
+    @pytest.mark.parametrize("weights", [(0.5, 0.2, 0.3), (0.6, 0.4, 0.0), (0.7, 0.4, -0.1)])
+    def test_they_are_those_of_differences(
+        self, bars: Shapes, poses: Tensor, weights: tuple[float, ...], backend: str
+    ) -> None:
+        solver = tm.Solver(tolerance=1e-12, backend=backend)
+        alpha = torch.tensor(500.0, dtype=DOUBLE)
+        generator = torch.Generator().manual_seed(1)
+        taken = torch.randn(poses.shape[1:], generator=generator, dtype=DOUBLE)
+        moves = torch.randn(poses.shape, generator=generator, dtype=DOUBLE), pulls(0.7, -0.4, -0.3), pulls(40)[0]
+
+        def value(*given: Tensor) -> Tensor:
+            objective = tm.Objective(coarse_faces=200, alpha=given[2])
+            return (Blend(bars.bases, bars.faces, objective=objective, solver=solver)(*given[:2]) * taken).sum()
+
+        given = [x.clone().requires_grad_() for x in (poses, pulls(*weights))]
+        stiffness = torch.nn.Parameter(alpha)
+        value(*given, stiffness).backward()
+        found = [x.grad for x in (*given, stiffness)]
+        for i, (move, h) in enumerate(zip(moves, (3e-6, 3e-6, 3e-4), strict=True)):
+            ends = []
+            for sign in (1, -1):
+                there = [poses, pulls(*weights), alpha]
+                there[i] = there[i] + sign * h * move
+                with torch.no_grad():
+                    ends.append(float(value(*there)))
+            gradient = found[i]
+            assert gradient is not None
+            assert float((gradient * move).sum()) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-5)
+
+    def test_at_a_key_frame_there_is_one(self, layer: Blend, poses: Tensor) -> None:
+        w = pulls(0, 1, 0).requires_grad_()
+        x = layer(poses, w)
+        assert torch.equal(x, poses[1])
+        x.square().sum().backward()
+        assert w.grad is not None and bool(w.grad.isfinite().all()) and bool(w.grad.any())
+
+
+class TestResults:
+    def test_float32(self, bars: Shapes, poses: Tensor, layer: Blend) -> None:
+        single = Blend(bars.bases, bars.faces, **modal(coarse_faces=200, rotations=True, local=True)).float()
+        w = pulls(0.5, 0.2, 0.3)
+        found = single(poses.float(), w.float())
+        assert found.dtype == torch.float32
+        assert far(found.double(), layer(poses, w)) < 1e-3
+
+    def test_it_is_near_the_optimum(self, bars: Shapes, poses: Tensor, layer: Blend) -> None:
+        """Of the energy on the fine mesh, against that of a long descent of all vertices, and of the linear blend."""
+        polished = Blend(bars.bases, bars.faces, solver=tm.Solver(polish=30))
+        shell, frame, w = tm.ShellEnergy(bars.faces), layer.layer.members[0].frame, pulls(0.4, 0.3, 0.3)
+
+        def energy(x: Tensor) -> float:
+            each = (shell(frame.scale * x, frame.scale * pose) for pose in bars.keyframes)
+            return float(sum(own * part for own, part in zip(w, each, strict=True)))
+
+        best, found = (energy(one(bars.keyframes, w)) for one in (polished, layer))
+        linear = energy((w[:, None, None] * bars.keyframes).sum(0))
+        assert best <= found < best + 0.1 * (linear - best)
+
+    @pytest.mark.filterwarnings("ignore::torch_modal.MeshWarning")
+    @pytest.mark.parametrize("first", [1.6, 0.1])
+    def test_strips_of_several_curvatures_have_the_mean_one(self, first: float) -> None:
+        """Of 1.6 and -1.2 the ends turn by more than a full turn from each other."""
+        u, v = (x.flatten() for x in torch.meshgrid(torch.linspace(0, 3, 30), torch.linspace(0, 1, 10), indexing="ij"))
+        index = torch.arange(300).view(30, 10)
+        a, b, c, d = (x.flatten() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+        faces = torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
+
+        def rolled(k: float) -> Tensor:
+            return torch.stack([torch.sin(k * u) / k, v, (1 - torch.cos(k * u)) / k], -1).double()
+
+        x = torch.stack([rolled(first), rolled(-1.2), rolled(0.7)])
+        blend = Blend(tm.extract_bases(x, faces, 10, progress=False), faces)
+        found, truth = blend(x, pulls(0.5, 0.4, 0.1)), rolled(0.5 * first - 0.48 + 0.07)
+        found = best_fit(found, truth, torch.ones(300, dtype=DOUBLE)).apply(found)
+        assert far(found, truth) < 1e-3
+
+    @pytest.mark.parametrize("base", ["rotations", "linear"])
+    def test_terms_with_anchors_pull(self, bars: Shapes, base: str) -> None:
+        x, w = bars.keyframes, pulls(0.4, 0.3, 0.3)
+        plain = Blend(bars.bases, bars.faces, objective=tm.Objective(base=base))(x, w)  # type: ignore[arg-type]
+        goal = plain[5] + 0.2
+        objective = tm.Objective(base=base, terms=(Pull(5, goal),))  # type: ignore[arg-type]
+        pulled = Blend(bars.bases, bars.faces, objective=objective)(x, w)
+        assert float((pulled[5] - goal).norm()) < 0.3 * float((plain[5] - goal).norm())
+
+    @pytest.mark.parametrize("name", ["hand", "creature"])
+    def test_no_triangle_folds_over(self, name: str) -> None:
+        sample = load_sample(name)
+        bases = tm.extract_bases(sample.keyframes, sample.faces, 15, progress=False)
+        n, generator = len(bases), torch.Generator().manual_seed(0)
+        w = torch.distributions.Exponential(1.0).icdf(torch.rand(8, n, generator=generator, dtype=DOUBLE))
+        w = w / w.sum(-1, keepdim=True)
+        result = Blend(bases, sample.faces, "fast").solve(sample.keyframes, w)
+        assert bool(result.solution.usable.all())
+        opposite = lambda x: turned_over(x, sample.faces)  # noqa: E731
+        worst = max(opposite(x) for x in sample.keyframes)
+        assert max(opposite(x) for x in result.shapes) <= worst + 0.001
+
+    def test_what_is_worse_than_its_start_falls_back(
+        self, bars: Shapes, layer: Blend, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        member = layer.layer.members[0]
+        monkeypatch.setattr(member, "refined", lambda x, rests: 1.5 * x)
+        with pytest.warns(tm.ConvergenceWarning, match="came out worse"):
+            x = layer(bars.keyframes, pulls(0.5, 0.2, 0.3))
+        assert int(layer.solve(bars.keyframes, pulls(0.5, 0.2, 0.3)).solution.status) == Status.FELL_BACK
+        monkeypatch.undo()
+        assert far(layer(bars.keyframes, pulls(0.5, 0.2, 0.3)), x) < 0.1
+
+    def test_samples_that_are_not_finite_are_invalid_alone(self, layer: Blend, poses: Tensor) -> None:
+        broken = poses.clone()
+        broken[2, 0] = torch.nan
+        result = layer.solve(torch.stack([poses, broken]), pulls(0.5, 0.2, 0.3))
+        assert result.solution.status.tolist() == [Status.CONVERGED, Status.INVALID]
+        assert bool(result.shapes[0].isfinite().all()) and bool(result.shapes[1].isnan().all())
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        "weights, words",
+        [
+            (pulls(0.5, 0.2, 0.2), "add up to 1"),
+            (pulls(0.9, 0.4, -0.3), "below zero to -0.25"),
+            (pulls(0.5, torch.nan, 0.5), "add up to 1"),
+            (pulls(0.5, 0.5), "with the same K"),
+            (torch.tensor([1, 0, 0]), "floating-point"),
+            ([0.5, 0.2, 0.3], "with the same K"),
+        ],
+    )
+    def test_weights_that_do_not_fit(self, layer: Blend, poses: Tensor, weights: Tensor, words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            layer(poses, weights)
+
+    def test_shapes_that_do_not_fit(self, layer: Blend, poses: Tensor) -> None:
+        with pytest.raises(ValueError, match="floating-point of shape"):
+            layer(poses[:, 1:], pulls(0.5, 0.2, 0.3))
+        with pytest.raises(ValueError, match="do not broadcast"):
+            layer(poses.expand(2, -1, -1, -1), pulls(0.5, 0.2, 0.3).expand(3, -1))
+
+    def test_settings_of_pairs(self, bars: Shapes) -> None:
+        for changes in ({"space": "paired"}, {"contact": True}):
+            with pytest.raises(ValueError, match="of two key-frames"):
+                Blend(bars.bases, bars.faces, objective=tm.Objective(**changes))  # type: ignore[arg-type]
+
+
+class TestParts:
+    def test_the_mean_of_rotations_has_no_gradient_of_squared_angles(self, generator: torch.Generator) -> None:
+        half = torch.randn(3, 5, 40, generator=generator, dtype=DOUBLE)
+        half = 0.6 * half / half.norm(dim=0).clamp_min(1)
+        w = torch.softmax(torch.randn(5, 1, generator=generator, dtype=DOUBLE), 0)
+        rotations = about(half)
+        found = mean(rotations, w)
+        left = (w * arc(product(conjugate(found)[:, None], rotations))).sum(-2)
+        assert float(left.abs().max()) < 1e-10
+
+    def test_the_mean_of_two_is_on_the_way(self) -> None:
+        half = torch.tensor([[0.0, 0.3], [0.0, -1.0], [0.0, 2.4]], dtype=DOUBLE)[..., None]  # beyond half a turn
+        rotations = about(half)
+        for t in (-0.1, 0.2, 0.5, 0.9):
+            expected = power(rotations[:, 1], torch.tensor(t, dtype=DOUBLE))
+            torch.testing.assert_close(mean(rotations, pulls(1 - t, t)[:, None]), expected, rtol=0, atol=1e-12)
+
+    def test_parabolas_add_up_to_one(self, generator: torch.Generator) -> None:
+        w, q = (torch.rand(4, 3, generator=generator, dtype=DOUBLE) for _ in range(2))
+        whole, value, least = merged(w, q)
+        at = pulls(0.3, -2.0, 5.0)
+        torch.testing.assert_close(whole * (at - value) ** 2 + least, (w * (at - q) ** 2).sum(0))
+
+    def test_angles_come_round(self) -> None:
+        angles = pulls(3.1, -3.1, 3.0)[:, None]
+        found = on_one_branch(angles, torch.ones_like(angles))
+        assert float(found.amax() - found.amin()) < 0.2
+
+
+class Pull(tm.Term):
+    """One vertex towards a point."""
+
+    sampled = True
+
+    def __init__(self, vertex: int, goal: Tensor) -> None:
+        super().__init__(1e3)
+        self.vertex = vertex
+        self.register_buffer("goal", goal[None])
+
+    @property
+    def anchors(self) -> Tensor:
+        return self.goal  # type: ignore[return-value]
+
+    def elements(self, mesh: tm.energy.term.Mesh) -> Tensor:
+        return torch.tensor([[mesh.first_anchor, self.vertex]])
+
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return (edge_vectors[0].square().sum() + 1e-6).sqrt()
+
+    def at_rest(self, measures: Tensor) -> Tensor:
+        return torch.zeros_like(measures)
+
+
+def turned_over(x: Tensor, faces: Tensor) -> float:
+    """Part of the neighbouring triangles whose normals are opposite."""
+    first, second = sides(x.T[:, None], faces)
+    normals = torch.nn.functional.normalize(cross(first, second)[:, 0], dim=0)
+    pairs = torch.tensor(tm.geometry.connectivity.Connectivity(faces.numpy(), len(x)).face_neighbours)
+    return float(((normals[:, pairs[:, 0]] * normals[:, pairs[:, 1]]).sum(0) < -0.9).double().mean())

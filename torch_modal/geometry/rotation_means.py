@@ -1,0 +1,78 @@
+r"""Weighted means of rotations: where the weighted sum of the logarithms of all, seen from the mean, vanishes.
+
+Quaternions have their real part first; components come first. Their signs tell the way round.
+"""
+
+import torch
+from torch import Tensor
+
+from torch_modal.geometry.rotations import SMALL, about, arc, conjugate, product
+from torch_modal.geometry.vectors import cross
+
+# Newton steps from the mean of quaternions, before the one that has derivatives. Rotations within 90 degrees of a point
+# have then a mean that is exact to rounding, and derivatives to six digits or more.
+STEPS = 1
+
+# Smallest eigenvalue of the Hessian for which a step is one of Newton: below it, where rotations spread by about a
+# turn, there is no one mean, and steps go by the mean of logarithms.
+LEAST = 0.1
+
+
+def mean(rotations: Tensor, weights: Tensor) -> Tensor:
+    """The weighted mean of K rotations; of two, the point on the way from one to the other.
+
+    It has first derivatives only.
+
+    Args:
+        rotations: Quaternions relative to one of them, which has no rotation. *Shape:* ``(4, ..., K, F)``.
+        weights: They add up to one. *Shape:* ``(..., K, 1)``.
+
+    Returns:
+        *Shape:* ``(4, ..., F)``.
+    """
+    with torch.no_grad():
+        found = (weights * rotations).sum(-2)
+        found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)
+        for _ in range(STEPS):
+            found = _stepped(found, rotations, weights)
+    return _stepped(found, rotations, weights)
+
+
+def _stepped(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
+    """A Newton step; at the mean, its derivatives are those of the mean."""
+    relative = product(conjugate(found)[..., None, :], rotations)
+    arcs = arc(relative)
+    downhill = (weights * arcs).sum(-2)
+    with torch.no_grad():
+        hessian, least = _hessian(relative, arcs, weights)
+        hessian = torch.where(least < LEAST, _identity(least), hessian)
+    return product(found, about(_solved(hessian, downhill)))
+
+
+def _hessian(relative: Tensor, arcs: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Of half the sum of squared angles, and a lower bound of its eigenvalues. *Shape:* ``(3, 3, ..., F), (..., F)``.
+
+    Along its axis a rotation has 1, across it ``a cot(a)`` of half its angle.
+    """
+    squared = (arcs * arcs).sum(0)
+    small = squared < SMALL
+    safe = torch.where(small, 1, squared)
+    sine = relative[1:].square().sum(0).sqrt().clamp_min(torch.finfo(arcs.dtype).tiny)
+    # a cot(a) = 1 - a²/3 - a⁴/45 - 2 a⁶/945 - ...
+    series = 1 / 3 + squared / 45 + 2 * squared * squared / 945
+    less = torch.where(small, series, (1 - safe.sqrt() * relative[0] / sine) / safe)
+    across = (weights * (1 - less * squared)).sum(-2)
+    along = ((weights * less * arcs)[:, None] * arcs).sum(-2)
+    return along + _identity(across) * across, across
+
+
+def _identity(like: Tensor) -> Tensor:
+    """The matrix, with as many dimensions behind. *Shape:* ``(3, 3, 1, ...)``."""
+    return torch.eye(3).to(like).reshape(3, 3, *[1] * like.dim())
+
+
+def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """Of symmetric matrices, by cofactors. *Shape:* ``(3, 3, ...), (3, ...) -> (3, ...)``."""
+    a, b, c = matrix
+    cofactors = cross(b, c), cross(c, a), cross(a, b)
+    return sum(x * part for x, part in zip(right, cofactors, strict=True)) / (a * cofactors[0]).sum(0)
