@@ -59,7 +59,8 @@ examples:
 
 MODES = """\
 Compute the vibration modes of key-frames: the lowest elastic modes of the solid
-that each surface encloses, restricted to the surface.
+that each surface encloses, restricted to the surface, or of the surface itself
+where it is open or thin.
 
 They are what `subdivide` computes first. Read the files with
 torch_modal.ModalBasis.load. With --mesher tetwild, which is not deterministic, two

@@ -21,7 +21,7 @@ def why_shell(surfaces: list[CanonicalSurface]) -> str:
         thickness = 2 * abs(signed_volume(surface.points, surface.faces)) / surface.area**1.5
         what = f"key-frame {index} is" if len(surfaces) > 1 else "the shape is"
         if holes > OPEN:
-            return f"{what} open: holes as long as its boundary would have {100 * holes:.2g} % of its area"
+            return f"{what} open: a round hole with its boundary would have {holes:.2g} times its area"
         if thickness < THIN:
-            return f"{what} thin: its mean thickness is {100 * thickness:.2g} % of the root of its area"
+            return f"{what} thin: its mean thickness is {thickness:.2g} times the root of its area"
     return ""
