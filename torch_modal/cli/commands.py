@@ -117,7 +117,7 @@ def modes(args: argparse.Namespace) -> None:
         first = next((value for value in basis.eigenvalues.tolist() if value > 0), 1.0)
         report(f"{mesh.name:24s}" + "".join(f"{value:>10.3g}" for value in values))
         report(f"{'  frequency / first':24s}" + "".join(f"{(value / first) ** 0.5:>10.3f}" for value in values))
-    report("eigenvalues are squared frequencies, in 1 / (unit of the mesh)^2; the stiffness of solids and shells differs")
+    report("eigenvalues are squared frequencies, in 1 / (unit of the mesh)^2; solids and shells differ in stiffness")
     report(f"bases: {files[0]}" + (f" to {files[-1].name}" if len(files) > 1 else ""))
 
 
