@@ -113,7 +113,7 @@ class Sheet:
 
     @property
     def scale(self) -> Scale:
-        """Orders of eigenvalues: the lowest one of a flat sheet is about 200 times the zero."""
+        """Orders of eigenvalues, by the lowest one of a flat sheet."""
         lowest = 100 * 2 * BETA / (SIZE**4 * THICKNESS * SIZE)
         return Scale(shift=50 * lowest, zero=5e-6 * lowest)
 
