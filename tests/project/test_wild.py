@@ -122,7 +122,7 @@ def stubborn(pipe: Connection) -> None:
     """Ends itself in "fast", never comes back from "paper"."""
     os.setsid()
     while True:
-        name, ways = pipe.recv()
+        name, ways, _ = pipe.recv()
         pipe.send("modes")
         for preset, contact in ways:
             pipe.send("in-between")
