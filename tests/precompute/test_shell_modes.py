@@ -270,3 +270,23 @@ def test_progress_counts_both_attempts(capsule: Mesh) -> None:
     poses = np.stack([strip()[0]] * 3)
     extract_bases(poses, strip()[1], 3, cache=False, progress=lambda done, total, _: counted.append((done, total)))
     assert counted[-1] == (6, 6)
+
+
+def test_coincident_vertices_are_one() -> None:
+    """An edge without a length has no stiffness: its ends would move against each other."""
+    vertices, faces = strip(2.0, 1.0, (20, 10))
+    split = int(np.argmin(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)))
+    around = np.flatnonzero((faces == split).any(axis=1))
+    new = len(vertices)
+    half = around[: len(around) // 2]
+    moved = faces.copy()
+    moved[half] = np.where(moved[half] == split, new, moved[half])
+    ends = np.intersect1d(moved[half].reshape(-1), np.delete(moved[around], range(len(half)), axis=0).reshape(-1))
+    fill = [[split, new, int(end)] for end in ends if end not in (split, new)]
+    double = np.concatenate([moved, fill])
+    plain = extract_modes(vertices, faces, 6, method="shell", cache=False)
+    same = extract_modes(
+        np.concatenate([vertices, vertices[split : split + 1]]), double, 6, method="shell", cache=False
+    )
+    np.testing.assert_allclose(same.eigenvalues, plain.eigenvalues, rtol=1e-6)
+    torch.testing.assert_close(same.modes[:, new], same.modes[:, split], rtol=0, atol=1e-12)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.connectivity import connected_pieces, double_areas
+from torch_modal.geometry.connectivity import Connectivity, connected_pieces, double_areas
 from torch_modal.geometry.decimation import decimate
 from torch_modal.geometry.inspect import degenerate_faces, repeated_faces
 
@@ -41,6 +41,23 @@ class Coarsening:
     def n_vertices(self) -> int:
         """Number of coarse vertices."""
         return int(self.clusters.max()) + 1
+
+    def joined(self, x: FloatArray, shortest: float) -> "Coarsening":
+        """With clusters merged whose averages coincide.
+
+        Args:
+            x: A shape. *Shape:* ``(V, 3)``.
+            shortest: Length of an edge over the mean up to which its ends coincide.
+        """
+        points, edges = self.restrict(x), Connectivity(self.faces, self.n_vertices).edges
+        lengths = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
+        short = lengths <= shortest * lengths.mean()
+        if not short.any():
+            return self
+        joint = connected_pieces(edges[short], len(points))
+        faces = _coarse_faces(joint, self.faces)
+        index = _compact(faces, len(points))
+        return Coarsening(np.where(self.clusters >= 0, index[joint[self.clusters]], -1), index[faces])
 
     def restriction(self) -> sparse.csr_matrix:
         """Matrix of the cluster average. *Shape:* ``(V_coarse, V)``."""

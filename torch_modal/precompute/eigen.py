@@ -34,6 +34,8 @@ class Scale(NamedTuple):
     """Lanczos is shifted by minus this: it is near the lowest modes of slender bodies."""
     zero: float
     """Largest eigenvalue that counts as zero."""
+    enough: float = ENOUGH
+    """Residual that is accepted if further steps do not help."""
 
 
 class ModalAnalysisError(RuntimeError):
@@ -132,10 +134,10 @@ def lowest_modes(
             f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero beside the first elastic "
             f"one, {first_elastic:.2e}; the mesh is degenerate"
         )
-    if found.residual < ENOUGH:
+    if found.residual < scale.enough:
         return found
     raise ModalAnalysisError(
-        f"the modes leave a relative residual of {found.residual:.2e} (allowed: {ENOUGH:g}), and further "
+        f"the modes leave a relative residual of {found.residual:.2e} (allowed: {scale.enough:g}), and further "
         "steps do not help; the mesh is likely degenerate"
     )
 

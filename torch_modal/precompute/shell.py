@@ -19,7 +19,7 @@ from torch_modal.energy.rest_hessian import BETA, rest_hessian
 from torch_modal.geometry.canonical import SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
 from torch_modal.io.cache import Arrays
-from torch_modal.precompute.coarsening import coarsen
+from torch_modal.precompute.coarsening import Collapses, coarsen
 from torch_modal.precompute.eigen import Scale
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import small_pieces
@@ -30,8 +30,13 @@ COARSE_FACES = 4000
 """Faces of the mesh that modes are computed on: with 2,000 or 8,000, in-betweens are as good."""
 FACES_PER_MODE = 50
 """Where many modes are asked for, there are more faces."""
+SHORTEST = 1e-6
+"""Length of an edge over the mean up to which its ends are one vertex: it would have no stiffness."""
 LEAST_MASS = 1e-3
 """Smallest mass of a vertex over the mean."""
+MOST_ROUNDING = 0.1
+"""Residual of the modes that is accepted if further steps do not help: it is rounding of ``K phi`` at slivers, which
+are stiffer than the rest by many orders. Lanczos has bounded the error of the inverted problem by then."""
 SPREAD = 1.5
 """Averages over neighbours that carry displacements from clusters to vertices, per radius of a cluster in edges."""
 
@@ -80,7 +85,12 @@ class Sheet:
         piece = self._fine.vertex_pieces[faces[:, 0]]
         small = small_pieces(np.bincount(piece, double_areas(points, faces)), points[faces], piece)
         own = faces[~small[piece]]
-        coarse = coarsen(points[None], own, self._n_faces)
+        # Modes do not mind needles, for which `coarsen` would collapse several times.
+        few = len(own) <= self._n_faces
+        coarse = (
+            coarsen(points[None], own, self._n_faces) if few else Collapses(own).of([0], points[None])(0, self._n_faces)
+        )
+        coarse = coarse.joined(points, SHORTEST)
         return coarse.clusters, coarse.restrict(points), Connectivity(coarse.faces, coarse.n_vertices)
 
     @property
@@ -115,7 +125,7 @@ class Sheet:
     def scale(self) -> Scale:
         """Orders of eigenvalues, by the lowest one of a flat sheet."""
         lowest = 100 * 2 * BETA / (SIZE**4 * THICKNESS * SIZE)
-        return Scale(shift=50 * lowest, zero=5e-6 * lowest)
+        return Scale(shift=50 * lowest, zero=5e-6 * lowest, enough=MOST_ROUNDING)
 
     def carried(self, motions: FloatArray) -> FloatArray:
         """Motions of the coarse mesh, at all points of the surface. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
