@@ -201,9 +201,7 @@ def test_the_choice(capsule: Mesh, data_dir: Path, caplog: pytest.LogCaptureFixt
     torch.testing.assert_close(both[0].modes, shell.modes, rtol=0, atol=0)
 
 
-def test_where_no_solid_can_be_had(
-    capsule: Mesh, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_where_no_solid_can_be_had(capsule: Mesh, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The shell if the surface is the cause; an error if another attempt may succeed, so that calls agree."""
     shell = extract_modes(*capsule, 4, method="shell", cache=False)
 
@@ -222,6 +220,12 @@ def test_where_no_solid_can_be_had(
             found = extract_modes(*capsule, 4, mesher=Failing(error), cache=False)  # type: ignore[arg-type]
         assert str(error) in caplog.text
         torch.testing.assert_close(found.modes, shell.modes, rtol=0, atol=0)
+        both = np.stack([capsule[0], capsule[0]])
+        for one in extract_bases(both, capsule[1], 4, mesher=Failing(error), cache=False, progress=False):  # type: ignore[arg-type]
+            torch.testing.assert_close(one.modes, shell.modes, rtol=0, atol=0)
+        for _ in range(2):  # the second time, the failure is remembered
+            again = extract_modes(*capsule, 4, mesher=Failing(error), cache_dir=str(tmp_path))  # type: ignore[arg-type]
+            torch.testing.assert_close(again.modes, shell.modes, rtol=0, atol=0)
     for method, failure in (("auto", TetrahedralizationError("killed")), ("solid", ModalAnalysisError("in pieces"))):
         with pytest.raises(type(failure), match=str(failure)):
             extract_modes(*capsule, 4, method=method, mesher=Failing(failure), cache=False)  # type: ignore[arg-type]

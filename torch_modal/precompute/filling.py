@@ -137,7 +137,8 @@ class Filler:
             raise TetrahedralizationError(
                 f"{failure['reason'].tobytes().decode()}. An earlier run found this for the same surface and settings, "
                 f"and it was not tried again; to try again, {longer}clear the cache in {self.cache.folder} "
-                "(torch-modal cache --clear), or do without it"
+                "(torch-modal cache --clear), or do without it",
+                fails_until,
             )
         try:
             return self.mesher.fill(surface, self.timeout, self.stop)

@@ -252,7 +252,9 @@ def naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
     except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
         if n_keyframes == 1:
             raise
-        raise type(error)(f"key-frame {index}: {error}") from error
+        named = type(error)(f"key-frame {index}: {error}")
+        named.__dict__.update(error.__dict__)  # how long a failure lasts
+        raise named from error
 
 
 def solve(n_vertices: int, body: Elastic, n_modes: int, tolerance: float, cache: Cache) -> Solved:
