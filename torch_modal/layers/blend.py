@@ -10,7 +10,7 @@ from torch_modal.inbetween.among import Among, WeightedSamples
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.layers.in_between import InBetween, full_precision, unflattened
+from torch_modal.layers.in_between import InBetween, full_precision, unflattened, with_exact
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.solver import Solution
 
@@ -161,9 +161,5 @@ def _with_exact_keyframes(shapes: Tensor, keyframes: Tensor, weights: Tensor) ->
     shapes = shapes.to(keyframes.dtype)
     alone = (weights != 0).sum(-1, keepdim=True) == 1
     for x, there in zip(keyframes.unbind(-3), ((weights == 1) & alone).unbind(-1), strict=True):
-        exactly = x.detach()
-        if torch.is_grad_enabled():
-            known = shapes.detach()
-            exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)
-        shapes = torch.where(there[..., None, None], exactly, shapes)
+        shapes = with_exact(shapes, there, x)
     return shapes

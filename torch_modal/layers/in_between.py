@@ -359,14 +359,24 @@ def with_exact_ends(shapes: Tensor, x_a: Tensor, x_b: Tensor, t: Tensor | float)
     for end, x in ((0, x_a), (1, x_b)):
         if not isinstance(t, Tensor) and t != end:
             continue
-        exactly = x.to(shapes).detach()
-        if torch.is_grad_enabled():
-            # No number comes of the other end where that is not finite, and no gradient.
-            known = shapes.detach()
-            exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)
-        there = torch.as_tensor(t == end, device=shapes.device)
-        shapes = torch.where(there[..., None, None], exactly, shapes)
+        shapes = with_exact(shapes, torch.as_tensor(t == end, device=shapes.device), x)
     return shapes
+
+
+def with_exact(shapes: Tensor, there: Tensor, x: Tensor) -> Tensor:
+    """In-betweens, of which some are a key-frame to the last bit; gradients stay those of the in-between there.
+
+    Args:
+        shapes: *Shape:* ``(..., V, 3)``.
+        there: Which of them. *Shape:* ``(...)``, bool.
+        x: The key-frame. *Shape:* ``(..., V, 3)``.
+    """
+    exactly = x.to(shapes).detach()
+    if torch.is_grad_enabled():
+        # No number comes of an in-between where that is not finite, and no gradient.
+        known = shapes.detach()
+        exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)
+    return torch.where(there[..., None, None], exactly, shapes)
 
 
 @contextmanager

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.energy.rest_hessian import BETA, rest_hessian
+from torch_modal.energy.rest_hessian import rest_hessian
+from torch_modal.energy.shell import BETA
 from torch_modal.geometry.canonical import SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
 from torch_modal.io.cache import Arrays
