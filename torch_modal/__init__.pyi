@@ -13,6 +13,7 @@ from .data.dataset import ShapeDataset as ShapeDataset
 from .data.deformation import RandomModalDeformation as RandomModalDeformation
 from .data.packed import augment_packed as augment_packed
 from .data.packed import collate_packed as collate_packed
+from .data.random_blend import RandomBlend as RandomBlend
 from .data.random_in_between import RandomExtrapolation as RandomExtrapolation
 from .data.random_in_between import RandomInBetween as RandomInBetween
 from .data.rigid_motion import RandomRigidMotion as RandomRigidMotion
@@ -65,6 +66,8 @@ from .solve.adjoint import ConvergenceWarning as ConvergenceWarning
 from .solve.gauss_newton import GaussNewtonStep as GaussNewtonStep
 from .solve.solver import Solution as Solution
 from .solve.solver import Status as Status
+from .statistics.components import Components as Components
+from .statistics.fit import Fitted as Fitted
 from .view.animation import save_animation as save_animation
 from .view.document import Page as Page
 from .view.live import LiveSession as LiveSession

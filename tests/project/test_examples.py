@@ -106,6 +106,13 @@ def test_motion_from_markers_is_nearer_than_pca_and_than_the_path() -> None:
 
 
 @pytest.mark.slow
+def test_new_shapes_are_drawn_and_poses_follow_their_markers(tmp_path: Path) -> None:
+    errors = load_example("new_shapes").main(tmp_path, n=20, n_modes=8)
+    assert max(errors["fitted"]) < 0.3 * min(errors["linear span"])
+    assert all((tmp_path / f"{name}.png").stat().st_size > 50_000 for name in ("shapes", "all", "markers"))
+
+
+@pytest.mark.slow
 def test_figures_of_the_paper_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Those of the samples; the others have tests of their own."""
     load_example("paper/run").main(tmp_path, ["1", "3", "6"])

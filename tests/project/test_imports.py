@@ -34,6 +34,7 @@ FLOORS = [
     "layers",
     "motion",
     "registration",
+    "statistics",
     "codec",
     "data",
     "view",

@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -27,16 +28,24 @@ from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.io.cache import CacheWarning
 from torch_modal.io.content import ContentError, code_digest, content_digest
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.path import Path as MotionPath
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.shell import THICKNESS
 from torch_modal.solve.adjoint import ConvergenceWarning
 from torch_modal.solve.solver import Status
+from torch_modal.statistics.components import Components
+from torch_modal.statistics.fit import Fitted, fit
+from torch_modal.statistics.observations import Observations, checked_observations, checked_weights
+from torch_modal.statistics.variation import Variation
 from torch_modal.version import __version__
 
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8
+
+# Key-frames whose modes a mean has, at most.
+_BASES_OF_MEAN = 6
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -195,6 +204,135 @@ class ShapeSpace:
         after, before = (norm(pick(y, j) - pick(y, i)) for y in rows)
         return after / before - 1
 
+    # ----------------------------------------------------------------------------------------------------- statistics
+    @torch.no_grad()
+    def mean(self, weights: Tensor | None = None) -> Tensor:
+        """The shape of least weighted energy towards all key-frames (:class:`torch_modal.Blend`).
+
+        Args:
+            weights: Of the key-frames; even by default. *Shape:* ``(K,)``.
+
+        Returns:
+            *Shape:* ``(V, 3)``, float64.
+        """
+        even = torch.full((len(self),), 1 / len(self), dtype=torch.float64)
+        return self._blend()(self._keyframes_like(even), even if weights is None else weights.to(even))
+
+    @kept(1)
+    def _blend(self) -> Blend:
+        objective, solver = self.settings
+        # Modes of a few tell those of all; further ones cost more than they give.
+        few = self.bases[:: max(1, len(self) // _BASES_OF_MEAN)][:_BASES_OF_MEAN]
+        return Blend(few, self.faces, objective=replace(objective, contact=False), solver=solver)
+
+    def components(self, n: int | None = None) -> Components:
+        """Principal components of the key-frames, with coordinates of shapes and shapes of coordinates.
+
+        Args:
+            n: How many; by default all, one less than there are key-frames.
+
+        Raises:
+            ValueError: There are fewer.
+        """
+        most = len(self) - 1
+        if n is None:
+            n = most
+        if not 1 <= n <= most:
+            raise ValueError(f"{len(self)} key-frames have {most} components; got n={n}")
+        variation = self.variation()
+        return Components(variation.coordinates, variation.average + variation.deviations, n)
+
+    @kept(1)
+    def variation(self) -> Variation:
+        """How the key-frames vary, which :meth:`sample` and :meth:`fit` share.
+
+        Raises:
+            ValueError: There is only one key-frame.
+        """
+        if len(self) < 2:
+            raise ValueError(
+                "one key-frame alone does not vary; a space for sample, fit or components needs two or more"
+            )
+        shapes = self._keyframes_like(torch.empty(0, dtype=torch.float64))
+        return Variation(shapes, self.faces)
+
+    @torch.no_grad()
+    def sample(
+        self,
+        n: int,
+        generator: torch.Generator | None = None,
+        *,
+        concentration: float = 1.0,
+        locality: float = 1.0,
+    ) -> Tensor:
+        """New members: random mixtures of the key-frames, with weights that vary from part to part of the surface.
+
+        Each part of the surface lies between the key-frames, a leg perhaps nearer to one and the head to another, so
+        that lengths and angles stay those of the key-frames and their mixtures. A draw in which triangles fold over
+        that no key-frame has is made less local until none does. For shapes outside of what the key-frames show,
+        apply :class:`RandomModalDeformation`.
+
+        Args:
+            n: How many.
+            generator: Source of random numbers; by default PyTorch's own.
+            concentration: Of the Dirichlet density of the weights: 1 is even over all mixtures, less prefers single
+                key-frames, more their mean.
+            locality: Standard deviation of the logarithms of the weights over the surface; with 0, all of it has the
+                same.
+
+        Returns:
+            In the pose of the first key-frame. *Shape:* ``(n, V, 3)``, in the dtype of the space.
+
+        Raises:
+            ValueError: An argument is out of range.
+        """
+        if n < 0:
+            raise ValueError(f"n is 0 or more, got {n}")
+        check_density(concentration, locality)
+        variation = self.variation()
+        out = torch.empty(n, self.n_vertices, 3, dtype=self.dtype)
+        for i in range(n):
+            weights, factors = variation.draw(concentration, locality, generator)
+            out[i] = variation.member(weights, factors)[0]
+        return out
+
+    def fit(
+        self, points: Tensor, vertices: Tensor, *, near: int | Tensor | None = None, robust: bool = False
+    ) -> Fitted:
+        """The shape that meets observed points: weights of the key-frames that vary over the surface, then elasticity.
+
+        What the points leave open is as in the key-frames: lengths and angles of each part are those of the mixture
+        of key-frames that looks most like it. Of several sets of points, each is met on its own.
+
+        Gradients reach the points. They are those of weights and rigid motion, by the implicit function theorem; the
+        elastic steps that follow, and the trust in points, are constants of the graph.
+
+        Args:
+            points: In the caller's units, of at least three vertices; any rigid motion is followed. *Shape:*
+                ``(..., n, 3)``.
+            vertices: The vertex that each point shows. *Shape:* ``(n,)``.
+            near: A key-frame, or weights of all, *shape* ``(K,)``, that the shape is likely near to. Default: all
+                alike.
+            robust: Whether points that fit nothing are ignored.
+
+        Returns:
+            The shapes with their weights, and by how much they miss each point. Should the points be missed by more
+            than of a key-frame that is moved rigidly, it is that one.
+
+        Raises:
+            ValueError: There is only one key-frame, or points, vertices or weights do not fit.
+        """
+        about = checked_weights(near, len(self))
+        places = checked_observations(points, vertices, self.n_vertices)
+        variation = self.variation()
+        found = []
+        for own in points.reshape(-1, *points.shape[-2:]):
+            known = own.to("cpu", torch.float64)
+            to = Observations(known, places, torch.ones_like(known[:, 0]))
+            found.append(fit(variation, to, about, robust))
+        lead = points.shape[:-2]
+        return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
+
     # ------------------------------------------------------------------------------------------- computed at first use
     def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
         """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
@@ -325,6 +463,16 @@ class ShapeSpace:
         if i > j:
             return self.in_between(x_b, x_a, 1 - t, j, i)
         return _shapes(self.layer(i, j, x_a).solve(x_a, x_b, t), i, j)
+
+
+def check_density(concentration: float, locality: float) -> None:
+    """Check what new members are drawn with.
+
+    Raises:
+        ValueError: It is out of range.
+    """
+    if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
+        raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")
 
 
 def _expected(strains: Tensor, weights: Tensor | None = None) -> Tensor:

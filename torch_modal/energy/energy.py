@@ -102,6 +102,10 @@ class OnMesh(nn.Module):
         measures = self.term.measures(edge_vectors)
         return measures.sum(-1, keepdim=True) if self.term.total else measures
 
+    def on_elements(self, weights: Tensor) -> Tensor:
+        """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
+        return weights.mean(-1, keepdim=True) if self.term.total else weights[..., self.corners].mean(-2)
+
     def acting(self, weight: Tensor, difference: Tensor) -> Tensor:
         """The weights where the measures are stiff. *Shape:* ``(B, R, M)``."""
         return torch.where(difference == 0, 0, weight) if self.term.one_sided else weight
@@ -240,6 +244,23 @@ class Energy(nn.Module):
             wholes.append((factor * whole)[..., None, :])
             constant = constant + (factor * spread).sum(-1)
         return Reference(tuple(measures), tuple(wholes), constant)
+
+    def mixed(self, rest: Rest, weights: Tensor) -> Rest:
+        """One rest shape whose measures are weighted sums of those of K shapes.
+
+        Where weights differ from vertex to vertex, or are far below zero, :meth:`among` asks for harmonic means.
+
+        Args:
+            rest: Of K shapes.
+            weights: They add up to one. *Shape:* ``(K, V)``.
+        """
+        measures, stiffness = [], []
+        for part, values, pulls in zip(self.parts, rest.measures, rest.weights, strict=True):
+            own, pulls = part.on_elements(weights), pulls.expand_as(values)
+            values = on_one_branch(values, pulls) if part.term.periodic else values
+            measures.append((own * values).sum(-2))
+            stiffness.append((own * pulls).sum(-2).clamp_min(0))
+        return Rest(tuple(measures), tuple(stiffness))
 
     @staticmethod
     def against(rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:

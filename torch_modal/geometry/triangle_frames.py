@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rotations import turned
+from torch_modal.geometry.rotations import SMALL, product, turn_of, turned
 from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
 # Smallest height relative to the sides; below, it is rounding, and the division amplifies noise.
@@ -154,19 +154,27 @@ def bent_sides(bending: BentTriangles, own: Frames) -> Sides:
     return Sides(turned(bending.turn, own.world(*first)), turned(bending.turn, own.world(*second)))
 
 
+def bending_between(own: Frames, other: Frames, turns: Tensor) -> BentTriangles:
+    """Rotation and strain from one shape to another: :func:`bent_sides` of it are the sides of the other.
+
+    Args:
+        own: Frames of the shape that bends.
+        other: Frames of the other.
+        turns: Quaternions from the first frames to the others; their signs tell the way round. *Shape:* ``(4, B, F)``.
+    """
+    polar = _polar(own, other)
+    half = 0.5 * torch.atan2(polar.sin, polar.cos)
+    turn = turn_of(product(turns, torch.cat([half.cos()[None], half.sin() * own.normal])))
+    return BentTriangles(turn, _logarithm(polar.xx, polar.xy, polar.yy))
+
+
 def mirrored_sides(centre: Frames, other: Frames) -> Sides:
     r"""Sides of the shape that lies as far beyond ``centre`` as ``other`` lies before it.
 
     From ``centre`` to ``other`` a triangle turns by ``R`` and stretches by ``U``. The mirror image turns by ``R^T``
     and stretches by :math:`4 (1 + U)^{-2}`, which agrees with :math:`U^{-1}` to first order and stays between 0 and 4.
     """
-    m_xx = other.length / centre.length
-    m_xy = (other.along - m_xx * centre.along) / centre.height
-    m_yy = other.height / centre.height
-    trace = torch.hypot(m_xx + m_yy, m_xy)  # of U; never 0, as both heights are above 0
-    cos, sin = (m_xx + m_yy) / trace, -m_xy / trace
-    u_xx, u_xy = cos * m_xx, cos * m_xy + sin * m_yy
-    u_yy = cos * m_yy - sin * m_xy
+    cos, sin, u_xx, u_xy, u_yy = _polar(centre, other)
     determinant = (1 + u_xx) * (1 + u_yy) - u_xy**2
     i_xx, i_xy, i_yy = (2 * v / determinant for v in (1 + u_yy, -u_xy, 1 + u_xx))
     g_xx, g_xy, g_yy = i_xx**2 + i_xy**2, i_xy * (i_xx + i_yy), i_xy**2 + i_yy**2
@@ -187,6 +195,38 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """*Shape:* ``(3, B, F), (3, B, F) -> (B, F)``."""
     return (a * b).sum(0)
+
+
+class _Polar(NamedTuple):
+    """The map of a triangle's plane to another's, as a rotation after a stretch. *Shape of each:* ``(B, F)``."""
+
+    cos: Tensor
+    sin: Tensor
+    xx: Tensor
+    xy: Tensor
+    yy: Tensor
+
+
+def _polar(own: Frames, other: Frames) -> _Polar:
+    m_xx = other.length / own.length
+    m_xy = (other.along - m_xx * own.along) / own.height
+    m_yy = other.height / own.height
+    trace = torch.hypot(m_xx + m_yy, m_xy)  # of the stretch; never 0, as both heights are above 0
+    cos, sin = (m_xx + m_yy) / trace, -m_xy / trace
+    return _Polar(cos, sin, cos * m_xx, cos * m_xy + sin * m_yy, cos * m_yy - sin * m_xy)
+
+
+def _logarithm(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Matrix logarithm of symmetric positive definite 2 x 2 matrices, by entries."""
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    squared = half**2 + xy**2
+    small = squared < SMALL * mean**2
+    radius = torch.where(small, 1, squared).sqrt()
+    ratio = torch.where(small, squared / mean**2, 0)
+    near = (1 + ratio * (1 / 3 + ratio * (1 / 5 + ratio / 7))) / mean
+    odd = torch.where(small, near, torch.atanh(torch.where(small, 0, radius / mean)) / radius)
+    even = 0.5 * (mean**2 - squared).log()
+    return even + odd * half, odd * xy, even - odd * half
 
 
 def _exponential(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch_modal import trees
 from torch_modal.backends.torch.fine_steps import FurtherEnergy, relax
 from torch_modal.backends.torch.rests import Rests
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import cross, pick
 
@@ -68,6 +68,12 @@ class FineEnergy(nn.Module):
                 moved = relax(self.energy, moved, reference, n_steps, n_products, some.anchors, further)
             parts.append(moved)
         return torch.cat(parts)
+
+    def towards(
+        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FurtherEnergy] = ()
+    ) -> Tensor:
+        """The same towards a reference. *Shape:* ``(B, V, 3)``."""
+        return relax(self.energy, x, reference, n_steps, n_products, None, beside)
 
     def chunks(self, rests: Rests) -> Iterator[tuple[slice, Rests]]:
         """Samples that are relaxed at a time, each with its own rest shapes."""

@@ -8,11 +8,11 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.fine_energy import Beside, FineEnergy, chunk_of
-from torch_modal.backends.torch.fine_steps import FurtherTerms
+from torch_modal.backends.torch.fine_steps import FurtherEnergy, FurtherTerms
 from torch_modal.backends.torch.rests import Rests
 from torch_modal.backends.warp.fine_steps import WarpSteps
 from torch_modal.backends.warp.modal_energy import merged_reference
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
 
@@ -65,3 +65,13 @@ class WarpFineEnergy(FineEnergy):
                 moved = self.steps.descend(moved, to, others, n_steps, n_products)
             parts.append(moved)
         return torch.cat(parts).to(x)
+
+    def towards(
+        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FurtherEnergy] = ()
+    ) -> Tensor:
+        """As in the base class. Gradients are left to torch."""
+        recorded = torch.is_grad_enabled() and x.requires_grad
+        if self.further is not None or recorded or traced(x) or transformed(x):
+            return super().towards(x, reference, n_steps, n_products, beside)
+        to = self.steps.packed(reference)
+        return self.steps.descend(x.double().contiguous(), to, list(beside), n_steps, n_products).to(x)

@@ -152,10 +152,10 @@ class WarpShell(nn.Module):
         return self.packed(self.energy.between(one, other, t, stiffness))
 
     def packed(self, reference: Reference) -> ShellReference:
-        """A reference of torch's, towards two rest shapes, as one of the kernels'."""
+        """A reference of torch's, towards one or two rest shapes, as one of the kernels'."""
         stretch = torch.stack([2 * reference.weights[0][:, 0], reference.measures[0][:, 0]], -1)
-        both = torch.stack([2 * reference.weights[1], reference.measures[1]], -1)  # (B, 2, H, 2)
-        hinges = both.movedim(1, 2).flatten(2)
+        every = torch.stack([2 * reference.weights[1], reference.measures[1]], -1)  # (B, R, H, 2)
+        hinges = torch.nn.functional.pad(every.movedim(1, 2).flatten(2), (0, 4 - 2 * every.shape[1]))
         bend = hinges.new_zeros(len(hinges), len(self.record), 4).index_copy(1, self.interior, hinges)
         volume = [values[2][:, 0, 0] for values in (reference.weights, reference.measures)]
         constant = torch.as_tensor(reference.constant).to(stretch).expand(len(stretch))

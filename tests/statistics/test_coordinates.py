@@ -1,0 +1,83 @@
+"""Rotations and strains of triangles as coordinates, and principal components in them."""
+
+import pytest
+import torch
+from conftest import Shapes
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+from torch_modal.geometry.local_rotations import _turn_between
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rotations import exp
+from torch_modal.geometry.triangle_frames import BentTriangles, bending_between, bent_sides, frames, sides
+from torch_modal.statistics.coordinates import BendingCoordinates
+
+
+def far(x: torch.Tensor, y: torch.Tensor) -> float:
+    """Largest distance after the best rigid motion, over the diagonal."""
+    moved = best_fit(x, y, torch.ones(len(x)).to(x)).apply(x)
+    return float((moved - y).norm(dim=-1).max() / (y.amax(0) - y.amin(0)).norm())
+
+
+@pytest.mark.parametrize("name", ["hand", "creature"])
+def test_shapes_have_coordinates_that_give_them_back(name: str) -> None:
+    sample = load_sample(name)
+    coordinates = BendingCoordinates(sample.keyframes[0], sample.faces)
+    turn = exp(torch.tensor([0.4, -1.1, 0.3], dtype=torch.float64))
+    found = coordinates.of(sample.keyframes @ turn.mT + 3)
+    torch.testing.assert_close(found[0], torch.zeros_like(found[0]), rtol=0, atol=1e-9)
+    assert max(far(x, y) for x, y in zip(coordinates.shapes(found), sample.keyframes, strict=True)) < 1e-10
+
+
+def test_a_bend_is_found_again(bars: Shapes, generator: torch.Generator) -> None:
+    own = frames(sides(bars.keyframes[0].mT[:, None].contiguous(), bars.faces))
+    n = own.length.shape[1]
+    turn = torch.randn(3, 1, n, generator=generator, dtype=torch.float64)
+    strain = tuple(0.3 * torch.randn(1, n, generator=generator, dtype=torch.float64) for _ in range(3))
+    other = frames(bent_sides(BentTriangles(turn, strain), own))  # type: ignore[arg-type]
+    quaternions = _turn_between(own, other)
+    found = bending_between(own, other, quaternions)
+    # Of both signs of a quaternion, one is the turn that was made.
+    opposite = bending_between(own, other, -quaternions)
+    off = torch.minimum((found.turn - turn).norm(dim=0), (opposite.turn - turn).norm(dim=0))
+    assert float(off.max()) < 1e-9
+    for one, other_one in zip(found.strain, strain, strict=True):
+        torch.testing.assert_close(one, other_one, rtol=0, atol=1e-9)
+
+
+class TestComponents:
+    def test_all_of_them_span_the_keyframes(self, bars: Shapes) -> None:
+        components = tm.ShapeSpace(bars.bases, bars.faces).components()
+        found = components.coordinates(bars.keyframes)
+        assert found.shape == (3, 2)
+        back = components.shapes(found)
+        assert max(far(x, y) for x, y in zip(back, bars.keyframes, strict=True)) < 1e-9
+        torch.testing.assert_close(found.var(0), components.variances)
+        assert float(components.shares.sum()) == pytest.approx(1)
+        torch.testing.assert_close(found.mean(0), torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-9)
+
+    def test_one_bends_where_a_displacement_would_shear(self) -> None:
+        sample = load_sample("hand")
+        bases = tm.extract_bases(sample.keyframes, sample.faces, 8, progress=False)
+        components = tm.ShapeSpace(bases, sample.faces).components(1)
+        middle = components.shapes(components.coordinates(sample.keyframes).mean(0, keepdim=True))[0]
+        i, j = torch.tensor(tm.geometry.connectivity.Connectivity(sample.faces.numpy()).edges).unbind(1)
+        lengths = [(x[i] - x[j]).norm(dim=-1) for x in (*sample.keyframes, middle, sample.keyframes.mean(0))]
+        wanted = 0.5 * (lengths[0] + lengths[1])
+        bent, straight = (float((one - wanted).abs().mean()) for one in lengths[2:])
+        assert bent < 0.3 * straight
+
+    def test_too_many(self, bars: Shapes) -> None:
+        space = tm.ShapeSpace(bars.bases, bars.faces)
+        with pytest.raises(ValueError, match="3 key-frames have 2 components"):
+            space.components(3)
+        with pytest.raises(ValueError, match="one key-frame alone does not vary"):
+            tm.ShapeSpace(bars.bases[:1], bars.faces).variation()
+
+
+def test_the_mean_has_the_shape_of_a_blend(bars: Shapes) -> None:
+    space = tm.ShapeSpace(bars.bases, bars.faces)
+    weights = torch.full((3,), 1 / 3, dtype=torch.float64)
+    torch.testing.assert_close(space.mean(), tm.Blend(bars.bases, bars.faces, "fast")(bars.keyframes, weights))
+    one = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    assert torch.equal(space.mean(one), space.keyframes(one)[1])

@@ -1,0 +1,186 @@
+"""Shapes that meet observed points: distance, gradients, outliers, errors."""
+
+import pytest
+import torch
+from conftest import Shapes
+from test_coordinates import far
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rotations import exp
+from torch_modal.statistics.fit import Fit, followed
+from torch_modal.statistics.observations import Observations
+from torch_modal.statistics.patches import LocalMixtures, Patches
+
+DOUBLE = torch.float64
+
+
+def markers(x: Tensor, n: int = 20) -> Tensor:
+    """Vertices that are far from each other."""
+    found, distances = [0], (x - x[0]).norm(dim=-1)
+    while len(found) < n:
+        found.append(int(distances.argmax()))
+        distances = torch.minimum(distances, (x - x[found[-1]]).norm(dim=-1))
+    return torch.tensor(found)
+
+
+@pytest.fixture(scope="module")
+def creature() -> tuple[tm.ShapeSpace, Tensor]:
+    """All poses but one, and that one."""
+    sample = load_sample("creature")
+    bases = tm.extract_bases(sample.keyframes, sample.faces, 8, progress=False)
+    return tm.ShapeSpace([basis for k, basis in enumerate(bases) if k != 2], sample.faces), sample.keyframes[2]
+
+
+@pytest.fixture(scope="module")
+def space(bars: Shapes) -> tm.ShapeSpace:
+    return tm.ShapeSpace(bars.bases, bars.faces, dtype=DOUBLE)
+
+
+def test_a_pose_that_is_not_among_the_keyframes(creature: tuple[tm.ShapeSpace, Tensor]) -> None:
+    space, truth = creature
+    picked = markers(truth)
+    turn = exp(torch.tensor([0.2, 2.0, -0.4], dtype=DOUBLE))
+    moved = truth @ turn.mT + 5
+    found = space.fit(moved[picked], picked)
+
+    def error(x: Tensor) -> float:
+        return float((x - moved).norm(dim=-1).mean())
+
+    shapes = space.keyframes(truth)
+    nearest = min(error(best_fit(x, moved, torch.ones(len(x)).to(x)).apply(x)) for x in shapes)
+    linear = _linear(shapes, moved, picked)
+    assert error(found.shape) < 0.5 * error(linear)
+    assert error(found.shape) < 0.35 * nearest
+    assert float(found.misses.max()) < 0.01 * float((truth.amax(0) - truth.amin(0)).norm())
+    torch.testing.assert_close(found.weights.sum(0), torch.ones(len(truth), dtype=DOUBLE))
+
+
+def _linear(shapes: Tensor, moved: Tensor, picked: Tensor) -> Tensor:
+    """The nearest shape of the linear span, seen at the picked vertices."""
+    pose = best_fit(shapes, moved.expand_as(shapes), torch.ones(len(moved), dtype=DOUBLE))
+    aligned = pose.apply(shapes)
+    off = (aligned[1:] - aligned[0])[:, picked].flatten(1)
+    ridge = 1e-4 * float(off.square().sum(1).mean()) * torch.eye(len(off), dtype=DOUBLE)
+    right = off @ (moved[picked] - aligned[0, picked]).flatten()
+    weights = torch.linalg.solve(off @ off.mT + ridge, right)
+    return aligned[0] + torch.einsum("k,kvc->vc", weights, aligned[1:] - aligned[0])
+
+
+def test_a_rigid_motion_of_the_points_moves_the_shape(space: tm.ShapeSpace, bars: Shapes) -> None:
+    truth = tm.Blend(bars.bases, bars.faces)(bars.keyframes, torch.tensor([0.3, 0.4, 0.3], dtype=DOUBLE))
+    picked = markers(truth, 12)
+    turn = exp(torch.tensor([1.0, -2.0, 0.5], dtype=DOUBLE))
+    one, other = space.fit(truth[picked], picked), space.fit(truth[picked] @ turn.mT - 7, picked)
+    torch.testing.assert_close(one.shape @ turn.mT - 7, other.shape, rtol=0, atol=1e-6)
+    batch = space.fit(torch.stack([truth[picked], truth[picked] @ turn.mT - 7]).float(), picked)
+    assert batch.shape.shape == (2, space.n_vertices, 3) and batch.shape.dtype == torch.float32
+    torch.testing.assert_close(batch.shape[0].double(), one.shape, rtol=0, atol=1e-4)
+
+
+def test_gradients_are_those_of_weights_and_pose(
+    space: tm.ShapeSpace, bars: Shapes, generator: torch.Generator
+) -> None:
+    variation = space.variation()
+    picked = markers(bars.keyframes[1], 12)
+    points = 0.5 * (bars.keyframes[1] + bars.keyframes[2])[picked]
+    about = torch.full((3,), 1 / 3, dtype=DOUBLE)
+    taken = torch.randn(space.n_vertices, 3, generator=generator, dtype=DOUBLE)
+    move = torch.randn(points.shape, generator=generator, dtype=DOUBLE)
+
+    def assembled(points: Tensor) -> Tensor:
+        to = Observations(points, picked, torch.ones(len(points), dtype=DOUBLE))
+        given = Fit(variation, to, about)
+        x = given.shape(given.solved(False)[0])
+        return (best_fit(x[picked], points, to.weights).apply(x) * taken).sum()
+
+    ends = [assembled(points + s * 1e-5 * move) for s in (1, -1)]
+    expected = float(ends[0] - ends[1]) / 2e-5
+    leaf = points.clone().requires_grad_()
+    found = space.fit(leaf, picked)
+    assert torch.equal(found.shape.detach(), space.fit(points, picked).shape)
+    # The elastic steps are carried along by the pose; without them the gradient is exact.
+    to = Observations(leaf, picked, torch.ones(len(points), dtype=DOUBLE))
+    given = Fit(variation, to._replace(points=points), about)
+    x = given.shape(followed(given, given.solved(False)[0], to))
+    (best_fit(x[picked], leaf, to.weights).apply(x) * taken).sum().backward()
+    assert leaf.grad is not None
+    assert float((leaf.grad * move).sum()) == pytest.approx(expected, rel=1e-5)
+    leaf.grad = None
+    (found.shape * taken).sum().backward()
+    assert float((leaf.grad * move).sum()) == pytest.approx(expected, rel=0.2)
+
+
+def test_outliers_are_ignored_if_asked(creature: tuple[tm.ShapeSpace, Tensor]) -> None:
+    space, truth = creature
+    picked = markers(truth, 30)
+    points = truth[picked].clone()
+    size = float((truth.amax(0) - truth.amin(0)).norm())
+    points[[3, 17]] += torch.tensor([0.0, 0.4 * size, 0.0], dtype=DOUBLE)
+    plain, robust = (space.fit(points, picked, robust=robust) for robust in (False, True))
+
+    def error(x: Tensor) -> float:
+        return float((x - truth).norm(dim=-1).mean())
+
+    assert error(robust.shape) < 0.3 * error(plain.shape)
+    assert float(robust.trust[[3, 17]].max()) < 0.05 and float(robust.trust.median()) > 0.5
+
+
+def test_a_keyframe_comes_back(space: tm.ShapeSpace, bars: Shapes) -> None:
+    picked = markers(bars.keyframes[1])
+    for near in (None, 1, torch.tensor([0.0, 1.0, 0.0])):
+        assert far(space.fit(bars.keyframes[1][picked], picked, near=near).shape, bars.keyframes[1]) < 0.01
+
+
+def test_what_no_mixture_meets_falls_back_to_a_keyframe(
+    space: tm.ShapeSpace, bars: Shapes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    variation = space.variation()
+    monkeypatch.setattr(variation, "relaxed", lambda x, *_: 3 * x)
+    picked = markers(bars.keyframes[1])
+    found = space.fit(bars.keyframes[1][picked], picked)
+    assert far(found.shape, bars.keyframes[1]) < 1e-9
+    assert torch.equal(found.weights[1], torch.ones(space.n_vertices, dtype=DOUBLE))
+
+
+@pytest.mark.parametrize(
+    "points, vertices, near, words",
+    [
+        (torch.zeros(2, 3), torch.tensor([0, 1]), None, "n of 3 or more"),
+        (torch.full((3, 3), torch.nan), torch.tensor([0, 1, 2]), None, "not finite"),
+        (torch.zeros(3, 3), torch.tensor([0, 1]), None, "one vertex index for each"),
+        (torch.zeros(3, 3), torch.tensor([0, 1, 10**6]), None, "lie in 0 to 163"),
+        (torch.zeros(3, 3), torch.tensor([0, 1, 1]), None, "three vertices"),
+        (torch.zeros(3, 3), torch.tensor([0, 1, 2]), 3, "one of 3 key-frames"),
+        (torch.zeros(3, 3), torch.tensor([0, 1, 2]), torch.tensor([0.5, 0.5, 0.5]), "add up to one"),
+    ],
+)
+def test_arguments_that_do_not_fit(
+    space: tm.ShapeSpace, points: Tensor, vertices: Tensor, near: object, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        space.fit(points, vertices, near=near)  # type: ignore[arg-type]
+
+
+class TestPatches:
+    def test_they_share_all_vertices(self, space: tm.ShapeSpace) -> None:
+        variation = space.variation()
+        patches = Patches(variation.coordinates.mean, variation.coordinates.reconstruction)
+        torch.testing.assert_close(patches.shares.sum(0), torch.ones(space.n_vertices, dtype=DOUBLE))
+        torch.testing.assert_close(patches.masses.sum(1), torch.ones(len(patches), dtype=DOUBLE))
+
+    def test_a_mixture_is_recognised_whatever_its_pose(self, space: tm.ShapeSpace) -> None:
+        variation = space.variation()
+        turn = exp(torch.tensor([1.0, -2.0, 0.5], dtype=DOUBLE))
+        for k, x in enumerate(variation.shapes):
+            weights = variation.mixtures.weights(x @ turn.mT + 1)
+            assert float((weights[k] - 1).abs().mean()) < 0.1
+
+    def test_equal_shapes_share_a_patch(self, space: tm.ShapeSpace) -> None:
+        variation = space.variation()
+        twice = variation.shapes[[0, 0]]
+        patches = Patches(variation.coordinates.mean, variation.coordinates.reconstruction)
+        weights = LocalMixtures(patches, twice).weights(twice[0])
+        torch.testing.assert_close(weights, torch.full_like(weights, 0.5))

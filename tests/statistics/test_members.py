@@ -1,0 +1,81 @@
+"""New members of a shape space, and the transform that draws them."""
+
+import pytest
+import torch
+from conftest import Shapes
+from test_coordinates import far
+
+import torch_modal as tm
+from torch_modal.geometry.connectivity import Connectivity
+
+
+@pytest.fixture(scope="module")
+def space(bars: Shapes) -> tm.ShapeSpace:
+    return tm.ShapeSpace(bars.bases, bars.faces, dtype=torch.float64)
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_same_seed_has_the_same_members(space: tm.ShapeSpace) -> None:
+    one, other = (space.sample(3, seeded()) for _ in range(2))
+    assert torch.equal(one, other) and one.shape == (3, space.n_vertices, 3) and one.dtype == torch.float64
+    assert float((space.sample(3, seeded(1)) - one).abs().max()) > 0.01
+    assert len(space.sample(0)) == 0
+
+
+def test_edges_keep_the_lengths_of_the_keyframes(space: tm.ShapeSpace, bars: Shapes) -> None:
+    i, j = torch.tensor(Connectivity(bars.faces.numpy()).edges).unbind(1)
+    lengths = (bars.keyframes[:, i] - bars.keyframes[:, j]).norm(dim=-1)
+    members = space.sample(20, seeded())
+    found = (members[:, i] - members[:, j]).norm(dim=-1)
+    beyond = torch.relu(found - lengths.amax(0)) + torch.relu(lengths.amin(0) - found)
+    assert float((beyond / lengths.mean(0)).mean()) < 0.01
+    variation = space.variation()
+    most = max(variation.folds(x) for x in bars.keyframes)
+    assert max(variation.folds(x) for x in members) <= most
+
+
+def test_a_draw_that_folds_is_made_less_local(space: tm.ShapeSpace, monkeypatch: pytest.MonkeyPatch) -> None:
+    variation = space.variation()
+    weights, factors = variation.draw(1.0, 3.0, seeded())
+    smoother = variation.member(weights, 0.25 * factors)[0]
+    # Of the given shapes none folds, of the first two draws each does.
+    counts = iter([0, 0, 0, 1, 1, 0])
+    monkeypatch.setattr(variation, "folds", lambda _: next(counts))
+    assert torch.equal(variation.member(weights, factors)[0], smoother)
+
+
+def test_concentration_and_locality(space: tm.ShapeSpace) -> None:
+    variation = space.variation()
+    few, many = (torch.stack([variation.draw(c, 0.0, seeded(i))[0] for i in range(50)]) for c in (0.1, 100.0))
+    assert float(few.amax(1).mean()) > 0.85 and float(many.amax(1).mean()) < 0.45
+    weights, factors = variation.draw(1.0, 0.0, seeded())
+    assert not bool(factors.any())
+    local = variation.member(weights, factors)[1]
+    torch.testing.assert_close(local, weights[:, None].expand_as(local))
+
+
+@pytest.mark.parametrize("options", [{"concentration": 0.0}, {"locality": -1.0}, {"concentration": float("nan")}])
+def test_densities_that_do_not_exist(space: tm.ShapeSpace, options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="concentration is above 0"):
+        space.sample(1, **options)
+    with pytest.raises(ValueError, match="concentration is above 0"):
+        tm.RandomBlend(**options)
+
+
+class TestRandomBlend:
+    def test_replaces_shapes_in_their_pose(self, space: tm.ShapeSpace, bars: Shapes) -> None:
+        transform = tm.RandomBlend(p=1.0, generator=seeded(), space=space)
+        given = bars.keyframes[[0, 1]].float() + 10
+        found = transform(given)
+        assert found.shape == given.shape and found.dtype == torch.float32
+        torch.testing.assert_close(found.mean(1), given.mean(1), rtol=0, atol=0.2)
+        assert torch.equal(transform(given, transform.params), found)
+        assert min(far(found[0].double(), x) for x in bars.keyframes) > 1e-3
+
+    def test_leaves_others_alone(self, space: tm.ShapeSpace, bars: Shapes) -> None:
+        assert torch.equal(tm.RandomBlend(p=0.0, space=space)(bars.keyframes), bars.keyframes)
+        with pytest.raises(ValueError, match="needs key-frames and modes"):
+            tm.RandomBlend(p=1.0)(bars.keyframes)

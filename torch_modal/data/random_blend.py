@@ -1,0 +1,57 @@
+"""New members of a shape space in the place of given shapes."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch
+from torch_modal.data.space import ShapeSpace, check_density
+from torch_modal.geometry.rigid import best_fit
+
+
+class RandomBlend(ShapeAugmentation):
+    """Replaces shapes by random mixtures of all key-frames (:meth:`ShapeSpace.sample`), aligned with the given shapes.
+
+    Labels of the vertices stay, and so do those of shapes: give it shapes whose labels all key-frames share. The result
+    has no gradient.
+
+    Args:
+        concentration: As for :meth:`ShapeSpace.sample`.
+        locality: Likewise.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``concentration`` or ``locality`` is out of range.
+    """
+
+    shown = ("concentration", "locality")
+    uses_keyframes = True
+
+    def __init__(self, concentration: float = 1.0, locality: float = 1.0, p: float = 0.5, **options: Any) -> None:
+        super().__init__(p, **options)
+        check_density(concentration, locality)
+        self.concentration, self.locality = concentration, locality
+
+    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+        """``weights`` of the key-frames, and ``factors`` by which they vary over the surface."""
+        variation = self._space(space).variation()
+        drawn = [variation.draw(self.concentration, self.locality, generator) for _ in range(n)]
+        if not drawn:
+            return {"weights": torch.zeros(0, len(variation)), "factors": torch.zeros(0, len(variation), 0)}
+        weights, factors = (torch.stack(part) for part in zip(*drawn, strict=True))
+        return {"weights": weights, "factors": factors}
+
+    @torch.no_grad()
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
+    ) -> ShapeBatch:
+        """Draw a member for each shape."""
+        space = self._space(space)
+        assert batch.given is not None
+        variation, areas = space.variation(), space.reconstruction(batch.shapes.device).areas.to(batch.shapes)
+        rows = zip(params["weights"].double().cpu(), params["factors"].double().cpu(), strict=True)
+        found = torch.stack([variation.member(*row)[0] for row in rows]).to(batch.shapes)
+        shapes: Tensor = best_fit(found, batch.shapes, areas).apply(found)
+        return batch._replace(shapes=shapes, nearest=space.nearest(shapes), given=torch.zeros_like(batch.given))
