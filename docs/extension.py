@@ -51,7 +51,7 @@ def directive_for(name: str) -> list[str]:
     """The autodoc directive of a public name."""
     value = getattr(tm, name)
     if inspect.ismodule(value):
-        return [f".. automodule:: torch_modal.{name}", ""]
+        return [f".. automodule:: torch_modal.{name}", "   :members:", "   :imported-members:", ""]
     if inspect.isclass(value):
         kind = "exception" if issubclass(value, BaseException) else "class"
         bases = [] if value.__bases__ == (object,) else ["   :show-inheritance:"]

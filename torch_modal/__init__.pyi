@@ -1,5 +1,6 @@
 """The public names, and the modules that they are loaded from when they are first used."""
 
+from . import losses as losses
 from .codec.compress import Compressed as Compressed
 from .codec.compress import compress as compress
 from .codec.sequence import ModalSequence as ModalSequence

@@ -35,6 +35,7 @@ FLOORS = [
     "motion",
     "registration",
     "statistics",
+    "losses",
     "codec",
     "data",
     "view",

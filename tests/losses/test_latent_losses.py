@@ -1,0 +1,167 @@
+"""Losses on latent spaces: against dense Hessians and differences, rigid motions, decoders of all kinds."""
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor, nn
+
+import torch_modal as tm
+from torch_modal.geometry.rotations import exp
+
+DOUBLE = torch.float64
+
+
+class Bending(nn.Module):
+    """A key-frame, displacements of a small network, and a rotation by the last latent."""
+
+    def __init__(self, shapes: Shapes, generator: torch.Generator) -> None:
+        super().__init__()
+        self.x = shapes.keyframes[0]
+        first, second = (
+            torch.randn(*size, generator=generator, dtype=DOUBLE) for size in ((3, 8), (8, self.x.numel()))
+        )
+        self.first, self.second = nn.Parameter(first), nn.Parameter(0.05 * second)
+
+    def forward(self, z: Tensor) -> Tensor:
+        x = self.x + (torch.tanh(z[:, :3] @ self.first) @ self.second).view(-1, *self.x.shape)
+        axis = torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE)
+        return x @ exp(z[:, 3:] * axis).mT + z[:, None, 3:]
+
+
+@pytest.fixture
+def decoder(bars: Shapes, generator: torch.Generator) -> Bending:
+    return Bending(bars, generator)
+
+
+@pytest.fixture
+def z(generator: torch.Generator) -> Tensor:
+    return 0.3 * torch.randn(2, 4, generator=generator, dtype=DOUBLE)
+
+
+class TestLatentElasticity:
+    @pytest.mark.parametrize("step", [None, 1e-4])
+    def test_against_the_dense_hessian(self, bars: Shapes, decoder: Bending, z: Tensor, step: float | None) -> None:
+        options = {"alpha": 1.0, "beta": 0.01, "gamma": 0.1}
+        shell = tm.losses.ShellLoss(bars.faces, **options)
+        mean, roots = (
+            tm.losses.LatentElasticity(bars.faces, spectrum, step=step, **options)(decoder, z)  # type: ignore[arg-type]
+            for spectrum in ("mean", "roots")
+        )
+        for i, own in enumerate(z):
+            x = decoder(own[None])[0].detach()
+            hessian = torch.func.hessian(lambda y, x=x: shell(y, x))(x).reshape(x.numel(), -1)
+            jacobian = torch.func.jacrev(lambda c: decoder(c[None])[0].flatten())(own)
+            values = torch.linalg.eigvalsh(0.5 * jacobian.mT @ hessian @ jacobian)
+            assert float(values[0]) < 1e-9 * float(values[-1]), "the latent that only moves the shape costs nothing"
+            assert float(mean[i]) == pytest.approx(float(values.mean()), rel=1e-6)
+            assert float(roots[i]) == pytest.approx(float(values.clamp_min(0).sqrt().mean()), rel=1e-3)
+
+    @pytest.mark.parametrize("spectrum", ["mean", "roots"])
+    @pytest.mark.parametrize("step", [None, 1e-2])
+    def test_gradients(self, bars: Shapes, decoder: Bending, z: Tensor, spectrum: str, step: float | None) -> None:
+        loss = tm.losses.LatentElasticity(bars.faces, spectrum, step=step)  # type: ignore[arg-type]
+        move = torch.sin(torch.arange(z.numel(), dtype=DOUBLE)).view_as(z)
+        ends = [float(loss(decoder, z + s * move).sum()) for s in (1e-5, -1e-5)]
+        leaf = z.clone().requires_grad_()
+        loss(decoder, leaf).sum().backward()
+        assert leaf.grad is not None and decoder.second.grad is not None
+        assert float((leaf.grad * move).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
+        weight = decoder.second.detach().clone()
+        step_ = 1e-5 * torch.sin(torch.arange(weight.numel(), dtype=DOUBLE)).view_as(weight)
+        values = []
+        for sign in (1, -1):
+            decoder.second.data = weight + sign * step_
+            values.append(float(loss(decoder, z).sum()))
+        assert float((decoder.second.grad * step_).sum()) == pytest.approx((values[0] - values[1]) / 2, rel=1e-6)
+
+    def test_random_directions_estimate_the_mean(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+        every = tm.losses.LatentElasticity(bars.faces, "mean")(decoder, z)
+        one = tm.losses.LatentElasticity(bars.faces, "mean", directions=1)
+        generator = torch.Generator().manual_seed(0)
+        drawn = torch.stack([one(decoder, z, generator).detach() for _ in range(300)])
+        torch.testing.assert_close(drawn.mean(0), every.detach(), rtol=0.15, atol=0)
+        again = one(decoder, z, torch.Generator().manual_seed(0))
+        torch.testing.assert_close(again.detach(), drawn[0], rtol=0, atol=0)
+
+    def test_leading_dimensions_and_dtype(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+        loss = tm.losses.LatentElasticity(bars.faces)
+        torch.testing.assert_close(loss(decoder, z[:, None]), loss(decoder, z)[:, None])
+        single = loss.to(torch.float32)(lambda own: decoder(own.double()).float(), z.float())
+        assert single.dtype == torch.float32
+        torch.testing.assert_close(single.double(), loss(decoder, z), rtol=1e-3, atol=0)
+
+    def test_decoders_without_forward_mode(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+        class Backward(torch.autograd.Function):
+            @staticmethod
+            def forward(ctx: object, x: Tensor) -> Tensor:
+                return x.clone()
+
+            @staticmethod
+            def backward(ctx: object, grad: Tensor) -> Tensor:
+                return grad
+
+        def own(z: Tensor) -> Tensor:
+            return Backward.apply(decoder(z))  # type: ignore[no-any-return]
+
+        with pytest.raises((NotImplementedError, RuntimeError), match="step="):
+            tm.losses.LatentElasticity(bars.faces)(own, z)
+        found = tm.losses.LatentElasticity(bars.faces, step=1e-4)(own, z)
+        torch.testing.assert_close(found, tm.losses.LatentElasticity(bars.faces)(decoder, z), rtol=1e-5, atol=0)
+
+    @pytest.mark.parametrize(
+        "options, words",
+        [({"spectrum": "root"}, "'roots' or 'mean'"), ({"directions": 0}, "1 or more"), ({"step": 0.0}, "above 0")],
+    )
+    def test_arguments(self, bars: Shapes, options: dict[str, object], words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            tm.losses.LatentElasticity(bars.faces, **options)  # type: ignore[arg-type]
+
+    def test_flat_outputs(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+        with pytest.raises(ValueError, match=r"makes shapes \(2, V, 3\)"):
+            tm.losses.LatentElasticity(bars.faces)(lambda z: decoder(z).flatten(1), z)
+
+
+class TestPathEnergy:
+    def test_is_the_sum_over_the_steps(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+        codes = torch.stack([z[0], 0.5 * (z[0] + z[1]), z[1]])
+        shell = tm.losses.ShellLoss(bars.faces)
+        x = decoder(codes)
+        expected = 2 * (shell(x[1], x[0]) + shell(x[2], x[1]))
+        path = tm.losses.PathEnergy(bars.faces)
+        torch.testing.assert_close(path(decoder, codes), expected)
+        torch.testing.assert_close(path(decoder, torch.stack([codes, codes]))[1], expected)
+
+    def test_straight_lines_become_motions(self, bars: Shapes) -> None:
+        """A linear decoder of two key-frames and a third latent that gives back what the line shears away."""
+        x = bars.keyframes
+        between = tm.InBetween(bars.bases[:2], bars.faces, "fast")(x[0], x[1], 0.5)
+        off = between - 0.5 * (x[0] + x[1])
+
+        def decoder(z: Tensor) -> Tensor:
+            w = z[:, :1, None]
+            return (1 - w) * x[0] + w * x[1] + z[:, 1:, None] * off
+
+        path = tm.losses.PathEnergy(bars.faces)
+        ends = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=DOUBLE)
+        inner = torch.tensor([[0.25, 0.0], [0.5, 0.0], [0.75, 0.0]], dtype=DOUBLE).requires_grad_()
+
+        def energy() -> Tensor:
+            value: Tensor = path(decoder, torch.cat([ends[:1], inner, ends[1:]]))
+            return value
+
+        straight = energy().item()
+        optimizer = torch.optim.LBFGS([inner], max_iter=50, line_search_fn="strong_wolfe")
+
+        def closure() -> Tensor:
+            optimizer.zero_grad()
+            value = energy()
+            value.backward()
+            return value
+
+        optimizer.step(closure)
+        assert energy().item() < 0.75 * straight
+        assert 0.8 < float(inner[1, 1].detach()) < 1.3
+
+    def test_one_code(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+        with pytest.raises(ValueError, match="two codes or more"):
+            tm.losses.PathEnergy(bars.faces)(decoder, z[:1])

@@ -1,0 +1,122 @@
+"""The shell energy as a loss: units, refinement, gradients, errors."""
+
+import pytest
+import torch
+import trimesh
+from conftest import Shapes
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+from torch_modal.geometry.rotations import exp
+
+DOUBLE = torch.float64
+
+
+def noisy(x: Tensor, generator: torch.Generator, size: float = 0.02) -> Tensor:
+    return x + size * torch.randn(x.shape, generator=generator, dtype=DOUBLE)
+
+
+@pytest.mark.parametrize("name", ["hand", "creature"])
+def test_units_and_poses_change_nothing(name: str) -> None:
+    sample = load_sample(name)
+    loss = tm.losses.ShellLoss(sample.faces)
+    a, b = sample.keyframes[:2]
+    turn = exp(torch.tensor([0.4, -1.1, 0.3], dtype=DOUBLE))
+    expected = float(loss(b, a))
+    assert expected > 1e-3
+    assert float(loss(1000 * b, 1000 * a)) == pytest.approx(expected, rel=1e-9)
+    assert float(loss(b @ turn.mT + 5, a - 3)) == pytest.approx(expected, rel=1e-9)
+    assert float(loss(a @ turn.mT, a)) < 1e-20
+    single = tm.losses.ShellLoss(sample.faces).to(torch.float32)
+    assert float(single(1e-3 * b.float(), 1e-3 * a.float())) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["hand", "creature"])
+def test_a_refined_mesh_has_the_same_value(name: str) -> None:
+    sample = load_sample(name)
+    a, b = (x.numpy() for x in sample.keyframes[:2])
+    faces = sample.faces.numpy()
+    coarse = tm.losses.ShellLoss(sample.faces).terms_of(sample.keyframes[1], sample.keyframes[0])
+
+    def refined(subdivide: object) -> tm.losses.ShellTerms:
+        (x, own), (y, _) = (subdivide(x, faces) for x in (a, b))  # type: ignore[operator]
+        return tm.losses.ShellLoss(torch.from_numpy(own)).terms_of(torch.from_numpy(y), torch.from_numpy(x))
+
+    smooth = refined(lambda x, f: trimesh.remesh.subdivide_loop(x, f, 1))
+    assert float(smooth.stretch) == pytest.approx(float(coarse.stretch), rel=0.02)
+    assert float(smooth.bend) == pytest.approx(float(coarse.bend), rel=0.05)
+    cut = refined(trimesh.remesh.subdivide)
+    assert float(cut.stretch) == pytest.approx(float(coarse.stretch), rel=1e-9)
+    assert float(cut.bend) == pytest.approx(2 * float(coarse.bend), rel=1e-9)
+
+
+def test_terms_are_what_they_are_said_to_be(bars: Shapes) -> None:
+    loss = tm.losses.ShellLoss(bars.faces, alpha=3.0, beta=0.5, gamma=2.0)
+    x = bars.keyframes[0]
+    terms = loss.terms_of(1.1 * x, x)
+    assert float(terms.stretch) == pytest.approx(0.01)
+    assert float(terms.bend) < 1e-20
+    assert float(terms.volume) == pytest.approx((1.1**3 - 1) ** 2)
+    assert float(loss(1.1 * x, x)) == pytest.approx(3 * 0.01 + 2 * (1.1**3 - 1) ** 2)
+
+
+def test_open_surfaces_have_no_volume(generator: torch.Generator) -> None:
+    n = torch.linspace(0, 1, 6, dtype=DOUBLE)
+    x = torch.stack([*torch.meshgrid(n, n, indexing="ij"), torch.zeros(6, 6, dtype=DOUBLE)], -1).view(-1, 3)
+    i = torch.arange(30).view(5, 6)[:, :5].flatten()
+    faces = torch.cat([torch.stack([i, i + 6, i + 1], 1), torch.stack([i + 1, i + 6, i + 7], 1)])
+    loss = tm.losses.ShellLoss(faces)
+    bent = x + torch.tensor([0.0, 0.0, 0.3]) * (x[:, :1] - 0.5) ** 2
+    terms = loss.terms_of(bent, x)
+    assert float(terms.volume) == 0 and float(loss(bent, x)) < 0.02
+    assert bool(loss(noisy(x, generator), x).isfinite())
+
+
+def test_gradients_and_double_backward(bars: Shapes, generator: torch.Generator) -> None:
+    loss = tm.losses.ShellLoss(bars.faces, beta=0.01, gamma=0.1)
+    x, rest = (noisy(bars.keyframes[k], generator) for k in (1, 0))
+    move = torch.randn(2, *x.shape, generator=generator, dtype=DOUBLE)
+
+    def value(s: float) -> Tensor:
+        return loss(x + s * move[0], rest + s * move[1])
+
+    ends = [value(s).item() for s in (1e-6, -1e-6)]
+    leaves = [y.clone().requires_grad_() for y in (x, rest)]
+    first = torch.autograd.grad(loss(*leaves), leaves, create_graph=True)
+    along = sum((part * way).sum() for part, way in zip(first, move, strict=True))
+    assert isinstance(along, Tensor)
+    assert along.item() == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-6)
+    second = torch.autograd.grad(along, leaves)
+    twice = float(sum((part * way).sum() for part, way in zip(second, move, strict=True)))
+    slopes = []
+    for s in (1e-5, -1e-5):
+        moved = [(y + s * way).requires_grad_() for y, way in zip((x, rest), move, strict=True)]
+        found = torch.autograd.grad(loss(*moved), moved)
+        slopes.append(float(sum((part * way).sum() for part, way in zip(found, move, strict=True))))
+    assert twice == pytest.approx((slopes[0] - slopes[1]) / 2e-5, rel=1e-5)
+
+
+def test_batches_broadcast(bars: Shapes, generator: torch.Generator) -> None:
+    loss = tm.losses.ShellLoss(bars.faces)
+    x = noisy(bars.keyframes[[0, 1]].repeat(2, 1, 1), generator).view(2, 2, -1, 3)
+    found = loss(x, bars.keyframes[2])
+    assert found.shape == (2, 2)
+    torch.testing.assert_close(found[1, 0], loss(x[1, 0], bars.keyframes[2]))
+    per_shape = torch.func.vmap(loss, in_dims=(0, None))(x[0], bars.keyframes[2])
+    torch.testing.assert_close(per_shape, found[0])
+
+
+def test_shapes_without_extent_have_finite_gradients(bars: Shapes) -> None:
+    loss = tm.losses.ShellLoss(bars.faces)
+    for x, rest in ((0 * bars.keyframes[0], bars.keyframes[0]), (bars.keyframes[0], 0 * bars.keyframes[0])):
+        leaf = x.clone().requires_grad_()
+        loss(leaf, rest).backward()
+        assert leaf.grad is not None and bool(leaf.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("shape", [(163, 3), (5, 164), (164, 3, 1)])
+def test_other_shapes(bars: Shapes, shape: tuple[int, ...]) -> None:
+    loss = tm.losses.ShellLoss(bars.faces)
+    with pytest.raises(ValueError, match="164 vertices that the faces name"):
+        loss(torch.zeros(shape), bars.keyframes[0])

@@ -1,0 +1,179 @@
+"""Elasticity of what a decoder makes of small steps, and of paths, in its latent space."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.autograd import lasting
+from torch_modal.losses.shell import BEND, VOLUME, ShellLoss
+
+Decoder = Callable[[Tensor], Tensor]
+
+# Added to eigenvalues below the root, as a part of their mean: the slope of a root is infinite at zero.
+FLOOR = 1e-6
+
+
+class LatentElasticity(nn.Module):
+    r"""How much shell energy a small step of the latent costs: small where latents move shapes as bodies move.
+
+    With the Jacobian ``J`` of the decoder and the Hessian ``H`` of :class:`ShellLoss` about the decoded shape, a step
+    ``u`` costs :math:`u^T G u` with :math:`G = \tfrac12 J^T H J`. Its eigenvalues are zero where the latent only turns
+    or shifts the shape. The loss is the mean of their square roots, as in ARAPReg (Huang et al. 2021), whose Hessian is
+    that of an as-rigid-as-possible energy, or of the eigenvalues themselves. ``H`` is Gauss and Newton's; no matrix of
+    vertices is made.
+
+    Args:
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        spectrum: ``"roots"``, or ``"mean"``, which one random direction estimates without bias.
+        directions: How many orthonormal directions of the latent are drawn at each call; all by default. Each costs
+            about two passes of the decoder.
+        step: Size of the steps in the latent by which the Jacobian is taken in central differences. None: by forward
+            mode, exact, for decoders whose operations have it.
+        alpha: Stiffnesses of :class:`ShellLoss`.
+        beta: Likewise.
+        gamma: Likewise.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+
+    def __init__(
+        self,
+        faces: Tensor,
+        spectrum: Literal["roots", "mean"] = "roots",
+        directions: int | None = None,
+        *,
+        step: float | None = None,
+        alpha: float | Tensor = 1.0,
+        beta: float | Tensor = BEND,
+        gamma: float | Tensor = VOLUME,
+    ) -> None:
+        super().__init__()
+        if spectrum not in ("roots", "mean"):
+            raise ValueError(f"spectrum is 'roots' or 'mean'; got {spectrum!r}")
+        if directions is not None and directions < 1:
+            raise ValueError(f"directions is 1 or more, or None for all; got {directions}")
+        if step is not None and not 0 < step < torch.inf:
+            raise ValueError(f"step is above 0, or None for forward mode; got {step}")
+        self.shell = ShellLoss(faces, alpha, beta, gamma)
+        self.spectrum, self.directions, self.step = spectrum, directions, step
+
+    def forward(self, decoder: Decoder, z: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The loss at each latent; gradients reach the latents and the parameters of the decoder.
+
+        Args:
+            decoder: Of latents ``(B, n)`` into shapes ``(B, V, 3)``, each for itself: no normalisation over the batch.
+            z: *Shape:* ``(..., n)``.
+            generator: Source of random directions.
+
+        Returns:
+            *Shape:* ``(...)``.
+
+        Raises:
+            ValueError: The decoder has another shape.
+            NotImplementedError: An operation of the decoder has no forward mode, and ``step`` is None.
+        """
+        flat = z.reshape(-1, z.shape[-1])
+        x, along = self._moved(decoder, flat, self._drawn(flat, generator))
+        gram = self._gram(x, along)
+        if self.spectrum == "mean":
+            return gram.diagonal(dim1=-2, dim2=-1).mean(-1).reshape(z.shape[:-1])
+        values = torch.linalg.eigvalsh(gram).clamp_min(0)
+        floor = FLOOR * values.mean(-1, keepdim=True) + torch.finfo(values.dtype).tiny
+        return (values + floor).sqrt().mean(-1).reshape(z.shape[:-1])
+
+    def _drawn(self, z: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Orthonormal directions. *Shape:* ``(k, n)``."""
+        n = z.shape[-1]
+        if self.directions is None or self.directions >= n:
+            return torch.eye(n).to(z)
+        device = z.device if generator is None else generator.device
+        drawn = torch.randn(n, self.directions, generator=generator, device=device, dtype=torch.float64)
+        return torch.linalg.qr(drawn)[0].mT.to(z)
+
+    def _moved(self, decoder: Decoder, z: Tensor, directions: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Decoded shapes, and their derivatives along directions of the latent. *Shape of each:* ``(B, V, 3)``."""
+        steps = [row.expand_as(z) for row in directions]
+        if self.step is not None:
+            both = [(decoder(z + self.step * row), decoder(z - self.step * row)) for row in steps]
+            return checked_decoded(decoder(z), z), [(up - down) / (2 * self.step) for up, down in both]
+        try:
+            found: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
+        except (NotImplementedError, RuntimeError) as error:
+            decoder(z)  # what is wrong without derivatives too has an error of its own
+            raise NotImplementedError(
+                f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
+            ) from error
+        return checked_decoded(found[0][0], z), [tangent for _, tangent in found]
+
+    def _gram(self, x: Tensor, along: list[Tensor]) -> Tensor:
+        """Products of displacements in the Hessian. *Shape:* ``(B, k, k)``."""
+        energy, scale = self.shell.energy, self.shell.scale(x)
+        reference = self.shell.against(scale * x)
+        at = energy.linearise(self.shell._rows(scale * x), reference)
+        each = [energy.rates(at, self.shell._rows(scale * field)) for field in along]
+        gram = x.new_zeros(len(x), len(along), len(along))
+        for weights, *rates in zip(reference.weights, *each, strict=True):
+            scaled = torch.stack(rates, 1) * weights.sqrt()  # (B, k, M)
+            gram = gram + scaled @ scaled.mT
+        return gram
+
+
+class PathEnergy(nn.Module):
+    r"""Elastic energy of a path of codes: :math:`(T-1) \sum_k W(x_{k+1}, x_k)` with :class:`ShellLoss` as ``W``.
+
+    The discrete path energy of Heeren et al. 2012, of decoded shapes. Minimised over the inner codes with the ends
+    fixed, a straight line in the latent becomes a motion in which the shapes bend more than they stretch; as a loss on
+    lines between codes, it teaches the decoder that lines are such motions.
+
+    Args:
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        alpha: Stiffnesses of :class:`ShellLoss`.
+        beta: Likewise.
+        gamma: Likewise.
+    """
+
+    @lasting
+    def __init__(
+        self,
+        faces: Tensor,
+        alpha: float | Tensor = 1.0,
+        beta: float | Tensor = BEND,
+        gamma: float | Tensor = VOLUME,
+    ) -> None:
+        super().__init__()
+        self.shell = ShellLoss(faces, alpha, beta, gamma)
+
+    def forward(self, decoder: Decoder, codes: Tensor) -> Tensor:
+        """The energy of each path.
+
+        Args:
+            decoder: Of latents ``(B, n)`` into shapes ``(B, V, 3)``.
+            codes: T of 2 or more. *Shape:* ``(..., T, n)``.
+
+        Returns:
+            *Shape:* ``(...)``.
+
+        Raises:
+            ValueError: There are fewer than two codes, or the decoder has another shape.
+        """
+        if codes.dim() < 2 or codes.shape[-2] < 2:
+            raise ValueError(f"a path has two codes or more, (..., T, n); got {tuple(codes.shape)}")
+        flat = codes.reshape(-1, codes.shape[-1])
+        x = checked_decoded(decoder(flat), flat)
+        x = x.view(*codes.shape[:-1], *x.shape[1:])
+        each: Tensor = self.shell(x[..., 1:, :, :], x[..., :-1, :, :])
+        return (codes.shape[-2] - 1) * each.sum(-1)
+
+
+def checked_decoded(x: Tensor, z: Tensor) -> Tensor:
+    """Decoded shapes.
+
+    Raises:
+        ValueError: They are not ``(B, V, 3)``.
+    """
+    if x.dim() != 3 or x.shape[-1] != 3 or len(x) != len(z):
+        raise ValueError(f"the decoder makes shapes ({len(z)}, V, 3) of latents {tuple(z.shape)}; got {tuple(x.shape)}")
+    return x
