@@ -53,6 +53,7 @@ from .motion.subdivide import frame_times as frame_times
 from .motion.subdivide import keyframe_places as keyframe_places
 from .motion.subdivide import linear_sequence as linear_sequence
 from .motion.subdivide import subdivide as subdivide
+from .passengers.passengers import Passengers as Passengers
 from .precompute.basis import ModalBasis as ModalBasis
 from .precompute.eigen import ModalAnalysisError as ModalAnalysisError
 from .precompute.modes import extract_bases as extract_bases

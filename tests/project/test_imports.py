@@ -32,6 +32,7 @@ FLOORS = [
     "inbetween",
     "contact",
     "layers",
+    "passengers",
     "motion",
     "registration",
     "statistics",

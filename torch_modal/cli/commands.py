@@ -38,6 +38,7 @@ def subdivide(args: argparse.Namespace) -> None:
     require_packages(animation)
 
     import torch_modal as tm
+    from torch_modal.passengers.proxy import Proxy, proxy_size
 
     n, spread = len(args.meshes), {"cyclic": args.cyclic, "n_frames": args.frames, "times": args.times}
     places = tm.keyframe_places(n, args.levels, **spread)
@@ -48,10 +49,12 @@ def subdivide(args: argparse.Namespace) -> None:
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
-    bases = tm.extract_bases(welded.keyframes, welded.faces, args.modes, **_precompute_options(args))
+    n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
+    carrier = Proxy(welded.keyframes, welded.faces, n_proxy) if n_proxy else None
+    moving = (carrier.keyframes, carrier.faces) if carrier else (welded.keyframes, welded.faces)
+    bases = tm.extract_bases(*moving, args.modes, **_precompute_options(args))
     solved = tm.subdivide(
-        welded.keyframes,
-        welded.faces,
+        *moving,
         args.levels,
         bases=bases,
         **spread,
@@ -60,6 +63,9 @@ def subdivide(args: argparse.Namespace) -> None:
         preset=args.preset,
         contact=args.contact,
     )
+    if carrier:
+        report(f"moved by a proxy of {carrier.keyframes.shape[1]} vertices (--proxy 0: by the whole mesh)")
+        solved = carrier.carried(solved, places, welded.keyframes)
     frames = welded.scatter(solved)
     keys = [place for place in places if place < len(frames)]
     frames[keys] = keyframes

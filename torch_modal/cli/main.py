@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli import check, commands, compress, precompute, register, view
+from torch_modal.cli import carry, check, commands, compress, precompute, register, view
 from torch_modal.cli.arguments import (
     CACHE_DIR,
     Formatter,
@@ -192,6 +192,13 @@ def build_parser() -> argparse.ArgumentParser:
         "--contact", action="store_true", help="keep parts from passing through each other (extra contact)"
     )
     sub.add_argument(
+        "--proxy",
+        type=number(int, 0),
+        metavar="N",
+        help="a coarser mesh of N vertices moves, and carries the detail; 0: the mesh itself (default: 20000, for "
+        "meshes of more than 100000 vertices)",
+    )
+    sub.add_argument(
         "--preset",
         choices=("accurate", "fast", "paper"),
         default="accurate",
@@ -236,6 +243,10 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("check", check.run, check.SUMMARY, check.DESCRIPTION, check.EXAMPLES)
     check.add_arguments(sub)
+
+    sub = command("carry", carry.run, carry.SUMMARY, carry.DESCRIPTION, carry.EXAMPLES)
+    carry.add_arguments(sub)
+    add_common(sub, cache_dir=None, all_of=False)
 
     sub = command("modes", commands.modes, "vibration modes of key-frames, as safetensors", MODES, MODES_EXAMPLES)
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="key-frames of one connectivity")

@@ -5,6 +5,7 @@ is patched here. plyfile could do so, but its license is the GPL.
 """
 
 import re
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -144,6 +145,10 @@ class PlyAsset(Asset):
         new = dict(zip("xyz", positions.T, strict=True))
         if "normals" in self.carries:
             new |= dict(zip(("nx", "ny", "nz"), self._carried.at(positions).T, strict=True))
+        return self.with_columns(new)
+
+    def with_columns(self, new: Mapping[str, FloatArray]) -> bytes:
+        """The file with other values of some properties of the vertices. *Shape of each:* ``(V,)``."""
         place, size = self._place
         if self._format != "ascii":
             rows = self._rows.copy()
@@ -156,8 +161,8 @@ class PlyAsset(Asset):
         columns = {at[name]: _text(column, properties[name].type == "f4") for name, column in new.items()}
         for number in range(self._vertex.length):
             words = lines[place + number].split()
-            for column, text in columns.items():
-                words[column] = text[number]
+            for place_in_row, text in columns.items():
+                words[place_in_row] = text[number]
             lines[place + number] = b" ".join(words)
         return self.data[: self._start] + b"\n".join(lines) + b"\n"
 

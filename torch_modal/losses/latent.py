@@ -6,8 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import lasting
-from torch_modal.losses.shell import BEND, VOLUME, ShellLoss
+from torch_modal.losses.shell import ShellLoss
 
 Decoder = Callable[[Tensor], Tensor]
 
@@ -31,9 +30,7 @@ class LatentElasticity(nn.Module):
             about two passes of the decoder.
         step: Size of the steps in the latent by which the Jacobian is taken in central differences. None: by forward
             mode, exact, for decoders whose operations have it.
-        alpha: Stiffnesses of :class:`ShellLoss`.
-        beta: Likewise.
-        gamma: Likewise.
+        stiffness: ``alpha``, ``beta`` and ``gamma`` of :class:`ShellLoss`.
 
     Raises:
         ValueError: An argument is out of range.
@@ -46,9 +43,7 @@ class LatentElasticity(nn.Module):
         directions: int | None = None,
         *,
         step: float | None = None,
-        alpha: float | Tensor = 1.0,
-        beta: float | Tensor = BEND,
-        gamma: float | Tensor = VOLUME,
+        **stiffness: float | Tensor,
     ) -> None:
         super().__init__()
         if spectrum not in ("roots", "mean"):
@@ -57,7 +52,7 @@ class LatentElasticity(nn.Module):
             raise ValueError(f"directions is 1 or more, or None for all; got {directions}")
         if step is not None and not 0 < step < torch.inf:
             raise ValueError(f"step is above 0, or None for forward mode; got {step}")
-        self.shell = ShellLoss(faces, alpha, beta, gamma)
+        self.shell = ShellLoss(faces, **stiffness)
         self.spectrum, self.directions, self.step = spectrum, directions, step
 
     def forward(self, decoder: Decoder, z: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -130,21 +125,12 @@ class PathEnergy(nn.Module):
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        alpha: Stiffnesses of :class:`ShellLoss`.
-        beta: Likewise.
-        gamma: Likewise.
+        stiffness: ``alpha``, ``beta`` and ``gamma`` of :class:`ShellLoss`.
     """
 
-    @lasting
-    def __init__(
-        self,
-        faces: Tensor,
-        alpha: float | Tensor = 1.0,
-        beta: float | Tensor = BEND,
-        gamma: float | Tensor = VOLUME,
-    ) -> None:
+    def __init__(self, faces: Tensor, **stiffness: float | Tensor) -> None:
         super().__init__()
-        self.shell = ShellLoss(faces, alpha, beta, gamma)
+        self.shell = ShellLoss(faces, **stiffness)
 
     def forward(self, decoder: Decoder, codes: Tensor) -> Tensor:
         """The energy of each path.

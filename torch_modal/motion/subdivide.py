@@ -23,6 +23,7 @@ from torch_modal.keyframes.check import check_keyframes
 from torch_modal.keyframes.times import checked_times
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.motion.path import Path
+from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
@@ -47,6 +48,7 @@ def subdivide(
     objective: Objective | None = None,
     solver: Solver | None = None,
     contact: bool | None = None,
+    proxy: int | None = None,
     progress: Progress = None,
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
@@ -75,6 +77,9 @@ def subdivide(
         contact: Whether parts are kept from passing through each other, in the place of what the objective says
             (docs/contact.md; extra ``contact``). The shapes between two key-frames are pushed apart together, by a
             displacement that is smooth in time.
+        proxy: Vertices of a coarser mesh, by the same edge collapses in all key-frames, that moves in the place of the
+            mesh and carries its detail (docs/passengers.md). 0: none. Default: 20,000 for meshes of more than 100,000
+            vertices whose bases are not given.
         progress: What is said while it goes on: see :data:`torch_modal.progress.Progress`.
 
     Returns:
@@ -92,6 +97,30 @@ def subdivide(
     keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2)
     n_keys = len(keyframes)
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
+    if bases is not None:
+        if proxy:
+            raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
+        proxy = 0
+    n_proxy = proxy_size(proxy, keyframes.shape[1])
+    if n_proxy:
+        carrier = Proxy(keyframes, working_faces, n_proxy)
+        shapes = subdivide(
+            carrier.keyframes,
+            carrier.faces,
+            levels,
+            n_modes=n_modes,
+            cyclic=cyclic,
+            n_frames=n_frames,
+            times=times,
+            smooth=smooth,
+            preset=preset,
+            objective=objective,
+            solver=solver,
+            contact=contact,
+            proxy=0,
+            progress=progress,
+        )
+        return carrier.carried(shapes, places, keyframes)
     chosen = settings(preset, objective, solver, contact)
     contacts = None
     if chosen.objective.contact:

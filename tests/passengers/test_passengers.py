@@ -1,0 +1,160 @@
+"""Points that follow a shape: rigid motions, the surface, fingers, gradients, dtypes, errors."""
+
+import pytest
+import torch
+import trimesh
+from conftest import Shapes
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.rotations import exp
+from torch_modal.passengers.binding import closest_on_triangles
+
+DOUBLE = torch.float64
+TURN = exp(torch.tensor([0.4, -1.1, 2.3], dtype=DOUBLE))
+
+
+def around(x: Tensor, faces: Tensor, n: int, off: float) -> Tensor:
+    """Points near a surface. *Shape:* ``(n, 3)``."""
+    mesh = trimesh.Trimesh(x.numpy(), faces.numpy(), process=False)
+    found = torch.from_numpy(trimesh.sample.sample_surface(mesh, n, seed=0)[0].copy())
+    size = float((x.amax(0) - x.amin(0)).norm())
+    return found + off * size * torch.randn(n, 3, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+
+
+@pytest.mark.parametrize("name", ["hand", "creature"])
+def test_rigid_motions_are_followed_exactly(name: str) -> None:
+    sample = load_sample(name)
+    x = sample.keyframes[0]
+    points = around(x, sample.faces, 5000, 0.02)
+    passengers = tm.Passengers(x, sample.faces, points)
+    torch.testing.assert_close(passengers(x), points, rtol=0, atol=1e-12)
+    moved = x @ TURN.mT + 3
+    torch.testing.assert_close(passengers(moved), points @ TURN.mT + 3, rtol=0, atol=1e-12)
+    for found in (passengers.rotations(moved), passengers.gradients(moved)):
+        torch.testing.assert_close(found, TURN.expand(5000, 3, 3), rtol=0, atol=1e-12)
+
+
+def test_points_of_the_surface_stay_on_it(bars: Shapes) -> None:
+    x, y = bars.keyframes[:2]
+    weights = torch.rand(len(bars.faces), 3, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    weights = weights / weights.sum(1, keepdim=True)
+    passengers = tm.Passengers(x, bars.faces, torch.einsum("fi,fic->fc", weights, x[bars.faces]))
+    found = passengers(y)
+    off = (found - torch.einsum("fi,fic->fc", weights, y[bars.faces])).norm(dim=1)
+    edges = (y[bars.faces[:, 0]] - y[bars.faces[:, 1]]).norm(dim=1)
+    # Rounder than the facets, but for corners of triangles, by less than a tenth of an edge.
+    assert float(off.max()) < 0.1 * float(edges.mean())
+    corners = tm.Passengers(x, bars.faces, x)
+    torch.testing.assert_close(corners(y), y, rtol=0, atol=1e-12)
+
+
+def test_neighbours_stay_neighbours() -> None:
+    """Points that are close to each other and to one part of the surface do not tear apart."""
+    sample = load_sample("hand")
+    x, y = sample.keyframes[:2]
+    points = around(x, sample.faces, 4000, 0.003)
+    step = 1e-5 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
+    one, other = (tm.Passengers(x, sample.faces, p)(y) for p in (points, points + step))
+    stretch = (one - other).norm(dim=1) / step.norm(dim=1)
+    assert float(stretch.median()) < 1.5 and float(stretch.quantile(0.995)) < 6
+
+
+def test_fingers_keep_their_points() -> None:
+    """What a point follows lies around one place of the surface, though fingers touch."""
+    sample = load_sample("hand")
+    x = sample.keyframes[1]
+    passengers = tm.Passengers(x, sample.faces, around(x, sample.faces, 4000, 0.02))
+    i, j = torch.tensor(Connectivity(sample.faces.numpy()).edges).unbind(1)
+    lengths = (x[i] - x[j]).norm(dim=1).numpy()
+    graph = coo_matrix((lengths, (i.numpy(), j.numpy())), shape=(len(x), len(x)))
+    graph = graph + graph.T
+    reach = 6 * float(lengths.max())
+    for row in passengers.weights:
+        assert dijkstra(graph, indices=row.indices[0], limit=reach)[row.indices].max() < reach
+
+
+def test_anchors_decide_between_parts() -> None:
+    """Two sheets on each other: points in the middle follow the one that they are said to belong to."""
+    n = torch.linspace(0, 1, 5, dtype=DOUBLE)
+    sheet = torch.stack([*torch.meshgrid(n, n, indexing="ij"), torch.zeros(5, 5, dtype=DOUBLE)], -1).view(-1, 3)
+    i = torch.arange(20).view(4, 5)[:, :4].flatten()
+    faces = torch.cat([torch.stack([i, i + 5, i + 1], 1), torch.stack([i + 1, i + 5, i + 6], 1)])
+    upper = torch.tensor([0.0, 0.0, 0.1])
+    x, both = torch.cat([sheet, sheet + upper]), torch.cat([faces, faces + 25])
+    y = torch.cat([sheet, sheet + upper + 1])
+    points = sheet[[6, 12]] + 0.4 * upper
+    assert float((tm.Passengers(x, both, points)(y) - points).abs().max()) < 1e-12
+    anchored = tm.Passengers(x, both, points, torch.tensor([25 + 6, -1]))(y)
+    torch.testing.assert_close(anchored, points + torch.tensor([[1.0], [0.0]]))
+
+
+def test_gradients_batches_and_transforms(bars: Shapes) -> None:
+    x, y = bars.keyframes[:2]
+    points = around(x, bars.faces, 200, 0.02)
+    passengers = tm.Passengers(x, bars.faces, points)
+    generator = torch.Generator().manual_seed(0)
+    move, taken = torch.randn(2, *y.shape, generator=generator, dtype=DOUBLE)
+    taken = taken.repeat(2, 1)[:200]
+    for function in (passengers, passengers.rotations, passengers.gradients):
+
+        def value(s: float | Tensor, function: object = function) -> Tensor:
+            found = function(y + s * move)  # type: ignore[operator]
+            return (found.view(200, -1)[:, :3] * taken).sum()
+
+        s = torch.zeros((), dtype=DOUBLE, requires_grad=True)
+        value(s).backward()
+        assert s.grad is not None
+        assert float(s.grad) == pytest.approx(float(value(1e-6) - value(-1e-6)) / 2e-6, rel=1e-6)
+    batch = torch.stack([x, y]).view(2, 1, *x.shape)
+    found = passengers(batch)
+    assert found.shape == (2, 1, 200, 3)
+    torch.testing.assert_close(found[1, 0], passengers(y))
+    torch.testing.assert_close(torch.func.vmap(passengers)(batch), found)
+
+
+def test_float32_far_from_the_origin(bars: Shapes) -> None:
+    x, y = bars.keyframes[:2]
+    points = around(x, bars.faces, 300, 0.02)
+    passengers = tm.Passengers((x + 100).float(), bars.faces, (points + 100).float())
+    expected = tm.Passengers(x, bars.faces, points)(y)
+    found = passengers((y + 100).float())
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double() - 100, expected, rtol=0, atol=1e-4)
+    with pytest.raises(ValueError, match=r"passengers\.to\(shapes\.dtype\)"):
+        passengers(y)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"points": torch.zeros(4, 2)}, "points holds finite numbers"),
+        ({"points": torch.full((4, 3), torch.nan)}, "points holds finite numbers"),
+        ({"reference": torch.zeros(5, 3)}, "the faces name vertex 163"),
+        ({"anchors": torch.tensor([0])}, "anchors hold a vertex"),
+    ],
+)
+def test_arguments(bars: Shapes, change: dict[str, Tensor], words: str) -> None:
+    given = {"reference": bars.keyframes[0], "faces": bars.faces, "points": torch.zeros(4, 3)} | change
+    with pytest.raises(ValueError, match=words):
+        tm.Passengers(**given)
+
+
+def test_closest_points_on_triangles() -> None:
+    """Against trimesh; triangles that are lines too."""
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.randn(500, 3, 3, generator=generator, dtype=DOUBLE)
+    corners[-20:, 2] = 0.5 * (corners[-20:, 0] + corners[-20:, 1])
+    points = 2 * torch.randn(500, 3, generator=generator, dtype=DOUBLE)
+    weights, distances = closest_on_triangles(points.numpy(), corners.numpy())
+    assert weights.min() >= 0 and abs(weights.sum(1) - 1).max() < 1e-12
+    expected = torch.from_numpy(trimesh.triangles.closest_point(corners[:480].numpy(), points[:480].numpy()))
+    found = torch.einsum("ni,nic->nc", torch.from_numpy(weights), corners)
+    torch.testing.assert_close(found[:480], expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close((found - points).norm(dim=1), torch.from_numpy(distances))
+    ends = torch.minimum(*((points[480:] - corners[480:, k]).norm(dim=1) for k in (0, 1)))
+    assert bool((torch.from_numpy(distances[480:]) <= ends + 1e-12).all())

@@ -1,0 +1,86 @@
+"""A coarse carrier in the place of a fine mesh: key-frames, detail, distance to the whole solve."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+from conftest import Shapes
+from torch import Tensor
+
+import torch_modal as tm
+from torch_modal.cli import main as cli
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.io.frames import save_frames
+from torch_modal.passengers.proxy import Proxy
+
+
+@pytest.fixture(scope="module")
+def rough(bars: Shapes) -> tuple[Tensor, Tensor]:
+    """The bars with 2,594 vertices and a relief. *Shape:* ``(3, V, 3)``, ``(F, 3)``."""
+    faces, shapes = bars.faces.numpy(), [x.numpy() for x in bars.keyframes]
+    for _ in range(2):
+        finer = [trimesh.remesh.subdivide_loop(x, faces, 1) for x in shapes]
+        shapes, faces = [x for x, _ in finer], finer[0][1]
+    height = 0.02 * torch.sin(20 * torch.from_numpy(shapes[0])).prod(1)[:, None].numpy()
+    normals = [trimesh.Trimesh(x, faces, process=False).vertex_normals for x in shapes]
+    return torch.stack([torch.from_numpy(x + height * n) for x, n in zip(shapes, normals, strict=True)]), (
+        torch.from_numpy(faces)
+    )
+
+
+def test_key_frames_come_back_and_shapes_are_near_those_of_the_whole(rough: tuple[Tensor, Tensor]) -> None:
+    keyframes, faces = rough
+    whole, carried = (
+        tm.subdivide(keyframes, faces, 1, n_modes=8, preset="fast", proxy=n, progress=False) for n in (0, 300)
+    )
+    assert carried.shape == whole.shape == (5, *keyframes.shape[1:])
+    assert torch.equal(carried[::2], keyframes)
+    size = float((keyframes[0].amax(0) - keyframes[0].amin(0)).norm())
+    assert float((carried - whole).norm(dim=-1)[1::2].mean()) < 3e-3 * size
+    i, j = torch.tensor(Connectivity(faces.numpy()).edges).unbind(1)
+    lengths = [(x[..., i, :] - x[..., j, :]).norm(dim=-1) for x in (keyframes, carried, whole)]
+    wanted = 0.5 * (lengths[0][:-1] + lengths[0][1:])
+    carried_error, whole_error = (float((x[1::2] / wanted - 1).abs().mean()) for x in lengths[1:])
+    assert carried_error < 1.3 * whole_error
+
+
+def test_cycles_and_numbers_of_frames(rough: tuple[Tensor, Tensor]) -> None:
+    keyframes, faces = rough
+    options = {"n_modes": 8, "preset": "fast", "proxy": 300, "progress": False}
+    cycle = tm.subdivide(keyframes, faces, 1, cyclic=True, **options)
+    assert len(cycle) == 6 and torch.equal(cycle[::2], keyframes)
+    single = tm.subdivide(keyframes.float(), faces, 1, n_frames=8, **options)
+    places = tm.keyframe_places(3, 1, n_frames=8)
+    assert single.dtype == torch.float32 and torch.equal(single[places], keyframes.float())
+
+
+def test_detail_is_that_of_both_ends(rough: tuple[Tensor, Tensor]) -> None:
+    keyframes, faces = rough
+    proxy = Proxy(keyframes[:2], faces, 300)
+    for passengers, carrier, x in zip(proxy.passengers, proxy.keyframes, keyframes, strict=False):
+        torch.testing.assert_close(passengers(carrier), x, rtol=0, atol=1e-12)
+    half = proxy.carried(proxy.keyframes[[0, 0, 0]], [0, 2], keyframes[[0, 1]])
+    own, other = (passengers(proxy.keyframes[0]) for passengers in proxy.passengers)
+    torch.testing.assert_close(half[1], 0.5 * (own + other))
+
+
+@pytest.mark.parametrize("proxy, words", [(-1, "from 100 on"), (20, "from 100 on"), (0.5, "from 100 on")])
+def test_sizes(bars: Shapes, proxy: float, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        tm.subdivide(bars.keyframes, bars.faces, proxy=proxy)  # type: ignore[arg-type]
+
+
+def test_bases_of_the_whole_mesh(bars: Shapes) -> None:
+    with pytest.raises(ValueError, match="bases belong to the whole mesh"):
+        tm.subdivide(bars.keyframes, bars.faces, bases=bars.bases, proxy=120)
+
+
+def test_the_command(rough: tuple[Tensor, Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keyframes, faces = rough
+    meshes = save_frames(keyframes[:2].numpy(), faces.numpy(), tmp_path, fmt="obj", stem="key")
+    options = ["--modes", "6", "--levels", "1", "--preset", "fast", "--proxy", "300", "--out", str(tmp_path / "out")]
+    assert cli.main(["subdivide", *map(str, meshes), *options]) == 0
+    assert "moved by a proxy of 30" in capsys.readouterr().out
+    frames = tm.load_keyframes(sorted((tmp_path / "out").glob("frame-*.obj"))).keyframes
+    assert len(frames) == 3 and torch.equal(frames[[0, 2]], keyframes[:2])

@@ -1,0 +1,89 @@
+"""PLY files of points: scans, markers, and splats of 3D Gaussian splatting."""
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torch_modal.arrays import FloatArray
+from torch_modal.geometry.harmonics import MOST_DEGREE, rotated
+from torch_modal.io.asset import Asset
+from torch_modal.io.ply import PlyAsset
+
+_QUATERNION = [f"rot_{i}" for i in range(4)]
+_SCALES = [f"scale_{i}" for i in range(3)]
+_NORMALS = ["nx", "ny", "nz"]
+
+
+class PointFile(PlyAsset):
+    """A PLY file whose vertices move, with or without faces; all else stays as it is.
+
+    Args:
+        path: The file.
+
+    Raises:
+        FileNotFoundError: There is none.
+        ValueError: It is no PLY file of points.
+    """
+
+    def __init__(self, path: Path) -> None:
+        Asset.__init__(self, path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file")
+        self.data = path.read_bytes()
+        try:
+            self._read_header()
+            self.positions = self._columns("x", "y", "z")
+        except (ValueError, KeyError, IndexError) as error:
+            raise ValueError(f"{path} is no PLY file of points with x, y and z: {error}") from error
+        self.faces = np.zeros((0, 3), dtype=np.int64)
+        if self.is_splats and self._degree is None:
+            raise ValueError(
+                f"{path} has {len(self._harmonics)} f_rest properties; splats of degree 0 to {MOST_DEGREE} have 0, 9, "
+                "24 or 45"
+            )
+
+    @property
+    def is_splats(self) -> bool:
+        """Whether the points are splats: with a rotation and logarithms of scales."""
+        return {*_QUATERNION, *_SCALES} <= self._vertex.properties.keys()
+
+    @cached_property
+    def _harmonics(self) -> list[str]:
+        """Properties of the harmonics above degree 0, one channel after the other."""
+        names = (name for name in self._vertex.properties if name.startswith("f_rest_"))
+        return sorted(names, key=lambda name: int(name.removeprefix("f_rest_")))
+
+    @property
+    def _degree(self) -> int | None:
+        sizes = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(MOST_DEGREE + 1)}
+        return sizes.get(len(self._harmonics))
+
+    def moved(self, positions: FloatArray, rotations: FloatArray, gradients: FloatArray) -> bytes:
+        """The file with points that moved, and what turns with them: normals; of splats axes, scales and harmonics.
+
+        Axes of splats turn, and scales change as lengths along the axes do.
+
+        Args:
+            positions: *Shape:* ``(P, 3)``.
+            rotations: *Shape:* ``(P, 3, 3)``.
+            gradients: Deformation gradients. *Shape:* ``(P, 3, 3)``.
+        """
+        new = dict(zip("xyz", positions.T, strict=True))
+        names = self._vertex.properties.keys()
+        if {*_NORMALS} <= names:
+            turned = np.einsum("pij,pj->pi", rotations, self._columns(*_NORMALS))
+            new |= dict(zip(_NORMALS, turned.T, strict=True))
+        if self.is_splats:
+            quaternions = self._columns(*_QUATERNION)
+            given = Rotation.from_quat(quaternions, scalar_first=True)
+            turned = (Rotation.from_matrix(rotations) * given).as_quat(scalar_first=True)
+            new |= dict(zip(_QUATERNION, turned.T, strict=True))
+            stretch = np.linalg.norm(gradients @ given.as_matrix(), axis=1)
+            scales = self._columns(*_SCALES) + np.log(np.maximum(stretch, np.finfo(np.float32).tiny))
+            new |= dict(zip(_SCALES, scales.T, strict=True))
+            if self._harmonics:
+                own = self._columns(*self._harmonics).reshape(len(positions), 3, -1)
+                new |= dict(zip(self._harmonics, rotated(own, rotations).reshape(len(positions), -1).T, strict=True))
+        return self.with_columns(new)

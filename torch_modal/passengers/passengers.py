@@ -1,0 +1,208 @@
+"""Points that follow a shape."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor, nn
+
+from torch_modal.autograd import lasting, traced, transformed
+from torch_modal.geometry.rigid import best_rotation
+from torch_modal.geometry.vectors import cross, inverse, norm, pick
+from torch_modal.keyframes.arrays import as_faces
+from torch_modal.passengers.binding import binding
+
+# Newton's steps for the rotation nearest to a mean of rotations; each doubles the digits, from the first or second on.
+POLAR_STEPS = 6
+
+
+class Passengers(nn.Module):
+    r"""Points that follow a carrier: markers, scans, splats, fine meshes, accessories.
+
+    Each point is bound once, to the vertices of the nearest triangles, and moves with them and with how the surface
+    around them turns:
+
+    .. math::
+        p'(x) = \sum_v w_v \left(x_v + R_v(x)\, (p - \bar x_v)\right)
+
+    (embedded deformation, Sumner et al. 2007, with rotations that follow from the shape). Points on the surface stay on
+    its triangles; rigid motions are followed exactly. Parts that are near in space and not along the surface, such as
+    fingers, do not pull on each other's points. The time is linear in the number of points.
+
+    Results have the dtype and the device of the shapes, where the module has to be too (``.to``). Gradients reach the
+    shapes.
+
+    Args:
+        reference: The carrier when the points are bound. *Shape:* ``(V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        points: In the coordinates of the reference. *Shape:* ``(P, 3)``.
+        anchors: Where it is known, a vertex of the carrier that each point belongs to, otherwise -1: it follows the
+            triangles there, even if others are nearer. *Shape:* ``(P,)``.
+
+    Raises:
+        ValueError: Shapes that do not fit, or numbers that are not finite.
+    """
+
+    reference: Tensor
+    faces: Tensor
+    points: Tensor
+    inverses: Tensor
+    areas: Tensor
+
+    @lasting
+    def __init__(self, reference: Tensor, faces: Tensor, points: Tensor, anchors: Tensor | None = None) -> None:
+        super().__init__()
+        corners = torch.from_numpy(as_faces(faces))
+        for name, x in (("reference", reference), ("points", points)):
+            if x.dim() != 2 or x.shape[1] != 3 or not x.is_floating_point() or not bool(x.isfinite().all()):
+                raise ValueError(f"{name} holds finite numbers of the shape (n, 3); got {tuple(x.shape)} of {x.dtype}")
+        if int(corners.max()) >= len(reference):
+            raise ValueError(f"the faces name vertex {int(corners.max())}; the reference has {len(reference)}")
+        if anchors is not None and (anchors.shape != points.shape[:1] or bool((anchors >= len(reference)).any())):
+            raise ValueError(f"anchors hold a vertex of {len(reference)} for each of {len(points)} points, or -1")
+        own, bound = (x.detach().double().cpu() for x in (reference, points))
+        known = None if anchors is None else anchors.detach().cpu().numpy()
+        self.register_buffer("faces", corners, persistent=False)
+        self._bind(own, bound, binding(bound.numpy(), own.numpy(), corners.numpy(), known))
+        self.to(reference)
+
+    def _bind(self, reference: Tensor, points: Tensor, weights: sparse.csr_matrix) -> None:
+        #: Of the carrier's vertices, for each point. *Shape:* ``(P, V)``.
+        self.weights = weights
+        self._matrices: dict[Any, tuple[Tensor, Tensor]] = {}
+        self.register_buffer("reference", reference, persistent=False)
+        self.register_buffer("points", points, persistent=False)
+        first, second, normal = _sides(reference.mT, self.faces)
+        area = 0.5 * norm(cross(first, second))
+        flat = area <= 1e-12 * area.mean()
+        frame = torch.stack([first, second, normal], 1).movedim(-1, 0)  # (F, 3, 3), sides as columns
+        frame = torch.where(flat[:, None, None], torch.eye(3).to(frame), frame)
+        self.register_buffer("inverses", torch.linalg.inv(frame), persistent=False)
+        self.register_buffer("areas", torch.where(flat, 0, area), persistent=False)
+
+    @lasting
+    def rebound(self, reference: Tensor, points: Tensor) -> "Passengers":
+        """The same weights for another pose of carrier and points. *Shape:* ``(V, 3), (P, 3)``."""
+        found = Passengers.__new__(Passengers)
+        nn.Module.__init__(found)
+        found.register_buffer("faces", self.faces.cpu(), persistent=False)
+        found._bind(reference.detach().double().cpu(), points.detach().double().cpu(), self.weights)
+        return found.to(self.points)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def forward(self, shapes: Tensor) -> Tensor:
+        """The points of each shape. *Shape:* ``(..., V, 3) -> (..., P, 3)``.
+
+        Raises:
+            ValueError: Shapes of another carrier, dtype or device.
+        """
+        flat = self._flat(shapes)
+        turns = best_rotation(self._deformation(flat))  # (B, V, 3, 3)
+        # About the carrier's middle, for the sake of float32.
+        middle = self.reference.mean(0)
+        offsets = flat - middle - torch.einsum("bvij,vj->bvi", turns, self.reference - middle)
+        found = self._mixed(torch.cat([turns.flatten(2), offsets], -1))
+        own = self.points - middle
+        moved = (found[..., :9].unflatten(-1, (3, 3)) * own[:, None]).sum(-1) + found[..., 9:]
+        return (moved + middle).view(*shapes.shape[:-2], -1, 3)
+
+    def rotations(self, shapes: Tensor) -> Tensor:
+        """How the surroundings of each point turn. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``."""
+        flat = self._flat(shapes)
+        found = self._mixed(best_rotation(self._deformation(flat)).flatten(2)).unflatten(-1, (3, 3))
+        return _nearest_rotation(found).view(*shapes.shape[:-2], -1, 3, 3)
+
+    def gradients(self, shapes: Tensor) -> Tensor:
+        """How they turn and stretch: the deformation gradient, whose thickness is kept. *Shape:* ``(..., P, 3, 3)``.
+
+        A covariance ``C`` at a point becomes ``G C G^T``.
+        """
+        flat = self._flat(shapes)
+        found = self._mixed(self._deformation(flat).flatten(2)).unflatten(-1, (3, 3))
+        return found.view(*shapes.shape[:-2], -1, 3, 3)
+
+    def _flat(self, shapes: Tensor) -> Tensor:
+        if shapes.shape[-2:] != self.reference.shape or shapes.dtype != self.reference.dtype:
+            raise ValueError(
+                f"shapes are those of the carrier, (..., {len(self.reference)}, 3) of {self.reference.dtype}; got "
+                f"{tuple(shapes.shape)} of {shapes.dtype}. Another dtype: passengers.to(shapes.dtype)"
+            )
+        if shapes.device != self.reference.device:
+            raise ValueError(f"shapes are on {shapes.device}, the passengers on {self.reference.device}; use .to()")
+        return shapes.reshape(-1, *shapes.shape[-2:])
+
+    def _deformation(self, x: Tensor) -> Tensor:
+        """Mean deformation gradient around each vertex. *Shape:* ``(B, V, 3) -> (B, V, 3, 3)``."""
+        first, second, normal = _sides(x.movedim(-1, 0).contiguous(), self.faces)  # (3, B, F)
+        frame = torch.stack([first, second, normal], 1).movedim((0, 1), (-2, -1))  # (B, F, 3, 3)
+        each = ((frame @ self.inverses) * self.areas[:, None, None]).flatten(2)
+        total = x.new_zeros(x.shape[1], 1)
+        summed = x.new_zeros(*x.shape[:2], 9)
+        for corner in self.faces.T:
+            summed = summed.index_add(1, corner, each)
+            total = total.index_add(0, corner, self.areas[:, None])
+        return (summed * inverse(total, total <= 0)).unflatten(-1, (3, 3))
+
+    def _mixed(self, values: Tensor) -> Tensor:
+        """Weighted sums over the vertices that points follow. *Shape:* ``(B, V, n) -> (B, P, n)``."""
+        if traced(values) or transformed(values):  # sparse products know neither
+            entries = self.weights.tocoo()
+            row, column = (torch.from_numpy(part).long().to(values.device) for part in (entries.row, entries.col))
+            each = values[:, column] * torch.from_numpy(entries.data).to(values)[:, None]
+            return values.new_zeros(len(values), len(self), values.shape[2]).index_add(1, row, each)
+        columns = values.movedim(0, 1).flatten(1)
+        found: Tensor = _Product.apply(columns, *self._matrix(values))
+        return found.unflatten(1, (len(values), -1)).movedim(1, 0)
+
+    def _matrix(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """The weights and their transpose, of a dtype and on a device."""
+        key = like.dtype, like.device
+        if key not in self._matrices:
+            self._matrices = {key: (_csr(self.weights, like), _csr(self.weights.T.tocsr(), like))}
+        return self._matrices[key]
+
+
+class _Product(torch.autograd.Function):
+    """A sparse matrix times a dense one; torch would transpose it anew at each backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
+        ctx.save_for_backward(matrix, transposed)
+        return matrix @ x
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        matrix, transposed = ctx.saved_tensors
+        found: Tensor = _Product.apply(grad.contiguous(), transposed, matrix)
+        return found, None, None
+
+
+def _csr(matrix: sparse.csr_matrix, like: Tensor) -> Tensor:
+    starts, columns = (torch.from_numpy(np.asarray(part)) for part in (matrix.indptr, matrix.indices))
+    values = torch.from_numpy(matrix.data).to(like.dtype)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR")  # "beta", since 2021
+        return torch.sparse_csr_tensor(starts, columns, values, matrix.shape, check_invariants=False).to(like.device)
+
+
+def _sides(rows: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Two sides and the unit normal of each triangle. *Shape:* ``(3, ..., V) -> (3, ..., F)`` each."""
+    origin, first, second = (pick(rows, corner) for corner in faces.T)
+    first, second = first - origin, second - origin
+    normal = cross(first, second)
+    length = norm(normal)
+    return first, second, normal * inverse(length, (normal * normal).sum(0) <= 0)
+
+
+def _nearest_rotation(x: Tensor) -> Tensor:
+    """Of means of rotations that are less than half a turn apart, by Newton's iteration. *Shape:* ``(..., 3, 3)``."""
+    for _ in range(POLAR_STEPS):
+        a, b, c = x.unbind(-2)
+        cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
+        determinant = (a * cofactors[..., 0, :]).sum(-1)[..., None, None]
+        x = 0.5 * (x + cofactors * inverse(determinant, determinant.abs() <= torch.finfo(x.dtype).tiny))
+    return x
