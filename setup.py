@@ -41,7 +41,7 @@ HAS_WARP = (
     " or (sys_platform == 'win32' and platform_machine == 'AMD64')"
 )
 # The site: sh docs/build.sh
-DOCS = ["sphinx>=7.4", "furo>=2024.8", "myst-nb>=1.1", "sphinx-copybutton>=0.5"]
+DOCS = ["sphinx>=7.4", "furo>=2024.8", "myst-nb>=1.1", "sphinx-copybutton>=0.5", "latex2mathml>=3.77"]
 
 setup(
     name="torch_modal",

@@ -16,7 +16,6 @@ extensions = [
     "myst_nb",  # Markdown pages, and notebooks with the outputs that they are stored with
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "extension",  # beside this file: what is generated from the package
@@ -26,7 +25,7 @@ highlight_language = "none"  # of indented blocks: equations, tables, output
 nb_execution_mode = "off"  # tests/project/test_docs.py runs them
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
-mathjax_path = "https://cdn.jsdelivr.net/npm/mathjax@3/es5/tex-mml-chtml.js"  # what alone needs a network
+html_math_renderer = "mathml"  # of extension.py; MathJax would need a network
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
 autodoc_member_order = "bysource"

@@ -12,10 +12,12 @@ from typing import Any
 
 from docutils import nodes
 from docutils.statemachine import StringList
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import nested_parse_with_titles
+from sphinx.writers.html5 import HTML5Translator
 
 import torch_modal as tm
 
@@ -221,6 +223,18 @@ def follow_links(app: Sphinx, page: str, source: list[str]) -> None:
         source[0] = re.sub(r"\]\(\.\./([^)\s]+)\)", followed, source[0])
 
 
+def write_inline_math(translator: HTML5Translator, node: nodes.math) -> None:
+    """A formula as MathML, which browsers draw without a script and without a network."""
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def write_math_block(translator: HTML5Translator, node: nodes.math_block) -> None:
+    """The same, on lines of its own."""
+    translator.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    raise nodes.SkipNode
+
+
 def always_index(app: Sphinx, *_: Any) -> list[str]:
     """What is unlisted may have changed although index.md has not."""
     return ["index"]
@@ -265,6 +279,7 @@ def write_shape_pages(app: Sphinx) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Tell Sphinx of all this."""
+    app.add_html_math_renderer("mathml", (write_inline_math, None), (write_math_block, None))
     app.add_directive("public-names", PublicNames)
     app.add_directive("command-help", CommandHelp)
     app.add_directive("benchmark-list", BenchmarkList)

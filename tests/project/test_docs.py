@@ -175,3 +175,18 @@ def test_links_within_the_site_lead_somewhere(site: Path) -> None:
         for link in re.findall(r'(?:href|src)="([^"#?]+)[^"]*"', text):
             if not re.match(r"[a-z]+:|//", link):
                 assert (page.parent / link).resolve().exists(), f"{page.name}: {link}"
+
+
+@pytest.mark.slow
+def test_site_needs_no_network(site: Path) -> None:
+    """Scripts, styles, fonts, pictures and formulas are all within."""
+    elsewhere = re.compile(
+        r"""src=["'](?:https?:)?//|<link[^>]+href=["'](?:https?:)?//|url\(["']?(?:https?:)?//|@import"""
+    )
+    for page in [*site.rglob("*.html"), *site.rglob("*.css")]:
+        found = [match[0] for match in elsewhere.finditer(page.read_text()) if "canonical" not in match[0]]
+        assert not found, f"{page.name}: {found}"
+    theory = (site / "theory.html").read_text()
+    assert (
+        theory.count("<math") > 50 and "\\frac" not in theory and "$" not in re.sub("<script.*?</script>", "", theory)
+    )
