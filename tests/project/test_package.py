@@ -63,10 +63,10 @@ def test_links_of_the_page_on_pypi_are_whole_and_lead_somewhere(metadata: email.
     assert len(links) > 8 and all(link.startswith(("https://", "#")) for link in links)
     inside = [re.match(r"https://github\.com/[^/]+/[^/]+/(raw|blob)/HEAD/(.+)", link) for link in links]
     found = [match for match in inside if match]
-    assert any(match[1] == "raw" and match[2].endswith(".gif") for match in found)
+    assert any(match[1] == "raw" and match[2].endswith((".png", ".gif")) for match in found)
     for match in found:
         assert (ROOT / match[2].partition("#")[0]).exists(), match[0]
-        assert (match[1] == "raw") == match[2].endswith(".png")
+        assert (match[1] == "raw") == match[2].endswith((".png", ".gif"))
 
 
 def test_wheel_holds_the_package_alone(built: Path) -> None:
