@@ -71,6 +71,7 @@ def test_links_of_the_page_on_pypi_are_whole_and_lead_somewhere(metadata: email.
 
 def test_wheel_holds_the_package_alone(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
+    assert wheel.name.endswith("-py3-none-any.whl"), "nothing is compiled"
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"torch_modal"}
     for wanted in ("py.typed", "__init__.pyi", "samples/hand/key-0.ply", "samples/creature/key-5.ply"):

@@ -1,0 +1,116 @@
+"""What docs/promises.md says of everything that takes shapes."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+
+import torch_modal as tm
+
+TRANSFORMS = {
+    "in-between": lambda **options: tm.RandomInBetween(p=1.0, **options),
+    "extrapolation": lambda **options: tm.RandomExtrapolation(p=1.0, **options),
+    "deformation": lambda **options: tm.RandomModalDeformation(p=1.0, **options),
+    "rigid motion": lambda **options: tm.RandomRigidMotion(p=1.0, **options),
+    "blend": lambda **options: tm.RandomBlend(p=1.0, **options),
+}
+
+
+@pytest.fixture(scope="module")
+def space(bars: Shapes) -> tm.ShapeSpace:
+    return tm.ShapeSpace(bars.bases, bars.faces)
+
+
+def everything(bars: Shapes, space: tm.ShapeSpace) -> dict[str, Callable[[Tensor], Any]]:
+    """What takes key-frames ``(3, V, 3)``."""
+    bases, faces = bars.bases, bars.faces
+    found: dict[str, Callable[[Tensor], Any]] = {
+        "subdivide": lambda x: tm.subdivide(x, faces, 1, bases=bases, preset="fast", progress=False),
+        "linear_sequence": lambda x: tm.linear_sequence(x, tm.keyframe_places(3, 1)),
+        "InBetween": lambda x: tm.InBetween(bases, faces, "fast")(x[0], x[1], 0.3),
+        "Blend": lambda x: tm.Blend(bases, faces, "fast")(x, torch.tensor([0.2, 0.3, 0.5], dtype=x.dtype)),
+        "Path": lambda x: tm.Path(bases, faces, preset="fast")(x, 0.7),
+        "Passengers": lambda x: tm.Passengers(x[0], faces, x[0] + 0.01)(x),
+        "ShellLoss": lambda x: tm.losses.ShellLoss(faces)(x, x[0]),
+        "fit": lambda x: space.fit(x[1, ::10], torch.arange(0, x.shape[1], 10)),
+        "components": lambda x: space.components().coordinates(x),
+        "self_contacts": lambda x: tm.self_contacts(x, faces),
+    }
+    for name, make in TRANSFORMS.items():
+        found[name] = make(space=space, generator=torch.Generator().manual_seed(0))
+    return found
+
+
+NAMES = ["subdivide", "linear_sequence", "InBetween", "Blend", "Path", "Passengers", "ShellLoss", "fit", "components"]
+NAMES += ["self_contacts", *TRANSFORMS]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_that_is_given_changes(bars: Shapes, space: tm.ShapeSpace, name: str) -> None:
+    given, before, state = bars.keyframes.clone(), bars.keyframes.clone(), torch.get_rng_state()
+    everything(bars, space)[name](given)
+    assert torch.equal(given, before)
+    assert torch.equal(torch.get_rng_state(), state), "PyTorch's own random numbers were drawn"
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_one_generator_decides_everything(bars: Shapes, space: tm.ShapeSpace, name: str) -> None:
+    def drawn(seed: int) -> Tensor:
+        found: Tensor = TRANSFORMS[name](space=space, generator=torch.Generator().manual_seed(seed))(bars.keyframes)
+        return found
+
+    torch.manual_seed(1)
+    first = drawn(0)
+    torch.manual_seed(2)
+    assert torch.equal(drawn(0), first) and not torch.equal(drawn(1), first)
+    sampled = [space.sample(2, torch.Generator().manual_seed(3)) for _ in range(2)]
+    assert torch.equal(*sampled)
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_sequences_are_batches(bars: Shapes, space: tm.ShapeSpace, name: str) -> None:
+    transform = TRANSFORMS[name](space=space, generator=torch.Generator().manual_seed(0))
+    frames = torch.lerp(bars.keyframes[0], bars.keyframes[1], torch.linspace(0, 1, 5)[:, None, None].double())
+    assert transform(frames).shape == frames.shape
+    labels = torch.arange(frames.shape[1]).expand(5, -1)
+    both = tm.AugmentationSequential(transform, data_keys=["shapes", "vertex_labels"], space=space)
+    moved, kept = both(frames, labels)
+    assert moved.shape == frames.shape and torch.equal(kept, labels)
+
+
+def test_the_order_of_vertices_stays(bars: Shapes) -> None:
+    """Vertices and faces in any order, and vertices that no face names."""
+    generator = torch.Generator().manual_seed(0)
+    order, faces_order = (torch.randperm(n, generator=generator) for n in (bars.keyframes.shape[1], len(bars.faces)))
+    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+    shuffled = torch.cat([bars.keyframes[:, order], torch.full((3, 2, 3), 7.0, dtype=torch.float64)], 1)
+    faces = rank[bars.faces][faces_order]
+    frames = tm.subdivide(shuffled, faces, 1, n_modes=6, preset="fast", progress=False)
+    assert torch.equal(frames[::2], shuffled)
+    plain = tm.subdivide(bars.keyframes, bars.faces, 1, n_modes=6, preset="fast", progress=False)
+    torch.testing.assert_close(frames[1, rank], plain[1], rtol=0, atol=0.02)
+
+
+def test_a_status_for_each_sample(bars: Shapes) -> None:
+    layer = tm.InBetween(bars.bases[:2], bars.faces, "fast")
+    x = bars.keyframes[0].repeat(3, 1, 1)
+    x[1] = torch.nan
+    found = layer.solve(x, bars.keyframes[1], 0.5)
+    assert found.solution.status.tolist() == [tm.Status.CONVERGED, tm.Status.INVALID, tm.Status.CONVERGED]
+    assert bool(found.shapes[[0, 2]].isfinite().all())
+
+
+def test_each_promise_is_kept_by_a_test() -> None:
+    """The page names the tests."""
+    root = Path(__file__).parents[2]
+    page = (root / "docs" / "promises.md").read_text()
+    named = re.findall(r"`(tests/\S+?::\w+)`", page)
+    assert len(named) >= 8
+    for name in named:
+        file, _, test = name.partition("::")
+        assert f"def {test}" in (root / file).read_text(), name
