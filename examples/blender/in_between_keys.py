@@ -1,0 +1,152 @@
+"""Blender add-on: in-betweens of an object's shape keys.
+
+Install it under Edit > Preferences > Add-ons > Install from Disk, and name the program ``torch-modal`` there (of the
+environment that the package is installed in: Blender's own Python needs nothing). With a mesh object selected, Object >
+In-Between Shape Keys adds shapes between its shape keys, as keys of their own that are animated one after the other.
+"""
+
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+bl_info = {
+    "name": "In-Between Shape Keys",
+    "author": "torch_modal contributors",
+    "version": (0, 1, 0),
+    "blender": (3, 6, 0),
+    "location": "Object > In-Between Shape Keys",
+    "description": "Physically plausible shapes between shape keys",
+    "category": "Animation",
+}
+
+PREFIX = "between "
+
+Point = tuple[float, float, float]
+
+
+def write_mesh(path: Path, points: Sequence[Point], triangles: Sequence[tuple[int, int, int]]) -> None:
+    """An OBJ file whose numbers read back the same."""
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in points]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def read_points(path: Path) -> list[Point]:
+    """The vertices of an OBJ file."""
+    rows = (line.split() for line in path.read_text().splitlines() if line.startswith("v "))
+    return [(float(x), float(y), float(z)) for _, x, y, z, *_ in rows]
+
+
+def in_betweens(
+    program: str,
+    shapes: Sequence[Sequence[Point]],
+    triangles: Sequence[tuple[int, int, int]],
+    levels: int,
+    cyclic: bool = False,
+    contact: bool = False,
+) -> list[list[Point]]:
+    """All frames, the given shapes among them, by the command line.
+
+    Raises:
+        RuntimeError: The program is not there, or says why not.
+    """
+    with tempfile.TemporaryDirectory(prefix="torch_modal-") as name:
+        folder = Path(name)
+        files = [folder / f"key-{i:03d}.obj" for i in range(len(shapes))]
+        for file, points in zip(files, shapes, strict=True):
+            write_mesh(file, points, triangles)
+        command = [program, "subdivide", *map(str, files), "--levels", str(levels), "--out", str(folder / "out")]
+        command += ["--quiet", *["--cyclic"] * cyclic, *["--contact"] * contact]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise RuntimeError(f"{program} does not start ({error}); name it in the add-on's preferences") from error
+        if done.returncode != 0:
+            raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "it gave no reason")
+        return [read_points(file) for file in sorted((folder / "out").glob("frame-*.obj"))]
+
+
+class Preferences(bpy.types.AddonPreferences):  # type: ignore[misc]
+    """Where the program is."""
+
+    bl_idname = __name__
+
+    program: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="torch-modal", default="torch-modal", subtype="FILE_PATH"
+    )
+
+    def draw(self, context: Any) -> None:
+        """One field."""
+        self.layout.prop(self, "program")
+
+
+class InBetweenKeys(bpy.types.Operator):  # type: ignore[misc]
+    """Add shapes between the shape keys of the active object, and animate them."""
+
+    bl_idname = "object.in_between_shape_keys"
+    bl_label = "In-Between Shape Keys"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 (Blender reads it so)
+
+    levels: bpy.props.IntProperty(name="Levels", default=3, min=1, max=6)  # type: ignore[valid-type]
+    step: bpy.props.IntProperty(name="Frames per Shape", default=2, min=1)  # type: ignore[valid-type]
+    cyclic: bpy.props.BoolProperty(name="Cyclic", default=False)  # type: ignore[valid-type]
+    contact: bpy.props.BoolProperty(name="Contact", default=False)  # type: ignore[valid-type]
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """A mesh with two shape keys or more."""
+        own = context.active_object
+        return own is not None and own.type == "MESH" and own.data.shape_keys is not None
+
+    def execute(self, context: Any) -> set[str]:
+        """Compute, add, animate."""
+        own = context.active_object
+        keys = [key for key in own.data.shape_keys.key_blocks if not key.name.startswith(PREFIX)]
+        if len(keys) < 2:
+            self.report({"ERROR"}, "two shape keys or more are needed")
+            return {"CANCELLED"}
+        own.data.calc_loop_triangles()
+        triangles = [tuple(part.vertices) for part in own.data.loop_triangles]
+        shapes = [[tuple(point.co) for point in key.data] for key in keys]
+        program = context.preferences.addons[__name__].preferences.program
+        try:
+            frames = in_betweens(program, shapes, triangles, self.levels, self.cyclic, self.contact)
+        except RuntimeError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for key in [key for key in own.data.shape_keys.key_blocks if key.name.startswith(PREFIX)]:
+            own.shape_key_remove(key)
+        start = context.scene.frame_current
+        for i, points in enumerate(frames):
+            key = own.shape_key_add(name=f"{PREFIX}{i:04d}", from_mix=False)
+            for target, point in zip(key.data, points, strict=True):
+                target.co = point
+            # Each fades into the next: the sum of both values is one.
+            for value, offset in ((0.0, -1), (1.0, 0), (0.0, 1)):
+                key.value = value
+                key.keyframe_insert("value", frame=start + (i + offset) * self.step)
+        self.report({"INFO"}, f"{len(frames)} shapes between {len(keys)} shape keys")
+        return {"FINISHED"}
+
+
+def menu(self: Any, context: Any) -> None:
+    """The entry of the menu."""
+    self.layout.operator(InBetweenKeys.bl_idname)
+
+
+def register() -> None:
+    """What Blender calls when the add-on is turned on."""
+    bpy.utils.register_class(Preferences)
+    bpy.utils.register_class(InBetweenKeys)
+    bpy.types.VIEW3D_MT_object.append(menu)
+
+
+def unregister() -> None:
+    """And when it is turned off."""
+    bpy.types.VIEW3D_MT_object.remove(menu)
+    bpy.utils.unregister_class(InBetweenKeys)
+    bpy.utils.unregister_class(Preferences)
