@@ -52,6 +52,11 @@ def in_between(bars: Shapes, preset: Any) -> Case:
     return Case(layer, (x_a, x_b, t), (like(x_a), like(x_b, 1), 0 * t if middle else like(t)))
 
 
+def mid_shape(bars: Shapes) -> Case:
+    pair = tuple(bars.keyframes[:2])
+    return Case(tm.MidShape(bars.bases[:2], bars.faces, preset="fast"), pair, tuple(map(like, pair)))
+
+
 def blend(bars: Shapes, preset: Any) -> Case:
     weights = numbers(0.3, 0.5, 0.2)
     tangents = like(bars.keyframes), numbers(1, -3, 2)
@@ -73,6 +78,7 @@ def path(bars: Shapes, preset: Any, smooth: bool) -> Case:
 CASES: dict[str, Callable[[Shapes], Case]] = {
     **{f"in_between_{p}": lambda bars, p=p: in_between(bars, p) for p in ("paper", "fast", "accurate")},
     **{f"blend_{p}": lambda bars, p=p: blend(bars, p) for p in ("fast", "accurate")},
+    "mid_shape": mid_shape,
     "decoder": decoder,
     "path_smooth": lambda bars: path(bars, "accurate", smooth=True),
     **{f"path_{p}": lambda bars, p=p: path(bars, p, smooth=False) for p in ("fast", "accurate")},
@@ -270,6 +276,14 @@ def test_contact_is_refused(bars: Shapes, kind: Any, run: Any) -> None:
     # And where it is the time alone that has a tangent.
     with pytest.raises(RuntimeError, match="no forward mode"):
         run(lambda t: layer(*given[:-1], t), (t,), (torch.ones_like(t),))
+
+
+@pytest.mark.parametrize("run", [jvp, dual])
+def test_a_fit_to_observations_is_refused(bars: Shapes, run: Any) -> None:
+    space, picked = tm.ShapeSpace(bars.bases, bars.faces, dtype=DOUBLE), torch.arange(0, len(bars.keyframes[0]), 9)
+    points = bars.keyframes[1][picked]
+    with pytest.raises(RuntimeError):
+        run(lambda points: space.fit(points, picked).shape, (points,), (like(points),))
 
 
 @pytest.mark.parametrize("run", [jvp, dual])
