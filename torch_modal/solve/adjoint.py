@@ -36,10 +36,9 @@ class _ArgMin(torch.autograd.Function):
     r"""Amplitudes :math:`a^*(\theta)` at which :math:`\partial E / \partial a = 0`, for placements :math:`\theta`.
 
     Backward solves with the full Hessian: :math:`\bar\theta = -(\partial_\theta \partial_a E)^T H^{-1} \bar a`. Forward
-    mode is its transpose. With
-    ``2 J^T J`` in its place the gradient is wrong wherever a residual remains at the optimum, and here much of it does.
-    Only the solution is kept: memory does not grow with the number of steps. Samples that did not converge have no
-    such gradient; theirs is zero.
+    mode is its transpose. With ``2 J^T J`` in its place the gradient is wrong wherever a residual remains at the
+    optimum, and here much of it does. Only the solution is kept: memory does not grow with the number of steps. Samples
+    that did not converge have no such gradient; theirs is zero.
     """
 
     @staticmethod
