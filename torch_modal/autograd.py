@@ -9,6 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 Made = TypeVar("Made")
 Given = ParamSpec("Given")
@@ -20,8 +21,15 @@ def traced(x: Tensor) -> bool:
 
 
 def transformed(x: Tensor) -> bool:
-    """Whether a tensor is a wrapper of a ``torch.func`` transform."""
-    return torch.func.debug_unwrap(x, recurse=False) is not x
+    """Whether a tensor is a wrapper of a ``torch.func`` transform, or has a tangent of forward-mode differentiation."""
+    if torch.func.debug_unwrap(x, recurse=False) is not x:
+        return True
+    return forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None  # the first alone is fast
+
+
+def recorded(*given: Tensor) -> bool:
+    """Whether what is made of tensors in a backward pass is to be differentiated once more, which kernels cannot be."""
+    return torch.is_grad_enabled() or any(map(transformed, given))
 
 
 def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
@@ -53,11 +61,11 @@ class Recent:
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The object of a key; computed if it is not in the cache, as by :func:`lasting`."""
+        """The object of a key; computed if it is not in the cache, by :func:`made_outside`."""
         if key not in self._kept:
             while len(self._kept) >= self.limit:  # before making, so that there are never more
                 self._kept.popitem(last=False)
-            self._kept[key] = lasting(make)()
+            self._kept[key] = made_outside(make)
         self._kept.move_to_end(key)
         return self._kept[key]
 
@@ -101,6 +109,10 @@ class _Outside(torch.autograd.Function):
         """Saves nothing."""
 
     @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
+        """Nothing has a tangent."""
+
+    @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, None]:
         return None, None
 
@@ -121,6 +133,39 @@ def applied(function: Any, *given: Any) -> Any:
         isinstance(value, Tensor) and (traced(value) or transformed(value)) for value in given
     )
     return function.forward(*given) if plain else function.apply(*given)
+
+
+def pushed(function: Callable[..., Any], given: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
+    """The Jacobian of a function times tangents, None for zero, as the transpose of its gradient.
+
+    Within ``torch.autograd.forward_ad``, torch has no other forward mode, but reverse mode.
+    """
+    found, back = torch.func.vjp(function, *given)[:2]
+    zeros = torch.zeros_like(found) if isinstance(found, Tensor) else tuple(map(torch.zeros_like, found))
+    return transposed(back, zeros, given, tangents)
+
+
+def transposed(
+    linear: Callable[..., Sequence[Tensor]], zeros: Any, given: Sequence[Tensor], tangents: Sequence[Tensor | None]
+) -> Any:
+    """The transpose of a linear function, times tangents of what it gives, None for zero.
+
+    Args:
+        linear: The function.
+        zeros: What it takes.
+        given: What it gives has these shapes.
+        tangents: One of each.
+
+    Raises:
+        RuntimeError: This is forward mode within forward mode.
+    """
+    if torch._functorch.eager_transforms.JVP_NESTING > 1:  # type: ignore[attr-defined]
+        raise RuntimeError(
+            "forward mode within forward mode: torch would leave out a part of the second derivative here; take jvp or "
+            "jacfwd of grad, vjp or jacrev"
+        )
+    known = (torch.zeros_like(x) if own is None else own for x, own in zip(given, tangents, strict=True))
+    return torch.func.vjp(lambda to: tuple(linear(to)), zeros)[1](tuple(known))[0]
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:

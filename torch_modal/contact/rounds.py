@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.contact.active import ActiveContacts
-from torch_modal.contact.search import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch
+from torch_modal.contact.search import FINE_PRODUCTS, FINE_STEPS, ROUNDS, Contacts, ContactSearch, refuse_transforms
 from torch_modal.inbetween.between import Batch, Between
 from torch_modal.inbetween.samples import InBetweenResult, Samples
 from torch_modal.solve.solver import Solution
@@ -61,6 +61,7 @@ class ContactRounds(Between):
         Contacts are found without a gradient; the steps with them have one.
         """
         x, solution = super().solved(batch)
+        refuse_transforms(x)
         pair, samples = batch.pair, batch.samples
         search = ContactSearch(self.mesh, pair.first, pair.second, samples.which, samples.t, pairs=self.crossing_pairs)
         pushed = self.found(batch, x.detach(), search) if len(x) == 1 else None

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_modal.autograd import transformed
 from torch_modal.contact.detect import Search
 from torch_modal.energy.contact import GAP, STIFFNESS, Contact
 from torch_modal.energy.energy import Energy, Reference
@@ -18,6 +19,19 @@ ROUNDS = 4
 FINE_STEPS = 3
 FINE_PRODUCTS = 20
 """Newton steps of all vertices with contacts, and iterations in each: contacts are stiff."""
+
+
+def refuse_transforms(x: Tensor) -> None:
+    """Refuse shapes whose numbers cannot be read, or whose tangents would be lost: the search is not torch's.
+
+    Raises:
+        RuntimeError: They are within a transform of ``torch.func``, or have a tangent.
+    """
+    if transformed(x):
+        raise RuntimeError(
+            "shapes with contact have no forward mode, and no transforms of torch.func: take torch.autograd.grad, or "
+            "contact=False"
+        )
 
 
 class Contacts(NamedTuple):

@@ -35,7 +35,7 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
         found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)
         for _ in range(STEPS):
             found = _stepped(found, rotations, weights)
-    return _stepped(found, rotations, weights)
+    return _stepped(found.detach(), rotations, weights)  # forward mode goes through no_grad
 
 
 def _stepped(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
@@ -46,7 +46,7 @@ def _stepped(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
     with torch.no_grad():
         hessian, least = _hessian(relative, arcs, weights)
         hessian = torch.where(least < LEAST, _identity(least), hessian)
-    return product(found, about(_solved(hessian, downhill)))
+    return product(found, about(_solved(hessian.detach(), downhill)))
 
 
 def _hessian(relative: Tensor, arcs: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

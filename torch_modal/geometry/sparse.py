@@ -164,6 +164,10 @@ class _Solve(torch.autograd.Function):
         ctx.solver = inputs[0]
 
     @staticmethod
+    def jvp(ctx: Any, _: None, tangent: Tensor) -> Tensor:
+        return _Solve.apply(ctx.solver, tangent)
+
+    @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor]:
         return None, _Solve.apply(ctx.solver, grads[0])
 

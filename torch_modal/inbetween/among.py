@@ -155,6 +155,7 @@ def _aligned(frame: Frame, keyframes: Tensor, weights: Tensor) -> Group:
         turns = best_rotation(to_reference)
         for _ in range(ROUNDS):
             turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
+    turns = turns.detach()  # forward mode goes through no_grad
     for _ in range(LAST_ROUNDS):
         turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
     turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
@@ -196,6 +197,7 @@ def _largest_difference(off: Tensor, masses: Tensor, weights: Tensor) -> Tensor:
         eye = torch.eye(weights.shape[1]).to(weights)
         system = torch.where(apart, largest[:, None, None] * eye - product + projection, eye)
         resolvent = torch.where(apart, torch.linalg.inv_ex(system).inverse - projection, 0)
+    found, resolvent = found.detach(), resolvent.detach()  # as above
     # One Newton step, which changes nothing, has the derivatives of the eigenvector.
     found = found + (resolvent @ product @ found[..., None]).squeeze(-1)
     parts = torch.where(exists[:, None], weights * found, 0)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, lasting, outlasting
+from torch_modal.autograd import broadcast_shapes, lasting, outlasting, transformed
 from torch_modal.contact.rounds import ContactRounds
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
@@ -372,7 +372,7 @@ def with_exact(shapes: Tensor, there: Tensor, x: Tensor) -> Tensor:
         x: The key-frame. *Shape:* ``(..., V, 3)``.
     """
     exactly = x.to(shapes).detach()
-    if torch.is_grad_enabled():
+    if torch.is_grad_enabled() or transformed(shapes):
         # No number comes of an in-between where that is not finite, and no gradient.
         known = shapes.detach()
         exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)

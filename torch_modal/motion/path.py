@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, lasting
+from torch_modal.contact.search import refuse_transforms
 from torch_modal.contact.trajectory import push_apart
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.hermite import Tangents, around, located, wrapped
@@ -219,6 +220,7 @@ class Path(nn.Module):
 
     def _in_contact(self, keyframes: Tensor, i: int, samples: Samples, result: InBetweenResult) -> InBetweenResult:
         """Shapes of one interval pushed apart, by a displacement found at even times of each motion."""
+        refuse_transforms(result.shapes)
         member = self.layer.members[self.members[i]]
         even = torch.arange(1, N_SEARCHED + 1).to(samples.t) / (N_SEARCHED + 1)
         shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import applied, flattened
+from torch_modal.autograd import applied, flattened, transposed
 from torch_modal.solve.gauss_newton import GaussNewtonStep
 from torch_modal.solve.quasi_newton import descend
 from torch_modal.solve.solver import Solution, Status
@@ -35,10 +35,10 @@ class Minimisation(NamedTuple):
 class _ArgMin(torch.autograd.Function):
     r"""Amplitudes :math:`a^*(\theta)` at which :math:`\partial E / \partial a = 0`, for placements :math:`\theta`.
 
-    Backward solves with the full Hessian: :math:`\bar\theta = -(\partial_\theta \partial_a E)^T H^{-1} \bar a`. With
-    ``2 J^T J`` in its place the gradient is wrong wherever a residual remains at the optimum, and here much of it does.
-    Only the solution is kept: memory does not grow with the number of steps. Samples that did not converge have no
-    such gradient; theirs is zero.
+    Backward solves with the full Hessian: :math:`\bar\theta = -(\partial_\theta \partial_a E)^T H^{-1} \bar a`. Forward
+    mode is its transpose. With ``2 J^T J`` in its place the gradient is wrong wherever a residual remains at the
+    optimum, and here much of it does. Only the solution is kept: memory does not grow with the number of steps. Samples
+    that did not converge have no such gradient; theirs is zero.
     """
 
     @staticmethod
@@ -70,23 +70,21 @@ class _ArgMin(torch.autograd.Function):
         amplitudes, *diagnostics = output
         ctx.mark_non_differentiable(*diagnostics)
         ctx.minimisation, ctx.tree = minimisation, tree
+        ctx.n_diagnostics = len(diagnostics)
         ctx.save_for_backward(amplitudes, diagnostics[-1], *tensors)
+        ctx.save_for_forward(amplitudes, diagnostics[-1], *tensors)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        amplitudes, _, *tensors = ctx.saved_tensors
+        pull_back = _adjoint(ctx.minimisation.step, ctx.tree, *ctx.saved_tensors)
+        moved = transposed(pull_back, torch.zeros_like(amplitudes), tensors, tangents[6:])
+        return moved, *(None,) * ctx.n_diagnostics
 
     @staticmethod
     def backward(ctx: Any, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        step = ctx.minimisation.step
-        amplitudes, status, *tensors = ctx.saved_tensors
-        placement = trees.filled(ctx.tree, tensors)
-        converged = (status == Status.CONVERGED)[:, None]
-        derivatives = step.energy.derivatives(amplitudes, placement)
-        hessian = step.ridged(derivatives.gauss_newton + derivatives.second_order)
-        eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-        adjoint, info = torch.linalg.solve_ex(torch.where(converged[..., None], hessian, eye), to_amplitudes)
-        singular = (info != 0)[:, None]
-        _warn_of_singular(singular)
-        adjoint = torch.where(converged & ~singular, adjoint, 0)
-        to_placement = step.energy.pull_back(amplitudes, adjoint, placement)
-        return (None,) * 6 + tuple(-gradient for gradient in trees.leaves(to_placement))
+        pull_back = _adjoint(ctx.minimisation.step, ctx.tree, *ctx.saved_tensors)
+        return (None,) * 6 + pull_back(to_amplitudes)
 
     @staticmethod
     def vmap(
@@ -99,6 +97,36 @@ class _ArgMin(torch.autograd.Function):
             flat[i] = tensor
         output = _ArgMin.apply(minimisation, tree, *flat)
         return tuple(value.unflatten(0, (info.batch_size, -1)) for value in output), (0,) * len(output)
+
+
+def _adjoint(
+    step: Any, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
+) -> Callable[[Tensor], tuple[Tensor, ...]]:
+    """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear.
+
+    Args:
+        step: Of the minimisation.
+        tree: Skeleton of the placement.
+        amplitudes: That were found. *Shape:* ``(B, n)``.
+        status: *Shape:* ``(B,)``.
+        tensors: Of the placement.
+    """
+    placement = trees.filled(tree, tensors)
+    converged = (status == Status.CONVERGED)[:, None]
+    derivatives = step.energy.derivatives(amplitudes, placement)
+    hessian = step.ridged(derivatives.gauss_newton + derivatives.second_order)
+    eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
+    matrix = torch.where(converged[..., None], hessian, eye)
+
+    def pull_back(to_amplitudes: Tensor) -> tuple[Tensor, ...]:
+        adjoint, info = torch.linalg.solve_ex(matrix, to_amplitudes)
+        singular = (info != 0)[:, None]
+        _warn_of_singular(singular)
+        adjoint = torch.where(converged & ~singular, adjoint, 0)
+        to_placement = step.energy.pull_back(amplitudes, adjoint, placement)
+        return tuple(-gradient for gradient in trees.leaves(to_placement))
+
+    return pull_back
 
 
 def _warn_of_singular(singular: Tensor) -> None:

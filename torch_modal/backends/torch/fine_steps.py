@@ -294,6 +294,10 @@ class _Length(torch.autograd.Function):
         ctx.n_inputs = len(inputs)
 
     @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
+        """Nothing has a tangent."""
+
+    @staticmethod
     def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
         return (None,) * ctx.n_inputs
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import applied, flattened, traced
+from torch_modal.autograd import applied, flattened, pushed, recorded, traced
 from torch_modal.backends.torch.fine_steps import STEP_LENGTHS, FurtherDerivatives, FurtherEnergy, relax
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellPoint, ShellReference, WarpShell
@@ -177,7 +177,7 @@ class WarpSteps(WarpShell):
         n_kept = n_products if keep else 1
         kept = torch.empty(3, n_kept, *x.shape, dtype=x.dtype, device=x.device)
         residuals, directions, products = (part.unbind() if keep else [part[0]] * n_products for part in kept)
-        solution, reached = torch.empty(2, *x.shape, dtype=x.dtype, device=x.device)
+        solution, reached = torch.empty_like(x), torch.empty_like(x)  # no views, of which forward mode has no tangents
         sizes, swept, forms = scalars = torch.zeros(3, n_products + 1, b, dtype=x.dtype, device=x.device)
         size, sweep, form = (part.unbind() for part in (sizes, swept, forms))
         vertices, records = (b, n), (b, len(self.record))
@@ -341,11 +341,17 @@ class _Relaxed(torch.autograd.Function):
         ctx.fused, ctx.n_steps, ctx.n_products, ctx.kept, *given = inputs
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(output[1], *given)
+        ctx.save_for_forward(output[1], *given)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, None]:
+        _, *given = ctx.saved_tensors
+        return pushed(partial(ctx.fused.oracle, ctx.n_steps, ctx.n_products), given, tangents[4:]), None
 
     @staticmethod
     def backward(ctx: Any, to_shape: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         lengths, *given = ctx.saved_tensors
-        if torch.is_grad_enabled():  # torch differentiates its own code once more
+        if recorded(to_shape, *given):  # torch differentiates its own code once more
             run = partial(ctx.fused.oracle, ctx.n_steps, ctx.n_products)
             return (None,) * 4 + torch.func.vjp(run, *given)[1](to_shape)
         given = [lengths, to_shape.contiguous(), *(value.detach().contiguous() for value in given)]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.autograd import applied, flattened, made_outside, traced, transformed
+from torch_modal.autograd import applied, flattened, made_outside, pushed, recorded, traced, transformed
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.energy import merged, on_one_branch
@@ -70,11 +70,18 @@ class _Referred(torch.autograd.Function):
         ctx.shell, *given = inputs
         ctx.mark_non_differentiable(output[-1])
         ctx.save_for_backward(*given)
+        ctx.save_for_forward(*given)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        given = ctx.saved_tensors
+        found = pushed(lambda *given: tuple(ctx.shell.reference_by_torch(*given)), given, tangents[1:])
+        return *found[:-1], None
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         given = ctx.saved_tensors
-        if torch.is_grad_enabled():
+        if recorded(*grads, *given):
             return (None, *torch.func.vjp(lambda *given: tuple(ctx.shell.reference_by_torch(*given)), *given)[1](grads))
         received = ShellReference(*(grad.contiguous() for grad in grads))
         return (None, *ctx.shell.from_reference(received, *(value.detach().contiguous() for value in given)))
@@ -157,11 +164,11 @@ class WarpModalEnergy(ModalEnergy):
             return super().place(base, reference, extra, anchors)
         return Placement(base.double(), None if extra is None else extra.double(), reference)  # type: ignore[arg-type]
 
-    def _plain(self, placement: Placement) -> Placement | None:
-        """The placement for torch; None where it is for kernels."""
+    def _plain(self, placement: Placement, direction: Tensor | None = None) -> Placement | None:
+        """The placement for torch; None where it, and a direction in the amplitudes, are for kernels."""
         if not isinstance(placement.reference, ShellReference):
             return placement
-        values = placement.base, placement.extra, *placement.reference
+        values = placement.base, placement.extra, *placement.reference, direction
         if torch.is_grad_enabled() or any(x is not None and (traced(x) or transformed(x)) for x in values):
             base, extra, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
             return super().place(base, self.shell.unpacked(reference), extra)
@@ -299,7 +306,7 @@ class WarpModalEnergy(ModalEnergy):
         to: Any = placement.reference
         if not isinstance(to, ShellReference):
             return super().pull_back(a, direction, placement)
-        plain = self._plain(placement)
+        plain = self._plain(placement, direction)
         if plain is not None:
             pulled = super().pull_back(a.to(plain.base), direction.to(plain.base), plain)
             return self._repacked(pulled, placement)

@@ -39,7 +39,11 @@ class _Pulls(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.ends, ctx.weights = inputs[:2]
+        ctx.ends, ctx.weights, _, ctx.n = inputs
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor) -> Tensor:
+        return _Pulls.apply(ctx.ends, ctx.weights, tangents[2], ctx.n)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import applied, flattened, traced
+from torch_modal.autograd import applied, flattened, pushed, recorded, traced, transformed
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 
@@ -57,7 +57,7 @@ class WarpRotations(LocalRotations):
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """The sign of the quaternion of each triangle. *Shape:* ``(B, F)``."""
         module, b = kernels("rotations"), len(areas)
-        if areas.device.type != "cpu":  # the walk down the tree is one thread's
+        if areas.device.type != "cpu" or transformed(areas):  # the walk down the tree is one thread's
             return self._sign_votes(quaternions.movedim(-1, 0), areas)
         n_pieces = self._n_pieces
         quaternions, weights = quaternions.double().contiguous(), areas.double()
@@ -118,7 +118,8 @@ class WarpRotations(LocalRotations):
 
 def _means(total: Tensor) -> Tensor:
     """Weighted sums over their weights. *Shape:* ``(B, E, 4) -> (3, B, E)``."""
-    return (total[..., :3] / total[..., 3:].clamp_min(torch.finfo(total.dtype).tiny)).movedim(-1, 0)
+    sums, weights = total.movedim(-1, 0).split([3, 1])  # no view in the end, of which forward mode has no tangent
+    return sums / weights.clamp_min(torch.finfo(total.dtype).tiny)
 
 
 def _to_sums(total: Tensor, to_means: Tensor) -> Tensor:
@@ -143,11 +144,18 @@ class _OnTrajectory(torch.autograd.Function):
         ctx.fused, *given = inputs
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(output[1], *given)
+        ctx.save_for_forward(output[1], *given)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, None]:
+        _, packed, which, t = ctx.saved_tensors
+        given = packed, t
+        return pushed(lambda packed, t: ctx.fused.trajectory_oracle(packed, which, t), given, tangents[1::2]), None
 
     @staticmethod
     def backward(ctx: Any, to_edges: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         total, packed, which, t = ctx.saved_tensors
-        if torch.is_grad_enabled():
+        if recorded(to_edges, packed, t):
             back = torch.func.vjp(lambda packed, t: ctx.fused.trajectory_oracle(packed, which, t), packed, t)[1]
             to_packed, to_t = back(to_edges)
         else:
@@ -185,11 +193,17 @@ class _Turned(torch.autograd.Function):
         ctx.fused, *given = inputs
         ctx.mark_non_differentiable(*output[1:])
         ctx.save_for_backward(*output[1:], *given)
+        ctx.save_for_forward(*output[1:], *given)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, None, None]:
+        _, _, *given = ctx.saved_tensors
+        return pushed(ctx.fused.oracle, given, tangents[1:]), None, None
 
     @staticmethod
     def backward(ctx: Any, to_edges: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         sign, total, *given = ctx.saved_tensors
-        if torch.is_grad_enabled():
+        if recorded(to_edges, *given):
             return (None, *torch.func.vjp(ctx.fused.oracle, *given)[1](to_edges))
         given = [value.detach().contiguous() for value in given]
         return (None, *ctx.fused.from_sums(_to_sums(total, to_edges), sign, *given))

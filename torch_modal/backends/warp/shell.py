@@ -114,7 +114,8 @@ class WarpShell(nn.Module):
 
     def _weighed(self, t: Tensor, gamma: Tensor, sizes: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Pulls and shortest lengths of both ends, *shape* ``(B, 2)``; of volumes stiffness, value, constant."""
-        found = (*t.new_empty(2, len(t), 2).unbind(), *t.new_empty(3, len(t)).unbind())
+        # The last are no views, of which forward mode has no tangents.
+        found = (*t.new_empty(2, len(t), 2).unbind(), *(t.new_empty(len(t)) for _ in range(3)))
         launch(kernels("references").weigh, (len(t),), [t, gamma, *sizes, len(self.record), *found])
         return found
 
