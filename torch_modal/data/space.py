@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import Recent, lasting
+from torch_modal.autograd import Recent, lasting, transformed
 from torch_modal.data.motion import Motion, Span
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
@@ -321,7 +321,10 @@ class ShapeSpace:
 
         Raises:
             ValueError: There is only one key-frame, or points, vertices or weights do not fit.
+            RuntimeError: The points are within a transform of ``torch.func``, or have a tangent.
         """
+        if transformed(points):
+            raise RuntimeError("fits have no forward mode, and no transforms of torch.func: take torch.autograd.grad")
         about = checked_weights(near, len(self))
         places = checked_observations(points, vertices, self.n_vertices)
         variation = self.variation()

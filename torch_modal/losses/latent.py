@@ -56,7 +56,10 @@ class LatentElasticity(nn.Module):
         self.spectrum, self.directions, self.step = spectrum, directions, step
 
     def forward(self, decoder: Decoder, z: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The loss at each latent; gradients reach the latents and the parameters of the decoder.
+        """The loss at each latent; gradients reach the latents and the parameters of the decoder, through ``J``.
+
+        ``H`` is a constant of the graph: else a decoder would learn to crumple, so that edges are long and across the
+        way in which they move.
 
         Args:
             decoder: Of latents ``(B, n)`` into shapes ``(B, V, 3)``, each for itself: no normalisation over the batch.
@@ -72,7 +75,7 @@ class LatentElasticity(nn.Module):
         """
         flat = z.reshape(-1, z.shape[-1])
         x, along = self._moved(decoder, flat, self._drawn(flat, generator))
-        gram = self._gram(x, along)
+        gram = self._gram(x.detach(), along)
         if self.spectrum == "mean":
             return gram.diagonal(dim1=-2, dim2=-1).mean(-1).reshape(z.shape[:-1])
         values = torch.linalg.eigvalsh(gram).clamp_min(0)
@@ -104,7 +107,7 @@ class LatentElasticity(nn.Module):
         return checked_decoded(found[0][0], z), [tangent for _, tangent in found]
 
     def _gram(self, x: Tensor, along: list[Tensor]) -> Tensor:
-        """Products of displacements in the Hessian. *Shape:* ``(B, k, k)``."""
+        """Products of displacements in the Hessian about shapes. *Shape:* ``(B, k, k)``."""
         energy, scale = self.shell.energy, self.shell.scale(x)
         reference = self.shell.against(scale * x)
         at = energy.linearise(self.shell._rows(scale * x), reference)
@@ -120,8 +123,7 @@ class PathEnergy(nn.Module):
     r"""Elastic energy of a path of codes: :math:`(T-1) \sum_k W(x_{k+1}, x_k)` with :class:`ShellLoss` as ``W``.
 
     The discrete path energy of Heeren et al. 2012, of decoded shapes. Minimised over the inner codes with the ends
-    fixed, a straight line in the latent becomes a motion in which the shapes bend more than they stretch; as a loss on
-    lines between codes, it teaches the decoder that lines are such motions.
+    fixed, a straight line in the latent becomes a motion in which the shapes bend more than they stretch.
 
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
