@@ -7,9 +7,9 @@ frames (codes are optimised for each, from the nearest pose's) and, between pose
 decoded middle of both codes against the frame in the middle. Distances are means over the vertices, in percent of the
 diagonal; edges are mean relative errors of length, in percent. Augmentation is by 200 further shapes: random convex
 mixtures (``linear``), or members that ``ShapeSpace.sample`` draws (``samples``). ``ARAPReg`` is the regulariser of
-Huang et al. 2021 by its formula, square roots of the spectrum of the as-rigid-as-possible Hessian with rotations eliminated,
-in our own code; ``elastic`` is ``LatentElasticity``. Both look at four codes, random mixtures of two, in every second
-step. Means over bodies and seeds are geometric.
+Huang et al. 2021 by its formula, square roots of the spectrum of the as-rigid-as-possible Hessian with rotations
+eliminated, in our own code; ``elastic`` is ``LatentElasticity``. Both look at four codes, random mixtures of two, in
+every second step. Means over bodies and seeds are geometric.
 """
 
 import argparse
