@@ -6,10 +6,11 @@ A body's poses, even over its clips, train a plain multi-layer perceptron with a
 frames (codes are optimised for each, from the nearest pose's) and, between poses that follow each other in a clip, the
 decoded middle of both codes against the frame in the middle. Distances are means over the vertices, in percent of the
 diagonal; edges are mean relative errors of length, in percent. Augmentation is by 200 further shapes: random convex
-mixtures (``linear``), or members that ``ShapeSpace.sample`` draws (``samples``). ``ARAPReg`` is the regulariser of
-Huang et al. 2021 by its formula, square roots of the spectrum of the as-rigid-as-possible Hessian with rotations
-eliminated, in our own code; ``elastic`` is ``LatentElasticity``. Both look at four codes, random mixtures of two, in
-every second step. Means over bodies and seeds are geometric.
+mixtures (``linear``), members that ``ShapeSpace.sample`` draws (``samples``), or in-betweens of pairs of poses with the
+codes between theirs (``in-betweens``; four times of each pair that follows in a clip, and of 25 others). ``ARAPReg`` is
+the regulariser of Huang et al. 2021 by its formula, square roots of the spectrum of the as-rigid-as-possible Hessian
+with rotations eliminated, in our own code; ``elastic`` is ``LatentElasticity``. Both look at four codes, random
+mixtures of two, in every second step. Means over bodies and seeds are geometric.
 """
 
 import argparse
@@ -32,7 +33,7 @@ LEARNING_RATE, PRIOR = 2e-3, 1e-4
 # Of the losses on the latent space, beside a mean distance in sizes of the body.
 WEIGHTS = {"ARAPReg": 1e-3, "elastic": 1e-3}
 OTHERS = ("plain", "linear", "ARAPReg")
-ARMS = (*OTHERS, "elastic", "samples", "samples + elastic")
+ARMS = (*OTHERS, "elastic", "samples", "samples + elastic", "in-betweens")
 
 Regulariser = Callable[[nn.Module, Tensor, torch.Generator], Tensor]
 
@@ -62,17 +63,27 @@ class Task:
         distance = (found.double() - truth).norm(dim=-1).mean() / self.size
         return 100 * float(distance), 100 * float(((lengths - true).abs() / true.mean()).mean())
 
-    def more(self, arm: str, seed: int) -> Tensor:
-        """Shapes beside the poses."""
-        generator = torch.Generator().manual_seed(seed)
+    def more(self, arm: str, seed: int) -> tuple[Tensor, Tensor]:
+        """Shapes beside the poses, and the weights of the poses' codes for the first of them; others have their own."""
+        generator, n = torch.Generator().manual_seed(seed), len(self.poses)
+        shapes, weights = [self.poses[:0]], [torch.zeros(0, n)]
         if arm == "linear":
-            weights = -torch.rand(N_MORE, len(self.poses), generator=generator, dtype=torch.float64).log()
-            return torch.einsum("nk,kvc->nvc", weights / weights.sum(1, keepdim=True), self.poses)
-        if arm.startswith("samples"):
-            space = tm.ShapeSpace(tm.extract_bases(self.poses, self.faces, 5, progress=False), self.faces)
-            found = space.sample(N_MORE, generator).double()
-            return best_fit(found, self.poses[0].expand_as(found), torch.ones(found.shape[1]).double()).apply(found)
-        return self.poses[:0]
+            mixed = -torch.rand(N_MORE, n, generator=generator, dtype=torch.float64).log()
+            shapes.append(torch.einsum("nk,kvc->nvc", mixed / mixed.sum(1, keepdim=True), self.poses))
+        if "samples" in arm or "in-betweens" in arm:
+            bases = tm.extract_bases(self.poses, self.faces, 10, progress=False)
+            space = tm.ShapeSpace(bases, self.faces, preset="fast")
+        if "in-betweens" in arm:
+            others = torch.randint(n, (N_MORE // 8, 2), generator=generator).tolist()
+            for i, j in [*self.pairs, *((i, j) for i, j in others if i != j)]:
+                t = torch.rand(4, generator=generator)
+                shapes.append(space.keyframe_in_between(i, j, t.double()).double())
+                weights.append(torch.zeros(4, n).index_copy(1, torch.tensor([i, j]), torch.stack([1 - t, t], 1)))
+        if "samples" in arm:
+            shapes.append(space.sample(N_MORE, generator).double())
+        found = torch.cat(shapes)
+        masses = torch.ones(found.shape[1]).double()
+        return best_fit(found, self.poses[0].expand_as(found), masses).apply(found), torch.cat(weights)
 
     def regulariser(self, arm: str) -> Regulariser | None:
         """On the latent space."""
@@ -120,14 +131,16 @@ def trained(task: Task, arm: str, seed: int, steps: int) -> tuple[nn.Module, Ten
     """A decoder, and the codes of the poses."""
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
-    shapes = (torch.cat([task.poses, task.more(arm, seed)]) / task.size).float()
-    decoder = decoder_of(shapes.shape[1], shapes[: len(task.poses)].mean(0))
-    codes = nn.Parameter(0.1 * torch.randn(len(shapes), N_CODE, generator=generator))
+    further, weights = task.more(arm, seed)
+    shapes, n = (torch.cat([task.poses, further]) / task.size).float(), len(task.poses)
+    decoder = decoder_of(shapes.shape[1], shapes[:n].mean(0))
+    free = nn.Parameter(0.1 * torch.randn(len(shapes) - len(weights), N_CODE, generator=generator))
     regularise = task.regulariser(arm)
-    optimizer = torch.optim.Adam([*decoder.parameters(), codes], lr=LEARNING_RATE)
+    optimizer = torch.optim.Adam([*decoder.parameters(), free], lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    n = len(task.poses)
     for step in range(steps):
+        # In-betweens have the codes between those of their ends.
+        codes = torch.cat([free[:n], weights @ free[:n], free[n:]])
         own = torch.arange(len(shapes))
         if len(shapes) > 2 * n:  # as many of the poses as of the others
             own = torch.cat([own[:n], n + torch.randperm(len(shapes) - n, generator=generator)[:n]])
@@ -140,7 +153,7 @@ def trained(task: Task, arm: str, seed: int, steps: int) -> tuple[nn.Module, Ten
         loss.backward()
         optimizer.step()
         schedule.step()
-    return decoder, codes.detach()[:n]
+    return decoder, free.detach()[:n]
 
 
 def tested(task: Task, decoder: nn.Module, codes: Tensor) -> list[float]:
