@@ -129,6 +129,11 @@ def test_float32_far_from_the_origin(bars: Shapes) -> None:
         passengers(y)
 
 
+def test_no_points(bars: Shapes) -> None:
+    passengers = tm.Passengers(bars.keyframes[0], bars.faces, torch.zeros(0, 3))
+    assert passengers(bars.keyframes).shape == (3, 0, 3)
+
+
 @pytest.mark.parametrize(
     "change, words",
     [
@@ -136,6 +141,7 @@ def test_float32_far_from_the_origin(bars: Shapes) -> None:
         ({"points": torch.full((4, 3), torch.nan)}, "points holds finite numbers"),
         ({"reference": torch.zeros(5, 3)}, "the faces name vertex 163"),
         ({"anchors": torch.tensor([0])}, "anchors hold a vertex"),
+        ({"reference": torch.ones(164, 3)}, "no face of the reference has an area"),
     ],
 )
 def test_arguments(bars: Shapes, change: dict[str, Tensor], words: str) -> None:

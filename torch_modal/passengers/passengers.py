@@ -63,6 +63,9 @@ class Passengers(nn.Module):
         if anchors is not None and (anchors.shape != points.shape[:1] or bool((anchors >= len(reference)).any())):
             raise ValueError(f"anchors hold a vertex of {len(reference)} for each of {len(points)} points, or -1")
         own, bound = (x.detach().double().cpu() for x in (reference, points))
+        first, second, _ = _sides(own.mT, corners)
+        if not bool(cross(first, second).any()):
+            raise ValueError("no face of the reference has an area: there is no surface to follow")
         known = None if anchors is None else anchors.detach().cpu().numpy()
         self.register_buffer("faces", corners, persistent=False)
         self._bind(own, bound, binding(bound.numpy(), own.numpy(), corners.numpy(), known))
