@@ -37,7 +37,7 @@ def test_harmonics_turn_with_the_function(degree: int) -> None:
     generator = np.random.default_rng(1)
     n = (degree + 1) ** 2 - 1
     coefficients = generator.standard_normal((40, 3, n))
-    turns = Rotation.random(40, rng=0).as_matrix()
+    turns = Rotation.from_rotvec(generator.standard_normal((40, 3))).as_matrix()
     directions = generator.standard_normal((25, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -59,7 +59,7 @@ def test_a_splat_is_the_same_seen_from_a_body_that_turned(tmp_path: Path, bars: 
     moved = PointFile(tmp_path / "moved.ply")._rows
 
     def covariance(own: np.ndarray) -> np.ndarray:
-        axes = Rotation.from_quat(np.stack([own[f"rot_{i}"] for i in range(4)], 1), scalar_first=True).as_matrix()
+        axes = Rotation.from_quat(np.stack([own[f"rot_{i}"] for i in (1, 2, 3, 0)], 1)).as_matrix()
         scaled = axes * np.exp(np.stack([own[f"scale_{i}"] for i in range(3)], 1))[:, None]
         return np.asarray(scaled @ scaled.transpose(0, 2, 1))
 

@@ -76,10 +76,12 @@ class PointFile(PlyAsset):
             turned = np.einsum("pij,pj->pi", rotations, self._columns(*_NORMALS))
             new |= dict(zip(_NORMALS, turned.T, strict=True))
         if self.is_splats:
-            quaternions = self._columns(*_QUATERNION)
-            given = Rotation.from_quat(quaternions, scalar_first=True)
-            turned = (Rotation.from_matrix(rotations) * given).as_quat(scalar_first=True)
-            new |= dict(zip(_QUATERNION, turned.T, strict=True))
+            # SciPy's quaternions have the scalar last, and a length.
+            quaternions = np.roll(self._columns(*_QUATERNION), -1, axis=1)
+            quaternions[~quaternions.any(1), 3] = 1
+            given = Rotation.from_quat(quaternions)
+            turned = (Rotation.from_matrix(rotations) * given).as_quat()
+            new |= dict(zip(_QUATERNION, np.roll(turned, 1, axis=1).T, strict=True))
             stretch = np.linalg.norm(gradients @ given.as_matrix(), axis=1)
             scales = self._columns(*_SCALES) + np.log(np.maximum(stretch, np.finfo(np.float32).tiny))
             new |= dict(zip(_SCALES, scales.T, strict=True))
