@@ -29,7 +29,9 @@ def test_units_and_poses_change_nothing(name: str) -> None:
     assert float(loss(b @ turn.mT + 5, a - 3)) == pytest.approx(expected, rel=1e-9)
     assert float(loss(a @ turn.mT, a)) < 1e-20
     single = tm.losses.ShellLoss(sample.faces).to(torch.float32)
-    assert float(single(1e-3 * b.float(), 1e-3 * a.float())) == pytest.approx(expected, rel=1e-3)
+    small = 1e-3 * b.float(), 1e-3 * a.float()
+    assert float(single(*small)) == pytest.approx(expected, rel=1e-3)
+    assert float(single.terms_of(*small).bend) == pytest.approx(float(loss.terms_of(b, a).bend), rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["hand", "creature"])
