@@ -2,21 +2,23 @@
 
     python tests/benchmarks/learning.py [--bodies fox trex] [--poses 16] [--seeds 2] [--arms plain samples]
 
-A body's poses, even over its clips, train a plain multi-layer perceptron with a code for each. Tested are 24 other
-frames (codes are optimised for each, from the nearest pose's) and, between poses that follow each other in a clip, the
-decoded middle of both codes against the frame in the middle. Distances are means over the vertices, in percent of the
-diagonal; edges are mean relative errors of length, in percent. Augmentation is by 200 further shapes: random convex
-mixtures (``linear``), members that ``ShapeSpace.sample`` draws (``samples``), or in-betweens of pairs of poses with the
-codes between theirs (``in-betweens``; four times of each pair that follows in a clip, and of 25 others). ``ARAPReg`` is
-the regulariser of Huang et al. 2021 by its formula, square roots of the spectrum of the as-rigid-as-possible Hessian
-with rotations eliminated, in our own code; ``elastic`` is ``LatentElasticity``. Both look at four codes, random
-mixtures of two, in every second step. Means over bodies and seeds are geometric.
+A body's poses train a plain multi-layer perceptron with a code for each. They are pairs of frames a third of a second
+apart (eight frames; with ``--apart 0`` single poses, those that follow in a clip being pairs), even over its clips.
+Tested are 24 other frames (codes are optimised for each, from the nearest pose's) and the decoded middle of the codes
+of each pair against the frame in the middle. Distances are means over the vertices, in percent of the diagonal; edges
+are mean relative errors of length, in percent. Augmentation is by 600 further shapes: random convex mixtures
+(``linear``), members that ``ShapeSpace.sample`` draws (``samples``), in-betweens of pairs of poses with the codes
+between theirs (``in-betweens``; of the pairs above, and as many of others), or half of each. ``ARAPReg`` is the
+regulariser of Huang et al. 2021 by its formula, square roots of the spectrum of the as-rigid-as-possible Hessian with
+rotations eliminated, in our own code; ``elastic`` is ``LatentElasticity``. Both look at four codes, random mixtures of
+two, in every second step. ``shell`` adds ``ShellLoss`` against the targets. Means over bodies and seeds are geometric.
 """
 
 import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from itertools import combinations, pairwise
 
 import numpy as np
 import torch
@@ -28,12 +30,14 @@ import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import best_fit
 
-N_CODE, N_MORE, N_TEST = 16, 200, 24
+N_CODE, N_MORE, N_TEST = 16, 600, 24
+BATCH = 3
+"""Further shapes in a step, over the number of poses."""
 LEARNING_RATE, PRIOR = 2e-3, 1e-4
 # Of the losses on the latent space, beside a mean distance in sizes of the body.
-WEIGHTS = {"ARAPReg": 1e-3, "elastic": 1e-3}
+WEIGHTS = {"ARAPReg": 1e-3, "elastic": 1e-3, "shell": 1e-2}
 OTHERS = ("plain", "linear", "ARAPReg")
-ARMS = (*OTHERS, "elastic", "samples", "samples + elastic", "in-betweens")
+ARMS = (*OTHERS, "shell", "elastic", "samples", "in-betweens", "samples + in-betweens")
 
 Regulariser = Callable[[nn.Module, Tensor, torch.Generator], Tensor]
 
@@ -41,15 +45,24 @@ Regulariser = Callable[[nn.Module, Tensor, torch.Generator], Tensor]
 class Task:
     """A body: what is trained on, what is tested."""
 
-    def __init__(self, body: str, n_poses: int) -> None:
+    def __init__(self, body: str, n_poses: int, apart: int) -> None:
         with np.load(DATA / "animals" / f"{body}.npz") as given:
             frames, self.faces = torch.tensor(given["frames"]).double(), torch.tensor(given["faces"]).long()
             starts = [*given["clip_starts"].tolist(), len(frames)]
         frames = best_fit(frames, frames[0].expand_as(frames), torch.ones(frames.shape[1]).double()).apply(frames)
         self.size = float((frames[0].amax(0) - frames[0].amin(0)).norm())
-        places = np.unique(np.linspace(0, len(frames) - 1, n_poses).round().astype(int))
+        if apart:
+            firsts = np.concatenate([np.arange(start, end - apart) for start, end in pairwise(starts)])
+            firsts = firsts[np.linspace(0, len(firsts) - 1, n_poses // 2).round().astype(int)]
+            places = np.unique([firsts, firsts + apart])
+        else:
+            places = np.unique(np.linspace(0, len(frames) - 1, n_poses).round().astype(int))
         clip = np.searchsorted(starts, places, side="right")
-        self.pairs = [(i, i + 1) for i in range(len(places) - 1) if clip[i] == clip[i + 1]]
+        self.pairs = [
+            (i, j)
+            for i, j in combinations(range(len(places)), 2)
+            if clip[i] == clip[j] and (places[j] - places[i] == apart if apart else j == i + 1)
+        ]
         self.middles = frames[[(places[i] + places[j]) // 2 for i, j in self.pairs]]
         rest = np.setdiff1d(np.arange(len(frames)), places)
         self.test = frames[rest[np.linspace(0, len(rest) - 1, N_TEST).round().astype(int)]]
@@ -66,6 +79,7 @@ class Task:
     def more(self, arm: str, seed: int) -> tuple[Tensor, Tensor]:
         """Shapes beside the poses, and the weights of the poses' codes for the first of them; others have their own."""
         generator, n = torch.Generator().manual_seed(seed), len(self.poses)
+        share = N_MORE // (1 + (arm == "samples + in-betweens"))
         shapes, weights = [self.poses[:0]], [torch.zeros(0, n)]
         if arm == "linear":
             mixed = -torch.rand(N_MORE, n, generator=generator, dtype=torch.float64).log()
@@ -74,13 +88,14 @@ class Task:
             bases = tm.extract_bases(self.poses, self.faces, 10, progress=False)
             space = tm.ShapeSpace(bases, self.faces, preset="fast")
         if "in-betweens" in arm:
-            others = torch.randint(n, (N_MORE // 8, 2), generator=generator).tolist()
-            for i, j in [*self.pairs, *((i, j) for i, j in others if i != j)]:
-                t = torch.rand(4, generator=generator)
+            others = [torch.randperm(n, generator=generator)[:2].tolist() for _ in self.pairs]
+            each = share // (2 * len(self.pairs))
+            for i, j in [*self.pairs, *others]:
+                t = torch.rand(each, generator=generator)
                 shapes.append(space.keyframe_in_between(i, j, t.double()).double())
-                weights.append(torch.zeros(4, n).index_copy(1, torch.tensor([i, j]), torch.stack([1 - t, t], 1)))
+                weights.append(torch.zeros(each, n).index_copy(1, torch.tensor([i, j]), torch.stack([1 - t, t], 1)))
         if "samples" in arm:
-            shapes.append(space.sample(N_MORE, generator).double())
+            shapes.append(space.sample(share, generator).double())
         found = torch.cat(shapes)
         masses = torch.ones(found.shape[1]).double()
         return best_fit(found, self.poses[0].expand_as(found), masses).apply(found), torch.cat(weights)
@@ -89,7 +104,7 @@ class Task:
         """On the latent space."""
         if arm == "ARAPReg":
             return self._rigidity
-        if arm.endswith("elastic"):
+        if arm == "elastic":
             loss = tm.losses.LatentElasticity(self.faces, directions=4).float()
             return lambda decoder, z, generator: WEIGHTS["elastic"] * loss(decoder, z, generator).mean()
         return None
@@ -136,15 +151,18 @@ def trained(task: Task, arm: str, seed: int, steps: int) -> tuple[nn.Module, Ten
     decoder = decoder_of(shapes.shape[1], shapes[:n].mean(0))
     free = nn.Parameter(0.1 * torch.randn(len(shapes) - len(weights), N_CODE, generator=generator))
     regularise = task.regulariser(arm)
+    shell = tm.losses.ShellLoss(task.faces).float() if arm == "shell" else None
     optimizer = torch.optim.Adam([*decoder.parameters(), free], lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for step in range(steps):
         # In-betweens have the codes between those of their ends.
         codes = torch.cat([free[:n], weights @ free[:n], free[n:]])
         own = torch.arange(len(shapes))
-        if len(shapes) > 2 * n:  # as many of the poses as of the others
-            own = torch.cat([own[:n], n + torch.randperm(len(shapes) - n, generator=generator)[:n]])
+        if len(shapes) > n:
+            own = torch.cat([own[:n], n + torch.randperm(len(shapes) - n, generator=generator)[: BATCH * n]])
         loss = (decoder(codes[own]) - shapes[own]).abs().mean() + PRIOR * codes[own].square().mean()
+        if shell is not None:
+            loss = loss + WEIGHTS["shell"] * shell(decoder(codes[own]), shapes[own]).mean()
         if regularise is not None and step % 2 == 0:
             i, j = torch.randint(n, (2, 4), generator=generator)
             u = torch.rand(4, 1, generator=generator)
@@ -184,14 +202,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bodies", nargs="+", default=["fox", "husky", "trex"], help="animals beside the repository")
     parser.add_argument("--poses", type=int, default=16)
+    parser.add_argument(
+        "--apart", type=int, default=8, help="frames between the poses of a pair; 0: even over the clips"
+    )
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
     given = parser.parse_args()
     limit_threads()
     found: dict[str, list[list[float]]] = defaultdict(list)
     for body in given.bodies:
-        task = Task(body, given.poses)
+        task = Task(body, given.poses, given.apart)
         for arm in given.arms:
             for seed in range(given.seeds):
                 start = time.process_time()

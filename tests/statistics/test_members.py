@@ -47,6 +47,16 @@ def test_a_draw_that_folds_is_made_less_local(space: tm.ShapeSpace, monkeypatch:
     assert torch.equal(variation.member(weights, factors)[0], smoother)
 
 
+def test_a_draw_that_always_folds_is_a_key_frame(space: tm.ShapeSpace, monkeypatch: pytest.MonkeyPatch) -> None:
+    variation = space.variation()
+    weights, factors = variation.draw(1.0, 3.0, seeded())
+    shapes = variation.shapes.unbind()
+    monkeypatch.setattr(variation, "folds", lambda x: int(not any(torch.equal(x, shape) for shape in shapes)))
+    x, own = variation.member(weights, factors)
+    assert torch.equal(x, shapes[int(weights.argmax())])
+    assert torch.equal(own.argmax(0), weights.argmax().expand(own.shape[1])) and torch.equal(own.sum(0), own.amax(0))
+
+
 def test_concentration_and_locality(space: tm.ShapeSpace) -> None:
     variation = space.variation()
     few, many = (torch.stack([variation.draw(c, 0.0, seeded(i))[0] for i in range(50)]) for c in (0.1, 100.0))

@@ -29,7 +29,7 @@ class RandomBlend(ShapeAugmentation):
     shown = ("concentration", "locality")
     uses_keyframes = True
 
-    def __init__(self, concentration: float = 1.0, locality: float = 1.0, p: float = 0.5, **options: Any) -> None:
+    def __init__(self, concentration: float = 0.2, locality: float = 3.0, p: float = 0.5, **options: Any) -> None:
         super().__init__(p, **options)
         check_density(concentration, locality)
         self.concentration, self.locality = concentration, locality

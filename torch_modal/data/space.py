@@ -262,15 +262,15 @@ class ShapeSpace:
         n: int,
         generator: torch.Generator | None = None,
         *,
-        concentration: float = 1.0,
-        locality: float = 1.0,
+        concentration: float = 0.2,
+        locality: float = 3.0,
     ) -> Tensor:
         """New members: random mixtures of the key-frames, with weights that vary from part to part of the surface.
 
         Each part of the surface lies between the key-frames, a leg perhaps nearer to one and the head to another, so
         that lengths and angles stay those of the key-frames and their mixtures. A draw in which triangles fold over
-        that no key-frame has is made less local until none does. For shapes outside of what the key-frames show,
-        apply :class:`RandomModalDeformation`.
+        that no key-frame has is made less local until none does; if that does not help, it is the key-frame of the
+        largest weight. For shapes outside of what the key-frames show, apply :class:`RandomModalDeformation`.
 
         Args:
             n: How many.

@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torch_modal import trees
 from torch_modal.backends.choice import choose
@@ -26,7 +27,7 @@ STEPS, PRODUCTS = 4, 30
 # Neighbours whose normals have a smaller cosine lie on each other.
 FOLDED = -0.9
 
-# A draw that folds is made less local, so often and by this factor; then not local at all.
+# A draw that folds is made less local, so often and by this factor; then not at all local; then a given shape.
 ROUNDS, SMOOTHER = 4, 0.5
 
 
@@ -112,7 +113,8 @@ class Variation:
     def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
         """A member of the set, in the pose of the mean, and its local weights; less local, if it would fold.
 
-        None of the weights is below zero, and they add up to one.
+        If it folds even then, it is the given shape of the largest weight. None of the weights is below zero, and they
+        add up to one.
 
         Args:
             weights: Of the shape. *Shape:* ``(K,)``.
@@ -128,8 +130,9 @@ class Variation:
             own = torch.softmax(logarithms + part * factors @ self.fields[1:], 0)
             x = self.relaxed(self.assembled(own), own, STEPS, PRODUCTS)
             if self.folds(x) <= most:
-                break
-        return x, own
+                return x, own
+        first = int(weights.argmax())
+        return self.shapes[first].clone(), one_hot(weights.argmax(), len(self)).to(own)[:, None].expand_as(own)
 
     def folds(self, x: Tensor) -> int:
         """How many pairs of neighbouring triangles lie on each other. *Shape:* ``(V, 3)``."""
