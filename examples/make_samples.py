@@ -259,11 +259,24 @@ def grasp(bones: dict[str, Bone], time: float) -> tuple[dict[str, Rotation], Arr
     return turns, between(WRIST_SHIFT, "palm")
 
 
+def gesture(bones: dict[str, Bone], number: float) -> tuple[dict[str, Rotation], Array]:
+    """The hand with each digit closed by a random amount of its own, the same for a number; 0 is open."""
+    closed = np.random.default_rng(int(number)).uniform(size=5) * (number > 0)
+    turns, shift = grasp(bones, 0.0)
+    for digit, amount in zip(("thumb", "index", "middle", "ring", "little"), closed, strict=True):
+        turns |= {name: turn for name, turn in grasp(bones, amount)[0].items() if name.startswith(digit)}
+    return turns, shift
+
+
 # ----------------------------------------------------------------------------------------------------- frames
 SAMPLES = {  # model, motion, grid cell, softness of the joints in radii, times of the frames
     "creature": (creature, gallop, 0.0270, 1.15, {"key": np.arange(6.0), "true": np.arange(6) + 0.5}),
     "hand": (hand, grasp, 0.0200, 1.0, {"key": np.array([0.0, 1.0]), "true": np.array([0.25, 0.5, 0.75])}),
 }
+
+
+Motion = Callable[[dict[str, Bone], float], tuple[dict[str, Rotation], Array]]
+"""From bones and a time to the rotations of the joints and the shift of the whole."""
 
 
 class Body(NamedTuple):
@@ -277,9 +290,10 @@ class Body(NamedTuple):
     """The shape at a time of its motion. *Shape:* ``(V, 3)``."""
 
 
-def sculpted(name: str) -> Body:
-    """Sculpt a sample; its motion is known at any time."""
-    model, motion, cell, softness, _ = SAMPLES[name]
+def sculpted(name: str, motion: Motion | None = None) -> Body:
+    """Sculpt a sample; its motion, or another, is known at any time."""
+    model, own, cell, softness, _ = SAMPLES[name]
+    motion = motion or own
     bones, flesh = model()
     rest, faces = sculpt(flesh, cell)
     weights, radius = bind(flesh, bones, rest, faces, softness)
@@ -290,6 +304,21 @@ def sculpted(name: str) -> Body:
         return restore_volume(posed, faces, volume, radius)
 
     return Body(rest, faces, frame)
+
+
+def parts_of(name: str, shape: Array) -> IntArray:
+    """Part of each vertex of a sample's shape at time 0: the bone whose flesh, posed as it is there, is nearest."""
+    model, motion, *_ = SAMPLES[name]
+    bones, flesh = model()
+    quaternions, translations = place_bones(bones, *motion(bones, 0.0))
+    order, names = list(bones), sorted({cone.bone for cone in flesh})
+    distances = []
+    for cone in flesh:
+        number = order.index(cone.bone)
+        turn = Rotation.from_quat(quaternions[number])
+        distances.append(cone.distance(turn.inv().apply(shape - translations[number]))[0])
+    owner = np.array([names.index(cone.bone) for cone in flesh])
+    return owner[np.argmin(distances, axis=0)]
 
 
 def describe(name: str, rest: Array, faces: IntArray, frames: dict[str, Array]) -> None:

@@ -3,6 +3,7 @@
 Install it under Edit > Preferences > Add-ons > Install from Disk, and name the program ``torch-modal`` there (of the
 environment that the package is installed in: Blender's own Python needs nothing). With a mesh object selected, Object >
 In-Between Shape Keys adds shapes between its shape keys, as keys of their own that are animated one after the other.
+The given keys are muted, and else stay as they are.
 """
 
 import subprocess
@@ -120,6 +121,9 @@ class InBetweenKeys(bpy.types.Operator):  # type: ignore[misc]
             return {"CANCELLED"}
         for key in [key for key in own.data.shape_keys.key_blocks if key.name.startswith(PREFIX)]:
             own.shape_key_remove(key)
+        # Values of other keys would be added to those below: muted, they stay as they are.
+        for key in keys[1:]:
+            key.mute = True
         start = context.scene.frame_current
         for i, points in enumerate(frames):
             key = own.shape_key_add(name=f"{PREFIX}{i:04d}", from_mix=False)
@@ -129,7 +133,7 @@ class InBetweenKeys(bpy.types.Operator):  # type: ignore[misc]
             for value, offset in ((0.0, -1), (1.0, 0), (0.0, 1)):
                 key.value = value
                 key.keyframe_insert("value", frame=start + (i + offset) * self.step)
-        self.report({"INFO"}, f"{len(frames)} shapes between {len(keys)} shape keys")
+        self.report({"INFO"}, f"{len(frames)} shapes between {len(keys)} shape keys, which are muted now")
         return {"FINISHED"}
 
 
