@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_modal.autograd import transformed
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
 from torch_modal.data.space import KeyframeReference, ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
@@ -90,7 +91,8 @@ class RandomModalDeformation(ShapeAugmentation):
         reconstruction = space.reconstruction(x.device)
         with torch.no_grad():
             scale, deformed = self._bounded(x.detach(), amplitudes.detach(), space, reference, reconstruction)
-        if not (torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)):
+        recording = torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)
+        if not recording and not transformed(x) and not transformed(amplitudes):
             return deformed
         deformed = deform(x, scale[:, None] * amplitudes, reference, reconstruction)
         # Shapes beyond the bound stay as they were.

@@ -13,8 +13,8 @@ from torch_modal.geometry.rigid import best_fit
 class RandomBlend(ShapeAugmentation):
     """Replaces shapes by random mixtures of all key-frames (:meth:`ShapeSpace.sample`), aligned with the given shapes.
 
-    Labels of the vertices stay, and so do those of shapes: give it shapes whose labels all key-frames share. The result
-    has no gradient.
+    Labels of the vertices stay, and so do those of shapes: give it shapes whose labels all key-frames share. Gradients
+    reach the given shapes through the alignment alone.
 
     Args:
         concentration: As for :meth:`ShapeSpace.sample`.
@@ -43,15 +43,14 @@ class RandomBlend(ShapeAugmentation):
         weights, factors = (torch.stack(part) for part in zip(*drawn, strict=True))
         return {"weights": weights, "factors": factors}
 
-    @torch.no_grad()
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
     ) -> ShapeBatch:
-        """Draw a member for each shape."""
+        """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
         space = self._space(space)
         assert batch.given is not None
         variation, areas = space.variation(), space.reconstruction(batch.shapes.device).areas.to(batch.shapes)
-        rows = zip(params["weights"].double().cpu(), params["factors"].double().cpu(), strict=True)
+        rows = zip(*(params[name].detach().double().cpu() for name in ("weights", "factors")), strict=True)
         found = torch.stack([variation.member(*row)[0] for row in rows]).to(batch.shapes)
         shapes: Tensor = best_fit(found, batch.shapes, areas).apply(found)
         return batch._replace(shapes=shapes, nearest=space.nearest(shapes), given=torch.zeros_like(batch.given))
