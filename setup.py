@@ -115,6 +115,7 @@ setup(
                 "DracoPy>=1.7",
                 "zstandard>=0.22",
                 "selenium>=4.20",
+                "h5py>=3.11",
             ],
             *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],
         ],

@@ -1,35 +1,44 @@
 """Clips of public bodies, of which every eighth frame is given: any method against the frames between.
 
     python tests/benchmarks/public.py [--bodies fox] [--step 8] [--methods linear smooth] [--pictures FOLDER]
-    python tests/benchmarks/public.py --method my_module:my_function
-    python tests/benchmarks/public.py --sequences coma/*/bareteeth dfaust/50002_jumping_jacks ...
+    python tests/benchmarks/public.py --method my_module:my_function [--peer-python FILE]
+    python tests/benchmarks/public.py --export clips; python tests/benchmarks/public.py --results mine
+    python tests/benchmarks/public.py --sequences coma/bareteeth dfaust/registrations_f.hdf5:50004_jumping_jacks ...
 
 Bodies are the animals beside the repository (CC0) and the samples of the package. A method is a function of key-frames
 ``(K, V, 3)``, faces ``(F, 3)``, the times of the key-frames and other times that gives shapes ``(T, V, 3)``: any of
-yours by ``--method``. A sequence of your own is a folder of meshes of one connectivity, PLY or OBJ, in the order of
-their names: the registrations of COMA, FAUST (``tr_reg_*.ply``, a sequence of poses), SMAL and TOSCA as they come, and
-those of DFAUST once they are written as meshes (``write_sequence_to_obj.py`` comes with them). None is shipped.
+yours by ``--method``. Or, for methods in other languages, ``--export`` writes ``body-clip.npz`` with ``keyframes``,
+``faces``, ``times`` and ``wanted``, and ``--results`` reads ``body-clip.npy`` with the shapes at the times wanted. With
+a Python that has it, morphomatics joins, pair by pair.
+
+A sequence of your own is a folder of meshes of one connectivity, PLY or OBJ, in the order of their names: the
+registrations of COMA, FAUST (``tr_reg_*.ply``, a sequence of poses), SMAL and TOSCA as they come; or DFAUST's file of
+registrations, with the name of one of its sequences or for all (``pip install h5py``). None is shipped.
 
 Means over the frames that are not given: error of edges, relative; of dihedral angles, in degrees, by edge length;
 distance to the truth, in percent of the diagonal; angle of normals, in degrees; conformal distortion of triangles
 against the truth, the median of ``(s1/s2 + s2/s1) / 2 - 1``; volume over the truth's; standard deviation of the area
 along the clip over its mean, with that of the truth beside it; hinges that are more than a right angle from the
-truth's, of a thousand; milliseconds of one core for each shape, without what is prepared beforehand. Rows are means
+truth's, of a thousand; pairs of triangles that intersect, in each shape, with those of the truth beside it (extra
+``contact``); milliseconds of one core for each shape, without what is prepared beforehand. Rows are means
 over clips.
 """
 
 import argparse
 import importlib
+import os
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from cases import DATA
+from cases import DATA, Case, KeyframeSet
+from methods import by_peer, peer_python
 from scipy.interpolate import CubicHermiteSpline
 from threads import limit_threads
 from torch import Tensor
@@ -57,6 +66,11 @@ class Clip(NamedTuple):
     """Numbers of the frames that are given, the first and the last among them. *Shape:* ``(K,)``."""
 
     @property
+    def label(self) -> str:
+        """Name of its files."""
+        return f"{self.body}-{self.name}".replace("/", "_").replace(" ", "_")
+
+    @property
     def others(self) -> Tensor:
         """Numbers of the others."""
         return torch.tensor([i for i in range(len(self.frames)) if i not in set(self.given.tolist())])
@@ -70,9 +84,12 @@ def clips(bodies: list[str], sequences: list[Path], step: int) -> Iterator[Clip]
             parts = zip(stored["clip_names"], stored["clip_starts"], stored["clip_lengths"], strict=True)
             for name, start, length in parts:
                 yield from cut(body, str(name), frames[start : start + length], faces, step)
-    for folder in sequences:
-        files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".ply", ".obj"))
-        yield from cut(folder.name, "", *tm.load_keyframes(files), step)
+    for sequence in sequences:
+        if sequence.is_dir():
+            files = sorted(file for file in sequence.iterdir() if file.suffix.lower() in (".ply", ".obj"))
+            yield from cut(sequence.name, "", *tm.load_keyframes(files), step)
+        else:
+            yield from dfaust(sequence, step)
     for name in ("creature", "hand") if not sequences else ():
         sample = load_sample(name)
         n = len(sample.truth)
@@ -83,6 +100,21 @@ def clips(bodies: list[str], sequences: list[Path], step: int) -> Iterator[Clip]
         else:
             frames = torch.cat([sample.keyframes[:1], sample.truth, sample.keyframes[1:]])
             yield Clip("samples", name, frames, sample.faces, torch.tensor([0, n + 1]))
+
+
+def dfaust(given: Path, step: int) -> Iterator[Clip]:
+    """One sequence, ``file.hdf5:name``, or all of a file: arrays ``(V, 3, T)`` by name, and ``faces``."""
+    import h5py
+
+    file, _, only = str(given).partition(":")
+    with h5py.File(file) as stored:
+        faces = torch.tensor(np.array(stored["faces"])).long()
+        names = sorted(name for name in stored if name != "faces")
+        if only and only not in names:
+            raise SystemExit(f"{file} has no sequence {only!r}; it has {', '.join(names)}")
+        for name in [only] if only else names:
+            frames = torch.tensor(np.array(stored[name])).double().movedim(-1, 0)
+            yield from cut(Path(file).stem, name, frames, faces, step)
 
 
 def cut(body: str, name: str, frames: Tensor, faces: Tensor, step: int) -> Iterator[Clip]:
@@ -124,6 +156,20 @@ class Ours:
         return self._path[1](keyframes, times)
 
 
+def morphomatics(keyframes: Tensor, faces: Tensor, when: Tensor, times: Tensor) -> Tensor:
+    """Each pair of key-frames by differential coordinates, in a process of its own."""
+    both, found = KeyframeSet(keyframes, faces), []
+    for i, (start, end) in enumerate(pairwise(when.tolist())):
+        inside = tuple((t - start) / (end - start) for t in times.tolist() if start <= t < end)
+        outcome = by_peer(Case("", both, i, i + 1, {}, inside), "first")
+        found.append(outcome.frames)
+        PEER_SECONDS.append(outcome.seconds)
+    return torch.cat(found)
+
+
+PEER_SECONDS: list[float] = []
+"""Of morphomatics: its processes are timed by themselves."""
+
 METHODS: dict[str, Method] = {
     "linear": linear,
     "Catmull-Rom": catmull_rom,
@@ -144,6 +190,7 @@ class Measures:
         first = clip.frames[0]
         self.diagonal = (first.amax(0) - first.amin(0)).norm()
         self.true = self.shell.measure(self.truth)
+        self.crossings = self._crossings(self.truth)
 
     def of(self, x: Tensor) -> dict[str, float]:
         """By name. *Shape:* ``(T, V, 3)``."""
@@ -166,7 +213,16 @@ class Measures:
             "area std, %": 100 * spread[0],
             "of truth, %": 100 * spread[1],
             "folds, 1/1000": 1000 * float((turned > torch.pi / 2).double().mean()),
+            "crossings": self._crossings(x),
+            "truth's": self.crossings,
         }
+
+    def _crossings(self, x: Tensor) -> float:
+        """Pairs of triangles that intersect, in the mean of the shapes."""
+        try:
+            return float(tm.self_contacts(x, self.faces).number.double().mean())
+        except ImportError:
+            return float("nan")
 
     def _normals(self, x: Tensor) -> tuple[Tensor, Tensor]:
         a, b, c = (x[:, corner] for corner in self.faces.T)
@@ -196,11 +252,21 @@ def score(clip: Clip, method: Method) -> tuple[dict[str, float], Tensor]:
     """Measures of a method, and its shapes."""
     keyframes, when = clip.frames[clip.given], clip.given.double()
     with torch.no_grad():
-        method(keyframes, clip.faces, when, clip.others.double())  # what is prepared once
+        if method is not morphomatics:
+            method(keyframes, clip.faces, when, clip.others.double())  # what is prepared once
+        PEER_SECONDS.clear()
         start = time.process_time()
         found = method(keyframes, clip.faces, when, clip.others.double())
-        taken = time.process_time() - start
+        taken = sum(PEER_SECONDS) or time.process_time() - start
     return Measures(clip).of(found) | {"ms": 1000 * taken / len(found)}, found
+
+
+def export(folder: Path, given: Iterable[Clip]) -> None:
+    """What methods may see of clips."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for clip in given:
+        seen = {"keyframes": clip.frames[clip.given], "faces": clip.faces, "times": clip.given, "wanted": clip.others}
+        np.savez(folder / f"{clip.label}.npz", **{name: value.numpy() for name, value in seen.items()})
 
 
 def table(title: str, rows: dict[str, list[dict[str, float]]]) -> None:
@@ -238,6 +304,9 @@ def main() -> None:
     parser.add_argument("--step", type=int, default=8, help="every so many frames are given")
     parser.add_argument("--methods", nargs="*", default=list(METHODS), help=f"of {', '.join(METHODS)}")
     parser.add_argument("--method", action="append", default=[], metavar="MODULE:FUNCTION", help="one of yours")
+    parser.add_argument("--results", type=Path, action="append", default=[], metavar="FOLDER", help="shapes of yours")
+    parser.add_argument("--export", type=Path, metavar="FOLDER", help="write what is given of each clip, and stop")
+    parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
     parser.add_argument("--by-body", action="store_true", help="a table for each body too")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw the best and the worst clip")
     given = parser.parse_args()
@@ -247,6 +316,13 @@ def main() -> None:
     for name in given.method:
         module, _, function = name.partition(":")
         methods[name] = getattr(importlib.import_module(module), function)
+    if given.peer_python:
+        os.environ["TORCH_MODAL_PEER_PYTHON"] = str(given.peer_python)
+    if peer_python():
+        methods["morphomatics"] = morphomatics
+    if given.export:
+        export(given.export, clips(given.bodies, given.sequences, given.step))
+        return
     every: dict[str, dict[str, list[dict[str, float]]]] = defaultdict(lambda: defaultdict(list))
     ranked = []
     start = time.perf_counter()
@@ -256,6 +332,11 @@ def main() -> None:
             found, shapes[name] = score(clip, method)
             for group in ("all clips", clip.body):
                 every[group][name].append(found)
+        for folder in given.results:
+            shapes[folder.name] = torch.from_numpy(np.load(folder / f"{clip.label}.npy")).double()
+            found = Measures(clip).of(shapes[folder.name]) | {"ms": float("nan")}
+            for group in ("all clips", clip.body):
+                every[group][folder.name].append(found)
         errors = [every["all clips"][name][-1]["edges, %"] for name in methods]
         ranked.append((errors[-1] / errors[0], clip, shapes))
     for group, rows in every.items():
