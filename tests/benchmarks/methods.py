@@ -232,8 +232,11 @@ def peer_python() -> str | None:
     return given or (sys.executable if importlib.util.find_spec("morphomatics") else None)
 
 
-def by_peer(case: Case, kind: str) -> Outcome:
-    """In-betweens by morphomatics, in a child process: its threads and its memory are its own."""
+def by_peer(case: Case, kind: str, plain: bool = True) -> Outcome:
+    """In-betweens by morphomatics, in a child process: its threads and its memory are its own.
+
+    With ``plain``, the note says how long it takes where it is not compiled.
+    """
     python = peer_python()
     if python is None:
         raise UnavailableError("pip install morphomatics, or name a Python that has it with --peer-python")
@@ -242,7 +245,7 @@ def by_peer(case: Case, kind: str) -> Outcome:
     with tempfile.TemporaryDirectory() as scratch:
         request, answer = Path(scratch) / "request.npz", Path(scratch) / "answer.npz"
         arrays = {"x_a": case.x_a[used].numpy(), "x_b": case.x_b[used].numpy(), "faces": number[case.faces].numpy()}
-        np.savez(request, kind=kind, times=np.array(case.times), **arrays)
+        np.savez(request, kind=kind, plain=plain, times=np.array(case.times), **arrays)
         command = [python, str(Path(__file__).with_name("peer_worker.py")), str(request), str(answer)]
         environment = {**os.environ, **PEER_ENVIRONMENT}
         environment.pop("PYTHONPATH", None)
@@ -256,4 +259,5 @@ def by_peer(case: Case, kind: str) -> Outcome:
         frames, seconds = torch.from_numpy(given["frames"]).to(case.x_a.dtype), float(given["seconds"])
     whole = torch.lerp(case.x_a, case.x_b, HALF).repeat(len(case.times), 1, 1)
     whole[:, used] = frames  # vertices of no face stay where they are
-    return Outcome(whole, seconds, f"{1e3 * float(given['plain_seconds']):.1f} ms if not compiled")
+    note = f"{1e3 * float(given['plain_seconds']):.1f} ms if not compiled" if plain else ""
+    return Outcome(whole, seconds, note)

@@ -160,8 +160,8 @@ def morphomatics(keyframes: Tensor, faces: Tensor, when: Tensor, times: Tensor) 
     """Each pair of key-frames by differential coordinates, in a process of its own."""
     both, found = KeyframeSet(keyframes, faces), []
     for i, (start, end) in enumerate(pairwise(when.tolist())):
-        inside = tuple((t - start) / (end - start) for t in times.tolist() if start <= t < end)
-        outcome = by_peer(Case("", both, i, i + 1, {}, inside), "first")
+        inside = tuple((t - start) / (end - start) for t in times.tolist() if start < t < end)
+        outcome = by_peer(Case("", both, i, i + 1, {}, inside), "first", plain=False)
         found.append(outcome.frames)
         PEER_SECONDS.append(outcome.seconds)
     return torch.cat(found)
