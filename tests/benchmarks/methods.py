@@ -232,10 +232,11 @@ def peer_python() -> str | None:
     return given or (sys.executable if importlib.util.find_spec("morphomatics") else None)
 
 
-def by_peer(case: Case, kind: str, plain: bool = True) -> Outcome:
+def by_peer(case: Case, kind: str, plain: bool = True, limit: float = PEER_SECONDS) -> Outcome:
     """In-betweens by morphomatics, in a child process: its threads and its memory are its own.
 
-    With ``plain``, the note says how long it takes where it is not compiled.
+    With ``plain``, the note says how long it takes where it is not compiled. No answer within the limit, in seconds, is
+    an :class:`UnavailableError`.
     """
     python = peer_python()
     if python is None:
@@ -250,9 +251,9 @@ def by_peer(case: Case, kind: str, plain: bool = True) -> Outcome:
         environment = {**os.environ, **PEER_ENVIRONMENT}
         environment.pop("PYTHONPATH", None)
         try:
-            run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PEER_SECONDS)
+            run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
         except subprocess.TimeoutExpired as error:
-            raise UnavailableError(f"no answer in {PEER_SECONDS} s") from error
+            raise UnavailableError(f"no answer in {limit:g} s") from error
         if run.returncode != 0:
             raise UnavailableError((run.stderr.strip() or f"exit code {run.returncode}").splitlines()[-1][:120])
         given = np.load(answer)
