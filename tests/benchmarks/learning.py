@@ -7,11 +7,11 @@ apart (eight frames; with ``--apart 0`` single poses, those that follow in a cli
 Tested are 24 other frames (codes are optimised for each, from the nearest pose's) and the decoded middle of the codes
 of each pair against the frame in the middle. Distances are means over the vertices, in percent of the diagonal; edges
 are mean relative errors of length, in percent. Augmentation is by 600 further shapes: random convex mixtures
-(``linear``), members that ``ShapeSpace.sample`` draws (``samples``), in-betweens of pairs of poses with the codes
-between theirs (``in-betweens``; of the pairs above, and as many of others), or half of each. ``ARAPReg`` is the
-regulariser of Huang et al. 2021 by its formula, square roots of the spectrum of the as-rigid-as-possible Hessian with
-rotations eliminated, in our own code; ``elastic`` is ``LatentElasticity``. Both look at four codes, random mixtures of
-two, in every second step. ``shell`` adds ``ShellLoss`` against the targets. Means over bodies and seeds are geometric.
+(``linear``), members that ``ShapeSpace.sample`` draws (``samples``), in-betweens of the pairs with the codes between
+theirs (``in-betweens``), or half of each. ``ARAPReg`` is the regulariser of Huang et al. 2021 by its formula, square
+roots of the spectrum of the as-rigid-as-possible Hessian with rotations eliminated, in our own code; ``elastic`` is
+``LatentElasticity``. Both look at four codes, random mixtures of two, in every second step. ``shell`` adds
+``ShellLoss`` against the targets. Means over bodies and seeds are geometric.
 """
 
 import argparse
@@ -88,9 +88,8 @@ class Task:
             bases = tm.extract_bases(self.poses, self.faces, 10, progress=False)
             space = tm.ShapeSpace(bases, self.faces, preset="fast")
         if "in-betweens" in arm:
-            others = [torch.randperm(n, generator=generator)[:2].tolist() for _ in self.pairs]
-            each = share // (2 * len(self.pairs))
-            for i, j in [*self.pairs, *others]:
+            each = share // len(self.pairs)
+            for i, j in self.pairs:
                 t = torch.rand(each, generator=generator)
                 shapes.append(space.keyframe_in_between(i, j, t.double()).double())
                 weights.append(torch.zeros(each, n).index_copy(1, torch.tensor([i, j]), torch.stack([1 - t, t], 1)))
