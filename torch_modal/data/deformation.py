@@ -7,7 +7,8 @@ from torch import Tensor
 
 from torch_modal.autograd import transformed
 from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
-from torch_modal.data.space import KeyframeReference, ShapeSpace
+from torch_modal.data.reference import KeyframeReference
+from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import BentTriangles, bend, bent_sides, frames, sides

@@ -6,23 +6,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent, lasting, transformed
 from torch_modal.data.motion import Motion, Span
+from torch_modal.data.reference import KeyframeReference, keyframe_reference
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
-from torch_modal.energy.bend import dihedral_gradient
-from torch_modal.geometry.canonical import size
-from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import Frames, frames, sides
-from torch_modal.geometry.vectors import cross, norm, pick
+from torch_modal.geometry.vectors import norm, pick
 from torch_modal.inbetween.samples import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.io.cache import CacheWarning
@@ -32,7 +29,6 @@ from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.path import Path as MotionPath
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.shell import THICKNESS
 from torch_modal.solve.adjoint import ConvergenceWarning
 from torch_modal.solve.solver import Status
 from torch_modal.statistics.components import Components
@@ -40,9 +36,6 @@ from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.observations import Observations, checked_observations, checked_weights
 from torch_modal.statistics.variation import Variation
 from torch_modal.version import __version__
-
-# Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
-_NOT_ELASTIC = 1e-8
 
 # Key-frames whose modes a mean has, at most.
 _BASES_OF_MEAN = 6
@@ -68,19 +61,6 @@ def kept(limit: int) -> Callable[[Method], Method]:
         return run
 
     return decorate
-
-
-class KeyframeReference(NamedTuple):
-    """A key-frame with scaled modes and triangle frames, for modal deformation."""
-
-    shape: Tensor
-    """*Shape:* ``(V, 3)``."""
-    modes: Tensor
-    """Modes over the roots of their eigenvalues, so scaled that independent standard normal amplitudes give an expected
-    root mean square strain of one, components first. *Shape:* ``(k, 3V)``. It is that of the edges; of sheets, where
-    bending strains their sides more than that, it is the strain of their sides."""
-    frames: Frames
-    """Of its triangles, for a batch of one."""
 
 
 class ShapeSpace:
@@ -348,23 +328,7 @@ class ShapeSpace:
     @kept(16)
     def reference(self, index: int, like: Tensor) -> KeyframeReference:
         """A key-frame for modal deformation, in the dtype and on the device of another tensor."""
-        basis = self.bases[index]
-        x = basis.reference.double()
-        values = basis.eigenvalues.double()
-        elastic = values > _NOT_ELASTIC * values.amax()
-        scale = torch.where(elastic, values, torch.inf).rsqrt()
-        modes = basis.modes.double() * scale[:, None, None]
-        i, j = self.edges.unbind(1)
-        side = x[j] - x[i]
-        slopes = ((modes[:, j] - modes[:, i]) * side).sum(-1) / side.square().sum(-1).clamp_min(1e-300)
-        expected = _expected(slopes)
-        bending, areas = _bending_strains(modes, x, self.faces)
-        bending = _expected(bending, areas)
-        if bending > _expected(slopes, side.square().sum(-1)):  # a sheet, which bends without a change of length
-            expected = bending
-        modes = modes / expected.clamp_min(torch.finfo(torch.float64).tiny)
-        own = frames(sides(x.mT[:, None], self.faces))
-        return KeyframeReference(x.to(like), modes.mT.flatten(1).to(like), Frames(*(part.to(like) for part in own)))
+        return keyframe_reference(self.bases[index], self.faces, self.edges, like)
 
     @kept(32)
     def layer(self, i: int, j: int, like: Tensor) -> InBetween:
@@ -476,31 +440,6 @@ def check_density(concentration: float, locality: float) -> None:
     """
     if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
         raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")
-
-
-def _expected(strains: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Expected root mean square for standard normal amplitudes. *Shape:* ``(k, n), (n,) -> ()``."""
-    squares = strains.square()
-    means = squares.mean(1) if weights is None else squares @ weights / weights.sum()
-    return means.sum().sqrt()
-
-
-def _bending_strains(modes: Tensor, x: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Strain of the sides of a sheet across each hinge, for the thickness that shell modes have, and the hinges' areas.
-
-    *Shape:* ``(k, V, 3), (V, 3), (F, 3) -> (k, H), (H,)``, to first order.
-    """
-    hinges = torch.tensor(Connectivity(faces.numpy(), len(x)).hinges)
-    first, *others = (torch.cat([x[None], modes])[:, corner] for corner in hinges.unbind(1))
-    vectors = torch.stack([other - first for other in others]).movedim(-1, 1)
-    rest, moves = vectors[:, :, 0], vectors[:, :, 1:]
-    angles = (dihedral_gradient(rest)[:, :, None] * moves).sum((0, 1))
-    e, a, b = rest
-    tiny = torch.finfo(x.dtype).tiny
-    areas = 0.5 * (norm(cross(e, a)) + norm(cross(e, b)))
-    apart = 2 * areas / (3 * norm(e)).clamp_min(tiny)  # of the centroids
-    thickness = THICKNESS * size(x.numpy(), faces.numpy())
-    return 0.5 * thickness * angles / apart.clamp_min(tiny), areas
 
 
 def _shapes(result: InBetweenResult, i: int, j: int) -> Tensor:
