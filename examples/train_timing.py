@@ -97,9 +97,12 @@ def load_data(n_seen: int = 64, n_markers: int = 16, noise: float = 0.005, seed:
     return Data(keyframes, faces, markers, seen, unseen, truth)
 
 
-def farthest_points(x: Tensor, n: int) -> Tensor:
-    """Vertices that are spread evenly: each is the farthest from those before. *Shape:* ``(V, 3) -> (n,)``."""
-    chosen = [int((x - x.mean(0)).norm(dim=1).argmax())]
+def farthest_points(x: Tensor, n: int, first: int | None = None) -> Tensor:
+    """Vertices that are spread evenly: each is the farthest from those before; the first is that from the middle.
+
+    *Shape:* ``(V, 3) -> (n,)``.
+    """
+    chosen = [int((x - x.mean(0)).norm(dim=1).argmax()) if first is None else first]
     distance = torch.full_like(x[:, 0], torch.inf)
     for _ in range(n - 1):
         distance = torch.minimum(distance, (x - x[chosen[-1]]).norm(dim=1))

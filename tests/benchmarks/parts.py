@@ -39,9 +39,14 @@ from torch_modal.geometry.triangle_frames import frames, sides
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from augment_segmentation import BATCH, N_MORE, N_POINTS, NOISE, TURNS, PointNet, mean_iou, trained
 from make_samples import gesture, parts_of, sculpted
+from train_timing import farthest_points
 
-SPAN = {"hand": 1.0, "creature": 6.0}
 N_FRAMES, N_TEST, N_PARTS, N_LANDMARKS, N_MODES = 49, 24, 12, 12, 30
+SCULPTED = {  # sample, motion if not its own, times
+    "gestures": ("hand", gesture, np.arange(N_FRAMES)),
+    "hand": ("hand", None, np.linspace(0, 1, N_FRAMES)),
+    "creature": ("creature", None, np.linspace(0, 6, N_FRAMES)),
+}
 ARMS = ("none", "rigid", "linear", "modal", "in-between", "weighted", "both", "all frames")
 
 
@@ -59,25 +64,17 @@ class Task(NamedTuple):
 
 def load(body: str) -> Task:
     """A body of either kind."""
-    if body == "gestures":
-        made = sculpted("hand", gesture)
-        x = torch.tensor(np.stack([made.frame(i) for i in range(N_FRAMES)]))
-        faces, parts = torch.tensor(made.faces).long(), torch.tensor(parts_of("hand", made.frame(0)))
-    elif body in SPAN:
-        made = sculpted(body)
-        x = torch.tensor(np.stack([made.frame(t) for t in np.linspace(0, SPAN[body], N_FRAMES)]))
-        faces = torch.tensor(made.faces).long()
-        parts = torch.tensor(parts_of(body, x[0].numpy()))
+    if body in SCULPTED:
+        sample, motion, times = SCULPTED[body]
+        made = sculpted(sample, motion)
+        x, faces = torch.tensor(np.stack([made.frame(t) for t in times])), torch.tensor(made.faces).long()
+        parts = torch.tensor(parts_of(sample, x[0].numpy()))
     else:
         with np.load(DATA / "animals" / f"{body}.npz") as given:
             x, faces = torch.tensor(given["frames"]).double(), torch.tensor(given["faces"]).long()
         parts = co_moving(x[:: max(1, len(x) // N_FRAMES)], faces)
     x = best_fit(x, x[0].expand_as(x), torch.ones(x.shape[1]).to(x)).apply(x)
-    found, distances = [0], (x[0] - x[0, 0]).norm(dim=-1)
-    while len(found) < N_LANDMARKS:
-        found.append(int(distances.argmax()))
-        distances = torch.minimum(distances, (x[0] - x[0, found[-1]]).norm(dim=-1))
-    return Task(x.float(), faces, parts, torch.tensor(found))
+    return Task(x.float(), faces, parts, farthest_points(x[0], N_LANDMARKS, first=0))
 
 
 def co_moving(x: Tensor, faces: Tensor) -> Tensor:
@@ -148,10 +145,7 @@ def landmark_error(task: Task, pool: Tensor, test: Tensor, seed: int, steps: int
 def run(body: str, n_poses: int, arms: list[str], seeds: int, steps: int) -> None:
     """Print a table."""
     task = load(body)
-    given, distances = [0], (task.x - task.x[0]).square().sum((1, 2))
-    while len(given) < n_poses:
-        given.append(int(distances.argmax()))
-        distances = torch.minimum(distances, (task.x - task.x[given[-1]]).square().sum((1, 2)))
+    given = farthest_points(task.x.flatten(1), n_poses, first=0)
     others = torch.arange(len(task.x))[(task.x[:, None] - task.x[given]).abs().amax((2, 3)).amin(1) > 0]
     test = others[torch.linspace(0, len(others) - 1, N_TEST).round().long()]
     rest = torch.tensor([i for i in others.tolist() if i not in set(test.tolist())])

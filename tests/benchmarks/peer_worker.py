@@ -2,8 +2,8 @@
 
 The Python that runs this needs morphomatics, not torch or torch_modal. The shape space (gradient and divergence of the
 reference, factors of its Poisson system, compiled geodesic) is made before the clock starts; what is timed goes from
-key-frames to in-betweens. The geodesic is compiled by ``jax.jit``; where ``plain``
-is set, how long it takes without is measured too.
+key-frames to in-betweens. The geodesic is compiled by ``jax.jit``; where ``plain`` is set, how long it takes without is
+measured too.
 """
 
 import sys

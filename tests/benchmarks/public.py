@@ -156,24 +156,28 @@ class Ours:
         return self._path[1](keyframes, times)
 
 
-def morphomatics(keyframes: Tensor, faces: Tensor, when: Tensor, times: Tensor) -> Tensor:
+class Morphomatics:
     """Each pair of key-frames by differential coordinates, in a process of its own; linear where that gives nothing."""
-    both, found = KeyframeSet(keyframes, faces), []
-    for i, (start, end) in enumerate(pairwise(when.tolist())):
-        inside = tuple((t - start) / (end - start) for t in times.tolist() if start < t < end)
-        try:
-            outcome = by_peer(Case("", both, i, i + 1, {}, inside), "first", plain=False, limit=60)
-        except UnavailableError as error:
-            print(f"morphomatics: {error}", flush=True)
-            wanted = torch.tensor(inside, dtype=when.dtype) * (end - start) + start
-            outcome = Outcome(linear(keyframes, faces, when, wanted), 0.0)
-        found.append(outcome.frames)
-        PEER_SECONDS.append(outcome.seconds)
-    return torch.cat(found)
 
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        """Of the last call, by the clocks of its processes, without what they prepare."""
 
-PEER_SECONDS: list[float] = []
-"""Of morphomatics: its processes are timed by themselves."""
+    def __call__(self, keyframes: Tensor, faces: Tensor, when: Tensor, times: Tensor) -> Tensor:
+        """As the others."""
+        both, found = KeyframeSet(keyframes, faces), []
+        for i, (start, end) in enumerate(pairwise(when.tolist())):
+            inside = tuple((t - start) / (end - start) for t in times.tolist() if start < t < end)
+            try:
+                outcome = by_peer(Case("", both, i, i + 1, {}, inside), "first", plain=False, limit=60)
+            except UnavailableError as error:
+                print(f"morphomatics: {error}", flush=True)
+                wanted = torch.tensor(inside, dtype=when.dtype) * (end - start) + start
+                outcome = Outcome(linear(keyframes, faces, when, wanted), 0.0)
+            found.append(outcome)
+        self.seconds = sum(outcome.seconds for outcome in found)
+        return torch.cat([outcome.frames for outcome in found])
+
 
 METHODS: dict[str, Method] = {
     "linear": linear,
@@ -253,17 +257,17 @@ class Measures:
         return (0.5 * trace / product - 1).median()
 
 
-def score(clip: Clip, method: Method) -> tuple[dict[str, float], Tensor]:
-    """Measures of a method, and its shapes."""
-    keyframes, when = clip.frames[clip.given], clip.given.double()
+def answer(clip: Clip, method: Method) -> tuple[Tensor, float]:
+    """Shapes of a method, and milliseconds for each."""
+    given = clip.frames[clip.given], clip.faces, clip.given.double(), clip.others.double()
     with torch.no_grad():
-        if method is not morphomatics:
-            method(keyframes, clip.faces, when, clip.others.double())  # what is prepared once
-        PEER_SECONDS.clear()
-        start = time.process_time()
-        found = method(keyframes, clip.faces, when, clip.others.double())
-        taken = sum(PEER_SECONDS) or time.process_time() - start
-    return Measures(clip).of(found) | {"ms": 1000 * taken / len(found)}, found
+        if isinstance(method, Morphomatics):
+            found, taken = method(*given), method.seconds
+        else:
+            method(*given)  # what is prepared once
+            start = time.process_time()
+            found, taken = method(*given), time.process_time() - start
+    return found, 1000 * taken / len(found)
 
 
 def export(folder: Path, given: Iterable[Clip]) -> None:
@@ -324,7 +328,7 @@ def main() -> None:
     if given.peer_python:
         os.environ["TORCH_MODAL_PEER_PYTHON"] = str(given.peer_python)
     if peer_python():
-        methods["morphomatics"] = morphomatics
+        methods["morphomatics"] = Morphomatics()
     if given.export:
         export(given.export, clips(given.bodies, given.sequences, given.step))
         return
@@ -332,18 +336,16 @@ def main() -> None:
     ranked = []
     start = time.perf_counter()
     for clip in clips(given.bodies, given.sequences, given.step):
-        shapes = {}
-        for name, method in methods.items():
-            found, shapes[name] = score(clip, method)
-            for group in ("all clips", clip.body):
-                every[group][name].append(found)
+        answers = {name: answer(clip, method) for name, method in methods.items()}
         for folder in given.results:
-            shapes[folder.name] = torch.from_numpy(np.load(folder / f"{clip.label}.npy")).double()
-            found = Measures(clip).of(shapes[folder.name]) | {"ms": float("nan")}
+            answers[folder.name] = torch.from_numpy(np.load(folder / f"{clip.label}.npy")).double(), float("nan")
+        measures = Measures(clip)
+        for name, (found, taken) in answers.items():
+            row = measures.of(found) | {"ms": taken}
             for group in ("all clips", clip.body):
-                every[group][folder.name].append(found)
+                every[group][name].append(row)
         errors = [every["all clips"][name][-1]["edges, %"] for name in methods]
-        ranked.append((errors[-1] / errors[0], clip, shapes))
+        ranked.append((errors[-1] / errors[0], clip, {name: found for name, (found, _) in answers.items()}))
     for group, rows in every.items():
         if group == "all clips" or given.by_body:
             table(f"{group}, {len(next(iter(rows.values())))}", rows)

@@ -29,7 +29,7 @@ def test_sequences_of_dfaust(bars: Shapes, registrations: Path) -> None:
     (one,) = public.clips([], [Path(f"{registrations}:50004_knees")], step=4)
     assert one.faces.equal(bars.faces) and one.given.tolist() == [0, 4, 8]
     torch.testing.assert_close(one.frames[0], bars.keyframes[0], rtol=0, atol=1e-6)
-    assert public.score(one, public.linear)[0]["edges, %"] < 1e-3
+    assert public.Measures(one).of(public.answer(one, public.linear)[0])["edges, %"] < 1e-3
     with pytest.raises(SystemExit, match="it has 50004_hips, 50004_knees"):
         list(public.clips([], [Path(f"{registrations}:50004_arms")], step=4))
 
