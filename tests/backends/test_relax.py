@@ -46,7 +46,7 @@ class Case:
         pulls = [pull[rows] for pull in self.pulls]
         rests = [self.shell.rest(rest.expand_as(self.x)[rows]) for rest in self.rests]
         factors = [(pulls[0] + pulls[1])[:, None] * stiffness for stiffness in self.shell.stiffness]
-        return self.core.between(rests[0], rests[1], pulls[1] / (pulls[0] + pulls[1]), factors)
+        return self.core.among(rests, torch.stack(pulls, -1) / (pulls[0] + pulls[1])[:, None], factors)
 
     def at(self, x: Tensor) -> list[Linearised]:
         return self.core.linearise(self.core.extend(x.movedim(-1, 0).contiguous()), self.reference)
@@ -86,7 +86,7 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
             )
 
         jacobian = jacfwd(residuals)(case.x[sample]).flatten(1)
-        stretched = core.parts[0].term.tension(*at[0][:1], *at[0][-2:])[sample] * norm(at[0].edge_vectors[0])[sample]
+        stretched = core.parts[0].term.tension(at[0].edge_vectors, at[0].slope, at[0].curvature)[sample] * norm(at[0].edge_vectors[0])[sample]
 
         def lengths(x: Tensor, stretched: Tensor = stretched) -> Tensor:
             return (stretched * case.shell.measure(x).length).sum()

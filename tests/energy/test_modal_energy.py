@@ -35,7 +35,7 @@ class Case:
         both = self.pulls[0] + self.pulls[1]
         factors = [both[:, None] * stiffness for stiffness in self.shell.stiffness]
         rests = [self.shell.rest(r) for r in self.rests]
-        reference = self.shell.energy.between(rests[0], rests[1], self.pulls[1] / both, factors)
+        reference = self.shell.energy.among(rests, torch.stack(self.pulls, -1) / both[:, None], factors)
         self.extra = random(BATCH, *x.shape) if extra else None
         self.placement = self.modal.place(base, reference, self.extra)
         self.a = 0.02 * size * random(BATCH, N + extra)

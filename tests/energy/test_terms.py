@@ -102,7 +102,7 @@ def test_closed_forms_agree_with_torch_func(surface: tuple[Mesh, Tensor], genera
     for terms in (written, plain):
         energy = Energy(mesh, terms)
         rest = energy.rest(energy.extend(x[:2].movedim(-1, 0)))
-        reference = Energy.against(rest, [term.stiffness for term in terms])
+        reference = energy.against(rest, [term.stiffness for term in terms])
         space = ModalEnergy(energy, columns)
         placement = space.place(x[1:3], reference)
         a = 0.1 * torch.ones(2, 6, dtype=DOUBLE)

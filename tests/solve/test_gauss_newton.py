@@ -12,6 +12,7 @@ from torch.func import jacfwd
 
 from torch_modal.energy.modal_energy import Derivatives, Placement
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.energy.term import periodic_square
 from torch_modal.inbetween.samples import ConvergenceError, report
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.solve.gauss_newton import GaussNewtonStep
@@ -180,9 +181,16 @@ def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes) -> None:
     rests = [frame.coarsen(x) for x in pair[:2]]
     shell = ShellEnergy(frame.coarse.faces)
 
+    def towards(x: Tensor, rest: Tensor) -> Tensor:
+        """Residuals of Eq. 5, with the periodic function of angles in the place of the square."""
+        found, turn = shell.residuals(x, rest)[0], (shell.measure(x).angle - shell.measure(rest).angle)[0]
+        n = len(shell.measure(x).length[0])
+        bend = found[n:-1] * (periodic_square(turn) / turn**2).sqrt()
+        return torch.cat([found[:n], bend, found[-1:]])
+
     def residuals(a: Tensor) -> Tensor:
         x = energy.parts[0].rows(a[None], placement[0]).movedim(0, -1)
-        return 0.5**0.5 * torch.cat([shell.residuals(x, rest)[0] for rest in rests])
+        return 0.5**0.5 * torch.cat([towards(x, rest) for rest in rests])
 
     truth = least_squares(
         lambda a: residuals(torch.from_numpy(a)).numpy(),

@@ -52,7 +52,7 @@ class PairBlocks(nn.Module):
 
 
 class Curvature(PairBlocks):
-    r"""The term :math:`\sum_q E'(q)\, \nabla^2 q` over all measures ``q`` of an energy.
+    r"""The term :math:`\sum_q E'(q)\, \nabla^2 q` over all measures ``q``, and the curvature beyond its bound.
 
     Args:
         energy: The energy.
@@ -64,6 +64,5 @@ class Curvature(PairBlocks):
     def of(self, energy: Energy, at: Sequence[Linearised]) -> Tensor:
         """The blocks at given shapes. *Shape:* ``(3, 3, B, P)``."""
         parts = zip(energy.parts, at, strict=True)
-        return self(
-            torch.cat([block for part, one in parts for block in part.term.blocks(one.edge_vectors, one.slope)], -1)
-        )
+        each = (part.term.blocks(one.edge_vectors, one.slope, one.beyond) for part, one in parts)
+        return self(torch.cat([block for blocks in each for block in blocks], -1))

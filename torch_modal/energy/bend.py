@@ -1,12 +1,11 @@
 """Dihedral angles, the second term of Eq. 5."""
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torch_modal.energy.term import Mesh, Term
+from torch_modal.energy.term import Mesh, PeriodicTerm, Term, wrap_angle
 from torch_modal.geometry.vectors import cross, inverse, norm, tiny
 
 # Eq. 5 divides by rest areas: l^2 / A has this bound, for needles; an equilateral hinge has 1.15.
@@ -16,10 +15,11 @@ MAX_BENDING_RATIO = 1e3
 COLLAPSED = 1e-6
 
 
-class Bend(Term):
-    r"""Dihedral angles: :math:`\beta \sum_h (\theta_h - \bar\theta_h)^2 \bar l_h^2 / \bar A_h`, the second of Eq. 5."""
+class SquaredBend(Term):
+    r"""Dihedral angles: :math:`\beta \sum_h (\theta_h - \bar\theta_h)^2 \bar l_h^2 / \bar A_h`, the second of Eq. 5.
 
-    periodic = True
+    Differences are wrapped: the energy has a kink where an angle differs by half a turn.
+    """
 
     def elements(self, mesh: Mesh) -> Tensor:
         """All hinges."""
@@ -52,9 +52,30 @@ class Bend(Term):
         i, j, k, m = mesh.hinges.unbind(1)
         return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
 
-    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
+    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
         """In closed form: ``torch.func`` knows neither checkpoints, whose tensors have hooks, nor ``torch.export``."""
         return (slope * dihedral_hessian(edge_vectors)).unbind()
+
+
+class Bend(PeriodicTerm, SquaredBend):
+    r"""Dihedral angles: :math:`\beta \sum_h f(\theta_h - \bar\theta_h) \bar l_h^2 / \bar A_h`, smooth at half a turn.
+
+    :class:`~torch_modal.energy.term.PeriodicTerm` has the function ``f``, which is the square of Eq. 5 below a radian.
+    """
+
+    def pairs(self, mesh: Mesh) -> Tensor:
+        """With that of the two tips."""
+        return torch.cat([super().pairs(mesh), mesh.hinges[:, 2:]])
+
+    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
+        """In closed form, as in the base class."""
+        found = torch.nn.functional.pad(slope * dihedral_hessian(edge_vectors), (0, 0) * 4 + (0, 1))
+        if beyond is not None:
+            j, k, m = dihedral_gradient(edge_vectors)
+            i = -(j + k + m)
+            ends = (i, j), (k, i), (k, j), (m, i), (m, j), (k, m)
+            found = found + torch.stack([(beyond * a)[:, None] * b for a, b in ends])
+        return found.unbind()
 
 
 def dihedral_angle(edge_vectors: Tensor) -> Tensor:
@@ -139,8 +160,3 @@ def collapsed(edge: Tensor, normal: Tensor) -> Tensor:
     bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
     base = (edge * edge).sum(0)
     return (normal * normal).sum(0) <= (bound * base) ** 2 + tiny(edge)
-
-
-def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle in ``[-pi, pi)``, with derivative one."""
-    return angle - 2 * math.pi * torch.floor(angle.detach() / (2 * math.pi) + 0.5)

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import lasting
-from torch_modal.energy.bend import wrap_angle
 from torch_modal.energy.term import Mesh, Term
-from torch_modal.geometry.vectors import inverse, pick
+from torch_modal.geometry.vectors import pick
 
 
 class Rest(NamedTuple):
@@ -27,12 +26,12 @@ class Rest(NamedTuple):
 
 
 class Reference(NamedTuple):
-    r"""The reference of an energy: :math:`\sum_{rm} W_{rm} (q_m - Q_{rm})^2 + c`, with R of 1 or 2."""
+    r"""The reference of an energy, :math:`\sum_m W_m (q_m - Q_m)^2 + c`; angles have four rows ``Q``."""
 
     measures: tuple[Tensor, ...]
-    """``Q``. *Shape of each:* ``(..., R, M)``."""
+    """``Q``, of :meth:`torch_modal.energy.term.Term.merged`. *Shape of each:* ``(..., R, M)``."""
     weights: tuple[Tensor, ...]
-    """``W``, the stiffness included. *Shape of each:* ``(..., R, M)``."""
+    """``W``, the stiffness included. *Shape of each:* ``(..., M)``."""
     constant: Tensor | float
     """``c``. *Shape:* ``(...)``."""
 
@@ -42,14 +41,16 @@ class Linearised(NamedTuple):
 
     edge_vectors: Tensor
     """*Shape:* ``(n-1, 3, B, M)``."""
+    measures: Tensor
+    """*Shape:* ``(B, M)``; M is 1 of a total, here and below."""
     gradients: Tensor
     """Of the measures in the edge vectors, *shape* ``(n-1, 3, B, M)``; of a total in the vertices, ``(3, B, V)``."""
-    difference: Tensor
-    """From the reference. *Shape:* ``(B, R, M)``; M is 1 of a total, here and below."""
     slope: Tensor
     """First derivative of the energy in each measure. *Shape:* ``(B, M)``."""
     curvature: Tensor
-    """Second derivative. *Shape:* ``(B, M)``."""
+    """Second derivative, or a bound that is never negative. *Shape:* ``(B, M)``."""
+    beyond: Tensor | None
+    """The second derivative beyond that, if any. *Shape:* ``(B, M)``."""
 
 
 def _outlasting_buffers(module: nn.Module) -> None:
@@ -105,10 +106,6 @@ class OnMesh(nn.Module):
     def on_elements(self, weights: Tensor) -> Tensor:
         """Weights of vertices on the elements: means of their corners. *Shape:* ``(..., V) -> (..., M or 1)``."""
         return weights.mean(-1, keepdim=True) if self.term.total else weights[..., self.corners].mean(-2)
-
-    def acting(self, weight: Tensor, difference: Tensor) -> Tensor:
-        """The weights where the measures are stiff. *Shape:* ``(B, R, M)``."""
-        return torch.where(difference == 0, 0, weight) if self.term.one_sided else weight
 
     def to_corners(self, on_edge_vectors: Tensor) -> Tensor:
         """From the edge vectors to the vertices of the elements. *Shape:* ``(n-1, 3, ..., M) -> (3, ..., n M)``."""
@@ -200,49 +197,22 @@ class Energy(nn.Module):
         """The same of vertices alone. *Shape:* ``(B, V, 3)``."""
         return self.rest(self.extend(x.movedim(-1, 0).contiguous()))
 
-    def between(self, first: Rest, second: Rest, t: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
-        r"""Both as the reference: :math:`(1-t) \sum w_a (q - q_a)^2 + t \sum w_b (q - q_b)^2`.
-
-        The sum of two squares of the same measure is one square and a constant, except where measures come round.
-
-        Args:
-            first: Rest shapes of the weight ``1 - t``.
-            second: Rest shapes of the weight ``t``.
-            t: Times. *Shape:* ``(...)``.
-            stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
-        """
-        t = t[..., None]
-        measures, weights, constant = [], [], torch.zeros_like(t[..., 0])
-        for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
-            pull_a, pull_b = (1 - t) * first.weights[i], t * second.weights[i]
-            if part.term.periodic:
-                measures.append(torch.stack([x.expand_as(pull_a) for x in (first.measures[i], second.measures[i])], -2))
-                weights.append(torch.stack([factor * pull_a, factor * pull_b], -2))
-                continue
-            whole = pull_a + pull_b
-            share = pull_b * inverse(whole, whole <= 0)
-            difference = part.term.difference(second.measures[i], first.measures[i])
-            measures.append((first.measures[i] + share * difference)[..., None, :])
-            weights.append((factor * whole)[..., None, :])
-            constant = constant + (factor * pull_a * share * difference**2).sum(-1)
-        return Reference(tuple(measures), tuple(weights), constant)
-
     def among(self, rests: Sequence[Rest], weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:
-        r"""K rest shapes as one: :math:`\sum_k s_k \sum w_k (q - q_k)^2`, for any number of them Eq. 8.
+        r"""K rest shapes as one: :math:`\sum_k s_k \sum w_k (q - q_k)^2`, by Eq. 8 for any number of them.
 
         Args:
             rests: The rest shapes.
             weights: ``s``. *Shape:* ``(..., K)``.
-            stiffness: As for :meth:`between`.
+            stiffness: Of each term: a number, or *shape* ``(..., M)`` or ``(..., 1)``.
         """
         measures, wholes, constant = [], [], torch.zeros_like(weights[..., 0])
         for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
             values = torch.stack([rest.measures[i] for rest in rests], -2)
             pulls = weights[..., None] * torch.stack([rest.weights[i] for rest in rests], -2).expand_as(values)
-            whole, value, spread = merged(pulls, on_one_branch(values, pulls) if part.term.periodic else values)
-            measures.append(value[..., None, :])
-            wholes.append((factor * whole)[..., None, :])
-            constant = constant + (factor * spread).sum(-1)
+            own = part.term.merged(values, pulls)
+            measures.append(own.measures)
+            wholes.append(factor * own.weights)
+            constant = constant + (factor * own.constant).sum(-1)
         return Reference(tuple(measures), tuple(wholes), constant)
 
     def mixed(self, rest: Rest, weights: Tensor) -> Rest:
@@ -257,24 +227,25 @@ class Energy(nn.Module):
         measures, stiffness = [], []
         for part, values, pulls in zip(self.parts, rest.measures, rest.weights, strict=True):
             own, pulls = part.on_elements(weights), pulls.expand_as(values)
-            values = on_one_branch(values, pulls) if part.term.periodic else values
-            measures.append((own * values).sum(-2))
+            measures.append((own * part.term.on_one_branch(values, pulls)).sum(-2))
             stiffness.append((own * pulls).sum(-2).clamp_min(0))
         return Rest(tuple(measures), tuple(stiffness))
 
-    @staticmethod
-    def against(rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
+    def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
-        weights = tuple((k * weight)[..., None, :] for k, weight in zip(stiffness, rest.weights, strict=True))
-        return Reference(tuple(measures[..., None, :] for measures in rest.measures), weights, 0.0)
+        merged = [
+            part.term.merged(measures[..., None, :], weight.expand_as(measures)[..., None, :])
+            for part, measures, weight in zip(self.parts, *rest, strict=True)
+        ]
+        weights = tuple(factor * own.weights for factor, own in zip(stiffness, merged, strict=True))
+        return Reference(tuple(own.measures for own in merged), weights, 0.0)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:
         """The energy of shapes. *Shape:* ``(3, ..., V) -> (...)``."""
         total: Any = reference.constant
         for part, rest, weight in zip(self.parts, reference.measures, reference.weights, strict=True):
-            difference = part.term.difference(part.measures(part.edge_vectors(extended))[..., None, :], rest)
-            total = total + (weight * difference**2).sum((-1, -2))
+            total = total + part.term.energies(part.measures(part.edge_vectors(extended)), rest, weight).sum(-1)
         return total
 
     # ---------------------------------------------------------------------------------------------------- derivatives
@@ -288,17 +259,17 @@ class Energy(nn.Module):
             if part.term.total:
                 corners = part.to_corners(gradients)
                 gradients = torch.zeros_like(extended).index_add(-1, part.corners.flatten(), corners)
-            difference = part.term.difference(measures[..., None, :], rest)
-            slope, curvature = 2 * (weight * difference).sum(-2), 2 * part.acting(weight, difference).sum(-2)
-            found.append(Linearised(edge_vectors, gradients, difference, slope, curvature.expand_as(slope)))
+            slope = part.term.slopes(measures, rest, weight)
+            curvatures = part.term.curvatures(measures, rest, weight)
+            found.append(Linearised(edge_vectors, measures, gradients, slope, *curvatures))
         return found
 
-    @staticmethod
-    def value_at(at: Sequence[Linearised], reference: Reference) -> Tensor:
+    def value_at(self, at: Sequence[Linearised], reference: Reference) -> Tensor:
         """The energy of shapes that were linearised. *Shape:* ``(B,)``."""
         found: Any = reference.constant
-        parts = zip(reference.weights, at, strict=True)
-        return found + sum((weight * one.difference**2).sum((-1, -2)) for weight, one in parts)
+        for part, one, rest, weight in zip(self.parts, at, reference.measures, reference.weights, strict=True):
+            found = found + part.term.energies(one.measures, rest, weight).sum(-1)
+        return found
 
     def rates(self, at: Sequence[Linearised], field: Tensor) -> list[Tensor]:
         """First change of the measures with a displacement. *Shape:* ``(3, B, V)``, extended; ``(B, M)`` of each."""
@@ -343,29 +314,3 @@ class Energy(nn.Module):
     def gradient(self, at: Sequence[Linearised]) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
         return self.gather(at, [one.slope for one in at])
-
-
-def merged(pulls: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """K parabolas as one: its weight, its minimum, and the sum of all there.
-
-    Weights below zero may outweigh the others: then there is no minimum, and no weight.
-
-    Args:
-        pulls: Their weights. *Shape:* ``(..., K, M)``.
-        values: Their minima. *Shape:* ``(..., K, M)``.
-
-    Returns:
-        *Shape of each:* ``(..., M)``.
-    """
-    whole = pulls.sum(-2)
-    shares = pulls * inverse(whole, whole <= 0)[..., None, :]
-    first = values[..., :1, :]
-    value = first.squeeze(-2) + (shares * (values - first)).sum(-2)
-    return torch.where(whole > 0, whole, 0), value, (pulls * (values - value[..., None, :]) ** 2).sum(-2)
-
-
-def on_one_branch(angles: Tensor, pulls: Tensor) -> Tensor:
-    """The same angles, within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
-    with torch.no_grad():
-        mean = torch.atan2((pulls * angles.sin()).sum(-2, True), (pulls * angles.cos()).sum(-2, True))
-    return mean + wrap_angle(angles - mean)

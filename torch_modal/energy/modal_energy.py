@@ -5,7 +5,7 @@ which are the same for a whole batch.
 """
 
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -197,11 +197,12 @@ class ModalEnergy(nn.Module):
         if placement.extra is not None:
             own = energy.gradient(at).transpose(0, 1)
             to_extra = a[:, n, None, None] * to_base + direction[:, n, None, None] * own
-        rates = [rate[:, None] for rate in rates]
-        parts = zip(energy.parts, placement.reference.weights, at, rates, strict=True)
-        to_measures = [-2 * part.acting(weight, one.difference) * rate for part, weight, one, rate in parts]
-        to_weights = [2 * rate * one.difference for one, rate in zip(at, rates, strict=True)]
-        constant = placement.reference.constant
+        to_measures, to_weights = [], []
+        measures, weights, constant = placement.reference
+        for part, one, rest, weight, rate in zip(energy.parts, at, measures, weights, rates, strict=True):
+            pulled = torch.func.vjp(partial(part.term.slopes, one.measures), rest, weight)[1](rate)
+            to_measures.append(pulled[0])
+            to_weights.append(pulled[1])
         to_constant = torch.zeros_like(constant) if isinstance(constant, Tensor) else constant
         return Placement(to_base, to_extra, Reference(tuple(to_measures), tuple(to_weights), to_constant))
 

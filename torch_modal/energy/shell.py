@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, lasting
-from torch_modal.energy.bend import Bend
+from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.energy import Energy, Reference, Rest
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, Term
@@ -81,7 +81,7 @@ class ShellEnergy(nn.Module):
     ) -> None:
         super().__init__()
         self.register_buffer("faces", torch.from_numpy(as_faces(faces)), persistent=False)
-        self.terms: Any = nn.ModuleList([Stretch(alpha), Bend(beta), Volume(gamma), *terms])
+        self.terms: Any = nn.ModuleList([Stretch(alpha), SquaredBend(beta), Volume(gamma), *terms])
         self.energy = Energy(Mesh.of(self.faces, int(self.faces.max()) + 1), [*self.terms])
 
     def _rows(self, x: Tensor) -> Tensor:
@@ -99,7 +99,7 @@ class ShellEnergy(nn.Module):
 
     def against(self, x_rest: Tensor) -> Reference:
         """Rest shapes as references, with the stiffnesses. *Shape:* ``(..., V, 3)``."""
-        return Energy.against(self.rest(x_rest), self.stiffness)
+        return self.energy.against(self.rest(x_rest), self.stiffness)
 
     def measure(self, x: Tensor) -> Measures:
         """Lengths, angles and volume of shapes. *Shape:* ``(..., V, 3)``."""
@@ -120,11 +120,11 @@ class ShellEnergy(nn.Module):
         rows = self._rows(x)
         reference = self.against(x_rest)
         parts = [
-            weight.sqrt() * part.term.difference(part.measures(part.edge_vectors(rows))[..., None, :], rest)
+            weight.sqrt() * part.term.difference(part.measures(part.edge_vectors(rows)), rest.squeeze(-2))
             for part, rest, weight in zip(self.energy.parts, reference.measures, reference.weights, strict=True)
         ]
-        lead = broadcast_shapes(*(part.shape[:-2] for part in parts))
-        return torch.cat([part.squeeze(-2).expand(*lead, -1) for part in parts], -1)
+        lead = broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*lead, -1) for part in parts], -1)
 
     def forward(self, x: Tensor, x_rest: Tensor) -> Tensor:
         """Energy of Eq. 5.

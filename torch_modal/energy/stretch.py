@@ -37,7 +37,7 @@ class Stretch(Term):
         squared = (edge_vectors * edge_vectors).sum(1, keepdim=True)
         return edge_vectors * inverse(squared.sqrt(), squared <= tiny(edge_vectors))
 
-    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
+    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
         """The length's Hessian with the other sign, between both ends; 0 where there is no length."""
         edge = edge_vectors[0]
         squared = (edge * edge).sum(0)

@@ -53,7 +53,7 @@ class Volume(Term):
         i, j, k = self.elements(mesh)[:, 1:].unbind(1)
         return torch.cat([torch.stack(side, 1) for side in ((i, j), (j, k), (k, i))])
 
-    def blocks(self, edge_vectors: Tensor, slope: Tensor) -> Sequence[Tensor]:
+    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
         """``p.(q x r)`` has the block ``-[r]`` between ``p`` and ``q``."""
         p, q, r = edge_vectors
         x, y, z = torch.cat([r, p, q], -1) * (slope / 6)

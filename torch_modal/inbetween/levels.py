@@ -119,7 +119,7 @@ class Levels(nn.Module):
     def against(self, x: Tensor, coarse: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Reference]:
         """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
         parts = zip(self.energies, self.seen(x, coarse), stiffness, strict=True)
-        return [Energy.against(energy.rest_of(own), factors) for energy, own, factors in parts]
+        return [energy.against(energy.rest_of(own), factors) for energy, own, factors in parts]
 
     def place(
         self,

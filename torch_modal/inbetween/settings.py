@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 from torch import Tensor
 
 from torch_modal.backends.choice import names
-from torch_modal.energy.bend import Bend
+from torch_modal.energy.bend import Bend, SquaredBend
 from torch_modal.energy.shell import ALPHA, BETA, GAMMA
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Term
@@ -69,7 +69,8 @@ class Objective:
 
     def all_terms(self) -> list[Term]:
         """Those of Eq. 5 and the further ones."""
-        return [Stretch(self.alpha), Bend(self.beta), Volume(self.gamma), *self.terms]
+        bend = SquaredBend if self.space == "paired" else Bend
+        return [Stretch(self.alpha), bend(self.beta), Volume(self.gamma), *self.terms]
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 from torch_modal import trees
 from torch_modal.backends.torch.fine_steps import FurtherTerms
 from torch_modal.backends.torch.rests import Rests
-from torch_modal.energy.bend import collapsed, dihedral_angle, wrap_angle
+from torch_modal.energy.bend import collapsed, dihedral_angle
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import DIAGONAL
-from torch_modal.energy.term import Mesh
+from torch_modal.energy.term import Mesh, periodic_square
 from torch_modal.geometry.vectors import cross, inverse, norm
 
 # Elements of each kind that are looked at, spread evenly: the sum is then known to a few percent.
@@ -29,7 +29,7 @@ class Distortion(nn.Module):
     r"""Stretching and bending of Eq. 5 against both key-frames, with a bounded contribution of each element.
 
     .. math:: \sum_e \alpha\, |l_e - \bar l_e| \min(|l_e - \bar l_e| / \bar l_e,\, 1)
-        + \sum_h \beta \min(\bar l_h^2 / \bar A_h,\, 8)\, (\theta_h - \bar\theta_h)^2
+        + \sum_h \beta \min(\bar l_h^2 / \bar A_h,\, 8)\, f(\theta_h - \bar\theta_h)
 
     The key-frames have the weights ``1 - t`` and ``t``, or those given. Further terms of the energy count in full.
 
@@ -90,7 +90,7 @@ class Distortion(nn.Module):
             length, angle, weight = trees.picked(measures(end), rests.which)
             off = (lengths - length).abs()
             stretching = (alpha * off * (off / length).clamp_max(1)).sum(-1)
-            bending = (beta * weight * wrap_angle(angles - angle) ** 2).sum(-1)
+            bending = (beta * weight * periodic_square(angles - angle)).sum(-1)
             total = total + pull * (self.shares[0] * stretching + self.shares[1] * bending)
         return total  # type: ignore[no-any-return]
 

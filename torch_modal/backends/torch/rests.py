@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torch_modal import trees
@@ -27,12 +28,10 @@ class Rests(NamedTuple):
     def reference(self, energy: Energy) -> Reference:
         """What shapes are compared with, of the terms that the stiffnesses belong to."""
         found = trees.picked([energy.rest_of(x) for x in self.shapes], self.which)
-        if self.t.dim() > 1:
-            return energy.among(found, self.t, self.stiffness)
-        first, *others = found
-        if not others:
-            return Energy.against(first, self.stiffness)
-        return energy.between(first, others[0], self.t, self.stiffness)
+        if len(found) == 1 and self.t.dim() == 1:
+            return energy.against(found[0], self.stiffness)
+        weights = self.t if self.t.dim() > 1 else torch.stack([1 - self.t, self.t], -1)
+        return energy.among(found, weights, self.stiffness)
 
     def pulls(self) -> tuple[Tensor, ...]:
         """The weight of each of the shapes. *Shape of each:* ``(B,)``."""

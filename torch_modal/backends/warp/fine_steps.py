@@ -72,7 +72,8 @@ class WarpSteps(WarpShell):
             return relax(self.energy, x, self.unpacked(ShellReference(*rest)), n_steps, n_products)
         first, second, t, *stiffness = rest
         one, other = (self.energy.rest_of(x) for x in (first, second))
-        return relax(self.energy, x, self.energy.between(one, other, t, stiffness), n_steps, n_products)
+        reference = self.energy.among((one, other), torch.stack([1 - t, t], -1), stiffness)
+        return relax(self.energy, x, reference, n_steps, n_products)
 
     # -------------------------------------------------------------------------------------------------------- the steps
     @torch.no_grad()

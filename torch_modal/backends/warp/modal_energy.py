@@ -10,9 +10,9 @@ from torch_modal import trees
 from torch_modal.autograd import applied, flattened, made_outside, pushed, recorded, traced, transformed
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
-from torch_modal.energy.energy import merged, on_one_branch
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
-from torch_modal.energy.term import Mesh
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.geometry.vectors import inverse
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8
@@ -44,18 +44,19 @@ def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffne
     own = shell_reference(shell, flat, flat, flat.new_zeros(len(flat)), *alone)
     stretch, bend, hard, volume, _ = (value.unflatten(0, weights.shape) for value in own)
     weights = weights.to(stretch)[..., None]
+    lengths = Term().merged(stretch[..., 1], weights * stretch[..., 0])
+    volumes = Term().merged(volume[..., None], weights * hard[..., None])
     pulls = weights * bend[..., 0]
-    lengths = merged(weights * stretch[..., 0], stretch[..., 1])
-    angles = merged(pulls, on_one_branch(bend[..., 1], pulls))
-    volumes = merged(weights * hard[..., None], volume[..., None])
-    none = torch.zeros_like(angles[0])
+    whole = pulls.sum(1)
+    shares = pulls * inverse(whole, whole <= 0)[:, None]
+    moments = (shares[..., None] * bend[..., 1:]).sum(1)
     # Weights are doubled, for derivatives.
-    constant = 0.5 * torch.cat([part[2] for part in (lengths, angles, volumes)], -1).sum(-1)
+    constant = 0.5 * (lengths.constant.sum(-1) + volumes.constant.squeeze(-1))
     return ShellReference(
-        torch.stack(lengths[:2], -1),
-        torch.stack([*angles[:2], none, none], -1),
-        volumes[0].squeeze(-1),
-        volumes[1].squeeze(-1),
+        torch.stack([lengths.weights, lengths.measures.squeeze(-2)], -1),
+        torch.cat([whole.clamp_min(0)[..., None], moments], -1),
+        volumes.weights.squeeze(-1),
+        volumes.measures.flatten(),
         constant,
     )
 
@@ -117,11 +118,11 @@ class WarpModalEnergy(ModalEnergy):
         self._shell = (shell,)
         places = self.curvature.places.int()
         n_edges, n_hinges = len(shell.record), len(shell.interior)
-        slots = places.new_zeros(n_edges, 6)
+        slots = places.new_zeros(n_edges, 7)
         slots[:, 0] = places[:n_edges]
-        slots[shell.interior, 1:] = places[n_edges : n_edges + 5 * n_hinges].unflatten(0, (5, -1)).T
+        slots[shell.interior, 1:] = places[n_edges : n_edges + 6 * n_hinges].unflatten(0, (6, -1)).T
         self.register_buffer("slots", slots, persistent=False)
-        capped_faces = places[n_edges + 5 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
+        capped_faces = places[n_edges + 6 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
         self.register_buffer("face_slots", capped_faces, persistent=False)
         self.register_buffer("pairs", self.curvature.pairs.int(), persistent=False)
         self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)

@@ -21,7 +21,7 @@ class ShellReference(NamedTuple):
     stretch: Tensor
     """Doubled weight and length. *Shape:* ``(B, E, 2)``."""
     bend: Tensor
-    """Doubled weights and angles of both. *Shape:* ``(B, E, 4)``."""
+    """Doubled weight, and moments of the rest angles. *Shape:* ``(B, E, 5)``."""
     stiffness: Tensor
     """Of the volume, doubled. *Shape:* ``(B,)``."""
     volume: Tensor
@@ -102,7 +102,7 @@ class WarpShell(nn.Module):
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
         pull, shortest, whole, volume, constant = self._weighed(t, gamma, self.sizes(first, second))
         b, n_edges = len(t), len(self.record)
-        stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 4)
+        stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 5)
         given = self._rest(first, second, pull, shortest, alpha, beta)
         launch(kernels("references").rest, (b, n_edges), [*given, stretch, bend, constant])
         return ShellReference(stretch, bend, whole, volume, constant)
@@ -150,23 +150,22 @@ class WarpShell(nn.Module):
     def reference_by_torch(self, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
         """The same by torch."""
         one, other = (self.energy.rest_of(x) for x in (first, second))
-        return self.packed(self.energy.between(one, other, t, stiffness))
+        return self.packed(self.energy.among((one, other), torch.stack([1 - t, t], -1), stiffness))
 
     def packed(self, reference: Reference) -> ShellReference:
-        """A reference of torch's, towards one or two rest shapes, as one of the kernels'."""
-        stretch = torch.stack([2 * reference.weights[0][:, 0], reference.measures[0][:, 0]], -1)
-        every = torch.stack([2 * reference.weights[1], reference.measures[1]], -1)  # (B, R, H, 2)
-        hinges = torch.nn.functional.pad(every.movedim(1, 2).flatten(2), (0, 4 - 2 * every.shape[1]))
-        bend = hinges.new_zeros(len(hinges), len(self.record), 4).index_copy(1, self.interior, hinges)
-        volume = [values[2][:, 0, 0] for values in (reference.weights, reference.measures)]
+        """A reference of torch's as one of the kernels'."""
+        (lengths, angles, volume), (per_length, stiffness, hard), _ = reference
+        stretch = torch.stack([2 * per_length, lengths.squeeze(-2)], -1)
+        hinges = torch.cat([2 * stiffness[..., None], angles.mT], -1)
+        bend = hinges.new_zeros(len(hinges), len(self.record), 5).index_copy(1, self.interior, hinges)
         constant = torch.as_tensor(reference.constant).to(stretch).expand(len(stretch))
-        return ShellReference(stretch, bend, 2 * volume[0], volume[1], constant)
+        return ShellReference(stretch, bend, 2 * hard.squeeze(-1), volume.flatten(), constant)
 
     def unpacked(self, reference: ShellReference) -> Reference:
         """The inverse of :meth:`packed`."""
-        bend = reference.bend.index_select(1, self.interior).unflatten(2, (2, 2)).movedim(2, 1)
-        measures = reference.stretch[:, None, :, 1], bend[..., 1], reference.volume[:, None, None]
-        weights = reference.stretch[:, None, :, 0], bend[..., 0], reference.stiffness[:, None, None]
+        bend = reference.bend.index_select(1, self.interior)
+        measures = reference.stretch[:, None, :, 1], bend[..., 1:].mT, reference.volume[:, None, None]
+        weights = reference.stretch[..., 0], bend[..., 0], reference.stiffness[:, None]
         return Reference(measures, tuple(0.5 * weight for weight in weights), reference.constant)
 
     # ------------------------------------------------------------------------------------------------------- the energy

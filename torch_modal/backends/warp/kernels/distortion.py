@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from torch_modal.backends.warp.kernels.elements import angle_of, is_flat, length_of, place, real, vec3, wrapped
+from torch_modal.backends.warp.kernels.elements import is_flat, length_of, phase_of, place, real, vec3, vec4
 
 LARGEST_WEIGHT = wp.constant(real(8.0))
 """As in :mod:`torch_modal.inbetween.comparison`."""
@@ -10,27 +10,30 @@ LARGEST_WEIGHT = wp.constant(real(8.0))
 
 @wp.func
 def measured(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
-    """Length, dihedral angle and its weight ``l^2 / A``; the last two are 0 without a hinge or where it collapses."""
+    """Length, cosine and sine of the dihedral angle, and its weight ``l^2 / A``; 0 without a hinge."""
     origin = x[place(at, q[0])]
     e = x[place(at, q[1])] - origin
-    found = vec3(length_of(e), real(0.0), real(0.0))
+    found = vec4(length_of(e), real(1.0), real(0.0), real(0.0))
     if q[2] >= 0:
         a = x[place(at, q[2])] - origin
         b = x[place(at, q[3])] - origin
         n1 = wp.cross(e, a)
         n2 = wp.cross(b, e)
         if not (is_flat(e, n1) or is_flat(e, n2)):
-            found[1] = angle_of(e, a, b, n1, n2)
+            phase = phase_of(e, b, n1, n2)
+            found[1] = phase[0]
+            found[2] = phase[1]
             weight = real(2.0) * wp.dot(e, e) / (wp.length(n1) + wp.length(n2))
-            found[2] = wp.min(weight, LARGEST_WEIGHT)
+            found[3] = wp.min(weight, LARGEST_WEIGHT)
     return found
 
 
 @wp.func
-def cost(found: vec3, rest: vec3, stretching: real, bending: real):
+def cost(found: vec4, rest: vec4, stretching: real, bending: real):
     off = wp.abs(found[0] - rest[0])
-    turn = wrapped(found[1] - rest[1])
-    return stretching * off * wp.min(off / rest[0], real(1.0)) + bending * rest[2] * turn * turn
+    turn = real(1.0) - found[1] * rest[1] - found[2] * rest[2]
+    bend = turn * (real(2.0) + turn / real(3.0))
+    return stretching * off * wp.min(off / rest[0], real(1.0)) + bending * rest[3] * bend
 
 
 @wp.kernel(enable_backward=False)

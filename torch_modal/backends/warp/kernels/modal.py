@@ -5,22 +5,23 @@ import warp as wp
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
     TINY,
-    angle_of,
+    bend_curvature,
+    bend_slope,
     corner,
     is_flat,
     length_of,
     middle_of,
+    moments,
+    phase_of,
     place,
     real,
     vec3,
-    vec4,
-    wrapped,
 )
 
 wide = wp.types.vector(length=8, dtype=real)
 """A row's entries of eight columns."""
-six = wp.types.vector(length=6, dtype=wp.int32)
-"""Where the blocks of an edge go, and the five of its hinge."""
+seven = wp.types.vector(length=7, dtype=wp.int32)
+"""Where the block of an edge goes, and the six of its hinge."""
 
 
 @wp.kernel(enable_backward=False)
@@ -29,7 +30,7 @@ def jacobian(
     record: wp.array(dtype=wp.vec4i),
     hinge: wp.array(dtype=wp.int32),
     stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=vec4),
+    bend: wp.array(dtype=moments),
     columns: wp.array(dtype=wide),
     extra: wp.array(dtype=vec3),
     n: int,
@@ -93,14 +94,13 @@ def jacobian(
             gb = vec3()
             off = real(0.0)
             if not (is_flat(e, n1) or is_flat(e, n2)):
-                theta = angle_of(e, tip_a, tip_b, n1, n2)
-                stiff = wp.sqrt(w[0] + w[2])
+                stiff = wp.sqrt(w[0])
                 if stiff > real(0.0):
-                    off = (w[0] * wrapped(theta - w[1]) + w[2] * wrapped(theta - w[3])) / stiff
+                    off = bend_slope(phase_of(e, tip_b, n1, n2), w) / stiff
                 ga = (-stiff * length / wp.dot(n1, n1)) * n1
                 gb = (-stiff * length / wp.dot(n2, n2)) * n2
                 ge = (real(-1.0) / wp.dot(e, e)) * (wp.dot(tip_a, e) * ga + wp.dot(tip_b, e) * gb)
-                total += w[0] + w[2]
+                total += w[0]
             gi = -(ge + ga + gb)
             for c in range(n_blocks):
                 y = c + n_blocks
@@ -138,8 +138,8 @@ def curved_edges(
     x: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
     stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=vec4),
-    slots: wp.array(dtype=six),
+    bend: wp.array(dtype=moments),
+    slots: wp.array(dtype=seven),
     n: int,
     n_slots: int,
     out: wp.array(dtype=wp.mat33d),
@@ -172,15 +172,21 @@ def curved_edges(
             n2 = wp.cross(b, e)
             if not (is_flat(e, n1) or is_flat(e, n2)):
                 w = bend[at]
-                theta = angle_of(e, a, b, n1, n2)
-                moment = w[0] * wrapped(theta - w[1]) + w[2] * wrapped(theta - w[3])
+                phase = phase_of(e, b, n1, n2)
+                moment = bend_slope(phase, w)
+                beyond = bend_curvature(phase, w) - w[0]
+                ga = (-length / wp.dot(n1, n1)) * n1
+                gb = (-length / wp.dot(n2, n2)) * n2
+                ge = (real(-1.0) / base) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)
+                gi = -(ga + gb + ge)
                 own1, across1, rest1 = half_of_hinge(e, a, n1, wp.cross(n1, e), length)
                 own2, across2, rest2 = half_of_hinge(e, b, n2, wp.cross(e, n2), length)
-                wp.atomic_add(out, place(to, slot[1]), -moment * (own1 + own2))
-                wp.atomic_add(out, place(to, slot[2]), -moment * rest1)
-                wp.atomic_add(out, place(to, slot[3]), moment * across1)
-                wp.atomic_add(out, place(to, slot[4]), -moment * rest2)
-                wp.atomic_add(out, place(to, slot[5]), moment * across2)
+                wp.atomic_add(out, place(to, slot[1]), beyond * wp.outer(gi, ge) - moment * (own1 + own2))
+                wp.atomic_add(out, place(to, slot[2]), beyond * wp.outer(ga, gi) - moment * rest1)
+                wp.atomic_add(out, place(to, slot[3]), beyond * wp.outer(ga, ge) + moment * across1)
+                wp.atomic_add(out, place(to, slot[4]), beyond * wp.outer(gb, gi) - moment * rest2)
+                wp.atomic_add(out, place(to, slot[5]), beyond * wp.outer(gb, ge) + moment * across2)
+                wp.atomic_add(out, place(to, slot[6]), beyond * wp.outer(ga, gb))
 
 
 @wp.kernel(enable_backward=False)

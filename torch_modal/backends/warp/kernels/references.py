@@ -4,15 +4,16 @@ import warp as wp
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
-    angle_of,
     corner,
+    doubled,
     is_flat,
     length_of,
     middle_of,
+    moments,
+    phase_of,
     place,
     real,
     vec3,
-    vec4,
 )
 from torch_modal.energy.bend import MAX_BENDING_RATIO
 from torch_modal.energy.stretch import MIN_RELATIVE_LENGTH
@@ -134,7 +135,7 @@ def rest(
     n_alpha: int,
     n_beta: int,
     stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=vec4),
+    bend: wp.array(dtype=moments),
     constant: wp.array(dtype=real),
     threads: int,
 ):
@@ -174,16 +175,21 @@ def rest(
             n1 = wp.cross(e2, a2)
             n2 = wp.cross(b2, e2)
             p1 = real(0.0)
-            t1 = real(0.0)
+            t1 = wp.vec2d()
             p2 = real(0.0)
-            t2 = real(0.0)
+            t2 = wp.vec2d()
             if not (is_flat(e1, m1) or is_flat(e1, m2)):
                 p1 = stiffness * both[0] * bend_weight(e1, m1, m2)
-                t1 = angle_of(e1, a1, b1, m1, m2)
+                t1 = phase_of(e1, b1, m1, m2)
             if not (is_flat(e2, n1) or is_flat(e2, n2)):
                 p2 = stiffness * both[1] * bend_weight(e2, n1, n2)
-                t2 = angle_of(e2, a2, b2, n1, n2)
-            bend[out] = vec4(p1, t1, p2, t2)
+                t2 = phase_of(e2, b2, n1, n2)
+            part = real(0.0)
+            if p1 + p2 > real(0.0):
+                part = p2 / (p1 + p2)
+            single = (real(1.0) - part) * t1 + part * t2
+            double = (real(1.0) - part) * doubled(t1) + part * doubled(t2)
+            bend[out] = moments(p1 + p2, single[0], single[1], double[0], double[1])
         else:
-            bend[out] = vec4()
+            bend[out] = moments()
     wp.atomic_add(constant, s, total)

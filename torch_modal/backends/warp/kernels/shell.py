@@ -6,20 +6,21 @@ from torch_modal.backends.warp.kernels.elements import (
     HALF,
     TINIEST,
     TINY,
-    angle_of,
+    bend_energy,
+    bend_slope,
     bent,
     corner,
     is_flat,
     length_of,
     middle_of,
+    moments,
+    phase_of,
     place,
     real,
     squared,
     stretched,
     symmetric,
     vec3,
-    vec4,
-    wrapped,
 )
 from torch_modal.energy.stretch import SLACK
 
@@ -31,7 +32,7 @@ def value(
     x: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
     stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=vec4),
+    bend: wp.array(dtype=moments),
     n: int,
     n_references: int,
     centre: wp.array(dtype=vec3),
@@ -59,13 +60,10 @@ def value(
             b = x[place(v, q[3])] - origin
             n1 = wp.cross(e, a)
             n2 = wp.cross(b, e)
-            theta = real(0.0)
+            phase = wp.vec2d(real(1.0), real(0.0))
             if not (is_flat(e, n1) or is_flat(e, n2)):
-                theta = angle_of(e, a, b, n1, n2)
-            w = bend[at]
-            d1 = wrapped(theta - w[1])
-            d2 = wrapped(theta - w[3])
-            found += w[0] * d1 * d1 + w[2] * d2 * d2
+                phase = phase_of(e, b, n1, n2)
+            found += bend_energy(phase, bend[at])
     wp.atomic_add(energy, s, HALF * found)
     middle = middle_of(x, centre, capped_faces, s, v)
     enclosed = real(0.0)
@@ -126,7 +124,7 @@ def linearise(
     x: wp.array(dtype=vec3),
     record: wp.array(dtype=wp.vec4i),
     stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=vec4),
+    bend: wp.array(dtype=moments),
     centre: wp.array(dtype=vec3),
     capped_faces: wp.array(dtype=wp.vec3i),
     n: int,
@@ -186,21 +184,17 @@ def linearise(
             n2 = wp.cross(b, e)
             w = bend[at]
             if is_flat(e, n1) or is_flat(e, n2):
-                d3 = wrapped(-w[1])
-                d4 = wrapped(-w[3])
-                own += w[0] * d3 * d3 + w[2] * d4 * d4
+                own += bend_energy(wp.vec2d(real(1.0), real(0.0)), w)
             else:
-                theta = angle_of(e, a, b, n1, n2)
-                d1 = wrapped(theta - w[1])
-                d2 = wrapped(theta - w[3])
-                moment = w[0] * d1 + w[2] * d2
-                stiffness = w[0] + w[2]
+                phase = phase_of(e, b, n1, n2)
+                moment = bend_slope(phase, w)
+                stiffness = w[0]
                 ga = (-length / wp.dot(n1, n1)) * n1
                 gb = (-length / wp.dot(n2, n2)) * n2
                 ge = (-per_length * per_length) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)
                 gi = -(ga + gb + ge)
                 found = bent(ge[0], ge[1], ge[2], ga[0], ga[1], ga[2], gb[0], gb[1], gb[2], stiffness)
-                own += w[0] * d1 * d1 + w[2] * d2 * d2
+                own += bend_energy(phase, w)
                 wp.atomic_add(gradient, q0, moment * gi)
                 wp.atomic_add(gradient, q1, moment * ge)
                 wp.atomic_add(gradient, q2, moment * ga)
