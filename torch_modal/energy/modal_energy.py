@@ -274,19 +274,22 @@ def _bordered(inner: Tensor, border: Tensor, corner: Tensor) -> Tensor:
 
 
 class SumOfEnergies(nn.Module):
-    """Several energies of the same amplitudes.
+    r"""Several energies of the same amplitudes, and an anchor at zeros: :math:`E(a) + \tfrac{1}{2} \rho |a|^2`.
 
     Args:
         parts: The energies, of one precision or several; a placement of the sum has one of each.
+        anchor: ``rho``.
     """
 
-    def __init__(self, *parts: ModalEnergy) -> None:
+    def __init__(self, *parts: ModalEnergy, anchor: float = 0.0) -> None:
         super().__init__()
         self.parts: Any = nn.ModuleList(parts)
+        self.anchor = anchor
 
     def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
-        return reduce(torch.add, [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)])
+        energies = [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
 
     def base_value(self, placement: Sequence[Placement]) -> Tensor:
         """Energy at amplitudes of zero. *Shape:* ``(..., B)``."""
@@ -295,13 +298,18 @@ class SumOfEnergies(nn.Module):
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
         found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
-        sums = (None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True))
-        return Derivatives(*sums)  # type: ignore[arg-type]
+        gradient, gauss_newton, *others = (
+            None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True)
+        )
+        eye = torch.eye(a.shape[-1]).to(gauss_newton)
+        return Derivatives(gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
 
     def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
         found = [part.value_and_gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
-        return reduce(torch.add, [value for value, _ in found]), reduce(torch.add, [gradient for _, gradient in found])
+        values, gradients = zip(*found, strict=True)
+        value = reduce(torch.add, values) + 0.5 * self.anchor * a.square().sum(-1)
+        return value, reduce(torch.add, gradients) + self.anchor * a
 
     def second_order(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""

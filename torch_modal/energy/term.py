@@ -253,37 +253,42 @@ class PeriodicTerm(Term):
     .. math:: f(d) = 2 (1 - \cos d) + \tfrac{1}{3} (1 - \cos d)^2 = d^2 + O(d^6)
 
     It is 1.2 % below the square at 60 degrees, 5 % at 90, and has no pull at half a turn, where the square of the
-    wrapped difference jumps from one side to the other. As a trigonometric polynomial of second order,
-
-    .. math:: f(d) = \tfrac{5}{2} - \tfrac{8}{3} \cos d + \tfrac{1}{6} \cos 2 d,
-
-    its weighted sum over K rest angles follows exactly from the weighted means of ``cos`` and ``sin`` of the angles and
-    of twice the angles: the four rows of a reference.
+    wrapped difference jumps from one side to the other. It is a trigonometric polynomial of second order, so that its
+    weighted mean over K rest angles follows exactly from five numbers, the rows of a reference: one of the angles and,
+    of the differences ``d`` from it, the weighted means of ``1 - cos d``, ``sin d``, ``1 - cos 2d`` and ``sin 2d``.
     """
 
     def merged(self, measures: Tensor, pulls: Tensor) -> Merged:
         """K rest angles by their first two trigonometric moments; arguments as in the base class."""
         whole = pulls.sum(-2)
         shares = pulls * inverse(whole, whole <= 0)[..., None, :]
-        parts = [measures.cos(), measures.sin(), (2 * measures).cos(), (2 * measures).sin()]
-        moments = torch.stack([(shares * part).sum(-2) for part in parts], -2)
-        return Merged(moments, torch.where(whole > 0, whole, 0), torch.zeros_like(whole))
+        first = measures[..., 0, :]
+        off = measures - first[..., None, :]
+        parts = _versine(off), off.sin(), _versine(2 * off), (2 * off).sin()
+        rows = torch.stack([first, *((shares * part).sum(-2) for part in parts)], -2)
+        return Merged(rows, torch.where(whole > 0, whole, 0), torch.zeros_like(whole))
 
     def energies(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
         """Overrides the square."""
-        first, second = _phases(measures, rest)
-        return weights * (2.5 - 8 / 3 * first[0] + second[0] / 6)
+        angle, a, b, c, d = rest.unbind(-2)
+        off = measures - angle
+        first, second = a * off.cos() - b * off.sin(), c * (2 * off).cos() - d * (2 * off).sin()
+        return weights * (periodic_square(off) + 8 / 3 * first - second / 6)
 
     def slopes(self, measures: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
         """First derivative of :meth:`energies` in the measures. *Shape:* ``(..., M)``."""
-        first, second = _phases(measures, rest)
-        return weights * (8 / 3 * first[1] - second[1] / 3)
+        angle, a, b, c, d = rest.unbind(-2)
+        off = measures - angle
+        first, second = a * off.sin() + b * off.cos(), c * (2 * off).sin() + d * (2 * off).cos()
+        return weights * (off.sin() * (2 + 2 / 3 * _versine(off)) - 8 / 3 * first + second / 3)
 
     def curvatures(self, measures: Tensor, rest: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """The largest second derivative, which is that of the square, and what the true one lacks of it."""
-        first, second = _phases(measures, rest)
-        twice = 2 * weights.expand_as(measures)
-        return twice, weights * (8 / 3 * first[0] - 2 / 3 * second[0]) - twice
+        angle, a, b, c, d = rest.unbind(-2)
+        off = measures - angle
+        first, second = a * off.cos() - b * off.sin(), c * (2 * off).cos() - d * (2 * off).sin()
+        lacking = weights * (-4 / 3 * _versine(off).square() - 8 / 3 * first + 2 / 3 * second)
+        return 2 * weights.expand_as(measures), lacking
 
     def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
         """The same angles, within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
@@ -292,19 +297,15 @@ class PeriodicTerm(Term):
         return mean + wrap_angle(measures - mean)
 
 
-def _phases(measures: Tensor, rest: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Weighted means of ``cos d, sin d`` and ``cos 2d, sin 2d``. *Shape:* ``(..., M), (..., 4, M)``."""
-    found = []
-    for angle, (c, s) in ((measures, rest.unbind(-2)[:2]), (2 * measures, rest.unbind(-2)[2:])):
-        cos, sin = angle.cos(), angle.sin()
-        found.append((c * cos + s * sin, c * sin - s * cos))
-    return found[0], found[1]
-
-
 def periodic_square(difference: Tensor) -> Tensor:
     """The function of :class:`PeriodicTerm`."""
-    versine = 1 - difference.cos()
+    versine = _versine(difference)
     return versine * (2 + versine / 3)
+
+
+def _versine(angle: Tensor) -> Tensor:
+    """``1 - cos``, without cancellation."""
+    return 2 * (0.5 * angle).sin().square()
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

@@ -118,7 +118,7 @@ class Between(nn.Module):
             ends = self.frame.place(*shapes[:2, None])
             references = torch.cat([ends.first, ends.second])
             blend = shared.blends.of(*places[:2]) if objective.base == "rotations" else None
-            self.space: Any = JointSpace(self.frame, levels, modes, references, blend)
+            self.space: Any = JointSpace(self.frame, levels, modes, references, blend, objective.anchor)
         else:
             self.space = PairedSpace(self.frame, levels(), modes)
 

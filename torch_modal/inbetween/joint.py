@@ -59,11 +59,12 @@ class _Modal(nn.Module):
         modes: Sequence[Tensor],
         references: Tensor,
         guess: bool,
+        anchor: float,
     ) -> None:
         super().__init__()
         self.levels = levels()
         self.columns = frame.elastic_columns(*frame.modes(*modes))
-        self.energy = self.levels.modal(self.columns)
+        self.energy = self.levels.modal(self.columns, anchor)
         # With the blend as the base there is nothing left to guess.
         self.guess = Guess(self.levels.mesh, self.columns.coarse, frame.coarsen(references)) if guess else None
 
@@ -81,6 +82,7 @@ class JointSpace(nn.Module):
         modes: Modes of both ends. *Shape of each:* ``(k, V, 3)``.
         references: Shapes that the modes belong to, in the frame. *Shape:* ``(2, V, 3)``.
         blend: By local rotations, if the base is to be one.
+        anchor: Weight of the anchor.
     """
 
     def __init__(
@@ -90,12 +92,13 @@ class JointSpace(nn.Module):
         modes: Sequence[Tensor],
         references: Tensor,
         blend: RotationBlend | None,
+        anchor: float,
     ) -> None:
         super().__init__()
         self.frame = frame
         self.blend = blend
         self._modal: Any = None
-        self._make: Any = partial(_Modal, frame, levels, modes, references, guess=blend is None)
+        self._make: Any = partial(_Modal, frame, levels, modes, references, blend is None, anchor)
 
     @property
     def modal(self) -> "_Modal":

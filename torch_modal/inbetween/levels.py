@@ -53,14 +53,13 @@ class Levels(nn.Module):
         """The energy of each level."""
         return [part.energy for part in self.parts]
 
-    def modal(self, columns: Columns) -> SumOfEnergies:
-        """All of them in the amplitudes of a space."""
-        return SumOfEnergies(
-            *(
-                part.modal(columns.at(part.energy.vertices) if part.energy.sampled else columns.coarse)
-                for part in self.parts
-            )
+    def modal(self, columns: Columns, anchor: float = 0.0) -> SumOfEnergies:
+        """All of them in the amplitudes of a space, anchored at zeros."""
+        parts = (
+            part.modal(columns.at(part.energy.vertices) if part.energy.sampled else columns.coarse)
+            for part in self.parts
         )
+        return SumOfEnergies(*parts, anchor=anchor)
 
     def stiffness(self, values: list[Tensor]) -> list[list[Tensor]]:
         """Stiffnesses of the elements of the fine mesh, on those of each level.

@@ -54,6 +54,7 @@ class Objective:
     gamma: float | Tensor = GAMMA
     mu: float | Tensor = 1.0  # the best of a grid over three spans of a hand; it depends on the mesh
     terms: tuple[Term, ...] = ()
+    anchor: float = 3000.0
     coarse_faces: int = 1000
     contact: bool = False
 

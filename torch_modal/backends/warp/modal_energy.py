@@ -11,8 +11,7 @@ from torch_modal.autograd import applied, flattened, made_outside, pushed, recor
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
-from torch_modal.energy.term import Mesh, Term
-from torch_modal.geometry.vectors import inverse
+from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8
@@ -46,15 +45,13 @@ def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffne
     weights = weights.to(stretch)[..., None]
     lengths = Term().merged(stretch[..., 1], weights * stretch[..., 0])
     volumes = Term().merged(volume[..., None], weights * hard[..., None])
-    pulls = weights * bend[..., 0]
-    whole = pulls.sum(1)
-    shares = pulls * inverse(whole, whole <= 0)[:, None]
-    moments = (shares[..., None] * bend[..., 1:]).sum(1)
+    angles = PeriodicTerm().merged(torch.atan2(bend[..., 2], bend[..., 1]), weights * bend[..., 0])
+    angle, *moments = angles.measures.unbind(-2)
     # Weights are doubled, for derivatives.
     constant = 0.5 * (lengths.constant.sum(-1) + volumes.constant.squeeze(-1))
     return ShellReference(
         torch.stack([lengths.weights, lengths.measures.squeeze(-2)], -1),
-        torch.cat([whole.clamp_min(0)[..., None], moments], -1),
+        torch.stack([angles.weights, angle.cos(), angle.sin(), *moments], -1),
         volumes.weights.squeeze(-1),
         volumes.measures.flatten(),
         constant,

@@ -21,7 +21,7 @@ class ShellReference(NamedTuple):
     stretch: Tensor
     """Doubled weight and length. *Shape:* ``(B, E, 2)``."""
     bend: Tensor
-    """Doubled weight, and moments of the rest angles. *Shape:* ``(B, E, 5)``."""
+    """Doubled weight, one of the rest angles by its phase, and the moments about it. *Shape:* ``(B, E, 7)``."""
     stiffness: Tensor
     """Of the volume, doubled. *Shape:* ``(B,)``."""
     volume: Tensor
@@ -102,7 +102,7 @@ class WarpShell(nn.Module):
         alpha, beta, gamma = (value.contiguous() for value in stiffness)
         pull, shortest, whole, volume, constant = self._weighed(t, gamma, self.sizes(first, second))
         b, n_edges = len(t), len(self.record)
-        stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 5)
+        stretch, bend = first.new_empty(b, n_edges, 2), first.new_empty(b, n_edges, 7)
         given = self._rest(first, second, pull, shortest, alpha, beta)
         launch(kernels("references").rest, (b, n_edges), [*given, stretch, bend, constant])
         return ShellReference(stretch, bend, whole, volume, constant)
@@ -156,15 +156,17 @@ class WarpShell(nn.Module):
         """A reference of torch's as one of the kernels'."""
         (lengths, angles, volume), (per_length, stiffness, hard), _ = reference
         stretch = torch.stack([2 * per_length, lengths.squeeze(-2)], -1)
-        hinges = torch.cat([2 * stiffness[..., None], angles.mT], -1)
-        bend = hinges.new_zeros(len(hinges), len(self.record), 5).index_copy(1, self.interior, hinges)
+        angle, *others = angles.unbind(-2)
+        hinges = torch.stack([2 * stiffness, angle.cos(), angle.sin(), *others], -1)
+        bend = hinges.new_zeros(len(hinges), len(self.record), 7).index_copy(1, self.interior, hinges)
         constant = torch.as_tensor(reference.constant).to(stretch).expand(len(stretch))
         return ShellReference(stretch, bend, 2 * hard.squeeze(-1), volume.flatten(), constant)
 
     def unpacked(self, reference: ShellReference) -> Reference:
         """The inverse of :meth:`packed`."""
         bend = reference.bend.index_select(1, self.interior)
-        measures = reference.stretch[:, None, :, 1], bend[..., 1:].mT, reference.volume[:, None, None]
+        angles = torch.cat([torch.atan2(bend[..., 2:3], bend[..., 1:2]), bend[..., 3:]], -1)
+        measures = reference.stretch[:, None, :, 1], angles.mT, reference.volume[:, None, None]
         weights = reference.stretch[..., 0], bend[..., 0], reference.stiffness[:, None]
         return Reference(measures, tuple(0.5 * weight for weight in weights), reference.constant)
 

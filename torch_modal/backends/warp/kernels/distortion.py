@@ -2,7 +2,16 @@
 
 import warp as wp
 
-from torch_modal.backends.warp.kernels.elements import is_flat, length_of, phase_of, place, real, vec3, vec4
+from torch_modal.backends.warp.kernels.elements import (
+    is_flat,
+    length_of,
+    phase_of,
+    place,
+    real,
+    turn_between,
+    vec3,
+    vec4,
+)
 
 LARGEST_WEIGHT = wp.constant(real(8.0))
 """As in :mod:`torch_modal.inbetween.comparison`."""
@@ -31,7 +40,7 @@ def measured(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
 @wp.func
 def cost(found: vec4, rest: vec4, stretching: real, bending: real):
     off = wp.abs(found[0] - rest[0])
-    turn = real(1.0) - found[1] * rest[1] - found[2] * rest[2]
+    turn = turn_between(wp.vec2d(rest[1], rest[2]), wp.vec2d(found[1], found[2]))[0]
     bend = turn * (real(2.0) + turn / real(3.0))
     return stretching * off * wp.min(off / rest[0], real(1.0)) + bending * rest[3] * bend
 

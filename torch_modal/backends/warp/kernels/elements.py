@@ -11,8 +11,8 @@ symmetric = wp.types.vector(length=6, dtype=real)
 """Entries ``xx, xy, xz, yy, yz, zz`` of a symmetric matrix."""
 stretched = wp.types.vector(length=5, dtype=real)
 """An edge: unit vector, stiffness across it, and how much more along it."""
-moments = wp.types.vector(length=5, dtype=real)
-"""Rest angles of a hinge: doubled weight, weighted means of ``cos, sin`` of the angles and of twice the angles."""
+moments = wp.types.vector(length=7, dtype=real)
+"""Rest angles of a hinge: doubled weight, ``cos, sin`` of one, and the four moments of the differences from it."""
 bent = wp.types.vector(length=10, dtype=real)
 """A hinge: gradients of the angle in the edge and in both tips, and the stiffness."""
 
@@ -20,8 +20,7 @@ TINY = wp.constant(real(1.4916681462400413e-154))  # vectors.tiny of float64
 TINIEST = wp.constant(real(2.2250738585072014e-308))
 FLAT = wp.constant(real(COLLAPSED))
 HALF = wp.constant(real(0.5))
-FIRST = wp.constant(real(8 / 3))  # of torch_modal.energy.term.PeriodicTerm
-SECOND = wp.constant(real(1 / 6))
+THIRD = wp.constant(real(1 / 3))
 LARGEST = wp.constant(0x7FFFFFFF)
 
 
@@ -64,29 +63,46 @@ def phase_of(e: vec3, b: vec3, n1: vec3, n2: vec3):
 
 
 @wp.func
-def doubled(p: wp.vec2d):
-    return wp.vec2d(p[0] * p[0] - p[1] * p[1], real(2.0) * p[0] * p[1])
+def turn_between(p: wp.vec2d, q: wp.vec2d):
+    """``1 - cos`` and ``sin`` of the angle from the one phase to the other."""
+    d = q - p
+    return wp.vec2d(HALF * wp.dot(d, d), p[0] * q[1] - p[1] * q[0])
+
+
+@wp.func
+def doubled(d: wp.vec2d):
+    """The same of twice the angle."""
+    return wp.vec2d(real(2.0) * d[1] * d[1], real(2.0) * d[1] * (real(1.0) - d[0]))
 
 
 @wp.func
 def bend_energy(p: wp.vec2d, w: moments):
     """Twice the energy of a hinge: :class:`torch_modal.energy.term.PeriodicTerm`."""
-    q = doubled(p)
-    return w[0] * (real(2.5) - FIRST * (w[1] * p[0] + w[2] * p[1]) + SECOND * (w[3] * q[0] + w[4] * q[1]))
+    d = turn_between(wp.vec2d(w[1], w[2]), p)
+    e = doubled(d)
+    first = w[3] * (real(1.0) - d[0]) - w[4] * d[1]
+    second = w[5] * (real(1.0) - e[0]) - w[6] * e[1]
+    return w[0] * (d[0] * (real(2.0) + d[0] * THIRD) + real(8.0) * THIRD * first - HALF * THIRD * second)
 
 
 @wp.func
 def bend_slope(p: wp.vec2d, w: moments):
     """First derivative of the energy in the angle."""
-    q = doubled(p)
-    return w[0] * (HALF * FIRST * (w[1] * p[1] - w[2] * p[0]) - SECOND * (w[3] * q[1] - w[4] * q[0]))
+    d = turn_between(wp.vec2d(w[1], w[2]), p)
+    e = doubled(d)
+    first = w[3] * d[1] + w[4] * (real(1.0) - d[0])
+    second = w[5] * e[1] + w[6] * (real(1.0) - e[0])
+    return w[0] * (d[1] * (real(1.0) + THIRD * d[0]) - real(4.0) * THIRD * first + HALF * THIRD * second)
 
 
 @wp.func
-def bend_curvature(p: wp.vec2d, w: moments):
-    """Second derivative."""
-    q = doubled(p)
-    return w[0] * (HALF * FIRST * (w[1] * p[0] + w[2] * p[1]) - real(2.0) * SECOND * (w[3] * q[0] + w[4] * q[1]))
+def bend_beyond(p: wp.vec2d, w: moments):
+    """Second derivative beyond that of the square."""
+    d = turn_between(wp.vec2d(w[1], w[2]), p)
+    e = doubled(d)
+    first = w[3] * (real(1.0) - d[0]) - w[4] * d[1]
+    second = w[5] * (real(1.0) - e[0]) - w[6] * e[1]
+    return w[0] * THIRD * (second - real(2.0) * d[0] * d[0] - real(4.0) * first)
 
 
 @wp.func

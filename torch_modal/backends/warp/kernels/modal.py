@@ -5,7 +5,7 @@ import warp as wp
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
     TINY,
-    bend_curvature,
+    bend_beyond,
     bend_slope,
     corner,
     is_flat,
@@ -174,7 +174,7 @@ def curved_edges(
                 w = bend[at]
                 phase = phase_of(e, b, n1, n2)
                 moment = bend_slope(phase, w)
-                beyond = bend_curvature(phase, w) - w[0]
+                beyond = bend_beyond(phase, w)
                 ga = (-length / wp.dot(n1, n1)) * n1
                 gb = (-length / wp.dot(n2, n2)) * n2
                 ge = (real(-1.0) / base) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)

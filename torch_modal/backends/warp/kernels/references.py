@@ -13,6 +13,7 @@ from torch_modal.backends.warp.kernels.elements import (
     phase_of,
     place,
     real,
+    turn_between,
     vec3,
 )
 from torch_modal.energy.bend import MAX_BENDING_RATIO
@@ -175,9 +176,9 @@ def rest(
             n1 = wp.cross(e2, a2)
             n2 = wp.cross(b2, e2)
             p1 = real(0.0)
-            t1 = wp.vec2d()
+            t1 = wp.vec2d(real(1.0), real(0.0))
             p2 = real(0.0)
-            t2 = wp.vec2d()
+            t2 = wp.vec2d(real(1.0), real(0.0))
             if not (is_flat(e1, m1) or is_flat(e1, m2)):
                 p1 = stiffness * both[0] * bend_weight(e1, m1, m2)
                 t1 = phase_of(e1, b1, m1, m2)
@@ -187,9 +188,9 @@ def rest(
             part = real(0.0)
             if p1 + p2 > real(0.0):
                 part = p2 / (p1 + p2)
-            single = (real(1.0) - part) * t1 + part * t2
-            double = (real(1.0) - part) * doubled(t1) + part * doubled(t2)
-            bend[out] = moments(p1 + p2, single[0], single[1], double[0], double[1])
+            turn = turn_between(t1, t2)
+            twice = doubled(turn)
+            bend[out] = moments(p1 + p2, t1[0], t1[1], part * turn[0], part * turn[1], part * twice[0], part * twice[1])
         else:
             bend[out] = moments()
     wp.atomic_add(constant, s, total)
