@@ -14,6 +14,9 @@ MAX_BENDING_RATIO = 1e3
 # Altitude of a triangle over its edge below which the triangle has no normal worth the name.
 COLLAPSED = 1e-6
 
+# Altitude of a triangle over its longest side at which its hinges have half of their weight.
+NEEDLE = 0.05
+
 
 class SquaredBend(Term):
     r"""Dihedral angles: :math:`\beta \sum_h (\theta_h - \bar\theta_h)^2 \bar l_h^2 / \bar A_h`, the second of Eq. 5.
@@ -61,7 +64,14 @@ class Bend(PeriodicTerm, SquaredBend):
     r"""Dihedral angles: :math:`\beta \sum_h f(\theta_h - \bar\theta_h) \bar l_h^2 / \bar A_h`, smooth at half a turn.
 
     :class:`~torch_modal.energy.term.PeriodicTerm` has the function ``f``, which is the square of Eq. 5 below a radian.
+    Hinges with a needle at rest, whose normal turns over at little cost, count for less, see :func:`fullness`.
     """
+
+    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
+        """Those of Eq. 5 times the :func:`fullness` of both triangles."""
+        e, a, b = edge_vectors
+        full = fullness(e, a, cross(e, a)) * fullness(e, b, cross(b, e))
+        return full * super().weights(edge_vectors, measures)
 
     def pairs(self, mesh: Mesh) -> Tensor:
         """With that of the two tips."""
@@ -153,6 +163,14 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
         own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1)) + across
         blocks += [-s - across, across]
     return torch.stack([-own, *blocks])
+
+
+def fullness(edge: Tensor, side: Tensor, normal: Tensor) -> Tensor:
+    """0 to 1 by the altitude of a triangle over its longest side: half at ``NEEDLE``. *Shape:* ``(3, ...) -> (...)``."""
+    other = side - edge
+    longest = torch.maximum(torch.maximum((edge * edge).sum(0), (side * side).sum(0)), (other * other).sum(0))
+    squared = (normal * normal).sum(0)
+    return squared * inverse(squared + (NEEDLE * longest).square(), squared <= tiny(edge))
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:

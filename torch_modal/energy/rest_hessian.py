@@ -5,7 +5,7 @@ import scipy.sparse as sp
 import torch
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.energy.bend import Bend
+from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.shell import ALPHA, BETA
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Term
@@ -26,7 +26,7 @@ def rest_hessian(points: FloatArray, edges: IntArray, hinges: IntArray, stretch:
     Returns:
         Symmetric positive semi-definite; row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
     """
-    return sp.csc_matrix(_of_term(Stretch(stretch * ALPHA), edges, points) + _of_term(Bend(BETA), hinges, points))
+    return sp.csc_matrix(_of_term(Stretch(stretch * ALPHA), edges, points) + _of_term(SquaredBend(BETA), hinges, points))
 
 
 def _of_term(term: Term, elements: IntArray, points: FloatArray) -> sp.csc_matrix:
