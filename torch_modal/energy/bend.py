@@ -166,7 +166,7 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
 
 
 def fullness(edge: Tensor, side: Tensor, normal: Tensor) -> Tensor:
-    """0 to 1 by the altitude of a triangle over its longest side: half at ``NEEDLE``. *Shape:* ``(3, ...) -> (...)``."""
+    """0 to 1 by the altitude of triangles over their longest side. *Shape:* ``(3, ...) -> (...)``."""
     other = side - edge
     longest = torch.maximum(torch.maximum((edge * edge).sum(0), (side * side).sum(0)), (other * other).sum(0))
     squared = (normal * normal).sum(0)

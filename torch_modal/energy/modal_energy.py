@@ -125,10 +125,6 @@ class ModalEnergy(nn.Module):
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
         return self.energy.value(self.rows(a, placement), placement.reference)
 
-    def base_value(self, placement: Placement) -> Tensor:
-        """Energy at amplitudes of zero. *Shape:* ``(..., B)``."""
-        return self.energy.value(placement.base.movedim(-2, 0).contiguous(), placement.reference)
-
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``.
 
@@ -290,10 +286,6 @@ class SumOfEnergies(nn.Module):
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
         energies = [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)]
         return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
-
-    def base_value(self, placement: Sequence[Placement]) -> Tensor:
-        """Energy at amplitudes of zero. *Shape:* ``(..., B)``."""
-        return reduce(torch.add, [part.base_value(own) for part, own in self._each(placement)])
 
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""

@@ -26,7 +26,8 @@ def rest_hessian(points: FloatArray, edges: IntArray, hinges: IntArray, stretch:
     Returns:
         Symmetric positive semi-definite; row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
     """
-    return sp.csc_matrix(_of_term(Stretch(stretch * ALPHA), edges, points) + _of_term(SquaredBend(BETA), hinges, points))
+    parts = (Stretch(stretch * ALPHA), edges), (SquaredBend(BETA), hinges)
+    return sp.csc_matrix(sum(_of_term(term, elements, points) for term, elements in parts))
 
 
 def _of_term(term: Term, elements: IntArray, points: FloatArray) -> sp.csc_matrix:

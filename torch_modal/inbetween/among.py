@@ -75,7 +75,7 @@ class Among(Between):
         minimisation = Minimisation(self.step, *limits, False, lambda _: None, report)
         solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         start = weights.new_zeros(len(weights), space.n_unknowns)
-        solution = solve(minimisation, problem.placement, start, usable, weights[:, 0], problem.energy)
+        solution = solve(minimisation, problem.placement, start, usable, weights[:, 0])
         rests = Rests(group.shapes.unbind(1), None, weights, stiffness, anchors)
         x = self.refined(space.lift(solution.amplitudes, problem), rests)
         # No shape is better for being far from a key-frame with a weight below zero.
@@ -117,13 +117,12 @@ class Among(Between):
         difference, column = space.difference(_combined(parts, fine), _combined(parts, coarse), straight)
         extras = levels.seen(space.column(difference), column) if levels.sampled else [column] * len(levels.energies)
         references = levels.among(levels.seen(fine, coarse), weights, stiffness)
-        placement = levels.place(space.energy, levels.seen(straight, coarse_straight), references, extras, anchors)
-        problem = JointProblem(placement, None, straight, (straight,), difference)
-        if space.blend is None:
-            return problem
-        blend = space.blend.among(fine, weights, straight)
-        seen = levels.seen(blend, frame.coarsen(blend))
-        return space.bent(problem, blend, levels.place(space.energy, seen, references, extras, anchors))
+        base, starts, seen = straight, (straight,), coarse_straight
+        if space.blend is not None:
+            base = space.blend.among(fine, weights, straight)
+            starts, seen = (base, straight), frame.coarsen(base)
+        placement = levels.place(space.energy, levels.seen(base, seen), references, extras, anchors)
+        return JointProblem(placement, None, base, starts, difference)
 
     def _brought(self, group: Group) -> Tensor | None:
         """The anchors of all terms, in the frame. *Shape:* ``(B, P, 3)``."""

@@ -19,7 +19,7 @@ from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.inbetween.blend import Blends
-from torch_modal.inbetween.comparison import SLACK, SLACK_OF_PATHS, no_worse
+from torch_modal.inbetween.comparison import SLACK, SLACK_OF_PATHS, needs_gradient, no_worse
 from torch_modal.inbetween.frame import Collapsing, Frame, mean_areas, shared_collapses
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.levels import Levels
@@ -43,8 +43,6 @@ class Batch(NamedTuple):
     problem: Any
     minimisation: Minimisation
     start: Tensor
-    energy: Tensor | None
-    """There, where it is known. *Shape:* ``(B,)``."""
     usable: Tensor
     pair: Pair
     samples: Samples
@@ -77,6 +75,13 @@ class Shared(NamedTuple):
         blends = Blends(mesh.connectivity, shapes, pairs[0], backend)
         weights, collapses = mean_areas(shapes, mesh.faces), shared_collapses(mesh.faces)
         return cls(backend, backend.fine_energy(mesh, terms), distortion, weights, collapses, blends)
+
+    def alone(self, shapes: Tensor) -> "Shared":
+        """The same, but for what depends on the references, of which these are all. *Shape:* ``(K, V, 3)``."""
+        mesh = self.blends.mesh
+        faces = torch.tensor(mesh.faces)
+        blends = Blends(mesh, shapes, (0, 1), self.backend)
+        return self._replace(weights=mean_areas(shapes, faces), collapses=shared_collapses(faces), blends=blends)
 
 
 class Between(nn.Module):
@@ -162,9 +167,7 @@ class Between(nn.Module):
             start = t.new_zeros(len(t), space.n_unknowns) if problem.start is None else problem.start
             limits = self.solver.max_steps, self.solver.tolerance
             minimisation = Minimisation(self.step, *limits, problem.start is not None, space.require, report)
-            x, solution = self.solved(
-                Batch(problem, minimisation, start, problem.energy, usable, pair, samples, anchors)
-            )
+            x, solution = self.solved(Batch(problem, minimisation, start, usable, pair, samples, anchors))
         shapes = self.backend.restore(self.frame, x, placed, t)
         if report is not None:
             warn_of_starts(solution)
@@ -196,18 +199,20 @@ class Between(nn.Module):
         """The same with what shapes are compared with."""
         if not starts or not len(x):
             return x, solution
+        shapes, slight = [x, *starts], self.distortion.slight(rests.stiffness, x)
         with torch.no_grad():
-            distortion = self.distortion([x, *starts], rests)
-        rounding = self.distortion.rounding(rests.stiffness, x)
-        x, worse = no_worse(x, starts, distortion, rounding, slack)
-        fell = worse & (solution.status != Status.INVALID)
+            distortion = self.distortion(shapes, rests)
+        if torch.is_grad_enabled() and needs_gradient(distortion, slight, slack):
+            distortion = self.distortion(shapes, rests)
+        x, replaced = no_worse(x, starts, distortion, slight, slack)
+        fell = replaced & (solution.status != Status.INVALID)
         return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
 
     def modal(self, batch: Batch) -> tuple[Tensor, Solution]:
         """Shapes of least energy in the modal space, and their solutions."""
         solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         problem = batch.problem
-        given = problem.placement, batch.start, batch.usable, batch.samples.t, batch.energy
+        given = problem.placement, batch.start, batch.usable, batch.samples.t
         solution = solve(batch.minimisation, *given)
         return self.space.lift(solution.amplitudes, problem), solution
 

@@ -13,39 +13,58 @@ from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
 
-# A shape falls back if it has more distortion than its start by this factor. Below it, the volume error, which is not
-# measured and which the starts have more of, and the choice of elements decide more than the shapes do.
+# A shape has at most this many times the distortion of its starts. Below, the volume error, which is not measured and
+# which the starts have more of, and the choice of elements decide more than the shapes do.
 SLACK = 1.2
 
-# The same for shapes of a smooth path, where a change from one to the other would be seen as a jump in time.
+# The same for shapes of a smooth path.
 SLACK_OF_PATHS = 3.0
+
+# From this part of the way between one and the slack on, a shape is blended into its start: none is replaced by a jump.
+MARGIN = 0.5
 
 
 def no_worse(
-    x: Tensor,
-    starts: Sequence[Tensor],
-    distortion: Tensor,
-    rounding: Tensor | float = 0.0,
-    slack: float = SLACK,
+    x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = SLACK
 ) -> tuple[Tensor, Tensor]:
-    """Shapes, and where one is worse than what it started from, the best of its starts.
+    """Shapes, blended into their starts as far as they have more distortion.
+
+    The result is a continuous function of the shapes, and differentiable if the distortions are.
 
     Args:
         x: *Shape:* ``(B, V, 3)``.
         starts: *Shape of each:* ``(B, V, 3)``.
         distortion: Of ``x`` and of the starts. *Shape:* ``(1 + S, B)``.
-        rounding: Distortions that are no larger are equal. *Shape:* ``(B,)``.
+        slight: Added to those of the starts: where nothing is strained, nothing is worse. *Shape:* ``(B,)``.
         slack: How many times as much distortion as its start a shape may have.
 
     Returns:
-        The shapes, *shape* ``(B, V, 3)``; where a start was taken, *shape* ``(B,)``, bool.
+        The shapes, *shape* ``(B, V, 3)``; where a start has replaced one, *shape* ``(B,)``, bool.
     """
-    found, *others = distortion
-    lowest, best = torch.stack(others).nan_to_num(torch.inf).min(0)
-    worse = ~(found <= slack * lowest + rounding) & lowest.isfinite()
-    # What need not be looked at need not be copied, either. A graph has no numbers to look at.
-    if not (traced(worse) or transformed(worse)) and not bool(worse.any()):
-        return x, worse
-    for i, start in enumerate(starts):
-        x = torch.where((worse & (best == i))[:, None, None], start, x)
-    return x, worse
+    own, *others = distortion
+    replaced = torch.zeros_like(own, dtype=torch.bool)
+    for start, other in zip(starts, others, strict=True):
+        part = _part(own, other + slight, slack)
+        replaced = replaced | (part == 1)
+        # What need not be looked at need not be copied, either. A graph has no numbers to look at.
+        if traced(part) or transformed(part) or bool((part > 0).any()):
+            whole = part[:, None, None]
+            x = torch.where(whole < 1, torch.lerp(x, start, whole), start)
+            own = torch.where(part < 1, torch.lerp(own, other, part), other)
+    return x, replaced
+
+
+def needs_gradient(distortion: Tensor, slight: Tensor, slack: float) -> bool:
+    """Whether :func:`no_worse` depends on the distortions to first order. *Shape:* ``(1 + S, B), (B,)``."""
+    if traced(distortion) or transformed(distortion):
+        return True
+    parts = _part(distortion[:1], distortion[1:] + slight, slack)
+    return bool(((parts > 0) & (parts < 1)).any())
+
+
+def _part(own: Tensor, other: Tensor, slack: float) -> Tensor:
+    """How far a shape gives way to one of its starts: 0 to 1. *Shape:* ``(B,)`` each."""
+    least = 1 + MARGIN * (slack - 1)
+    part = ((own / other - least) / (slack - least)).clamp(0, 1)
+    part = torch.where(own.isfinite(), part * part * (3 - 2 * part), 1)
+    return torch.where(other.isfinite(), part, 0)

@@ -118,7 +118,8 @@ class Frame(Alignment):
         collapses: Callable[[NDArray[np.float64]], Collapsing] | None = None,
         modes: Tensor | None = None,
     ) -> None:
-        scale = torch.tensor(DIAGONAL / size(shapes[0].numpy(), faces.numpy()), dtype=shapes.dtype)
+        sizes = [size(x.numpy(), faces.numpy()) for x in shapes]
+        scale = torch.tensor(DIAGONAL * len(sizes) / sum(sizes), dtype=shapes.dtype)
         weights = mean_areas(shapes, faces) if weights is None else weights
         turns = [best_fit(x, shapes[0], weights) for x in shapes[1:]]
         centre = turns[0].target

@@ -45,8 +45,6 @@ class JointProblem(NamedTuple):
     """Shapes that the result must not be worse than. *Shape of each:* ``(B, V, 3)``."""
     difference: Difference
     """The column of the last amplitude."""
-    energy: Tensor | None = None
-    """At zeros, where it is known. *Shape:* ``(B,)``."""
 
 
 class _Modal(nn.Module):
@@ -72,9 +70,10 @@ class _Modal(nn.Module):
 class JointSpace(nn.Module):
     r"""In-betweens ``x(a) = base + [Phi_a, Phi_b, x_b - x_a] a``.
 
-    What is minimised is :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)`, with Eq. 5 for ``d``. The base is linear
-    interpolation, or the blend by local rotations where that has less energy, so that the energy of the result is never
-    above that of linear interpolation.
+    What is minimised is :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x) + \tfrac{1}{2} \rho\, |a|^2`, with Eq. 5 for ``d``.
+    The base is the blend by local rotations, or linear interpolation. The columns are orthonormal under vertex weights
+    that add up to one, so that the anchor ``rho`` holds the mean squared distance from the base: without it, the
+    minimiser jumps between far minima of almost the same energy.
 
     Args:
         frame: Frame of the two bases.
@@ -165,41 +164,17 @@ class JointSpace(nn.Module):
         first, second, coarse_first, coarse_second = trees.picked(
             (pair.first, pair.second, coarse_first, coarse_second), index
         )
-        base = straight = torch.lerp(first, second, t[:, None, None])
-        starts = (straight,)
-        coarse = torch.lerp(coarse_first, coarse_second, t[:, None, None])
+        straight = torch.lerp(first, second, t[:, None, None])
+        if self.blend is None:
+            base, starts, coarse = straight, (straight,), torch.lerp(coarse_first, coarse_second, t[:, None, None])
+        else:
+            base = self.blend(first, second, t, straight)
+            starts, coarse = (base, straight), self.frame.coarsen(base)
         placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
         if self.modal.guess is not None:
             with torch.no_grad():
                 start = self.modal.guess(coarse_first, coarse_second, extras[0], t)
-        problem = JointProblem(placement, start, base, starts, difference)
-        if self.blend is None:
-            return problem
-        blend = self.blend(first, second, t, base)
-        seen = levels.seen(blend, self.frame.coarsen(blend))
-        return self.bent(problem, blend, levels.place(self.energy, seen, references, extras, anchors))
-
-    def bent(self, problem: JointProblem, blend: Tensor, turned: tuple[Placement, ...]) -> JointProblem:
-        """The problem with a blend by local rotations as its base, where that has less energy.
-
-        Args:
-            problem: With linear interpolation as the base.
-            blend: *Shape:* ``(B, V, 3)``.
-            turned: The placement there.
-        """
-        placement, straight = problem.placement, problem.base
-        with torch.no_grad():
-            pairs = zip(turned, placement, strict=True)
-            both = [bent._replace(base=torch.stack([bent.base, straight.base])) for bent, straight in pairs]
-            energies = self.energy.base_value(both)
-            better = energies[0] < energies[1]
-            energy = torch.where(better, energies[0], energies[1])
-        base = torch.where(better[:, None, None], blend, straight)
-        placement = tuple(
-            own._replace(base=torch.where(better[:, None, None], bent.base, own.base))
-            for bent, own in zip(turned, placement, strict=True)
-        )
-        return problem._replace(placement=placement, base=base, starts=(blend, straight), energy=energy)
+        return JointProblem(placement, start, base, starts, difference)
 
     def on_trajectory(self, pair: Pair, index: Tensor | None, t: Tensor) -> tuple[Tensor, ...]:
         """The shape on the smooth path through the neighbours in time, then the shapes that it is compared with.

@@ -40,8 +40,6 @@ class PairedProblem(NamedTuple):
     """*Shape:* ``(B, V, 3)``."""
     starts: tuple[Tensor, ...]
     """Linear interpolation, which the result must not be worse than. *Shape of each:* ``(B, V, 3)``."""
-    energy: None = None
-    """At zeros, it is not known."""
 
 
 class PairedEnergy(nn.Module):

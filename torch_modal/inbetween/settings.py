@@ -1,5 +1,6 @@
 """Objective, solver and presets: the settings of all in-betweens."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -25,7 +26,7 @@ def _whole(name: str, value: int, lowest: int) -> None:
 
 @dataclass(frozen=True)
 class Objective:
-    r"""The objective: :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)` or Eq. 4, with the energy of Eq. 5 for ``d``.
+    r"""The objective, with Eq. 5 for ``d``: Eq. 4, or :math:`(1-t) d(x_a, x) + t d(x_b, x) + \tfrac{1}{2} \rho |a|^2`.
 
     Attributes:
         space: ``"joint"`` (one shape in the sum of both modal spaces) or ``"paired"`` (Eq. 4 of the paper: one near
@@ -39,6 +40,8 @@ class Objective:
         mu: Weight of the similarity of Eq. 4, of no effect in the joint space: a number, or a tensor or parameter that
             broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.
+        anchor: ``rho``, the weight of the mean squared distance of the shape from its base at a size of 100, in the
+            joint space. Without it there are many minima of almost the same energy, between which shapes jump.
         coarse_faces: Faces of the mesh that the energy is evaluated on in the modal space.
         contact: Whether parts are kept from passing through each other (docs/contact.md). It needs the extra
             ``contact``, and the joint space.
@@ -62,6 +65,8 @@ class Objective:
         _choice("space", self.space, ("joint", "paired"))
         _choice("base", self.base, ("rotations", "linear"))
         _whole("coarse_faces", self.coarse_faces, 4)
+        if not 0 <= self.anchor < math.inf:
+            raise ValueError(f"anchor is a finite number, 0 or more; got {self.anchor!r}")
         if self.contact and self.space == "paired":
             raise ValueError("contact needs one shape for each in-between: space='joint', not 'paired'")
         wrong = [term for term in self.terms if not isinstance(term, Term)]
@@ -127,7 +132,7 @@ Preset = Literal["accurate", "fast", "paper"]
 
 PRESETS = {
     "accurate": Settings(Objective(), Solver()),
-    "fast": Settings(Objective(coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
+    "fast": Settings(Objective(anchor=10_000.0, coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
     "paper": Settings(Objective(space="paired"), Solver(local_steps=0)),
 }
 """The presets; docs/layer.md compares them."""

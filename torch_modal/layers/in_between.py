@@ -103,21 +103,18 @@ class InBetween(nn.Module):
         self.encloses = all(encloses(x, connectivity) for x in shapes)
         mesh = Mesh(connectivity)
         shared = Shared.of(mesh, torch.stack(shapes), self.pairs, list(self.terms), self.solver)
-        made = [
-            self.kind(
-                torch.stack([ends[i][0] for i in places]),
-                places,
-                [ends[i][1] for i in places],
-                mesh,
-                self.objective,
-                self.solver,
-                shared,
-            )
-            for places in self.places
-        ]
+        made = []
+        for places in self.places:
+            own, modes = torch.stack([ends[i][0] for i in places]), [ends[i][1] for i in places]
+            if not self.shares:
+                places, shared = range(len(places)), shared.alone(own)
+            made.append(self.kind(own, places, modes, mesh, self.objective, self.solver, shared))
         self.members = nn.ModuleList(made)
         self.prepare()
         self.members.to(like)
+
+    shares = False
+    """Whether pairs share what makes a motion through all of them smooth; otherwise each is what it is alone."""
 
     @property
     def kind(self) -> type[Between]:

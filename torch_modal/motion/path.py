@@ -31,7 +31,13 @@ N_SEARCHED = 31
 SAME_TIME = 2e-15
 
 
-class _Lazy(InBetween):
+class _OfPath(InBetween):
+    """Pairs of a path."""
+
+    shares = True
+
+
+class _Lazy(_OfPath):
     """Pairs of a smooth path, which minimises nothing: the tables of the minimisation are made on first use."""
 
     def prepare(self) -> None:
@@ -95,7 +101,7 @@ class Path(nn.Module):
             require_contact()
         objective = replace(objective, contact=False)
         pairs = [(i, (i + 1) % n) for i in range(n if cyclic else n - 1)]
-        kind = _Lazy if smooth and n > 2 and not objective.terms else InBetween
+        kind = _Lazy if smooth and n > 2 and not objective.terms else _OfPath
         self.layer = kind(list(bases), faces, objective=objective, solver=solver, pairs=pairs)
         self.cyclic = cyclic
         self.smooth = bool(smooth)

@@ -47,7 +47,6 @@ class _ArgMin(torch.autograd.Function):
         tree: Any,
         usable: Tensor,
         times: Tensor,
-        energy: Tensor | None,
         start: Tensor,
         *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
@@ -56,9 +55,9 @@ class _ArgMin(torch.autograd.Function):
         if minimisation.guessed:
             # Never a start that is worse than linear interpolation: what comes out must not be, either.
             zeros = torch.zeros_like(start)
-            start, energy = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
+            start, _ = minimisation.step.lowest(zeros, torch.stack([zeros, start]), placement)
         limits = minimisation.max_steps, minimisation.tolerance
-        solution = descend(minimisation.step, start, placement, *limits, energy=energy)
+        solution = descend(minimisation.step, start, placement, *limits)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         if minimisation.report is not None:
             minimisation.report(solution)
@@ -66,7 +65,7 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        minimisation, tree, _, _, _, _, *tensors = inputs
+        minimisation, tree, _, _, _, *tensors = inputs
         amplitudes, *diagnostics = output
         ctx.mark_non_differentiable(*diagnostics)
         ctx.minimisation, ctx.tree = minimisation, tree
@@ -78,13 +77,13 @@ class _ArgMin(torch.autograd.Function):
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
         amplitudes, _, *tensors = ctx.saved_tensors
         pull_back = _adjoint(ctx.minimisation.step, ctx.tree, *ctx.saved_tensors)
-        moved = transposed(pull_back, torch.zeros_like(amplitudes), tensors, tangents[6:])
+        moved = transposed(pull_back, torch.zeros_like(amplitudes), tensors, tangents[5:])
         return moved, *(None,) * ctx.n_diagnostics
 
     @staticmethod
     def backward(ctx: Any, to_amplitudes: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         pull_back = _adjoint(ctx.minimisation.step, ctx.tree, *ctx.saved_tensors)
-        return (None,) * 6 + pull_back(to_amplitudes)
+        return (None,) * 5 + pull_back(to_amplitudes)
 
     @staticmethod
     def vmap(
@@ -143,7 +142,7 @@ def _warn_of_singular(singular: Tensor) -> None:
 
 
 def solve_implicit(
-    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor, energy: Tensor | None
+    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor
 ) -> Solution:
     """Minimise; gradients of the amplitudes by the implicit function theorem.
 
@@ -153,17 +152,16 @@ def solve_implicit(
         start: Where to start, unless zeros have a lower energy. *Shape:* ``(B, n)``.
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
         times: Checked before all else. *Shape:* ``(B,)``.
-        energy: At the start, where it is known and the start is no guess. *Shape:* ``(B,)``.
     """
     tensors = trees.leaves(placement)
     # Kernels compute in float64, whatever goes in and comes out.
-    batched = (usable, times, energy, start.detach().to(tensors[0].dtype), *tensors)
+    batched = (usable, times, start.detach().to(tensors[0].dtype), *tensors)
     found = applied(_ArgMin, minimisation, trees.skeleton(placement), *batched)
     return Solution(*(value.to(start.dtype) if value.is_floating_point() else value for value in found))
 
 
 def solve_unrolled(
-    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor, energy: Tensor | None
+    minimisation: Minimisation, placement: Any, start: Tensor, usable: Tensor, times: Tensor
 ) -> Solution:
     """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
 

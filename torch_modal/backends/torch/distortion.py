@@ -11,7 +11,6 @@ from torch_modal.backends.torch.fine_steps import FurtherTerms
 from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.bend import collapsed, dihedral_angle
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.term import Mesh, periodic_square
 from torch_modal.geometry.vectors import cross, inverse, norm
 
@@ -21,8 +20,8 @@ MOST_ELEMENTS = 1024
 # Bound on the weight l^2 / A of a hinge with a needle; an equilateral hinge has 1.15.
 LARGEST_WEIGHT = 8.0
 
-# At a key-frame all shapes are the same, to so many roundings of a coordinate.
-ROUNDINGS = 30.0
+# Strain of edges below which nobody sees a difference.
+SLIGHT = 1e-4
 
 
 class Distortion(nn.Module):
@@ -94,10 +93,10 @@ class Distortion(nn.Module):
             total = total + pull * (self.shares[0] * stretching + self.shares[1] * bending)
         return total  # type: ignore[no-any-return]
 
-    def rounding(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
-        """The distortion that rounding of positions alone explains. *Shape:* ``(B,)``."""
-        off = ROUNDINGS * torch.finfo(like.dtype).eps * DIAGONAL
-        return self.shares[0] * len(self.edge) * stiffness[0].detach().mean(-1) * off**2
+    def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
+        """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""
+        lengths = norm(_edge_vectors(like.detach(), self.edges)[0]).sum(-1)
+        return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * SLIGHT**2
 
 
 def _edge_vectors(x: Tensor, corners: Tensor) -> Tensor:

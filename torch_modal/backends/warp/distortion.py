@@ -32,9 +32,9 @@ class WarpDistortion(Distortion):
             self.register_buffer(name, values.int(), persistent=False)
 
     def of_shell(self, shapes: Sequence[Tensor], rests: Rests) -> Tensor:
-        """As in the base class."""
+        """As in the base class, which has gradients."""
         t, stiffness = rests.t, rests.stiffness[:2]
-        if traced(t) or any(transformed(x) for x in (*shapes, *rests.shapes, t, *stiffness)):
+        if torch.is_grad_enabled() or traced(t) or any(transformed(x) for x in (*shapes, *rests.shapes, t, *stiffness)):
             return super().of_shell(shapes, rests)
         if t.dim() > 1:
             # From each of the rest shapes alone, then weighted.

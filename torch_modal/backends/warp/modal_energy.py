@@ -201,15 +201,6 @@ class WarpModalEnergy(ModalEnergy):
         found = self.shell.value(self._shapes(a, placement.base, placement.extra), to)
         return found.unflatten(0, a.shape[:-1]) + to.constant
 
-    def base_value(self, placement: Placement) -> Tensor:
-        """As in the base class."""
-        plain = self._plain(placement)
-        if plain is not None:
-            return super().base_value(plain).to(placement.base)
-        to: Any = placement.reference
-        found = self.shell.value(placement.base.flatten(0, -3), to)
-        return found.unflatten(0, placement.base.shape[:-2]) + to.constant
-
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
         """As in the base class."""
         plain = self._plain(placement)
