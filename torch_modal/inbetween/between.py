@@ -114,7 +114,7 @@ class Between(nn.Module):
         #: The energy on the fine mesh, for the local steps, and for stiffnesses of its elements.
         self.fine, self.distortion = shared.fine, shared.distortion
         collapses = partial(shared.collapses, places)
-        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses, modes[0])
+        self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses, modes)
         self.placing = Placing(self.frame, self.fine, self.backend)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
         modal = objective.space == "joint" and solver.gradient == "implicit"

@@ -1,6 +1,6 @@
 """Between the caller's coordinates and the frame in which an in-between is sought."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -34,7 +34,7 @@ class Coarse(nn.Module):
         n_faces: Of the coarse mesh, or more, where that does not resolve the modes or pieces.
         weights: Of the vertices. *Shape:* ``(V,)``.
         collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`.
-        modes: Of the first shape; None if it does not matter how well they are resolved. *Shape:* ``(k, V, 3)``.
+        modes: Of the shapes, which the coarse mesh should resolve; none if it does not matter. *Shape:* ``(k, V, 3)``.
     """
 
     faces: Tensor
@@ -51,7 +51,7 @@ class Coarse(nn.Module):
         n_faces: int,
         weights: Tensor,
         collapses: Collapsing | None,
-        modes: Tensor | None,
+        modes: Sequence[Tensor],
     ) -> None:
         super().__init__()
         coarsening = resolving(shapes, faces, n_faces, collapses, modes)
@@ -103,7 +103,7 @@ class Frame(Alignment):
         coarse_faces: Number of faces of the coarse mesh.
         weights: Of the vertices in alignments. Default: their mean areas. *Shape:* ``(V,)``.
         collapses: What is shared of the edge collapses of both, given them in the frame. Default: nothing.
-        modes: Of the first shape, which the coarse mesh should resolve. *Shape:* ``(k, V, 3)``.
+        modes: Of the bases, which the coarse mesh should resolve. *Shape of each:* ``(k, V, 3)``.
     """
 
     faces: Tensor
@@ -116,7 +116,7 @@ class Frame(Alignment):
         coarse_faces: int,
         weights: Tensor | None = None,
         collapses: Callable[[NDArray[np.float64]], Collapsing] | None = None,
-        modes: Tensor | None = None,
+        modes: Sequence[Tensor] = (),
     ) -> None:
         sizes = [size(x.numpy(), faces.numpy()) for x in shapes]
         scale = torch.tensor(DIAGONAL * len(sizes) / sum(sizes), dtype=shapes.dtype)
@@ -130,8 +130,9 @@ class Frame(Alignment):
         #: From the bases after the first to the frame. *Shape:* ``(K - 1, 3, 3)``.
         self.register_buffer("turns", torch.stack([turn.rotation for turn in turns]), persistent=False)
         own = None if collapses is None else collapses(references.numpy())
+        turned_modes = [part.turned(part.given) for part in self.modes(*modes)] if modes else []
         self._coarse: Any = None
-        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, own, modes)
+        self._make: Any = partial(Coarse, references, faces, coarse_faces, weights, own, turned_modes)
 
     @property
     def coarse(self) -> Coarse:

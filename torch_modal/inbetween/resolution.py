@@ -1,6 +1,6 @@
 """As many coarse faces as it takes to resolve the modes of a shape."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ def resolving(
     faces: Tensor,
     n_faces: int,
     collapses: Callable[[int, int], Coarsening] | None,
-    modes: Tensor | None,
+    modes: Sequence[Tensor],
 ) -> Coarsening:
     """A coarse mesh of so many faces, or of more, where those do not resolve the modes.
 
@@ -40,7 +40,7 @@ def resolving(
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_faces: How many are wanted.
         collapses: As for :func:`torch_modal.precompute.coarsening.coarsen`.
-        modes: Of the first shape; None if it does not matter. *Shape:* ``(k, V, 3)``.
+        modes: Of the shapes, in their axes; none if it does not matter. *Shape of each:* ``(k, V, 3)``.
     """
     enough = min(ENOUGH_FACES, len(faces))
     flat = [is_flat(x[faces.unique()].numpy()) for x in shapes]
@@ -52,13 +52,15 @@ def resolving(
             return given(curved if flat[keyframe] else keyframe, n)
 
     found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
-    if modes is None or len(modes) == 0 or n_faces >= enough:
+    if n_faces >= enough:
         return found
-    fine = stretching(Mesh.of(faces, shapes.shape[1]), shapes[0], modes)
+    whole, ends = Mesh.of(faces, shapes.shape[1]), [(x, y) for x, y in zip(shapes, modes, strict=False) if len(y)]
+    fine = [stretching(whole, *end) for end in ends]
     while n_faces < enough:
         mesh = Mesh.of(torch.from_numpy(found.faces), found.n_vertices)
-        x, moves = (torch.from_numpy(found.restrict(part.numpy())) for part in (shapes[0], modes))
-        if spread(fine, stretching(mesh, x, moves)) <= MOST_SPREAD:
+        coarse = [[torch.from_numpy(found.restrict(part.numpy())) for part in end] for end in ends]
+        pairs = zip(fine, coarse, strict=True)
+        if all(spread(own, stretching(mesh, x, moves)) <= MOST_SPREAD for own, (x, moves) in pairs):
             break
         n_faces = min(round(MORE * n_faces), ENOUGH_FACES)
         found = coarsen(shapes.numpy(), faces.numpy(), n_faces, collapses)
