@@ -1,6 +1,8 @@
 """Dihedral angles, the second term of Eq. 5."""
 
 from collections.abc import Sequence
+from functools import reduce
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,8 +16,8 @@ MAX_BENDING_RATIO = 1e3
 # Altitude of a triangle over its edge below which the triangle has no normal worth the name.
 COLLAPSED = 1e-6
 
-# Altitude of a triangle over its longest side at which its hinges have half of their weight.
-NEEDLE = 0.05
+# Altitude of a triangle over its longest side at which fullness() is a half; an equilateral one has 0.87.
+NEEDLE = 0.2
 
 
 class SquaredBend(Term):
@@ -64,14 +66,7 @@ class Bend(PeriodicTerm, SquaredBend):
     r"""Dihedral angles: :math:`\beta \sum_h f(\theta_h - \bar\theta_h) \bar l_h^2 / \bar A_h`, smooth at half a turn.
 
     :class:`~torch_modal.energy.term.PeriodicTerm` has the function ``f``, which is the square of Eq. 5 below a radian.
-    Hinges with a needle at rest, whose normal turns over at little cost, count for less, see :func:`fullness`.
     """
-
-    def weights(self, edge_vectors: Tensor, measures: Tensor) -> Tensor:
-        """Those of Eq. 5 times the :func:`fullness` of both triangles."""
-        e, a, b = edge_vectors
-        full = fullness(e, a, cross(e, a)) * fullness(e, b, cross(b, e))
-        return full * super().weights(edge_vectors, measures)
 
     def pairs(self, mesh: Mesh) -> Tensor:
         """With that of the two tips."""
@@ -165,12 +160,16 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
     return torch.stack([-own, *blocks])
 
 
-def fullness(edge: Tensor, side: Tensor, normal: Tensor) -> Tensor:
-    """0 to 1 by the altitude of triangles over their longest side. *Shape:* ``(3, ...) -> (...)``."""
-    other = side - edge
-    longest = torch.maximum(torch.maximum((edge * edge).sum(0), (side * side).sum(0)), (other * other).sum(0))
-    squared = (normal * normal).sum(0)
-    return squared * inverse(squared + (NEEDLE * longest).square(), squared <= tiny(edge))
+def fullness(edge_vectors: Tensor) -> Tensor:
+    """0 to 1 by how far both triangles of a hinge are from needles. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
+    e, a, b = edge_vectors
+    found: Any = 1.0
+    for side in (a, b):
+        sides, normal = (e, side, side - e), cross(e, side)
+        longest = reduce(torch.maximum, [(x * x).sum(0) for x in sides])
+        squared = (normal * normal).sum(0)
+        found = found * squared * inverse(squared + (NEEDLE * longest).square(), longest <= 0)
+    return found  # type: ignore[no-any-return]
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:

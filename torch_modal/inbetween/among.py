@@ -117,11 +117,12 @@ class Among(Between):
         difference, column = space.difference(_combined(parts, fine), _combined(parts, coarse), straight)
         extras = levels.seen(space.column(difference), column) if levels.sampled else [column] * len(levels.energies)
         references = levels.among(levels.seen(fine, coarse), weights, stiffness)
-        base, starts, seen = straight, (straight,), coarse_straight
+        base, starts, coarse_base = straight, (straight,), coarse_straight
         if space.blend is not None:
             base = space.blend.among(fine, weights, straight)
-            starts, seen = (base, straight), frame.coarsen(base)
-        placement = levels.place(space.energy, levels.seen(base, seen), references, extras, anchors)
+            starts, coarse_base = (base, straight), frame.coarsen(base)
+        seen = levels.seen(base, coarse_base)
+        placement = levels.place(space.energy, seen, levels.softened(references, seen), extras, anchors)
         return JointProblem(placement, None, base, starts, difference)
 
     def _brought(self, group: Group) -> Tensor | None:

@@ -156,8 +156,9 @@ class JointSpace(nn.Module):
             starts = self.on_trajectory(pair, index, t)
             base = starts[0]
             coarse = self.frame.coarsen(base)
-            references = levels.against(base, coarse, stiffness)
-            placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
+            seen = levels.seen(base, coarse)
+            references = levels.softened(levels.against(base, coarse, stiffness), seen)
+            placement = levels.place(self.energy, seen, references, extras, anchors)
             return JointProblem(placement, start, base, starts, difference)
         seen_first, seen_second = levels.seen(pair.first, coarse_first), levels.seen(pair.second, coarse_second)
         references = levels.between(seen_first, seen_second, index, t, stiffness)
@@ -170,7 +171,8 @@ class JointSpace(nn.Module):
         else:
             base = self.blend(first, second, t, straight)
             starts, coarse = (base, straight), self.frame.coarsen(base)
-        placement = levels.place(self.energy, levels.seen(base, coarse), references, extras, anchors)
+        seen = levels.seen(base, coarse)
+        placement = levels.place(self.energy, seen, levels.softened(references, seen), extras, anchors)
         if self.modal.guess is not None:
             with torch.no_grad():
                 start = self.modal.guess(coarse_first, coarse_second, extras[0], t)

@@ -115,6 +115,10 @@ class Levels(nn.Module):
         """
         return [part.among(x, weights, own) for part, x, own in zip(self.parts, shapes, stiffness, strict=True)]
 
+    def softened(self, references: Sequence[Any], bases: Sequence[Tensor]) -> list[Any]:
+        """References with less bending stiffness at needles of a shape, as each energy sees it."""
+        return [part.softened(own, x) for part, own, x in zip(self.parts, references, bases, strict=True)]
+
     def against(self, x: Tensor, coarse: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Reference]:
         """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
         parts = zip(self.energies, self.seen(x, coarse), stiffness, strict=True)

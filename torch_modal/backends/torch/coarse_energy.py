@@ -6,6 +6,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from torch_modal.backends.torch.rests import Rests
+from torch_modal.energy.bend import Bend, fullness
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy
 
@@ -48,3 +49,22 @@ class CoarseEnergy(nn.Module):
             stiffness: As there.
         """
         return Rests(shapes.unbind(1), None, weights, stiffness).reference(self.energy)
+
+    def softened(self, reference: Any, base: Tensor) -> Any:
+        """A reference with less bending stiffness at hinges with a needle.
+
+        The minimiser would turn their normals over, at little cost, and come to rest at the kink where they collapse.
+
+        Args:
+            reference: Of :meth:`between` or :meth:`among`.
+            base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
+        """
+        weights = list(reference.weights)
+        for i, part in enumerate(self.energy.parts):
+            if isinstance(part.term, Bend):
+                weights[i] = self.fullness(i, base) * weights[i]
+        return reference._replace(weights=tuple(weights))
+
+    def fullness(self, i: int, base: Tensor) -> Tensor:
+        """That of the hinges of a term. *Shape:* ``(B, V, 3) -> (B, H)``."""
+        return fullness(self.energy.parts[i].edge_vectors(base.movedim(-1, 0)))

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torch_modal import trees
@@ -33,3 +34,10 @@ class WarpCoarseEnergy(CoarseEnergy):
     def among(self, shapes: Tensor, weights: Tensor, stiffness: Sequence[Tensor]) -> Any:
         """As in the base class."""
         return merged_reference(self.shell, shapes, weights, *stiffness)
+
+    def softened(self, reference: Any, base: Tensor) -> Any:
+        """As in the base class."""
+        full = self.fullness(1, base).to(reference.bend)
+        factors = torch.ones_like(reference.bend[..., 0]).index_copy(1, self.shell.interior, full)
+        weights, others = reference.bend.split([1, 6], -1)
+        return reference._replace(bend=torch.cat([factors[..., None] * weights, others], -1))

@@ -16,12 +16,11 @@ from torch_modal.backends.warp.kernels.elements import (
     turn_between,
     vec3,
 )
-from torch_modal.energy.bend import MAX_BENDING_RATIO, NEEDLE
+from torch_modal.energy.bend import MAX_BENDING_RATIO
 from torch_modal.energy.stretch import MIN_RELATIVE_LENGTH
 from torch_modal.energy.volume import MIN_RELATIVE_VOLUME
 
 RATIO = wp.constant(real(MAX_BENDING_RATIO))
-NEEDLENESS = wp.constant(real(NEEDLE))
 SHORT = wp.constant(real(MIN_RELATIVE_LENGTH))
 THIN = wp.constant(real(MIN_RELATIVE_VOLUME))
 
@@ -117,18 +116,10 @@ def edge_weight(pull: real, length: real, shortest: real):
 
 
 @wp.func
-def fullness(e: vec3, a: vec3, n: vec3):
-    other = a - e
-    longest = wp.max(wp.max(wp.dot(e, e), wp.dot(a, a)), wp.dot(other, other))
-    flat = NEEDLENESS * longest
-    return wp.dot(n, n) / (wp.dot(n, n) + flat * flat)
-
-
-@wp.func
-def bend_weight(e: vec3, a: vec3, b: vec3, n1: vec3, n2: vec3):
+def bend_weight(e: vec3, n1: vec3, n2: vec3):
     base = wp.dot(e, e)
     area = HALF * (length_of(n1) + length_of(n2))
-    return fullness(e, a, n1) * fullness(e, b, n2) * base / wp.max(area, base / RATIO)
+    return base / wp.max(area, base / RATIO)
 
 
 @wp.kernel(enable_backward=False)
@@ -189,10 +180,10 @@ def rest(
             p2 = real(0.0)
             t2 = wp.vec2d(real(1.0), real(0.0))
             if not (is_flat(e1, m1) or is_flat(e1, m2)):
-                p1 = stiffness * both[0] * bend_weight(e1, a1, b1, m1, m2)
+                p1 = stiffness * both[0] * bend_weight(e1, m1, m2)
                 t1 = phase_of(e1, b1, m1, m2)
             if not (is_flat(e2, n1) or is_flat(e2, n2)):
-                p2 = stiffness * both[1] * bend_weight(e2, a2, b2, n1, n2)
+                p2 = stiffness * both[1] * bend_weight(e2, n1, n2)
                 t2 = phase_of(e2, b2, n1, n2)
             part = real(0.0)
             if p1 + p2 > real(0.0):
