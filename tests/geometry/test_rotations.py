@@ -14,6 +14,7 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.rotations import exp
 from torch_modal.inbetween.blend import Blends, RotationBlend
 from torch_modal.layers.mid_shape import MidShape
 
@@ -63,6 +64,21 @@ def test_pieces_have_a_sense_of_their_own() -> None:
     found = rotations(both[None], moved[None], T[2:3])[:, 0].mT
     wanted = torch.cat([ribbon(math.radians(125))[0], ribbon(math.radians(-125))[0]])
     torch.testing.assert_close(found, edges(wanted, mesh), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [LocalRotations, WarpRotations])
+def test_shapes_that_turn_alike_keep_together_half_a_turn_from_the_reference(kind: type[LocalRotations]) -> None:
+    """By 170, 190 and 200 degrees, which are 170, -170 and -160; a second piece does not turn."""
+    x, faces = ribbon(0.0)
+    mesh = Connectivity(torch.cat([faces, faces + len(x)]).numpy())
+
+    def shape(degrees: float) -> Tensor:
+        return torch.cat([x @ exp(math.radians(degrees) * torch.tensor([0.0, 0.6, 0.8]).double()).mT, x])
+
+    rotations = kind(mesh, shape(0).expand(2, -1, -1))
+    shapes = torch.stack([shape(170), shape(190), shape(200)])
+    found = rotations.among(shapes[None], torch.tensor([[0.3, 0.5, 0.2]], dtype=torch.float64))[:, 0].mT
+    torch.testing.assert_close(found, edges(shape(186), mesh), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("fused", [False, True])

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, tangent_offset
-from torch_modal.geometry.rotation_means import mean
+from torch_modal.geometry.rotation_means import agreeing, mean
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
@@ -70,6 +70,7 @@ class LocalRotations(nn.Module):
             avoids what is a sliver in any. *Shape:* ``(K, V, 3)``.
     """
 
+    reference: Tensor
     faces: Tensor
     sides: Tensor
     side_signs: Tensor
@@ -87,6 +88,8 @@ class LocalRotations(nn.Module):
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
+        #: The first reference, from which :meth:`among` measures rotations. *Shape:* ``(1, V, 3)``.
+        self.register_buffer("reference", references[:1].clone(), persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
@@ -95,7 +98,7 @@ class LocalRotations(nn.Module):
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
-        self.n_edges = len(mesh.edges)
+        self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
         wound = self._wound(a, b)
         #: For rotations beyond a full turn; None where there are none.
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
@@ -131,19 +134,26 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        own = Frames(*(x.unflatten(-2, weights.shape) for x in _frames(shapes.flatten(0, 1), self.faces)))
-        # Turns are those from the heaviest, which no order of the shapes changes.
-        rows = torch.arange(len(weights), device=weights.device)
-        start = Frames(*(x[..., rows, weights.argmax(1), :] for x in own))
-        turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
+        start, own = _frames(self.reference, self.faces), _frames(shapes.flatten(0, 1), self.faces)
+        turns = _turn_between(start, own)
         if self.clusters is None:
-            areas = own.doubled_areas.detach().flatten(0, 1)
-            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), areas).view(turns.shape[1:])
-            turn = mean(signs * turns, weights[..., None])
+            signs = self.sign(turns.detach().movedim(0, -1), own.doubled_areas.detach())
+            turns = (signs * turns).unflatten(1, weights.shape)
+            turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
-            turn = self.clusters.among(turns, weights[..., None])
-        wanted = _turned(turn, start, *((weights[..., None] * x).sum(-2) for x in own[3:]))
+            turn = self.clusters.among(turns.unflatten(1, weights.shape), weights[..., None])
+        wanted = _turned(turn, start, *((weights[..., None] * x.unflatten(0, weights.shape)).sum(-2) for x in own[3:]))
         return self._edges(wanted, self.areas.expand(len(weights), -1))
+
+    def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
+        """Signs for the pieces of K shapes, with which they turn the short way from each other.
+
+        *Shape:* ``(4, B, K, F), (B, K) -> (B, K, F)``.
+        """
+        zero = weights.new_zeros(*weights.shape, self.n_pieces)
+        rows = (self.areas * (turns * turn[..., None, :]).sum(0) for turn in turns.unbind(2))
+        products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
+        return pick(agreeing(products, weights[:, None]).mT, self.piece)
 
     def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
         """Whether parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
