@@ -84,21 +84,18 @@ def sides(x: Tensor, faces: Tensor) -> Sides:
 
 def frames(given: Sides) -> Frames:
     """The frame of each triangle; the normal of one without area is arbitrary and a constant, all is finite."""
-    first, second = given
-    # The images of orthonormal axes: with the equilateral triangle, two columns that are alike.
-    both = torch.cat([first, (second - 0.5 * first) / HEIGHT])
-    size = norm(both)
-    one, other = (both * inverse(size, _dot(both, both) <= tiny(both))).split(3)
-    up = cross(one, other)
+    one, other = given.first, (given.second - 0.5 * given.first) / HEIGHT  # the images of orthonormal axes
+    xx, xy, yy = _dot(one, one), _dot(one, other), _dot(other, other)
+    point, total = xx + yy <= tiny(one), (xx + yy).clamp_min(tiny(one))
+    up = cross(one, other) / total
     area = norm(up).clamp_min(FLAT)
     # Derivatives of what is arbitrary have no bound.
     normal = torch.where(area <= FLAT, up.detach(), up) / area
-    root = (1 + 2 * area).sqrt()
-    e1, e2 = (one + cross(other, normal)) / root, (other + cross(normal, one)) / root
-    scale = size / root
-    return Frames(
-        e1, e2, normal, scale * (_dot(one, one) + area), scale * _dot(one, other), scale * (_dot(other, other) + area)
-    )
+    lift = area * total
+    root = (total + 2 * lift).sqrt()
+    per = inverse(root, point)
+    e1, e2 = per * (one + cross(other, normal)), per * (other + cross(normal, one))
+    return Frames(e1, e2, normal, (xx + lift) / root, xy / root, (yy + lift) / root)
 
 
 def doubled_areas(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:

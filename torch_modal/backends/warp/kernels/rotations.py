@@ -13,6 +13,7 @@ packed_turn = wp.types.vector(length=12, dtype=real)
 
 FLAT = wp.constant(real(triangle_frames.FLAT))
 HEIGHT = wp.constant(real(triangle_frames.HEIGHT))
+PER_HEIGHT = wp.constant(real(1 / triangle_frames.HEIGHT))
 SMALL = wp.constant(real(rotations.SMALL))
 
 
@@ -33,25 +34,24 @@ def triangle(p: vec3, q: vec3, r: vec3):
     """triangle_frames.frames."""
     t = Triangle()
     one = q - p
-    other = (r - p - HALF * one) / HEIGHT
-    squared = wp.dot(one, one) + wp.dot(other, other)
-    size = wp.sqrt(wp.max(squared, TINY))
-    scale = real(0.0)
-    if squared > TINY:
-        scale = real(1.0) / size
-    one = scale * one
-    other = scale * other
-    up = wp.cross(one, other)
+    other = PER_HEIGHT * (r - p - HALF * one)
+    xx = wp.dot(one, one)
+    xy = wp.dot(one, other)
+    yy = wp.dot(other, other)
+    total = wp.max(xx + yy, TINY)
+    up = (real(1.0) / total) * wp.cross(one, other)
     area = wp.max(length_of(up), FLAT)
     t.flat = area <= FLAT
-    t.normal = up / area
-    root = wp.sqrt(real(1.0) + real(2.0) * area)
-    t.e1 = (one + wp.cross(other, t.normal)) / root
-    t.e2 = (other + wp.cross(t.normal, one)) / root
-    size = size / root
-    t.xx = size * (wp.dot(one, one) + area)
-    t.xy = size * wp.dot(one, other)
-    t.yy = size * (wp.dot(other, other) + area)
+    t.normal = (real(1.0) / area) * up
+    lift = area * total
+    per = real(1.0) / wp.sqrt(total + real(2.0) * lift)
+    t.xx = per * (xx + lift)
+    t.xy = per * xy
+    t.yy = per * (yy + lift)
+    if xx + yy <= TINY:
+        per = real(0.0)
+    t.e1 = per * (one + wp.cross(other, t.normal))
+    t.e2 = per * (other + wp.cross(t.normal, one))
     return t
 
 

@@ -9,6 +9,7 @@ import warp as wp
 from torch_modal.backends.warp.kernels.elements import HALF, place, real, vec3, vec4
 from torch_modal.backends.warp.kernels.rotations import (
     HEIGHT,
+    PER_HEIGHT,
     SMALL,
     Triangle,
     about,
@@ -81,7 +82,7 @@ def from_triangle(t: Triangle, torque: vec3, to_xx: real, to_xy: real, to_yy: re
         lift = real(1.0) / (t.xx * t.yy - t.xy * t.xy)
     one = to_xx * t.e1 + (mean + spin) * t.e2 - (lift * (t.yy * y + t.xy * x)) * t.normal
     other = (mean - spin) * t.e1 + to_yy * t.e2 + (lift * (t.xy * y + t.xx * x)) * t.normal
-    other = other / HEIGHT
+    other = PER_HEIGHT * other
     return one - HALF * other, other
 
 
