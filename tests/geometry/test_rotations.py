@@ -10,8 +10,11 @@ from torch import Tensor
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.warp.rotations import WarpRotations
+from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.rotations import exp
 from torch_modal.inbetween.blend import Blends, RotationBlend
 from torch_modal.layers.mid_shape import MidShape
 
@@ -63,6 +66,21 @@ def test_pieces_have_a_sense_of_their_own() -> None:
     torch.testing.assert_close(found, edges(wanted, mesh), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", [LocalRotations, WarpRotations])
+def test_shapes_that_turn_alike_keep_together_half_a_turn_from_the_reference(kind: type[LocalRotations]) -> None:
+    """By 170, 190 and 200 degrees, which are 170, -170 and -160; a second piece does not turn."""
+    x, faces = ribbon(0.0)
+    mesh = Connectivity(torch.cat([faces, faces + len(x)]).numpy())
+
+    def shape(degrees: float) -> Tensor:
+        return torch.cat([x @ exp(math.radians(degrees) * torch.tensor([0.0, 0.6, 0.8]).double()).mT, x])
+
+    rotations = kind(mesh, shape(0).expand(2, -1, -1))
+    shapes = torch.stack([shape(170), shape(190), shape(200)])
+    found = rotations.among(shapes[None], torch.tensor([[0.3, 0.5, 0.2]], dtype=torch.float64))[:, 0].mT
+    torch.testing.assert_close(found, edges(shape(186), mesh), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("fused", [False, True])
 def test_most_of_the_area_of_a_piece_says_which_way_it_turns(fused: bool) -> None:
     """Many small plates turn by more than half a turn, few large ones by less. A tree has its root at either end."""
@@ -89,13 +107,44 @@ def test_most_of_the_area_of_a_piece_says_which_way_it_turns(fused: bool) -> Non
     torch.testing.assert_close(found, (0.5 * wanted).cos(), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", [LocalRotations, WarpRotations])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_triangles_without_area_are_survived(dtype: torch.dtype) -> None:
+def test_triangles_without_area_are_survived(kind: type[LocalRotations], dtype: torch.dtype) -> None:
     (x_a, faces), (x_b, _) = ribbon(0.0), ribbon(2.0)
     x_a[3], x_b[5] = x_a[4], 0.5 * (x_b[4] + x_b[6])
+    x_a[:2], x_a[14] = x_a[2], x_a[2]  # one triangle is a point
     x_a, x_b = x_a.to(dtype), x_b.to(dtype)
-    rotations, _ = rotations_of(x_a, x_b, faces)
-    assert rotations(x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype)).isfinite().all()
+    rotations = kind(Connectivity(faces.numpy()), torch.stack([x_a, x_b]))
+    given = [x.requires_grad_() for x in (x_a[None], x_b[None], torch.tensor([0.5], dtype=dtype))]
+    found = rotations(*given)
+    assert found.isfinite().all()
+    for gradient in torch.autograd.grad(found.square().sum(), given):
+        assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("kind", ["torch", "warp"])
+@pytest.mark.parametrize("name", ["hand", "creature"])
+def test_the_corner_that_faces_begin_with_changes_nothing(name: str, kind: str, generator: torch.Generator) -> None:
+    """Between two shapes, among three, and along a motion."""
+    sample = load_sample(name)
+    x, faces = torch.cat([sample.keyframes, sample.truth])[:3].contiguous(), sample.faces
+    first = torch.randint(3, (len(faces), 1), generator=generator)
+    half, hours = T[2:3], Spacing(*(torch.ones(1, dtype=torch.float64) for _ in range(3)))
+    shapes = []
+    for corners in (faces, faces.gather(1, (first + torch.arange(3)) % 3)):
+        blend = RotationBlend(Connectivity(corners.numpy()), x, choose(kind))
+        trajectory = blend.rotations.trajectory(x[2:], x[:1], x[1:2], None, hours)
+        shapes.append(
+            torch.cat(
+                [
+                    blend(x[:1], x[1:2], half),
+                    blend.among(x[None], torch.tensor([[0.5, 0.2, 0.3]], dtype=torch.float64), x[:1]),
+                    blend.along(trajectory, torch.tensor([0]), x[:1], half),
+                ]
+            )
+        )
+    size = (x[0].amax(0) - x[0].amin(0)).norm()
+    assert float((shapes[0] - shapes[1]).norm(dim=-1).max() / size) < 1e-12
 
 
 @pytest.mark.parametrize("degrees", [0, 120, 300])

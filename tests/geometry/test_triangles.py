@@ -24,9 +24,11 @@ from torch_modal.geometry.triangle_frames import (
     bent_sides,
     edge_means,
     frames,
+    mapped,
     mirrored_sides,
     sides,
 )
+from torch_modal.geometry.vectors import cross
 
 F64 = torch.float64
 
@@ -42,8 +44,10 @@ def test_frames_are_orthonormal_and_give_the_sides_back(bars: Shapes) -> None:
     axes = torch.stack([own.e1, own.e2, own.normal]).movedim((0, 1), (-2, -1))
     identity = torch.eye(3, dtype=F64).expand(3, len(bars.faces), 3, 3)
     torch.testing.assert_close(axes @ axes.mT, identity)
-    torch.testing.assert_close(own.world(own.length, torch.zeros_like(own.length)), given.first)
-    torch.testing.assert_close(own.world(own.along, own.height), given.second)
+    for side, truth in zip(mapped(own.xx, own.xy, own.xy, own.yy), given, strict=True):
+        torch.testing.assert_close(own.world(*side), truth)
+    torch.testing.assert_close(2 * own.doubled_areas, 2 * cross(*given).norm(dim=0))
+    assert bool((own.xx * own.yy > own.xy**2).all())
 
 
 def test_a_rotation_field_is_a_turn_without_strain(bars: Shapes) -> None:
@@ -57,8 +61,9 @@ def test_a_rotation_field_is_a_turn_without_strain(bars: Shapes) -> None:
 
 
 def test_a_linear_field_has_its_symmetric_part_as_strain() -> None:
-    # A triangle in the plane z = 0 whose first side is along x, so that its frame is that of the world.
-    x = rows(torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1.5, 0]], dtype=F64))
+    # A triangle in the plane z = 0 that is symmetric to the middle of its first side, along x: its frame is that of
+    # the world.
+    x = rows(torch.tensor([[0.0, 0, 0], [2, 0, 0], [1.0, 1.5, 0]], dtype=F64))
     faces = torch.tensor([[0, 1, 2]])
     gradient = torch.tensor([[0.1, 0.3, 0], [-0.2, 0.4, 0], [0.05, -0.07, 0]], dtype=F64)
     found = bend(sides(rows(x[:, 0].mT @ gradient.T), faces), frames(sides(x, faces)))
@@ -71,7 +76,7 @@ def test_a_linear_field_has_its_symmetric_part_as_strain() -> None:
 def test_turns_become_finite_rotations(bars: Shapes) -> None:
     x, faces = rows(bars.keyframes[0]), bars.faces
     own = frames(sides(x, faces))
-    zero = torch.zeros_like(own.length)
+    zero = torch.zeros_like(own.xx)
     for omega in ([0.0, 0.0, 0.0], [2.0, -1.0, 0.7], [1e-9, 0.0, 0.0]):
         turn = torch.tensor(omega, dtype=F64)[:, None, None].expand_as(own.e1)
         found = bent_sides(BentTriangles(turn, (zero, zero, zero)), own)
@@ -84,13 +89,14 @@ def test_turns_become_finite_rotations(bars: Shapes) -> None:
 
 
 def test_the_stretch_is_the_exponential_of_the_strain() -> None:
-    x = rows(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=F64))
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.5, 0.75**0.5, 0]], dtype=F64)  # its frame is that of the world
+    x = rows(corners)
     own = frames(sides(x, torch.tensor([[0, 1, 2]])))
     for strain in ([[0.3, 0.2], [0.2, -0.1]], [[0.0, 0.4], [0.4, 0.0]], [[-3.0, 0.0], [0.0, -3.0]]):
         given = torch.tensor(strain, dtype=F64)
         entries = (given[0, 0].reshape(1, 1), given[0, 1].reshape(1, 1), given[1, 1].reshape(1, 1))
         found = bent_sides(BentTriangles(torch.zeros(3, 1, 1, dtype=F64), entries), own)
-        expected = torch.linalg.matrix_exp(given)
+        expected = torch.linalg.matrix_exp(given) @ corners[1:, :2].mT
         torch.testing.assert_close(found.first[:2, 0, 0], expected[:, 0])
         torch.testing.assert_close(found.second[:2, 0, 0], expected[:, 1])
 

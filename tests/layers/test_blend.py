@@ -2,10 +2,12 @@
 
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from conftest import Shapes, modal
+from conftest import Shapes, modal, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
@@ -56,6 +58,17 @@ def poses(bars: Shapes) -> Tensor:
     return torch.stack([x[0], x[1] @ turn.mT + 3, x[2] @ turn - 1])
 
 
+def assert_no_order(layer: Blend, keyframes: Tensor) -> None:
+    """Two orders, and weights on both sides of a tie, of key-frames turned any way."""
+    generator, d = torch.Generator().manual_seed(0), 1e-9
+    for _ in range(6):
+        turned = keyframes @ torch.stack([random_rotation(generator) for _ in range(3)]).mT
+        w = torch.stack([pulls(0.4, 0.2, 0.4), pulls(0.42 + d, 0.42 - d, 0.16), pulls(0.42 - d, 0.42 + d, 0.16)])
+        found, order = layer(turned, w), [2, 0, 1]
+        assert far(layer(turned[order], w[:, order]), found) < 1e-9
+        assert far(found[1], found[2]) < 1e-6
+
+
 class TestTwo:
     @pytest.mark.parametrize("preset", PRESETS)
     def test_two_key_frames_are_an_in_between(self, bars: Shapes, preset: str) -> None:
@@ -93,6 +106,24 @@ class TestInvariances:
         w = pulls(0.5, 0.2, 0.3)
         order = [2, 0, 1]
         assert far(layer(poses[order], w[order]), layer(poses, w)) < 1e-6
+
+    def test_neither_order_nor_ties_count_where_poses_are_far_apart(self, layer: Blend, poses: Tensor) -> None:
+        assert_no_order(layer, poses)
+
+    @pytest.mark.filterwarnings("ignore::torch_modal.MeshWarning")
+    @pytest.mark.parametrize("name", ["cow", "hand"])
+    def test_neither_order_nor_ties_count_in_bodies(self, name: str, data_dir: Path) -> None:
+        if name == "cow":
+            with np.load(data_dir / "animals" / "cow.npz") as given:
+                frames, faces = torch.tensor(given["frames"]).double(), torch.tensor(given["faces"]).long()
+            keyframes = frames[:: len(frames) // 3][:3]
+        else:
+            files = [data_dir / "mh-hand" / f"{n}.obj" for n in ("00-open", "02-fist", "04-spread")]
+            keyframes, faces = tm.load_keyframes(files)
+        bases = tm.extract_bases(keyframes, faces, 10, progress=False)
+        warnings.simplefilter("ignore", tm.ConvergenceWarning)  # of the base alone
+        for solver in (None, tm.Solver(max_steps=0, local_steps=0)):
+            assert_no_order(Blend(bases, faces, solver=solver), keyframes)
 
     def test_one_twice_has_both_weights(self, layer: Blend, poses: Tensor) -> None:
         x = layer(poses, pulls(0.5, 0.2, 0.3))

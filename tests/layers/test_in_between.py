@@ -21,6 +21,7 @@ from torch.func import functional_call, grad, jacrev, vmap
 
 import torch_modal as tm
 from torch_modal import trees
+from torch_modal.data.samples import load_sample
 from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry.connectivity import Connectivity
@@ -725,3 +726,21 @@ def test_modes_that_span_all_shapes() -> None:
             found.append(tm.InBetween(bases, faces, preset)(first, second, 0.5))
     for one in found:
         torch.testing.assert_close(one, found[0], rtol=0, atol=1e-5)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="pieces far apart share the size, the alignment, the coarse mesh and the modes; all four matter"
+)
+def test_a_ball_far_away_changes_nothing() -> None:
+    sample = load_sample("creature")
+    x, faces = sample.keyframes[:2], sample.faces
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1 * diagonal(x[0]))
+    far = torch.tensor(np.array(ball.vertices)) + x[0].mean(0) + times(3 * diagonal(x[0]), 0, 0)
+    both = torch.cat([x, far.expand(2, -1, -1)], 1)
+    all_faces = torch.cat([faces, torch.tensor(np.array(ball.faces)) + x.shape[1]])
+    alone, together = (
+        InBetween(tm.extract_bases(given, own, 15, progress=False), own, "fast")(*given, 0.5)
+        for given, own in ((x, faces), (both, all_faces))
+    )
+    off = (together - torch.cat([alone, far])).norm(dim=-1) / diagonal(x[0])
+    assert float(off.max()) < 1e-4

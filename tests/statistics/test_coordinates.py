@@ -31,7 +31,7 @@ def test_shapes_have_coordinates_that_give_them_back(name: str) -> None:
 
 def test_a_bend_is_found_again(bars: Shapes, generator: torch.Generator) -> None:
     own = frames(sides(bars.keyframes[0].mT[:, None].contiguous(), bars.faces))
-    n = own.length.shape[1]
+    n = own.xx.shape[1]
     turn = torch.randn(3, 1, n, generator=generator, dtype=torch.float64)
     strain = tuple(0.3 * torch.randn(1, n, generator=generator, dtype=torch.float64) for _ in range(3))
     other = frames(bent_sides(BentTriangles(turn, strain), own))  # type: ignore[arg-type]

@@ -9,9 +9,18 @@ from torch import Tensor, nn
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, tangent_offset
-from torch_modal.geometry.rotation_means import mean
+from torch_modal.geometry.rotation_means import agreeing, mean
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
-from torch_modal.geometry.triangle_frames import Frames, Sides, edge_means, frames, sides, stretched
+from torch_modal.geometry.triangle_frames import (
+    Frames,
+    Sides,
+    doubled_areas,
+    edge_means,
+    frames,
+    mapped,
+    sides,
+    stretched,
+)
 from torch_modal.geometry.vectors import pick
 
 # The tree along which turns are compared avoids slivers, whose normals mean little: one with an altitude of this part
@@ -30,15 +39,15 @@ class Trajectory(NamedTuple):
     e2: Tensor
     normal: Tensor
     size: Tensor
-    """Length, and coordinates along and across, at 0. *Shape:* ``(3, P, F)``."""
+    """Entries of the stretch at 0. *Shape:* ``(3, P, F)``."""
     step: Tensor
-    """To the shape at 1: axis times angle in the coordinates of the frames, then the growth of the size over the mean
-    length, so that all are turns or strains. *Shape:* ``(6, P, F)``."""
+    """To the shape at 1: axis times angle in the coordinates of the frames, then the growth of the stretch over the
+    mean size, so that all are turns or strains. *Shape:* ``(6, P, F)``."""
     first: Tensor
     """The tangent offset of the step at the start. *Shape:* ``(6, P, F)``."""
     last: Tensor
     unit: Tensor
-    """The mean length. *Shape:* ``(P, F)``."""
+    """The mean size. *Shape:* ``(P, F)``."""
 
     def rows(self, index: Tensor) -> "Trajectory":
         """Of some of the shapes."""
@@ -48,11 +57,12 @@ class Trajectory(NamedTuple):
 class LocalRotations(nn.Module):
     r"""Edge vectors between two shapes whose triangles turn at constant speed.
 
-    Between the key-frames a triangle turns by ``R`` and is sheared by the rest. At the time ``t`` its sides are
-    :math:`R^t\, ((1-t) S_a + t R^T S_b)`; an edge takes the mean of its triangles by area. Where linear interpolation
-    shrinks what turns, this does not. ``R`` alone does not tell a turn of 200 degrees from one of -160. But neighbours
-    turn alike: the signs of quaternions are passed on along a spanning tree, which tells up to a full turn. Where the
-    references turn by more from side to side, as a sheet that rolls up does, :class:`Clusters` take over.
+    Between the key-frames the frame of a triangle (:class:`Frames`) turns by ``R``; its stretch is the rest. At the
+    time ``t`` its sides are :math:`R^t\, ((1-t) S_a + t R^T S_b)`; an edge takes the mean of its triangles by area.
+    Where linear interpolation shrinks what turns, this does not. ``R`` alone does not tell a turn of 200 degrees from
+    one of -160. But neighbours turn alike: the signs of quaternions are passed on along a spanning tree, which tells up
+    to a full turn. Where the references turn by more from side to side, as a sheet that rolls up does,
+    :class:`Clusters` take over.
 
     Args:
         mesh: The connectivity.
@@ -60,6 +70,7 @@ class LocalRotations(nn.Module):
             avoids what is a sliver in any. *Shape:* ``(K, V, 3)``.
     """
 
+    reference: Tensor
     faces: Tensor
     sides: Tensor
     side_signs: Tensor
@@ -77,6 +88,8 @@ class LocalRotations(nn.Module):
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
+        #: The first reference, from which :meth:`among` measures rotations. *Shape:* ``(1, V, 3)``.
+        self.register_buffer("reference", references[:1].clone(), persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
@@ -85,7 +98,7 @@ class LocalRotations(nn.Module):
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
-        self.n_edges = len(mesh.edges)
+        self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
         wound = self._wound(a, b)
         #: For rotations beyond a full turn; None where there are none.
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
@@ -104,14 +117,13 @@ class LocalRotations(nn.Module):
         """Edge vectors at the time ``t``, components first. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (3, B, E)``."""
         a, b = (_frames(x, self.faces) for x in (first, second))
         areas, t = a.doubled_areas + b.doubled_areas, t[:, None]
-        length, along, height = (torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))
         turn = power(self._signed(a, b), t) if self.clusters is None else self.clusters(_turn_between(a, b), t)
-        return self._edges(Sides(rotate(turn, length * a.e1), rotate(turn, a.world(along, height))), areas)
+        return self._edges(_turned(turn, a, *(torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))), areas)
 
     def among(self, shapes: Tensor, weights: Tensor) -> Tensor:
         """Edge vectors of the weighted mean of K shapes, components first.
 
-        The rotation of a triangle is the mean of those of the shapes, its size the weighted sum. Of two references,
+        The rotation of a triangle is the mean of those of the shapes, its stretch the weighted sum. Of two references,
         this is :meth:`forward` at the time of the second weight.
 
         Args:
@@ -122,20 +134,26 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        own = Frames(*(x.unflatten(-2, weights.shape) for x in _frames(shapes.flatten(0, 1), self.faces)))
-        # Turns are those from the heaviest, which no order of the shapes changes.
-        rows = torch.arange(len(weights), device=weights.device)
-        start = Frames(*(x[..., rows, weights.argmax(1), :] for x in own))
-        turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
+        start, own = _frames(self.reference, self.faces), _frames(shapes.flatten(0, 1), self.faces)
+        turns = _turn_between(start, own)
         if self.clusters is None:
-            areas = own.doubled_areas.detach().flatten(0, 1)
-            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), areas).view(turns.shape[1:])
-            turn = mean(signs * turns, weights[..., None])
+            signs = self.sign(turns.detach().movedim(0, -1), own.doubled_areas.detach())
+            turns = (signs * turns).unflatten(1, weights.shape)
+            turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
-            turn = self.clusters.among(turns, weights[..., None])
-        length, along, height = ((weights[..., None] * x).sum(-2) for x in own[3:])
-        wanted = Sides(rotate(turn, length * start.e1), rotate(turn, start.world(along, height)))
+            turn = self.clusters.among(turns.unflatten(1, weights.shape), weights[..., None])
+        wanted = _turned(turn, start, *((weights[..., None] * x.unflatten(0, weights.shape)).sum(-2) for x in own[3:]))
         return self._edges(wanted, self.areas.expand(len(weights), -1))
+
+    def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
+        """Signs for the pieces of K shapes, with which they turn the short way from each other.
+
+        *Shape:* ``(4, B, K, F), (B, K) -> (B, K, F)``.
+        """
+        zero = weights.new_zeros(*weights.shape, self.n_pieces)
+        rows = (self.areas * (turns * turn[..., None, :]).sum(0) for turn in turns.unbind(2))
+        products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
+        return pick(agreeing(products, weights[:, None]).mT, self.piece)
 
     def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
         """Whether parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
@@ -160,7 +178,7 @@ class LocalRotations(nn.Module):
         """
         earlier, a, b, later = (None if x is None else _frames(x, self.faces) for x in (before, first, second, after))
         assert a is not None and b is not None
-        unit = 0.5 * (a.length + b.length)
+        unit = 0.5 * (a.size + b.size)
         unit = torch.maximum(unit, SHORTEST * unit.mean(-1, keepdim=True))
 
         def step(p: Frames | None, q: Frames | None, at: Frames) -> Tensor | None:
@@ -174,7 +192,11 @@ class LocalRotations(nn.Module):
         own = step(a, b, a)
         assert own is not None
         wide = spacing.mapped(lambda h: h[:, None])
-        bend = tangent_offset(own, step(earlier, a, a), step(b, later, b), wide, lambda x: x.square().sum(0))
+
+        def squared(x: Tensor) -> Tensor:
+            return x.square().sum(0) + x[4].square()  # twice the entry beside the diagonal, as in the norm of a matrix
+
+        bend = tangent_offset(own, step(earlier, a, a), step(b, later, b), wide, squared)
         return Trajectory(a.e1, a.e2, a.normal, torch.stack(a[3:]), own, *bend, unit)
 
     def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
@@ -207,8 +229,8 @@ class LocalRotations(nn.Module):
     def _along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None) -> Tensor:
         u = t[:, None]
         straight, bent = u * trajectory.step, beyond(TangentOffset(trajectory.first, trajectory.last), u)
-        length, along, height = trajectory.size + trajectory.unit * (straight + bent)[3:]
-        flat = torch.zeros_like(length)
+        xx, xy, yy = trajectory.size + trajectory.unit * (straight + bent)[3:]
+        flat = torch.zeros_like(xx)
 
         def placed(x: Tensor, y: Tensor) -> Tensor:
             side = torch.stack([x, y, flat])
@@ -217,10 +239,8 @@ class LocalRotations(nn.Module):
             return x * trajectory.e1 + y * trajectory.e2 + z * trajectory.normal
 
         end = trajectory.size + trajectory.unit * trajectory.step[3:]
-        areas = trajectory.size[0] * trajectory.size[2] + end[0] * end[2]
-        first, second = (length, flat), (along, height)
-        if bending is not None:
-            first, second = stretched(bending[3:], length, along, height)
+        areas = doubled_areas(*trajectory.size) + doubled_areas(*end)
+        first, second = mapped(xx, xy, xy, yy) if bending is None else stretched(bending[3:], xx, xy, yy)
         return self._edges(Sides(placed(*first), placed(*second)), areas)
 
     def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
@@ -261,6 +281,12 @@ def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
 def _turn_between(a: Frames, b: Frames) -> Tensor:
     """Quaternions of the rotations between the frames of triangles. *Shape:* ``(4, B, F)``."""
     return quaternion(b.e1[:, None] * a.e1 + b.e2[:, None] * a.e2 + b.normal[:, None] * a.normal)
+
+
+def _turned(turn: Tensor, own: Frames, xx: Tensor, xy: Tensor, yy: Tensor) -> Sides:
+    """Sides of triangles with another stretch in their frames, turned. *Shape:* ``(4, B, F), (B, F)``."""
+    first, second = mapped(xx, xy, xy, yy)
+    return Sides(rotate(turn, own.world(*first)), rotate(turn, own.world(*second)))
 
 
 def _frames(x: Tensor, faces: Tensor) -> Frames:

@@ -24,7 +24,7 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     It has first derivatives only.
 
     Args:
-        rotations: Quaternions relative to one of them, which has no rotation. *Shape:* ``(4, ..., K, F)``.
+        rotations: Quaternions whose signs are those of :func:`agreeing`. *Shape:* ``(4, ..., K, F)``.
         weights: They add up to one. *Shape:* ``(..., K, 1)``.
 
     Returns:
@@ -36,6 +36,25 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
         for _ in range(STEPS):
             found = _stepped(found, rotations, weights)
     return _stepped(found.detach(), rotations, weights)  # forward mode goes through no_grad
+
+
+@torch.no_grad()
+def agreeing(products: Tensor, weights: Tensor) -> Tensor:
+    r"""Signs with which K quaternions, or fields of them, are near their chordal mean (Markley et al. 2007).
+
+    The mean is the dominant eigenvector of :math:`\sum_k w_k q_k q_k^T`: it is continuous in the weights and depends on
+    no order. The signs change only where a rotation is half a turn away from it.
+
+    Args:
+        products: Inner products of all pairs. *Shape:* ``(..., K, K)``.
+        weights: *Shape:* ``(..., K)``.
+
+    Returns:
+        *Shape:* ``(..., K)``.
+    """
+    roots = weights.clamp_min(0).sqrt()
+    dominant = torch.linalg.eigh(roots[..., None] * products * roots[..., None, :]).eigenvectors[..., -1]
+    return torch.where((products @ (roots * dominant)[..., None]).squeeze(-1) < 0, -1.0, 1.0).to(products)
 
 
 def _stepped(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:

@@ -11,8 +11,11 @@ from torch import Tensor
 from torch_modal.geometry.rotations import SMALL, product, turn_of, turned
 from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
-# Smallest height relative to the sides; below, it is rounding, and the division amplifies noise.
+# Smallest area relative to the squared sides; below, the normal is rounding, and divisions amplify noise.
 FLAT = 1e-6
+
+# Height of an equilateral triangle with a side of 1.
+HEIGHT = 0.75**0.5
 
 
 class Sides(NamedTuple):
@@ -25,35 +28,43 @@ class Sides(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """A frame on each triangle, and its sides in it: ``first = length e1``, ``second = along e1 + height e2``."""
+    """A frame on each triangle, and its stretch in the plane of the frame.
+
+    An equilateral triangle with a side of 1, stretched by a symmetric positive definite 2 x 2 matrix, then rotated, is
+    the triangle (polar decomposition). Another first corner turns frame and stretch by a third of a turn about the
+    normal, in all shapes alike: nothing that is computed from them depends on it.
+    """
 
     e1: Tensor
-    """Unit vector along the first side. *Shape:* ``(3, B, F)``."""
+    """Unit vector in the plane: the rotated first side. *Shape:* ``(3, B, F)``."""
     e2: Tensor
     """Unit vector in the plane, orthogonal to it. *Shape:* ``(3, B, F)``."""
     normal: Tensor
     """Unit normal. *Shape:* ``(3, B, F)``."""
-    length: Tensor
-    """*Shape:* ``(B, F)``."""
-    along: Tensor
-    """*Shape:* ``(B, F)``."""
-    height: Tensor
-    """*Shape:* ``(B, F)``, above 0."""
+    xx: Tensor
+    """Entries of the stretch. *Shape:* ``(B, F)``."""
+    xy: Tensor
+    yy: Tensor
 
     def world(self, x: Tensor, y: Tensor) -> Tensor:
         """The vector with coordinates in the plane. *Shape:* ``(B, F), (B, F) -> (3, B, F)``."""
         return x * self.e1 + y * self.e2
 
     @property
+    def size(self) -> Tensor:
+        """Mean stretch: the side of an equilateral triangle. *Shape:* ``(B, F)``."""
+        return 0.5 * (self.xx + self.yy)
+
+    @property
     def doubled_areas(self) -> Tensor:
         """*Shape:* ``(B, F)``."""
-        return self.length * self.height
+        return doubled_areas(self.xx, self.xy, self.yy)
 
     @property
     def slenderness(self) -> Tensor:
         """Altitude over longest side. *Shape:* ``(B, F)``."""
-        ends = (self.length, 0), (self.along, self.height), (self.along - self.length, self.height)
-        return self.doubled_areas / torch.stack([x * x + y * y for x, y in ends]).amax(0)
+        (a, b), (c, d) = mapped(self.xx, self.xy, self.xy, self.yy)
+        return self.doubled_areas / torch.stack([x * x + y * y for x, y in ((a, b), (c, d), (c - a, d - b))]).amax(0)
 
 
 class BentTriangles(NamedTuple):
@@ -72,19 +83,29 @@ def sides(x: Tensor, faces: Tensor) -> Sides:
 
 
 def frames(given: Sides) -> Frames:
-    """The frame of each triangle; finite but arbitrary, and a constant, for one without area."""
-    first, second = given
-    length = norm(first)
-    e1 = first * inverse(length, _dot(first, first) <= tiny(first))
-    along = _dot(second, e1)
-    across = second - along * e1
-    rise, least = norm(across), FLAT * (length + along.abs())
-    height = torch.maximum(rise, least)
-    e2 = across / height
+    """The frame of each triangle; the normal of one without area is arbitrary and a constant, all is finite."""
+    one, other = given.first, (given.second - 0.5 * given.first) / HEIGHT  # the images of orthonormal axes
+    xx, xy, yy = _dot(one, one), _dot(one, other), _dot(other, other)
+    point, total = xx + yy <= tiny(one), (xx + yy).clamp_min(tiny(one))
+    up = cross(one, other) / total
+    area = norm(up).clamp_min(FLAT)
     # Derivatives of what is arbitrary have no bound.
-    flat = (rise <= least) | (_dot(across, across) <= tiny(across))
-    e1, e2, height = (torch.where(flat, value.detach(), value) for value in (e1, e2, height))
-    return Frames(e1, e2, cross(e1, e2), length, along, height)
+    normal = torch.where(area <= FLAT, up.detach(), up) / area
+    lift = area * total
+    root = (total + 2 * lift).sqrt()
+    per = inverse(root, point)
+    e1, e2 = per * (one + cross(other, normal)), per * (other + cross(normal, one))
+    return Frames(e1, e2, normal, (xx + lift) / root, xy / root, (yy + lift) / root)
+
+
+def doubled_areas(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+    """Twice the areas of equilateral triangles with a side of 1 after a stretch. *Shape of each:* ``(B, F)``."""
+    return HEIGHT * (xx * yy - xy * xy)
+
+
+def mapped(xx: Tensor, xy: Tensor, yx: Tensor, yy: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Both sides, in their plane, of equilateral triangles after a linear map. *Shape of each:* ``(B, F)``."""
+    return (xx, yx), (0.5 * xx + HEIGHT * xy, 0.5 * yx + HEIGHT * yy)
 
 
 def edge_means(wanted: Sides, weights: Tensor, edges: Tensor, signs: Tensor, n_edges: int) -> Tensor:
@@ -115,11 +136,11 @@ def bend(displaced: Sides, reference: Frames) -> BentTriangles:
         reference: Frames of the undeformed shape; a batch of one is broadcast.
     """
     axes = (reference.e1, reference.e2, reference.normal)
-    d_x, d_y = ([_dot(side, axis) for axis in axes] for side in displaced)
-    x_x, y_x, n_x = (d / reference.length for d in d_x)
-    x_y, y_y, n_y = (
-        (d - along * reference.along) / reference.height for d, along in zip(d_y, (x_x, y_x, n_x), strict=True)
-    )
+    first, second = displaced
+    one, other = first, (second - 0.5 * first) / HEIGHT
+    xx, xy, yy = _inverse(reference)
+    x_x, y_x, n_x = (_dot(xx * one + xy * other, axis) for axis in axes)
+    x_y, y_y, n_y = (_dot(xy * one + yy * other, axis) for axis in axes)
     spin = 0.5 * (y_x - x_y)
     return BentTriangles(n_y * axes[0] - n_x * axes[1] + spin * axes[2], (x_x, 0.5 * (x_y + y_x), y_y))
 
@@ -134,11 +155,10 @@ def convected(bending: BentTriangles, own: Frames) -> Tensor:
 
 
 def stretched(
-    strain: Tensor, length: Tensor, along: Tensor, height: Tensor
+    strain: Tensor, xx: Tensor, xy: Tensor, yy: Tensor
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Both sides, in their plane, after the exponential of a strain ``xx, xy, yy``. *Shape:* ``(3, B, F), (B, F)``."""
-    xx, xy, yy = _exponential(*strain)
-    return (xx * length, xy * length), (xx * along + xy * height, xy * along + yy * height)
+    """Both sides, in their plane, after a stretch and the exponential of a strain. *Shape:* ``(3, B, F), (B, F)``."""
+    return mapped(*_product(_exponential(*strain), (xx, xy, yy)))
 
 
 def bent_sides(bending: BentTriangles, own: Frames) -> Sides:
@@ -150,7 +170,7 @@ def bent_sides(bending: BentTriangles, own: Frames) -> Sides:
         bending: Rotations in the coordinates of ``own``.
         own: Frames of the undeformed shape.
     """
-    first, second = stretched(torch.stack(bending.strain), own.length, own.along, own.height)
+    first, second = stretched(torch.stack(bending.strain), *own[3:])
     return Sides(turned(bending.turn, own.world(*first)), turned(bending.turn, own.world(*second)))
 
 
@@ -184,12 +204,7 @@ def mirrored_sides(centre: Frames, other: Frames) -> Sides:
         p, q, r = (_dot(v, axis) for axis in (other.e1, other.e2, other.normal))
         return centre.world(cos * p + sin * q, cos * q - sin * p) + r * centre.normal
 
-    first = turned_back(g_xx * centre.length, g_xy * centre.length)
-    second = turned_back(
-        g_xx * centre.along + g_xy * centre.height,
-        g_xy * centre.along + g_yy * centre.height,
-    )
-    return Sides(first, second)
+    return Sides(*(turned_back(*side) for side in mapped(*_product((g_xx, g_xy, g_yy), centre[3:]))))
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -208,12 +223,22 @@ class _Polar(NamedTuple):
 
 
 def _polar(own: Frames, other: Frames) -> _Polar:
-    m_xx = other.length / own.length
-    m_xy = (other.along - m_xx * own.along) / own.height
-    m_yy = other.height / own.height
-    trace = torch.hypot(m_xx + m_yy, m_xy)  # of the stretch; never 0, as both heights are above 0
-    cos, sin = (m_xx + m_yy) / trace, -m_xy / trace
-    return _Polar(cos, sin, cos * m_xx, cos * m_xy + sin * m_yy, cos * m_yy - sin * m_xy)
+    xx, xy, yx, yy = _product(other[3:], _inverse(own))
+    trace = torch.hypot(xx + yy, yx - xy)  # of the stretch; never 0, as both determinants are above 0
+    cos, sin = (xx + yy) / trace, (yx - xy) / trace
+    return _Polar(cos, sin, cos * xx + sin * yx, cos * xy + sin * yy, cos * yy - sin * xy)
+
+
+def _inverse(own: Frames) -> tuple[Tensor, Tensor, Tensor]:
+    """The inverse of the stretch, by entries. *Shape of each:* ``(B, F)``."""
+    determinant = own.xx * own.yy - own.xy * own.xy
+    return own.yy / determinant, -own.xy / determinant, own.xx / determinant
+
+
+def _product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The product of symmetric 2 x 2 matrices, by entries ``xx, xy, yx, yy``. *Shape of each:* ``(B, F)``."""
+    (a_xx, a_xy, a_yy), (b_xx, b_xy, b_yy) = a, b
+    return a_xx * b_xx + a_xy * b_xy, a_xx * b_xy + a_xy * b_yy, a_xy * b_xx + a_yy * b_xy, a_xy * b_xy + a_yy * b_yy
 
 
 def _logarithm(xx: Tensor, xy: Tensor, yy: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.rigid import RigidMotion, best_rotation, centroid
-from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import arc, exp, quaternion
+from torch_modal.geometry.rotation_means import agreeing, mean
+from torch_modal.geometry.rotations import quaternion, rotate
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.comparison import SLACK
 from torch_modal.inbetween.frame import Frame
@@ -159,12 +159,10 @@ def _aligned(frame: Frame, keyframes: Tensor, weights: Tensor) -> Group:
     for _ in range(LAST_ROUNDS):
         turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
     turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
-    # Seen from the heaviest, the poses are less than half a turn away.
-    rows = torch.arange(len(weights), device=weights.device)
-    start = turns[rows, weights.argmax(1)]
-    relative = quaternion((start[:, None] @ turns.mT).movedim((-2, -1), (0, 1)))[..., None]
-    pose = mean(torch.where(relative[0] < 0, -relative, relative), weights[..., None])
-    rotation = start.mT @ exp(2 * arc(pose).squeeze(-1).movedim(0, -1))
+    poses = quaternion(turns.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
+    signs = agreeing(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
+    pose = mean((signs * poses)[..., None], weights[..., None])
+    rotation = rotate(pose, torch.eye(3).to(poses)[:, None]).movedim(0, 1)
     target = (weights[..., None] * centres).sum(1)
     return Group(centred @ turns.mT * frame.scale, weights, RigidMotion(rotation, torch.zeros_like(target), target))
 

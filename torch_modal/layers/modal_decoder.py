@@ -280,9 +280,9 @@ def _finite(name: str, x: Tensor, n_dimensions: int, keyframes: Tensor) -> Tenso
 
 def _bounded(columns: Tensor, own: Frames) -> Tensor:
     """Turns and strains; less where they are those of slivers, none without a size. *Shape:* ``(6, k, F)``."""
-    areas, least = own.doubled_areas, torch.minimum(own.length, own.height)
-    columns = torch.where(least > LEAST * own.length.mean(), columns, 0)
-    squared = columns.square().sum(0)
+    areas = own.doubled_areas
+    columns = torch.where(areas / own.size > LEAST * own.size.mean(), columns, 0)
+    squared = columns.square().sum(0) + columns[4].square()  # the entry beside the diagonal counts twice
     limit = MOST * ((areas * squared).sum(1, keepdim=True) / areas.sum()).sqrt()
     bound = (limit / squared.sqrt().clamp_min(torch.finfo(squared.dtype).tiny)).clamp_max(1)
     return (bound * columns).movedim(0, 1).contiguous()

@@ -41,9 +41,9 @@ class BendingCoordinates:
         self.reconstruction = Reconstruction(mean, faces)
         self.frames = self._frames(mean[None])
         areas = 0.5 * self.frames.doubled_areas[0]
-        #: Parts of the area that triangles have. *Shape:* ``(F,)``.
-        self.shares = areas / areas.sum()
-        self._has_area = self.shares * len(areas) > SMALLEST_AREA
+        self._has_area = areas > SMALLEST_AREA * areas.mean()
+        #: Weights of squared coordinates: parts of the area, twice beside the diagonal of strains. *Shape:* ``(6, F)``.
+        self.shares = areas / areas.sum() * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
 
     def _frames(self, x: Tensor) -> Frames:
         return frames(sides(x.movedim(-1, 0).contiguous(), self.faces))

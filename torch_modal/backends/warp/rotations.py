@@ -28,7 +28,6 @@ class WarpRotations(LocalRotations):
         }
         for name, values in of_faces.items():
             self.register_buffer(f"_{name}", values.int().contiguous(), persistent=False)
-        self._n_pieces = int(self.piece.max()) + 1
         self.register_buffer("_signs", self.side_signs.unflatten(0, (3, -1)).T.contiguous(), persistent=False)
 
     def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
@@ -59,7 +58,7 @@ class WarpRotations(LocalRotations):
         module, b = kernels("rotations"), len(areas)
         if areas.device.type != "cpu" or transformed(areas):  # the walk down the tree is one thread's
             return self._sign_votes(quaternions.movedim(-1, 0), areas)
-        n_pieces = self._n_pieces
+        n_pieces = self.n_pieces
         quaternions, weights = quaternions.double().contiguous(), areas.double()
         sign, vote = torch.empty_like(weights), weights.new_zeros(b, n_pieces)
         given = [quaternions, weights, self._order, self._parent, self._piece_of, n_pieces, sign, vote]

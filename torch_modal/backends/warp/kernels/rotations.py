@@ -2,16 +2,18 @@
 
 import warp as wp
 
-from torch_modal.backends.warp.kernels.elements import HALF, TINIEST, length_of, place, real, vec3, vec4
+from torch_modal.backends.warp.kernels.elements import HALF, TINIEST, TINY, length_of, place, real, vec3, vec4
 from torch_modal.geometry import rotations, triangle_frames
 
 packed_trajectory = wp.types.vector(length=31, dtype=real)
 """A row of :meth:`torch_modal.geometry.local_rotations.Trajectory`, in the order of its parts."""
 
 packed_turn = wp.types.vector(length=12, dtype=real)
-"""Of a triangle, the sides' directions in the first shape; length, along and height there, and how they change."""
+"""Of a triangle, both axes of its frame in the first shape, the entries of its stretch there, and how they change."""
 
-NO_HEIGHT = wp.constant(real(triangle_frames.FLAT))
+FLAT = wp.constant(real(triangle_frames.FLAT))
+HEIGHT = wp.constant(real(triangle_frames.HEIGHT))
+PER_HEIGHT = wp.constant(real(1 / triangle_frames.HEIGHT))
 SMALL = wp.constant(real(rotations.SMALL))
 
 
@@ -21,24 +23,41 @@ class Triangle:
     e1: vec3
     e2: vec3
     normal: vec3
-    length: real
-    along: real
-    height: real
+    xx: real
+    xy: real
+    yy: real
+    flat: bool
 
 
 @wp.func
 def triangle(p: vec3, q: vec3, r: vec3):
+    """triangle_frames.frames."""
     t = Triangle()
-    first = q - p
-    second = r - p
-    t.length = length_of(first)
-    t.e1 = first / t.length
-    t.along = wp.dot(second, t.e1)
-    rise = second - t.along * t.e1
-    t.height = wp.max(length_of(rise), NO_HEIGHT * (t.length + wp.abs(t.along)))
-    t.e2 = rise / t.height
-    t.normal = wp.cross(t.e1, t.e2)
+    one = q - p
+    other = PER_HEIGHT * (r - p - HALF * one)
+    xx = wp.dot(one, one)
+    xy = wp.dot(one, other)
+    yy = wp.dot(other, other)
+    total = wp.max(xx + yy, TINY)
+    up = (real(1.0) / total) * wp.cross(one, other)
+    area = wp.max(length_of(up), FLAT)
+    t.flat = area <= FLAT
+    t.normal = (real(1.0) / area) * up
+    lift = area * total
+    per = real(1.0) / wp.sqrt(total + real(2.0) * lift)
+    t.xx = per * (xx + lift)
+    t.xy = per * xy
+    t.yy = per * (yy + lift)
+    if xx + yy <= TINY:
+        per = real(0.0)
+    t.e1 = per * (one + wp.cross(other, t.normal))
+    t.e2 = per * (other + wp.cross(t.normal, one))
     return t
+
+
+@wp.func
+def doubled_area(xx: real, xy: real, yy: real):
+    return HEIGHT * (xx * yy - xy * xy)
 
 
 @wp.func
@@ -94,7 +113,7 @@ def turns(
         b = triangle(second[p], second[q], second[r])
         at = place(s * faces.shape[0], k)
         quaternions[at] = quaternion(a, b)
-        areas[at] = a.length * a.height + b.length * b.height
+        areas[at] = doubled_area(a.xx, a.xy, a.yy) + doubled_area(b.xx, b.xy, b.yy)
         packed[at] = packed_turn(
             a.e1[0],
             a.e1[1],
@@ -102,12 +121,12 @@ def turns(
             a.e2[0],
             a.e2[1],
             a.e2[2],
-            a.length,
-            a.along,
-            a.height,
-            b.length - a.length,
-            b.along - a.along,
-            b.height - a.height,
+            a.xx,
+            a.xy,
+            a.yy,
+            b.xx - a.xx,
+            b.xy - a.xy,
+            b.yy - a.yy,
         )
 
 
@@ -303,7 +322,9 @@ def part_turned(
         x = c[6] + t * c[9]
         y = c[7] + t * c[10]
         z = c[8] + t * c[11]
-        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], areas[at], x * one, y * one + z * two)
+        first = x * one + y * two
+        second = HALF * first + HEIGHT * (y * one + z * two)
+        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], areas[at], first, second)
 
 
 @wp.kernel(enable_backward=False)
@@ -331,17 +352,19 @@ def trajectory_edges(
         straight = about((HALF * u) * vec3(c[12], c[13], c[14]))
         bend = about(HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26])))
         unit = c[30]
-        length = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
-        along = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
-        height = c[11] + unit * (u * c[17] + a * c[23] + b * c[29])
+        xx = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
+        xy = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
+        yy = c[11] + unit * (u * c[17] + a * c[23] + b * c[29])
         q = composed(straight, bend)
         x = first_axis(q)
         y = second_axis(q)
         one = x[0] * e1 + x[1] * e2 + x[2] * normal
         two = y[0] * e1 + y[1] * e2 + y[2] * normal
-        area = c[9] * c[11] + (c[9] + unit * c[15]) * (c[11] + unit * c[17])
-        second = along * one + height * two
-        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], area, length * one, second)
+        area = doubled_area(c[9], c[10], c[11])
+        area += doubled_area(c[9] + unit * c[15], c[10] + unit * c[16], c[11] + unit * c[17])
+        first = xx * one + xy * two
+        second = HALF * first + HEIGHT * (xy * one + yy * two)
+        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], area, first, second)
 
 
 # ---------------------------------------------------------------------------------------------------- Poisson problem

@@ -6,11 +6,14 @@ A part ``exp(t log R)`` of a rotation turns by ``J(t theta) (t dtheta + theta dt
 
 import warp as wp
 
-from torch_modal.backends.warp.kernels.elements import place, real, vec3, vec4
+from torch_modal.backends.warp.kernels.elements import HALF, place, real, vec3, vec4
 from torch_modal.backends.warp.kernels.rotations import (
+    HEIGHT,
+    PER_HEIGHT,
     SMALL,
     Triangle,
     about,
+    doubled_area,
     half_turn,
     quaternion,
     sinc,
@@ -61,17 +64,26 @@ def reached(turn: vec4, half: vec3, part: vec4, t: real, torque: vec3):
 
 
 @wp.func
-def from_triangle(t: Triangle, torque: vec3, to_length: real, to_along: real, to_height: real):
-    """Gradients of the two sides from the first corner, from those of a triangle's frame and size."""
-    per_length = real(0.0)
-    if t.length > NO_LENGTH:
-        per_length = real(1.0) / t.length
-    lift = wp.dot(torque, t.e1) / t.height
-    swing = wp.dot(torque, t.normal) + t.height * to_along - t.along * to_height
-    sink = wp.dot(torque, t.e2) + t.along * lift
-    first = to_length * t.e1 + (per_length * swing) * t.e2 - (per_length * sink) * t.normal
-    second = to_along * t.e1 + to_height * t.e2 + lift * t.normal
-    return first, second
+def from_triangle(t: Triangle, torque: vec3, to_xx: real, to_xy: real, to_yy: real):
+    """Gradients of the two sides from the first corner, from those of a triangle's frame and stretch.
+
+    With the frame ``Q`` and the stretch ``U``, the columns ``Q U`` change by ``dQ U + Q dU``. In the plane, what is
+    antisymmetric of the change over the trace of ``U`` is the rotation; across it, the change is a rotation of ``U``.
+    """
+    x = wp.dot(torque, t.e1)
+    y = wp.dot(torque, t.e2)
+    mean = HALF * to_xy
+    spin = real(0.0)
+    if t.xx + t.yy > NO_LENGTH:
+        spin = wp.dot(torque, t.normal) + to_xx * t.xy - to_yy * t.xy + mean * (t.yy - t.xx)
+        spin = spin / (t.xx + t.yy)
+    lift = real(0.0)
+    if not t.flat:
+        lift = real(1.0) / (t.xx * t.yy - t.xy * t.xy)
+    one = to_xx * t.e1 + (mean + spin) * t.e2 - (lift * (t.yy * y + t.xy * x)) * t.normal
+    other = (mean - spin) * t.e1 + to_yy * t.e2 + (lift * (t.xy * y + t.xx * x)) * t.normal
+    other = PER_HEIGHT * other
+    return one - HALF * other, other
 
 
 @wp.kernel(enable_backward=False)
@@ -108,11 +120,11 @@ def from_turned(
         turn = sign[place(s * faces.shape[0], k)] * quaternion(a, b)
         half = half_turn(turn)
         part = about(t * half)
-        x = a.length + t * (b.length - a.length)
-        y = a.along + t * (b.along - a.along)
-        z = a.height + t * (b.height - a.height)
-        one = turned(part, x * a.e1)
-        two = turned(part, y * a.e1 + z * a.e2)
+        x = a.xx + t * (b.xx - a.xx)
+        y = a.xy + t * (b.xy - a.xy)
+        z = a.yy + t * (b.yy - a.yy)
+        one = turned(part, x * a.e1 + y * a.e2)
+        two = HALF * one + HEIGHT * turned(part, y * a.e1 + z * a.e2)
         # From the edges: of the sides ``one``, ``two - one`` and ``-two``, and of the area.
         of = sides[place(k, 0)]
         g = signs[place(k, 0)]
@@ -123,30 +135,32 @@ def from_turned(
         by_one = g[0] * vec3(e1[0], e1[1], e1[2]) - across
         by_two = across - g[2] * vec3(e3[0], e3[1], e3[2])
         to_area = wp.dot(by_one, one) + wp.dot(by_two, two) + e1[3] + e2[3] + e3[3]
-        area = a.length * a.height + b.length * b.height
+        area = doubled_area(a.xx, a.xy, a.yy) + doubled_area(b.xx, b.xy, b.yy)
         to_one = area * by_one
         to_two = area * by_two
         torque = wp.cross(one, to_one) + wp.cross(two, to_two)
         back = inverse(part)
-        flat_one = turned(back, to_one)
-        flat_two = turned(back, to_two)
+        flat_one = turned(back, to_one + HALF * to_two)
+        flat_two = HEIGHT * turned(back, to_two)
         to_x = wp.dot(a.e1, flat_one)
-        to_y = wp.dot(a.e1, flat_two)
+        to_y = wp.dot(a.e2, flat_one) + wp.dot(a.e1, flat_two)
         to_z = wp.dot(a.e2, flat_two)
         to_t += TWO * wp.dot(torque, half)
-        to_t += (b.length - a.length) * to_x + (b.along - a.along) * to_y + (b.height - a.height) * to_z
+        to_t += (b.xx - a.xx) * to_x + (b.xy - a.xy) * to_y + (b.yy - a.yy) * to_z
+        to_area = HEIGHT * to_area
         whole = reached(turn, half, part, t, torque)
         u, w = from_triangle(
             a,
             turned(back, torque) - turned(inverse(turn), whole),
-            to_x - t * to_x + to_area * a.height,
-            to_y - t * to_y,
-            to_z - t * to_z + to_area * a.length,
+            to_x - t * to_x + to_area * a.yy,
+            to_y - t * to_y - TWO * to_area * a.xy,
+            to_z - t * to_z + to_area * a.xx,
         )
         wp.atomic_add(to_first, p, -(u + w))
         wp.atomic_add(to_first, q, u)
         wp.atomic_add(to_first, r, w)
-        u, w = from_triangle(b, whole, t * to_x + to_area * b.height, t * to_y, t * to_z + to_area * b.length)
+        to_xy = t * to_y - TWO * to_area * b.xy
+        u, w = from_triangle(b, whole, t * to_x + to_area * b.yy, to_xy, t * to_z + to_area * b.xx)
         wp.atomic_add(to_second, p, -(u + w))
         wp.atomic_add(to_second, q, u)
         wp.atomic_add(to_second, r, w)
