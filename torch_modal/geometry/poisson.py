@@ -63,7 +63,8 @@ class Poisson(nn.Module):
     def _solver_of(self, weights: Tensor) -> SparseSolver:
         if self._made is None or not _equal(weights, self._made[0]):
             laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
-            self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy())
+            # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
+            self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy().copy())
         return self._made[1]
 
     def forward(self, wanted: Tensor, near: Tensor) -> Tensor:

@@ -94,6 +94,10 @@ class Passengers(nn.Module):
         found._bind(reference.detach().double().cpu(), points.detach().double().cpu(), self.weights)
         return found.to(self.points)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the products' matrices, which cannot be copied."""
+        return {**self.__dict__, "_matrices": {}}
+
     def __len__(self) -> int:
         return len(self.points)
 
