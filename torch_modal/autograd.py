@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torch_modal import trees
+
 Made = TypeVar("Made")
 Given = ParamSpec("Given")
 
@@ -45,6 +47,29 @@ def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
                 return make(*args, **kwargs)
         with torch.inference_mode(False), torch.no_grad():  # in this order: the first turns gradients on
             return make(*args, **kwargs)
+
+    return run
+
+
+def full_precision(compute: Callable[Given, Made]) -> Callable[Given, Made]:
+    """Decorate a function of tensors: no autocast, and no TF32 or bfloat16 inside products of float32.
+
+    Factorisations would fail, and shapes be wrong by thousandths.
+    """
+
+    @wraps(compute)
+    def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:
+        given = trees.leaves((*args, *kwargs.values()))
+        device = given[0].device.type if given and not given[0].is_meta else "cpu"  # "meta" has no autocast
+        precision = torch.get_float32_matmul_precision()
+        with torch.autocast(device, enabled=False):
+            if precision == "highest":
+                return compute(*args, **kwargs)
+            torch.set_float32_matmul_precision("highest")
+            try:
+                return compute(*args, **kwargs)
+            finally:
+                torch.set_float32_matmul_precision(precision)
 
     return run
 
@@ -89,10 +114,15 @@ def outlasting(x: Tensor) -> Tensor:
     return x.clone() if x.is_inference() else x
 
 
-def made_outside(make: Callable[[], Made]) -> Made:
-    """Create a cached object outside of all transforms of ``torch.compile`` and ``torch.func``."""
+def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
+    """Create an object outside of all transforms of ``torch.compile`` and ``torch.func``, to cache it or of numbers.
+
+    Args:
+        make: The function.
+        seen: Its arguments, whose numbers it can read; what ``vmap`` maps is their first dimension.
+    """
     found: list[Made] = []
-    _Outside.apply(lambda: found.append(make()), torch.empty(0))
+    _Outside.apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
     return found[0]
 
 
@@ -100,8 +130,8 @@ class _Outside(torch.autograd.Function):
     """``forward`` runs below all transforms, so its tensors outlive them."""
 
     @staticmethod
-    def forward(work: Callable[[], None], nothing: Tensor) -> Tensor:
-        lasting(work)()
+    def forward(work: Callable[..., None], nothing: Tensor, *seen: Tensor) -> Tensor:
+        lasting(work)(*seen)
         return nothing.clone()
 
     @staticmethod
@@ -113,14 +143,15 @@ class _Outside(torch.autograd.Function):
         """Nothing has a tangent."""
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, None]:
-        return None, None
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, ...]:
+        return (None,) * len(ctx.needs_input_grad)
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], work: Callable[[], None], nothing: Tensor
+        info: Any, in_dims: tuple[Any, ...], work: Callable[..., None], nothing: Tensor, *seen: Tensor
     ) -> tuple[Tensor, int | None]:
-        return _Outside.apply(work, nothing), in_dims[1]
+        first = [x if dim is None else x.movedim(dim, 0) for x, dim in zip(seen, in_dims[2:], strict=True)]
+        return _Outside.apply(work, nothing, *first), in_dims[1]
 
 
 def applied(function: Any, *given: Any) -> Any:

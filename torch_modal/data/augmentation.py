@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import full_precision, lasting
 from torch_modal.data.space import ShapeSpace
 
 Parameters = dict[str, Tensor]
@@ -146,6 +146,7 @@ class ShapeAugmentation(nn.Module):
         raise NotImplementedError
 
     # -------------------------------------------------------------------------------------------------------- calls
+    @full_precision
     def forward_parameters(
         self,
         n: int,
@@ -172,6 +173,7 @@ class ShapeAugmentation(nn.Module):
     def _drawn(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
         return {"batch_prob": uniform(n, generator) < self.p, **self.generate_parameters(n, space, generator)}
 
+    @full_precision
     def transform(
         self,
         batch: ShapeBatch,

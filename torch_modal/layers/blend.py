@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, traced, transformed
+from torch_modal.autograd import broadcast_shapes, full_precision, made_outside, traced
 from torch_modal.inbetween.among import Among, WeightedSamples
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.layers.in_between import InBetween, full_precision, unflattened, with_exact
+from torch_modal.layers.in_between import InBetween, unflattened, with_exact
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.solver import Solution
 
@@ -18,7 +18,7 @@ MOST_BELOW_ZERO = 0.25
 """What weights below zero may add up to: energies then still have a minimum."""
 
 ROUNDING = 1e-5
-"""Sums of weights may differ from one by so much."""
+"""Sums of weights may differ from one by so much, or by the rounding of their dtype."""
 
 
 class _OfAll(InBetween):
@@ -97,6 +97,7 @@ class Blend(nn.Module):
         """
         return self._batched(keyframes, weights, self.layer.report()).shapes
 
+    @full_precision
     def _batched(
         self, keyframes: Tensor, weights: Tensor, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
@@ -105,14 +106,15 @@ class Blend(nn.Module):
         n, item = keyframes.shape[-3], keyframes.shape[-2:]
         flat = keyframes.to(layer.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         pulls = weights.to(layer.dtype).expand(*lead, n).reshape(-1, n)
+        if torch.finfo(weights.dtype).bits < 32:  # of an autocast model: to more digits, they do not add up to one
+            pulls = pulls / pulls.sum(1, keepdim=True)
         stiffness = layer.stiffness_of(pulls[:, 0], lead)
         member = layer.members[0]
-        with full_precision(flat.device.type):
-            if n == 2 and len(layer.bases) == 2 and bool(((pulls >= 0) & (pulls <= 1)).all()):
-                t = pulls[:, 1]
-                result = member(Samples(flat[:, 0], flat[:, 1], None, t, layer.mu_of(t, lead), stiffness), report)
-            else:
-                result = member.weighted(WeightedSamples(flat, pulls, stiffness), report)
+        if n == 2 and len(layer.bases) == 2 and made_outside(_are_times, pulls):
+            t = pulls[:, 1]
+            result = member(Samples(flat[:, 0], flat[:, 1], None, t, layer.mu_of(t, lead), stiffness), report)
+        else:
+            result = member.weighted(WeightedSamples(flat, pulls, stiffness), report)
         shapes, solution = unflattened(result, lead)
         return InBetweenResult(_with_exact_keyframes(shapes, keyframes, weights), solution)
 
@@ -138,16 +140,23 @@ class Blend(nn.Module):
                 f"weights of shape {tuple(weights.shape)} do not broadcast against sets of key-frames of "
                 f"{tuple(keyframes.shape[:-3])}"
             ) from None
-        if traced(weights) or transformed(weights):
-            return lead
-        known = weights.detach().double()
-        off, below = (known.sum(-1) - 1).abs(), -known.clamp_max(0).sum(-1)
-        wrong = ~((off <= ROUNDING) & (below <= MOST_BELOW_ZERO + ROUNDING))
-        if bool(wrong.any()):
-            raise ValueError(
-                f"weights add up to 1, those below zero to -{MOST_BELOW_ZERO} at most; got {known[wrong][0].tolist()}"
-            )
+        if not traced(weights):
+            made_outside(_check_weights, weights)
         return lead
+
+
+def _are_times(weights: Tensor) -> bool:
+    return bool(((weights >= 0) & (weights <= 1)).all())
+
+
+def _check_weights(weights: Tensor) -> None:
+    known, rounding = weights.double(), max(ROUNDING, torch.finfo(weights.dtype).eps)
+    off, below = (known.sum(-1) - 1).abs(), -known.clamp_max(0).sum(-1)
+    wrong = ~((off <= rounding) & (below <= MOST_BELOW_ZERO + rounding))
+    if bool(wrong.any()):
+        raise ValueError(
+            f"weights add up to 1, those below zero to -{MOST_BELOW_ZERO} at most; got {known[wrong][0].tolist()}"
+        )
 
 
 def _with_exact_keyframes(shapes: Tensor, keyframes: Tensor, weights: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import Recent, broadcast_shapes, lasting, outlasting
+from torch_modal.autograd import Recent, broadcast_shapes, full_precision, lasting, outlasting
 from torch_modal.backends.torch.alignment import Alignment, Pair, vertex_tangent_offset
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.shell import DIAGONAL
@@ -171,6 +171,7 @@ class ModalDecoder(nn.Module):
         self._forget()
         return moved
 
+    @full_precision
     def forward(
         self, amplitudes: Tensor, t: Tensor | float, motions: Tensor | None = None, keyframes: Tensor | None = None
     ) -> Tensor:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, lasting
+from torch_modal.autograd import broadcast_shapes, full_precision, lasting
 from torch_modal.contact.search import refuse_transforms
 from torch_modal.contact.trajectory import push_apart
 from torch_modal.geometry.crossings import require_contact
@@ -20,7 +20,7 @@ from torch_modal.geometry.hermite import Tangents, around, located, wrapped
 from torch_modal.inbetween.samples import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.times import checked_times
-from torch_modal.layers.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
+from torch_modal.layers.in_between import InBetween, joined, unflattened, with_exact_ends
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.solver import Solution
 
@@ -158,6 +158,7 @@ class Path(nn.Module):
         """
         return self._batched(keyframes, t, self.layer.report()).shapes
 
+    @full_precision
     def _batched(
         self, keyframes: Tensor, t: Tensor | float, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
@@ -198,10 +199,9 @@ class Path(nn.Module):
         """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
         member = self.layer.members[self.members[i]]
         samples = self.samples(keyframes, i, which, u)
-        with full_precision(u.device.type):
-            result = member(samples, report)
-            if self.contact:
-                result = self._in_contact(keyframes, i, samples, result)
+        result = member(samples, report)
+        if self.contact:
+            result = self._in_contact(keyframes, i, samples, result)
         ends = keyframes[which, i], keyframes[which, (i + 1) % self.n_keyframes]
         return InBetweenResult(with_exact_ends(result.shapes, *ends, samples.t), result.solution)
 

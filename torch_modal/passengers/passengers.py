@@ -8,7 +8,7 @@ import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-from torch_modal.autograd import lasting, traced, transformed
+from torch_modal.autograd import full_precision, lasting, traced, transformed
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 from torch_modal.keyframes.arrays import as_faces
@@ -101,6 +101,7 @@ class Passengers(nn.Module):
     def __len__(self) -> int:
         return len(self.points)
 
+    @full_precision
     def forward(self, shapes: Tensor) -> Tensor:
         """The points of each shape. *Shape:* ``(..., V, 3) -> (..., P, 3)``.
 
@@ -117,12 +118,14 @@ class Passengers(nn.Module):
         moved = (found[..., :9].unflatten(-1, (3, 3)) * own[:, None]).sum(-1) + found[..., 9:]
         return (moved + middle).view(*shapes.shape[:-2], -1, 3)
 
+    @full_precision
     def rotations(self, shapes: Tensor) -> Tensor:
         """How the surroundings of each point turn. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``."""
         flat = self._flat(shapes)
         found = self._mixed(best_rotation(self._deformation(flat)).flatten(2)).unflatten(-1, (3, 3))
         return _nearest_rotation(found).view(*shapes.shape[:-2], -1, 3, 3)
 
+    @full_precision
     def gradients(self, shapes: Tensor) -> Tensor:
         """How they turn and stretch: the deformation gradient, whose thickness is kept. *Shape:* ``(..., P, 3, 3)``.
 

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import full_precision
 from torch_modal.energy.modal_energy import Derivatives
 
 # Fractions of a step that are tried, side by side, where the whole step disappoints.
@@ -137,6 +138,7 @@ class GaussNewtonStep(nn.Module):
         found = self._unless_uphill(a, energy, best, lowest, promised, derivatives)
         return found if derivatives.second_order is None else found._replace(newton=a + plain[1])
 
+    @full_precision
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, trying both directions at all lengths, without a branch that depends on data.
 
