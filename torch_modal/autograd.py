@@ -139,8 +139,8 @@ class _Outside(torch.autograd.Function):
         """Saves nothing."""
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
-        """Nothing has a tangent."""
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
+        return torch.empty(0)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, ...]:
@@ -152,6 +152,42 @@ class _Outside(torch.autograd.Function):
     ) -> tuple[Tensor, int | None]:
         first = [x if dim is None else x.movedim(dim, 0) for x, dim in zip(seen, in_dims[2:], strict=True)]
         return _Outside.apply(work, nothing, *first), in_dims[1]
+
+
+def once(x: Tensor, message: str) -> Tensor:
+    """The tensor, through which there are first derivatives; others raise a ``RuntimeError`` of this message."""
+    out: Tensor = x if traced(x) else _Once.apply(x, message, 1)
+    return out
+
+
+class _Once(torch.autograd.Function):
+    """Of the order that is left: at 0, any derivative raises."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor, message: str, order: int) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.given = inputs[1:]
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
+        return _Once._next(ctx, tangent)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        return _Once._next(ctx, grads[0]), None, None
+
+    @staticmethod
+    def _next(ctx: Any, derivative: Tensor) -> Tensor:
+        message, order = ctx.given
+        if not order:
+            raise RuntimeError(message)
+        found: Tensor = _Once.apply(derivative, message, order - 1)
+        return found
 
 
 def applied(function: Any, *given: Any) -> Any:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, made_outside, traced
+from torch_modal.autograd import broadcast_shapes, full_precision, made_outside, once, traced
 from torch_modal.inbetween.among import Among, WeightedSamples
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import InBetweenResult, Samples
@@ -19,6 +19,8 @@ MOST_BELOW_ZERO = 0.25
 
 ROUNDING = 1e-5
 """Sums of weights may differ from one by so much, or by the rounding of their dtype."""
+
+SECOND = "Blend has first derivatives only; those of InBetween, for two key-frames, may be differentiated again"
 
 
 class _OfAll(InBetween):
@@ -43,8 +45,9 @@ class Blend(nn.Module):
     of two bases have the shapes of :class:`InBetween` at the time of the second weight. A rigid motion between
     key-frames is taken out first; the result has the weighted mean of their poses.
 
-    Gradients reach the key-frames, the weights and the stiffnesses; they are first derivatives. The modes are
-    constants. Precision, warnings and statuses are those of :class:`InBetween`.
+    Gradients reach the key-frames, the weights and the stiffnesses. Second derivatives are an error, but for two
+    key-frames of a layer of two bases. The modes are constants. Precision, warnings and statuses are those of
+    :class:`InBetween`.
 
     Args:
         bases: The bases, one or more (:func:`torch_modal.extract_bases`); the first gives the scale.
@@ -110,11 +113,14 @@ class Blend(nn.Module):
             pulls = pulls / pulls.sum(1, keepdim=True)
         stiffness = layer.stiffness_of(pulls[:, 0], lead)
         member = layer.members[0]
-        if n == 2 and len(layer.bases) == 2 and made_outside(_are_times, pulls):
+        if n == 2 and len(layer.bases) == 2 and made_outside(_is_pair, pulls, flat):
             t = pulls[:, 1]
             result = member(Samples(flat[:, 0], flat[:, 1], None, t, layer.mu_of(t, lead), stiffness), report)
         else:
-            result = member.weighted(WeightedSamples(flat, pulls, stiffness), report)
+            # Second derivatives pass what goes in, in reverse mode, or what comes out, in forward mode.
+            x, w, *others = (once(given, SECOND) for given in (flat, pulls, *stiffness))
+            result = member.weighted(WeightedSamples(x, w, others), report)
+            result = result._replace(shapes=once(result.shapes, SECOND))
         shapes, solution = unflattened(result, lead)
         return InBetweenResult(_with_exact_keyframes(shapes, keyframes, weights), solution)
 
@@ -145,8 +151,9 @@ class Blend(nn.Module):
         return lead
 
 
-def _are_times(weights: Tensor) -> bool:
-    return bool(((weights >= 0) & (weights <= 1)).all())
+def _is_pair(weights: Tensor, keyframes: Tensor) -> bool:
+    """Whether :class:`InBetween` knows what to do: not of a key-frame that is not finite and has no weight."""
+    return bool(((weights >= 0) & (weights <= 1)).all() & keyframes.isfinite().all())
 
 
 def _check_weights(weights: Tensor) -> None:
