@@ -29,6 +29,32 @@ def transformed(x: Tensor) -> bool:
     return forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None  # the first alone is fast
 
 
+def mapped(x: Tensor) -> bool:
+    """Whether ``vmap`` maps a tensor, so that no number of it is one number."""
+    inner = torch.func.debug_unwrap(x, recurse=False)
+    return inner is not x and (torch._C._functorch.is_batchedtensor(x) or mapped(inner))
+
+
+def in_use(index: Tensor, n: int) -> list[int]:
+    """The numbers of an index; those that it may have, up to ``n``, where it has no data."""
+    return list(range(n)) if traced(index) else made_outside(lambda own: own.unique().tolist(), index)
+
+
+def require_numbers(layer: str, x: Tensor) -> None:
+    """Raise where tensors have no numbers, which decide the steps of a layer.
+
+    Raises:
+        RuntimeError: The tensor is on the meta device, or ``torch.export`` is at work.
+    """
+    if not x.is_meta and not torch.compiler.is_exporting():
+        return
+    kind = "a meta tensor has" if x.is_meta else "torch.export has"
+    raise RuntimeError(
+        f"{layer} takes steps that depend on the numbers of its input, and {kind} none: move it to a device with data, "
+        "and leave it out of what is exported; docs/layer.md names the settings and layers that can be exported"
+    )
+
+
 def recorded(*given: Tensor) -> bool:
     """Whether what is made of tensors in a backward pass is to be differentiated once more, which kernels cannot be."""
     return torch.is_grad_enabled() or any(map(transformed, given))

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, made_outside, once, traced
+from torch_modal.autograd import broadcast_shapes, full_precision, made_outside, once, require_numbers, traced
 from torch_modal.inbetween.among import Among, WeightedSamples
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import InBetweenResult, Samples
@@ -106,6 +106,7 @@ class Blend(nn.Module):
     ) -> InBetweenResult:
         layer = self.layer
         lead = self._check(keyframes, weights)
+        require_numbers("Blend", keyframes)
         n, item = keyframes.shape[-3], keyframes.shape[-2:]
         flat = keyframes.to(layer.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         pulls = weights.to(layer.dtype).expand(*lead, n).reshape(-1, n)

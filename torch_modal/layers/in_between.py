@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, lasting, outlasting, transformed
+from torch_modal.autograd import broadcast_shapes, full_precision, lasting, outlasting, require_numbers, transformed
 from torch_modal.contact.rounds import ContactRounds
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
@@ -180,6 +180,9 @@ class InBetween(nn.Module):
         self, x_a: Tensor, x_b: Tensor, t: Tensor | float, pair: Tensor | int, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
         times = self.check(x_a, x_b, t)
+        rotations = self.objective.space == "joint" and self.objective.base == "rotations"
+        if self.solver.gradient == "implicit" or self.solver.local_steps or rotations:
+            require_numbers("InBetween", x_a)
         chosen = self._chosen(pair)
         item = x_a.shape[-2:]
         own = broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], *([] if chosen is None else [chosen.shape]))

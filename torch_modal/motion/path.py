@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, full_precision, lasting
+from torch_modal import trees
+from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers
 from torch_modal.contact.search import refuse_transforms
 from torch_modal.contact.trajectory import push_apart
 from torch_modal.geometry.crossings import require_contact
@@ -163,6 +164,7 @@ class Path(nn.Module):
         self, keyframes: Tensor, t: Tensor | float, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
         layer = self.layer
+        require_numbers("Path", keyframes)
         if keyframes.dim() < 3 or keyframes.shape[-3] != self.n_keyframes:
             raise ValueError(
                 f"keyframes of this path have the shape (..., {self.n_keyframes}, V, 3); got {tuple(keyframes.shape)}"
@@ -182,7 +184,15 @@ class Path(nn.Module):
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = located(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
         order, parts = [], []
-        for i in segment.unique().tolist() or [0]:  # of nothing, nothing
+        intervals = in_use(segment, len(self.members)) or [0]  # of nothing, nothing
+        if mapped(segment):
+            # Of each interval all shapes, of which some are taken.
+            every = torch.arange(len(which), device=which.device)
+            order = [place * len(which) + every for place in range(len(intervals))]
+            whole = joined([self._between(flat, i, which, u, report) for i in intervals], order)
+            place = sum((segment == i) * place for place, i in enumerate(intervals))
+            return unflattened(trees.rows(whole, place * len(which) + every), lead)
+        for i in intervals:
             mine = torch.nonzero(segment == i).flatten()
             order.append(mine)
             parts.append(self._between(flat, i, which[mine], u[mine], report))

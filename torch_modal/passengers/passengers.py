@@ -116,14 +116,14 @@ class Passengers(nn.Module):
         found = self._mixed(torch.cat([turns.flatten(2), offsets], -1))
         own = self.points - middle
         moved = (found[..., :9].unflatten(-1, (3, 3)) * own[:, None]).sum(-1) + found[..., 9:]
-        return (moved + middle).view(*shapes.shape[:-2], -1, 3)
+        return (moved + middle).view(*shapes.shape[:-2], len(self), 3)
 
     @full_precision
     def rotations(self, shapes: Tensor) -> Tensor:
         """How the surroundings of each point turn. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``."""
         flat = self._flat(shapes)
         found = self._mixed(best_rotation(self._deformation(flat)).flatten(2)).unflatten(-1, (3, 3))
-        return _nearest_rotation(found).view(*shapes.shape[:-2], -1, 3, 3)
+        return _nearest_rotation(found).view(*shapes.shape[:-2], len(self), 3, 3)
 
     @full_precision
     def gradients(self, shapes: Tensor) -> Tensor:
@@ -133,7 +133,7 @@ class Passengers(nn.Module):
         """
         flat = self._flat(shapes)
         found = self._mixed(self._deformation(flat).flatten(2)).unflatten(-1, (3, 3))
-        return found.view(*shapes.shape[:-2], -1, 3, 3)
+        return found.view(*shapes.shape[:-2], len(self), 3, 3)
 
     def _flat(self, shapes: Tensor) -> Tensor:
         if shapes.shape[-2:] != self.reference.shape or shapes.dtype != self.reference.dtype:
@@ -166,7 +166,7 @@ class Passengers(nn.Module):
             return values.new_zeros(len(values), len(self), values.shape[2]).index_add(1, row, each)
         columns = values.movedim(0, 1).flatten(1)
         found: Tensor = _Product.apply(columns, *self._matrix(values))
-        return found.unflatten(1, (len(values), -1)).movedim(1, 0)
+        return found.unflatten(1, (len(values), values.shape[2])).movedim(1, 0)
 
     def _matrix(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The weights and their transpose, of a dtype and on a device."""

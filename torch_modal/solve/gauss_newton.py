@@ -145,7 +145,15 @@ class GaussNewtonStep(nn.Module):
         Args:
             a: Amplitudes. *Shape:* ``(B, n)``.
             placement: What the energy knows of each sample.
+
+        Raises:
+            ValueError: The amplitudes have no batch dimension, or several.
         """
+        if a.dim() != 2:
+            raise ValueError(
+                f"amplitudes have the shape (B, n), as the placement has B samples; got {tuple(a.shape)}: of one "
+                "sample, pass a[None] and place start[None]"
+            )
         derivatives = self.energy.derivatives(a, placement)
         directions = self.directions(derivatives)
         best, lowest = self.lowest(a, torch.cat([directions, self._shortened(directions)]), placement)
