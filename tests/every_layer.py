@@ -45,7 +45,7 @@ class Step(torch.nn.Module):
 
     def forward(self, x: Tensor, rest: Tensor) -> Tensor:
         placement = self.step.energy.place(x, self.shell.against(rest))
-        a = x.new_zeros(len(x), self.n_modes)
+        a = x.new_zeros(x.shape[0], self.n_modes)
         for _ in range(3):
             a = self.step(a, placement).amplitudes
         return a

@@ -10,6 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.utils._python_dispatch import _disable_current_modes
 
 from torch_modal import trees
 
@@ -87,15 +88,17 @@ def full_precision(compute: Callable[Given, Made]) -> Callable[Given, Made]:
     def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:
         given = trees.leaves((*args, *kwargs.values()))
         device = given[0].device.type if given and not given[0].is_meta else "cpu"  # "meta" has no autocast
+        if torch.is_autocast_enabled(device):  # no region else: exported programs cannot be saved with one
+            with torch.autocast(device, enabled=False):
+                return run(*args, **kwargs)
         precision = torch.get_float32_matmul_precision()
-        with torch.autocast(device, enabled=False):
-            if precision == "highest":
-                return compute(*args, **kwargs)
-            torch.set_float32_matmul_precision("highest")
-            try:
-                return compute(*args, **kwargs)
-            finally:
-                torch.set_float32_matmul_precision(precision)
+        if precision == "highest":
+            return compute(*args, **kwargs)
+        torch.set_float32_matmul_precision("highest")
+        try:
+            return compute(*args, **kwargs)
+        finally:
+            torch.set_float32_matmul_precision(precision)
 
     return run
 
@@ -123,6 +126,9 @@ class Recent:
     def __len__(self) -> int:
         return len(self._kept)
 
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._kept
+
 
 @contextmanager
 def one_thread() -> Iterator[None]:
@@ -147,6 +153,9 @@ def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
         make: The function.
         seen: Its arguments, whose numbers it can read; what ``vmap`` maps is their first dimension.
     """
+    if torch.compiler.is_exporting():  # without the modes that would record it
+        with _disable_current_modes(), torch._C.DisableTorchFunction():
+            return lasting(make)(*seen)
     found: list[Made] = []
     _Outside.apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
     return found[0]

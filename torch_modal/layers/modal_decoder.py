@@ -138,7 +138,9 @@ class ModalDecoder(nn.Module):
     def _current(self) -> None:
         """Align again where the buffers hold other numbers: they were loaded, edited in place, or replaced."""
         own = self.keyframes, self.times, self.reference
-        if not all(_same(now, then) for now, then in zip(own, self._made_of, strict=True)):
+        if not torch.compiler.is_exporting() and not all(
+            _same(now, then) for now, then in zip(own, self._made_of, strict=True)
+        ):
             self._align()
 
     def _forget(self) -> None:
@@ -251,6 +253,8 @@ class ModalDecoder(nn.Module):
         return self._interval(i, None)
 
     def _interval(self, i: int, keyframes: Tensor | None) -> Interval:
+        if torch.compiler.is_exporting() and i not in self._known:
+            keyframes = self.keyframes if keyframes is None else keyframes  # the program computes them at each call
         if keyframes is None:
             own: Interval = self._known.get(i, lambda: self._interval(i, self._made_of[0]))
             return own

@@ -163,7 +163,7 @@ class Passengers(nn.Module):
             entries = self.weights.tocoo()
             row, column = (torch.from_numpy(part).long().to(values.device) for part in (entries.row, entries.col))
             each = values[:, column] * torch.from_numpy(entries.data).to(values)[:, None]
-            return values.new_zeros(len(values), len(self), values.shape[2]).index_add(1, row, each)
+            return values.new_zeros(values.shape[0], len(self), values.shape[2]).index_add(1, row, each)
         columns = values.movedim(0, 1).flatten(1)
         found: Tensor = _Product.apply(columns, *self._matrix(values))
         return found.unflatten(1, (len(values), values.shape[2])).movedim(1, 0)
