@@ -10,6 +10,9 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.utils._python_dispatch import _disable_current_modes
+
+from torch_modal import trees
 
 Made = TypeVar("Made")
 Given = ParamSpec("Given")
@@ -25,6 +28,32 @@ def transformed(x: Tensor) -> bool:
     if torch.func.debug_unwrap(x, recurse=False) is not x:
         return True
     return forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None  # the first alone is fast
+
+
+def mapped(x: Tensor) -> bool:
+    """Whether ``vmap`` maps a tensor, so that no number of it is one number."""
+    inner = torch.func.debug_unwrap(x, recurse=False)
+    return inner is not x and (torch._C._functorch.is_batchedtensor(x) or mapped(inner))
+
+
+def in_use(index: Tensor, n: int) -> list[int]:
+    """The numbers of an index; those that it may have, up to ``n``, where it has no data."""
+    return list(range(n)) if traced(index) else made_outside(lambda own: own.unique().tolist(), index)
+
+
+def require_numbers(layer: str, x: Tensor) -> None:
+    """Raise where tensors have no numbers, which decide the steps of a layer.
+
+    Raises:
+        RuntimeError: The tensor is on the meta device, or ``torch.export`` is at work.
+    """
+    if not x.is_meta and not torch.compiler.is_exporting():
+        return
+    kind = "a meta tensor has" if x.is_meta else "torch.export has"
+    raise RuntimeError(
+        f"{layer} takes steps that depend on the numbers of its input, and {kind} none: move it to a device with data, "
+        "and leave it out of what is exported; docs/layer.md names the settings and layers that can be exported"
+    )
 
 
 def recorded(*given: Tensor) -> bool:
@@ -45,6 +74,31 @@ def lasting(make: Callable[Given, Made]) -> Callable[Given, Made]:
                 return make(*args, **kwargs)
         with torch.inference_mode(False), torch.no_grad():  # in this order: the first turns gradients on
             return make(*args, **kwargs)
+
+    return run
+
+
+def full_precision(compute: Callable[Given, Made]) -> Callable[Given, Made]:
+    """Decorate a function of tensors: no autocast, and no TF32 or bfloat16 inside products of float32.
+
+    Factorisations would fail, and shapes be wrong by thousandths.
+    """
+
+    @wraps(compute)
+    def run(*args: "Given.args", **kwargs: "Given.kwargs") -> Made:
+        given = trees.leaves((*args, *kwargs.values()))
+        device = given[0].device.type if given and not given[0].is_meta else "cpu"  # "meta" has no autocast
+        if torch.is_autocast_enabled(device):  # no region else: exported programs cannot be saved with one
+            with torch.autocast(device, enabled=False):
+                return run(*args, **kwargs)
+        precision = torch.get_float32_matmul_precision()
+        if precision == "highest":
+            return compute(*args, **kwargs)
+        torch.set_float32_matmul_precision("highest")
+        try:
+            return compute(*args, **kwargs)
+        finally:
+            torch.set_float32_matmul_precision(precision)
 
     return run
 
@@ -72,6 +126,9 @@ class Recent:
     def __len__(self) -> int:
         return len(self._kept)
 
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._kept
+
 
 @contextmanager
 def one_thread() -> Iterator[None]:
@@ -89,10 +146,18 @@ def outlasting(x: Tensor) -> Tensor:
     return x.clone() if x.is_inference() else x
 
 
-def made_outside(make: Callable[[], Made]) -> Made:
-    """Create a cached object outside of all transforms of ``torch.compile`` and ``torch.func``."""
+def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
+    """Create an object outside of all transforms of ``torch.compile`` and ``torch.func``, to cache it or of numbers.
+
+    Args:
+        make: The function.
+        seen: Its arguments, whose numbers it can read; what ``vmap`` maps is their first dimension.
+    """
+    if torch.compiler.is_exporting():  # without the modes that would record it
+        with _disable_current_modes(), torch._C.DisableTorchFunction():
+            return lasting(make)(*seen)
     found: list[Made] = []
-    _Outside.apply(lambda: found.append(make()), torch.empty(0))
+    _Outside.apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
     return found[0]
 
 
@@ -100,8 +165,8 @@ class _Outside(torch.autograd.Function):
     """``forward`` runs below all transforms, so its tensors outlive them."""
 
     @staticmethod
-    def forward(work: Callable[[], None], nothing: Tensor) -> Tensor:
-        lasting(work)()
+    def forward(work: Callable[..., None], nothing: Tensor, *seen: Tensor) -> Tensor:
+        lasting(work)(*seen)
         return nothing.clone()
 
     @staticmethod
@@ -109,18 +174,55 @@ class _Outside(torch.autograd.Function):
         """Saves nothing."""
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
-        """Nothing has a tangent."""
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
+        return torch.empty(0)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, None]:
-        return None, None
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, ...]:
+        return (None,) * len(ctx.needs_input_grad)
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], work: Callable[[], None], nothing: Tensor
+        info: Any, in_dims: tuple[Any, ...], work: Callable[..., None], nothing: Tensor, *seen: Tensor
     ) -> tuple[Tensor, int | None]:
-        return _Outside.apply(work, nothing), in_dims[1]
+        first = [x if dim is None else x.movedim(dim, 0) for x, dim in zip(seen, in_dims[2:], strict=True)]
+        return _Outside.apply(work, nothing, *first), in_dims[1]
+
+
+def once(x: Tensor, message: str) -> Tensor:
+    """The tensor, through which there are first derivatives; others raise a ``RuntimeError`` of this message."""
+    out: Tensor = x if traced(x) else _Once.apply(x, message, 1)
+    return out
+
+
+class _Once(torch.autograd.Function):
+    """Of the order that is left: at 0, any derivative raises."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor, message: str, order: int) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.given = inputs[1:]
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
+        return _Once._next(ctx, tangent)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        return _Once._next(ctx, grads[0]), None, None
+
+    @staticmethod
+    def _next(ctx: Any, derivative: Tensor) -> Tensor:
+        message, order = ctx.given
+        if not order:
+            raise RuntimeError(message)
+        found: Tensor = _Once.apply(derivative, message, order - 1)
+        return found
 
 
 def applied(function: Any, *given: Any) -> Any:

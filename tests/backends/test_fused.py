@@ -487,10 +487,25 @@ class TestBackend:
         )
         folder = Path(tm.__file__).parents[1]
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
-        assert (result.returncode, result.stdout) == (0, "")
-        # Warp's C code says so where there is no CUDA driver.
-        said = [line for line in result.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
-        assert said == []
+        assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+    def test_all_else_on_standard_error_is_passed_on(self) -> None:
+        """In order, of Python and of native code, with a line that has no end; and without standard error."""
+        code = (
+            "import os, sys; from torch_modal.backends.warp.launch import _without_line\n"
+            "def say(text): os.write(2, text)\n"
+            "say(b'before\\n')\n"
+            "try:\n"
+            "    with _without_line(b'a line'):\n"
+            "        print('during', file=sys.stderr); say(b'a line too many\\nnative\\n'); say(b'no end'); 1 / 0\n"
+            "except ZeroDivisionError: say(b', after\\n')\n"
+            "print('python', file=sys.stderr, flush=True); os.close(2)\n"
+            "with _without_line(b'a line'): print('out')\n"
+        )
+        folder = Path(tm.__file__).parents[1]
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
+        assert (result.returncode, result.stdout) == (0, "out\n")
+        assert result.stderr == "before\nduring\nnative\nno end, after\npython\n"
 
     def test_import_does_not_load_warp(self) -> None:
         code = "import sys, torch_modal.layers.in_between; sys.exit('warp' in sys.modules)"

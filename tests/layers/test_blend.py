@@ -207,6 +207,27 @@ class TestGradients:
         x.square().sum().backward()
         assert w.grad is not None and bool(w.grad.isfinite().all()) and bool(w.grad.any())
 
+    @pytest.mark.parametrize("of", [0, 1])
+    def test_second_ones_are_an_error(self, layer: Blend, poses: Tensor, of: int) -> None:
+        given = [poses, pulls(0.5, 0.2, 0.3)]
+
+        def value(x: Tensor) -> Tensor:
+            return layer(*[x if i == of else other for i, other in enumerate(given)]).square().sum()
+
+        leaf = given[of].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(value(leaf), leaf, create_graph=True)
+        with pytest.raises(RuntimeError, match="Blend has first derivatives"):
+            torch.autograd.grad(slope.square().sum(), leaf)
+        once = torch.func.grad(value)
+        torch.testing.assert_close(once(given[of]), slope.detach(), rtol=1e-6, atol=1e-6)
+        for twice in (
+            lambda: torch.func.grad(lambda x: once(x).square().sum())(given[of]),
+            lambda: torch.func.jvp(once, (given[of],), (given[of],)),
+            lambda: torch.func.grad(lambda x: torch.func.jvp(value, (x,), (given[of],))[1])(given[of]),
+        ):
+            with pytest.raises(RuntimeError, match="Blend has first derivatives"):
+                twice()
+
 
 class TestResults:
     def test_float32(self, bars: Shapes, poses: Tensor, layer: Blend) -> None:
@@ -287,6 +308,28 @@ class TestResults:
         assert result.solution.status.tolist() == [Status.CONVERGED, Status.INVALID]
         assert bool(result.shapes[0].isfinite().all()) and bool(result.shapes[1].isnan().all())
 
+    def test_of_two_neither(self, bars: Shapes, poses: Tensor) -> None:
+        two = Blend(bars.bases[:2], bars.faces, **modal(coarse_faces=200, rotations=True, local=True))
+        x = torch.stack([poses[0] * torch.nan, poses[1]])
+        result = two.solve(x, pulls(0, 1))
+        assert torch.equal(result.shapes, poses[1]) and result.solution.status == Status.CONVERGED
+
+    @pytest.mark.parametrize("place", [0, 2])
+    def test_a_key_frame_without_weight_is_not_looked_at(self, layer: Blend, poses: Tensor, place: int) -> None:
+        w, others = pulls(0.35, 0.3, 0.35), [i for i in range(3) if i != place]
+        w[place] = 0
+        w = (w / w.sum()).requires_grad_()
+        truth = layer(poses[others], w[others]).detach()
+        nothing = poses[place] * torch.nan, torch.ones_like(poses[0]), poses[place] * pulls(-1, 1, 1)
+        for bad in nothing:
+            x = poses.clone()
+            x[place] = bad
+            x.requires_grad_()
+            found = layer(x, w)
+            assert far(found.detach(), truth) < 1e-6
+            for slope in torch.autograd.grad(found.square().sum(), (x, w)):
+                assert bool(slope.isfinite().all())
+
 
 class TestErrors:
     @pytest.mark.parametrize(
@@ -303,6 +346,29 @@ class TestErrors:
     def test_weights_that_do_not_fit(self, layer: Blend, poses: Tensor, weights: Tensor, words: str) -> None:
         with pytest.raises(ValueError, match=words):
             layer(poses, weights)
+
+    def test_weights_that_do_not_fit_within_transforms(self, layer: Blend, poses: Tensor) -> None:
+        wrong, pose = pulls(0.5, 0.2, 0.2), poses[0]
+
+        def value(w: Tensor) -> Tensor:
+            return (layer(poses, w) * pose).sum()
+
+        for call in (
+            lambda: torch.func.grad(value)(wrong),
+            lambda: torch.func.jvp(value, (wrong,), (wrong,)),
+            lambda: torch.func.vmap(value)(torch.stack([pulls(0.5, 0.2, 0.3), wrong])),
+            lambda: torch.func.vmap(torch.func.grad(value), in_dims=1)(wrong[:, None]),
+            lambda: torch.func.functional_call(layer, dict(layer.named_buffers()), (poses, wrong)),
+            lambda: value(torch.nn.Parameter(wrong)),
+        ):
+            with pytest.raises(ValueError, match="add up to 1"):
+                call()
+
+    def test_two_weights_are_mapped(self, bars: Shapes, poses: Tensor) -> None:
+        two = Blend(bars.bases[:2], bars.faces, **modal(coarse_faces=200, rotations=True, local=True))
+        weights = torch.stack([pulls(0.3, 0.7), pulls(0.8, 0.2)])
+        found = torch.func.vmap(lambda w: two(poses[:2], w))(weights)
+        assert far(found, two(poses[:2], weights)) < 1e-6
 
     def test_shapes_that_do_not_fit(self, layer: Blend, poses: Tensor) -> None:
         with pytest.raises(ValueError, match="floating-point of shape"):

@@ -61,6 +61,8 @@ class ContactRounds(Between):
         Contacts are found without a gradient; the steps with them have one.
         """
         x, solution = super().solved(batch)
+        if not len(x):
+            return x, solution._replace(n_crossing=torch.zeros_like(solution.status))
         refuse_transforms(x)
         pair, samples = batch.pair, batch.samples
         search = ContactSearch(self.mesh, pair.first, pair.second, samples.which, samples.t, pairs=self.crossing_pairs)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import lasting
+from torch_modal.autograd import full_precision, lasting, require_numbers
 from torch_modal.data.space import ShapeSpace
 
 Parameters = dict[str, Tensor]
@@ -146,6 +146,7 @@ class ShapeAugmentation(nn.Module):
         raise NotImplementedError
 
     # -------------------------------------------------------------------------------------------------------- calls
+    @full_precision
     def forward_parameters(
         self,
         n: int,
@@ -172,6 +173,7 @@ class ShapeAugmentation(nn.Module):
     def _drawn(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
         return {"batch_prob": uniform(n, generator) < self.p, **self.generate_parameters(n, space, generator)}
 
+    @full_precision
     def transform(
         self,
         batch: ShapeBatch,
@@ -192,6 +194,8 @@ class ShapeAugmentation(nn.Module):
             ValueError: The rows of ``params`` or ``pool`` do not fit.
         """
         space = self.space if space is None else space
+        if self.uses_keyframes or torch.compiler.is_exporting():
+            require_numbers(type(self).__name__, batch.shapes)
         own = self._own_rows(batch.shapes, params)
         chosen = torch.nonzero(params["batch_prob"].cpu()).flatten()
         if not len(chosen):

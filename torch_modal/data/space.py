@@ -314,6 +314,9 @@ class ShapeSpace:
             to = Observations(known, places, torch.ones_like(known[:, 0]))
             found.append(fit(variation, to, about, robust))
         lead = points.shape[:-2]
+        if not found:
+            sizes = (self.n_vertices, 3), (len(self), self.n_vertices), points.shape[-2:-1], points.shape[-2:-1]
+            return Fitted(*(points.new_zeros(*lead, *size) for size in sizes))
         return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
 
     # ------------------------------------------------------------------------------------------- computed at first use

@@ -85,8 +85,9 @@ class ShellEnergy(nn.Module):
         self.energy = Energy(Mesh.of(self.faces, int(self.faces.max()) + 1), [*self.terms])
 
     def _rows(self, x: Tensor) -> Tensor:
-        """Vertices of faces, components first, extended. *Shape:* ``(..., V, 3) -> (3, ..., V)``."""
+        """Vertices of faces, components first, extended, float32 or more. *Shape:* ``(..., V, 3) -> (3, ..., V)``."""
         rows = x[..., : self.energy.n_vertices, :].movedim(-1, 0).contiguous()
+        rows = rows.to(torch.promote_types(rows.dtype, torch.float32))
         points = self.energy.anchors
         if points is None:
             return self.energy.extend(rows)

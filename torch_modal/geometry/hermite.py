@@ -16,6 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_modal.autograd import made_outside, traced
+
 # Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
 # what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
 LIMIT = 2.75
@@ -125,14 +127,19 @@ def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tu
         differences = times - t.detach()[:, None]
         to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
         t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
+    if not traced(t):
+        made_outside(_check_times, t, times)
+    segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
+    return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
+
+
+def _check_times(t: Tensor, times: Tensor) -> None:
     outside = ~((t >= times[0]) & (t <= times[-1]))
     if bool(outside.any()):
         raise ValueError(
             f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
             f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
         )
-    segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
-    return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
 
 
 def wrapped(t: Tensor, times: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, half_cotangents, vertex_areas
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by
+from torch_modal.geometry.sparse import SparseSolver, graph_laplacian, solve_by, solve_exported
 from torch_modal.geometry.triangle_frames import Sides, edge_means
 from torch_modal.geometry.vectors import pick
 
@@ -63,7 +63,8 @@ class Poisson(nn.Module):
     def _solver_of(self, weights: Tensor) -> SparseSolver:
         if self._made is None or not _equal(weights, self._made[0]):
             laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
-            self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy())
+            # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
+            self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy().copy())
         return self._made[1]
 
     def forward(self, wanted: Tensor, near: Tensor) -> Tensor:
@@ -82,9 +83,12 @@ class Poisson(nn.Module):
 
     def placed(self, right: Tensor, near: Tensor) -> Tensor:
         """The shape from the right-hand side of the normal equations. *Shape:* ``(3, ..., V)`` each."""
-        # Bound to the current weights: other weights may be in place during the backward solve.
-        solver = cache(partial(self._solver_of, self.weights))
-        x = solve_by(solver, right.movedim(0, -1)).movedim(-1, 0)
+        if torch.compiler.is_exporting():
+            x = solve_exported(self.edges, self.weights, self.free, right.movedim(0, -1)).movedim(-1, 0)
+        else:
+            # Bound to the current weights: other weights may be in place during the backward solve.
+            solver = cache(partial(self._solver_of, self.weights))
+            x = solve_by(solver, right.movedim(0, -1)).movedim(-1, 0)
         return x + self.centres(near - x)
 
     def centres(self, x: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.autograd import applied
+from torch_modal.autograd import Recent, applied
 
 try:
     import cholespy
@@ -183,3 +183,41 @@ def graph_laplacian(edges: IntArray, weights: FloatArray, n: int) -> sparse.csr_
     half = sparse.coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
     adjacency = (half + half.T).tocsr()
     return (sparse.diags(np.asarray(adjacency.sum(1)).reshape(-1)) - adjacency).tocsr()
+
+
+_EXPORTED = Recent(8)
+
+
+@torch.library.custom_op("torch_modal::solve_exported", mutates_args=())
+def solve_exported(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) -> Tensor:
+    """Solve with the Laplacian of edges, as an operation of exported programs, which hold no solver.
+
+    Args:
+        edges: *Shape:* ``(E, 2)``.
+        weights: *Shape:* ``(E,)``.
+        free: Unknowns to solve for. *Shape:* ``(n,)``.
+        right: Right-hand sides in columns. *Shape:* ``(..., V, m)``.
+    """
+    given = [x.detach().cpu().numpy() for x in (edges, weights.double(), free)]
+
+    def make() -> SparseSolver:
+        return SparseSolver(graph_laplacian(given[0], given[1], right.shape[-2]), given[2].copy())
+
+    solver: SparseSolver = _EXPORTED.get(tuple(x.tobytes() for x in given), make)
+    return solver.solved(right)
+
+
+@solve_exported.register_fake
+def _(edges: Tensor, weights: Tensor, free: Tensor, right: Tensor) -> Tensor:
+    return right.new_empty(right.shape)
+
+
+def _save(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:3])
+
+
+def _transposed(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor]:
+    return None, None, None, solve_exported(*ctx.saved_tensors, grad)
+
+
+solve_exported.register_autograd(_transposed, setup_context=_save)

@@ -91,16 +91,18 @@ class Among(Between):
         """The key-frames in the frame, and which samples have an in-between. *Shape:* ``(B,)``."""
         weights = samples.weights
         flat, finite = self.frame.finite(samples.keyframes.flatten(0, 1))
+        sized = (flat.amax(1) - flat.amin(1)).norm(dim=1) * self.frame.scale > SMALLEST_SIZE * DIAGONAL
+        # The reference stands in for what cannot be used: without a weight, it must do no harm.
+        flat = torch.where(sized[:, None, None], flat, self.frame.reference / self.frame.scale)
         group = _aligned(self.frame, flat.unflatten(0, weights.shape), weights)
-        shapes = group.shapes.detach()
-        sizes = (shapes.amax(-2) - shapes.amin(-2)).norm(dim=-1).amin(1)
-        self.placing.warn_of_size(sizes)
-        usable = finite.view_as(weights).all(1) & (sizes > SMALLEST_SIZE * DIAGONAL)
+        shapes, usable = group.shapes.detach(), (finite & sized).view_as(weights)
+        self.placing.warn_of_size((shapes.amax(-2) - shapes.amin(-2)).norm(dim=-1).amin(1))
         if self.placing.closed:
-            first = shapes[:, :1].expand_as(shapes)
-            mirrored = self.placing.mirrored(first.flatten(0, 1), shapes.flatten(0, 1))
-            usable = usable & ~mirrored.view_as(weights).any(1)
-        return group, usable
+            rows = torch.arange(len(weights), device=weights.device)
+            heaviest = shapes[rows, weights.argmax(1)][:, None].expand_as(shapes)
+            mirrored = self.placing.mirrored(heaviest.flatten(0, 1), shapes.flatten(0, 1))
+            usable = usable & ~mirrored.view_as(weights)
+        return group, (usable | (weights == 0)).all(1)
 
     def weighted_problem(self, group: Group, stiffness: list[list[Tensor]], anchors: Tensor | None) -> JointProblem:
         """The minimisation of each sample.

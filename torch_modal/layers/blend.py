@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, traced, transformed
+from torch_modal.autograd import broadcast_shapes, full_precision, made_outside, once, require_numbers, traced
 from torch_modal.inbetween.among import Among, WeightedSamples
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.layers.in_between import InBetween, full_precision, unflattened, with_exact
+from torch_modal.layers.in_between import InBetween, unflattened, with_exact
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.solver import Solution
 
@@ -18,7 +18,9 @@ MOST_BELOW_ZERO = 0.25
 """What weights below zero may add up to: energies then still have a minimum."""
 
 ROUNDING = 1e-5
-"""Sums of weights may differ from one by so much."""
+"""Sums of weights may differ from one by so much, or by the rounding of their dtype."""
+
+SECOND = "Blend has first derivatives only; those of InBetween, for two key-frames, may be differentiated again"
 
 
 class _OfAll(InBetween):
@@ -43,8 +45,9 @@ class Blend(nn.Module):
     of two bases have the shapes of :class:`InBetween` at the time of the second weight. A rigid motion between
     key-frames is taken out first; the result has the weighted mean of their poses.
 
-    Gradients reach the key-frames, the weights and the stiffnesses; they are first derivatives. The modes are
-    constants. Precision, warnings and statuses are those of :class:`InBetween`.
+    Gradients reach the key-frames, the weights and the stiffnesses. Second derivatives are an error, but for two
+    key-frames of a layer of two bases. The modes are constants. Precision, warnings and statuses are those of
+    :class:`InBetween`.
 
     Args:
         bases: The bases, one or more (:func:`torch_modal.extract_bases`); the first gives the scale.
@@ -97,22 +100,28 @@ class Blend(nn.Module):
         """
         return self._batched(keyframes, weights, self.layer.report()).shapes
 
+    @full_precision
     def _batched(
         self, keyframes: Tensor, weights: Tensor, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
         layer = self.layer
         lead = self._check(keyframes, weights)
+        require_numbers("Blend", keyframes)
         n, item = keyframes.shape[-3], keyframes.shape[-2:]
         flat = keyframes.to(layer.dtype).expand(*lead, n, *item).reshape(-1, n, *item)
         pulls = weights.to(layer.dtype).expand(*lead, n).reshape(-1, n)
+        if torch.finfo(weights.dtype).bits < 32:  # of an autocast model: to more digits, they do not add up to one
+            pulls = pulls / pulls.sum(1, keepdim=True)
         stiffness = layer.stiffness_of(pulls[:, 0], lead)
         member = layer.members[0]
-        with full_precision(flat.device.type):
-            if n == 2 and len(layer.bases) == 2 and bool(((pulls >= 0) & (pulls <= 1)).all()):
-                t = pulls[:, 1]
-                result = member(Samples(flat[:, 0], flat[:, 1], None, t, layer.mu_of(t, lead), stiffness), report)
-            else:
-                result = member.weighted(WeightedSamples(flat, pulls, stiffness), report)
+        if n == 2 and len(layer.bases) == 2 and made_outside(_is_pair, pulls, flat):
+            t = pulls[:, 1]
+            result = member(Samples(flat[:, 0], flat[:, 1], None, t, layer.mu_of(t, lead), stiffness), report)
+        else:
+            # Second derivatives pass what goes in, in reverse mode, or what comes out, in forward mode.
+            x, w, *others = (once(given, SECOND) for given in (flat, pulls, *stiffness))
+            result = member.weighted(WeightedSamples(x, w, others), report)
+            result = result._replace(shapes=once(result.shapes, SECOND))
         shapes, solution = unflattened(result, lead)
         return InBetweenResult(_with_exact_keyframes(shapes, keyframes, weights), solution)
 
@@ -138,16 +147,24 @@ class Blend(nn.Module):
                 f"weights of shape {tuple(weights.shape)} do not broadcast against sets of key-frames of "
                 f"{tuple(keyframes.shape[:-3])}"
             ) from None
-        if traced(weights) or transformed(weights):
-            return lead
-        known = weights.detach().double()
-        off, below = (known.sum(-1) - 1).abs(), -known.clamp_max(0).sum(-1)
-        wrong = ~((off <= ROUNDING) & (below <= MOST_BELOW_ZERO + ROUNDING))
-        if bool(wrong.any()):
-            raise ValueError(
-                f"weights add up to 1, those below zero to -{MOST_BELOW_ZERO} at most; got {known[wrong][0].tolist()}"
-            )
+        if not traced(weights):
+            made_outside(_check_weights, weights)
         return lead
+
+
+def _is_pair(weights: Tensor, keyframes: Tensor) -> bool:
+    """Whether :class:`InBetween` knows what to do: not of a key-frame that is not finite and has no weight."""
+    return bool(((weights >= 0) & (weights <= 1)).all() & keyframes.isfinite().all())
+
+
+def _check_weights(weights: Tensor) -> None:
+    known, rounding = weights.double(), max(ROUNDING, torch.finfo(weights.dtype).eps)
+    off, below = (known.sum(-1) - 1).abs(), -known.clamp_max(0).sum(-1)
+    wrong = ~((off <= rounding) & (below <= MOST_BELOW_ZERO + rounding))
+    if bool(wrong.any()):
+        raise ValueError(
+            f"weights add up to 1, those below zero to -{MOST_BELOW_ZERO} at most; got {known[wrong][0].tolist()}"
+        )
 
 
 def _with_exact_keyframes(shapes: Tensor, keyframes: Tensor, weights: Tensor) -> Tensor:

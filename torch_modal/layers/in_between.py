@@ -1,14 +1,13 @@
 """Shapes between two key-frames at any time, as a differentiable layer."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, lasting, outlasting, transformed
+from torch_modal.autograd import broadcast_shapes, full_precision, lasting, outlasting, require_numbers, transformed
 from torch_modal.contact.rounds import ContactRounds
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
@@ -173,10 +172,14 @@ class InBetween(nn.Module):
         """The dtype of the computation."""
         return self.members[0].frame.reference.dtype
 
+    @full_precision
     def _batched(
         self, x_a: Tensor, x_b: Tensor, t: Tensor | float, pair: Tensor | int, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
         times = self.check(x_a, x_b, t)
+        rotations = self.objective.space == "joint" and self.objective.base == "rotations"
+        if self.solver.gradient == "implicit" or self.solver.local_steps or rotations:
+            require_numbers("InBetween", x_a)
         chosen = self._chosen(pair)
         item = x_a.shape[-2:]
         own = broadcast_shapes(x_a.shape[:-2], x_b.shape[:-2], *([] if chosen is None else [chosen.shape]))
@@ -193,11 +196,10 @@ class InBetween(nn.Module):
             self.mu_of(times, lead),
             self.stiffness_of(times, lead),
         )
-        with full_precision(times.device.type):
-            if chosen is None:
-                result = self.members[0 if isinstance(pair, Tensor) else pair](samples, report)
-            else:
-                result = self._of_several(samples, chosen.expand(own).reshape(-1), report)
+        if chosen is None:
+            result = self.members[0 if isinstance(pair, Tensor) else pair](samples, report)
+        else:
+            result = self._of_several(samples, chosen.expand(own).reshape(-1), report)
         shapes, solution = unflattened(result, lead)
         return InBetweenResult(with_exact_ends(shapes, x_a, x_b, t), solution)
 
@@ -374,18 +376,3 @@ def with_exact(shapes: Tensor, there: Tensor, x: Tensor) -> Tensor:
         known = shapes.detach()
         exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)
     return torch.where(there[..., None, None], exactly, shapes)
-
-
-@contextmanager
-def full_precision(device: str) -> Iterator[None]:
-    """No autocast, and no TF32 or bfloat16 inside products of float32: factorisations would fail."""
-    precision = torch.get_float32_matmul_precision()
-    with torch.autocast(device, enabled=False):
-        if precision == "highest":
-            yield
-            return
-        torch.set_float32_matmul_precision("highest")
-        try:
-            yield
-        finally:
-            torch.set_float32_matmul_precision(precision)

@@ -6,13 +6,23 @@ key-frame serve all shapes of the motion: they bend the shape on the path, and l
 stretch.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import Recent, broadcast_shapes, lasting, outlasting
+from torch_modal.autograd import (
+    Recent,
+    broadcast_shapes,
+    full_precision,
+    in_use,
+    lasting,
+    mapped,
+    outlasting,
+    require_numbers,
+    traced,
+)
 from torch_modal.backends.torch.alignment import Alignment, Pair, vertex_tangent_offset
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.shell import DIAGONAL
@@ -128,7 +138,9 @@ class ModalDecoder(nn.Module):
     def _current(self) -> None:
         """Align again where the buffers hold other numbers: they were loaded, edited in place, or replaced."""
         own = self.keyframes, self.times, self.reference
-        if not all(_same(now, then) for now, then in zip(own, self._made_of, strict=True)):
+        if not torch.compiler.is_exporting() and not all(
+            _same(now, then) for now, then in zip(own, self._made_of, strict=True)
+        ):
             self._align()
 
     def _forget(self) -> None:
@@ -166,11 +178,13 @@ class ModalDecoder(nn.Module):
         return len(self.columns)
 
     @lasting
-    def _apply(self, *args: object, **kwargs: object) -> "ModalDecoder":
-        moved = super()._apply(*args, **kwargs)  # type: ignore[arg-type]
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "ModalDecoder":
+        require_numbers("ModalDecoder", fn(self.keyframes))
+        moved = super()._apply(fn, recurse)
         self._forget()
         return moved
 
+    @full_precision
     def forward(
         self, amplitudes: Tensor, t: Tensor | float, motions: Tensor | None = None, keyframes: Tensor | None = None
     ) -> Tensor:
@@ -200,15 +214,21 @@ class ModalDecoder(nn.Module):
         lead = broadcast_shapes(amplitudes.shape[:-1], t.shape)
         a = amplitudes.expand(*lead, -1).reshape(-1, self.n_modes)
         segment, u = self.located(t.expand(lead).reshape(-1))
-        order, parts = [], []
-        for i in segment.unique().tolist():
+        order: list[Tensor] = []
+        parts: list[Tensor] = []
+        everywhere = traced(segment) or mapped(segment)
+        for i in in_use(segment, self.n_intervals):
             interval = self._interval(i, keyframes)
+            if everywhere:  # of each interval all shapes, of which some are taken
+                x = self.alignment.restore(self.bent(i, interval, a, u), interval.pair, u)
+                parts = [x if not parts else torch.where((segment == i)[:, None, None], x, parts[0])]
+                continue
             for rows in torch.nonzero(segment == i).flatten().split(max(1, CHUNK // self.keyframes.shape[1])):
                 order.append(rows)
                 parts.append(self.alignment.restore(self.bent(i, interval, a[rows], u[rows]), interval.pair, u[rows]))
         if not parts:
             return amplitudes.new_zeros(*lead, *self.keyframes.shape[1:])
-        x = torch.cat(parts)[torch.argsort(torch.cat(order))]
+        x = parts[0] if everywhere else torch.cat(parts)[torch.argsort(torch.cat(order))]
         if motions is not None:
             x = moved(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)
         return x.reshape(*lead, *x.shape[1:])
@@ -233,6 +253,8 @@ class ModalDecoder(nn.Module):
         return self._interval(i, None)
 
     def _interval(self, i: int, keyframes: Tensor | None) -> Interval:
+        if torch.compiler.is_exporting() and i not in self._known:
+            keyframes = self.keyframes if keyframes is None else keyframes  # the program computes them at each call
         if keyframes is None:
             own: Interval = self._known.get(i, lambda: self._interval(i, self._made_of[0]))
             return own

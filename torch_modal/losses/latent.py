@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import full_precision
 from torch_modal.losses.shell import ShellLoss
 
 Decoder = Callable[[Tensor], Tensor]
@@ -106,6 +107,7 @@ class LatentElasticity(nn.Module):
             ) from error
         return checked_decoded(found[0][0], z), [tangent for _, tangent in found]
 
+    @full_precision
     def _gram(self, x: Tensor, along: list[Tensor]) -> Tensor:
         """Products of displacements in the Hessian about shapes. *Shape:* ``(B, k, k)``."""
         energy, scale = self.shell.energy, self.shell.scale(x)
@@ -157,11 +159,11 @@ class PathEnergy(nn.Module):
 
 
 def checked_decoded(x: Tensor, z: Tensor) -> Tensor:
-    """Decoded shapes.
+    """Decoded shapes, in float32 or more.
 
     Raises:
         ValueError: They are not ``(B, V, 3)``.
     """
     if x.dim() != 3 or x.shape[-1] != 3 or len(x) != len(z):
         raise ValueError(f"the decoder makes shapes ({len(z)}, V, 3) of latents {tuple(z.shape)}; got {tuple(x.shape)}")
-    return x
+    return x.to(torch.promote_types(x.dtype, torch.float32))  # of an autocast decoder

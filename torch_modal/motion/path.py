@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import broadcast_shapes, lasting
+from torch_modal import trees
+from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers
 from torch_modal.contact.search import refuse_transforms
 from torch_modal.contact.trajectory import push_apart
 from torch_modal.geometry.crossings import require_contact
@@ -20,7 +21,7 @@ from torch_modal.geometry.hermite import Tangents, around, located, wrapped
 from torch_modal.inbetween.samples import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.times import checked_times
-from torch_modal.layers.in_between import InBetween, full_precision, joined, unflattened, with_exact_ends
+from torch_modal.layers.in_between import InBetween, joined, unflattened, with_exact_ends
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.solver import Solution
 
@@ -164,10 +165,12 @@ class Path(nn.Module):
         """
         return self._batched(keyframes, t, self.layer.report()).shapes
 
+    @full_precision
     def _batched(
         self, keyframes: Tensor, t: Tensor | float, report: Callable[[Solution], None] | None
     ) -> InBetweenResult:
         layer = self.layer
+        require_numbers("Path", keyframes)
         if keyframes.dim() < 3 or keyframes.shape[-3] != self.n_keyframes:
             raise ValueError(
                 f"keyframes of this path have the shape (..., {self.n_keyframes}, V, 3); got {tuple(keyframes.shape)}"
@@ -187,7 +190,15 @@ class Path(nn.Module):
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = located(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
         order, parts = [], []
-        for i in segment.unique().tolist() or [0]:  # of nothing, nothing
+        intervals = in_use(segment, len(self.members)) or [0]  # of nothing, nothing
+        if mapped(segment):
+            # Of each interval all shapes, of which some are taken.
+            every = torch.arange(len(which), device=which.device)
+            order = [place * len(which) + every for place in range(len(intervals))]
+            whole = joined([self._between(flat, i, which, u, report) for i in intervals], order)
+            place = sum((segment == i) * place for place, i in enumerate(intervals))
+            return unflattened(trees.rows(whole, place * len(which) + every), lead)
+        for i in intervals:
             mine = torch.nonzero(segment == i).flatten()
             order.append(mine)
             parts.append(self._between(flat, i, which[mine], u[mine], report))
@@ -204,10 +215,9 @@ class Path(nn.Module):
         """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
         member = self.layer.members[self.members[i]]
         samples = self.samples(keyframes, i, which, u)
-        with full_precision(u.device.type):
-            result = member(samples, report)
-            if self.contact:
-                result = self._in_contact(keyframes, i, samples, result)
+        result = member(samples, report)
+        if self.contact:
+            result = self._in_contact(keyframes, i, samples, result)
         ends = keyframes[which, i], keyframes[which, (i + 1) % self.n_keyframes]
         return InBetweenResult(with_exact_ends(result.shapes, *ends, samples.t), result.solution)
 

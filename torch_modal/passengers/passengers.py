@@ -8,7 +8,7 @@ import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-from torch_modal.autograd import lasting, traced, transformed
+from torch_modal.autograd import full_precision, lasting, traced, transformed
 from torch_modal.geometry.rigid import best_rotation
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 from torch_modal.keyframes.arrays import as_faces
@@ -94,9 +94,14 @@ class Passengers(nn.Module):
         found._bind(reference.detach().double().cpu(), points.detach().double().cpu(), self.weights)
         return found.to(self.points)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the products' matrices, which cannot be copied."""
+        return {**self.__dict__, "_matrices": {}}
+
     def __len__(self) -> int:
         return len(self.points)
 
+    @full_precision
     def forward(self, shapes: Tensor) -> Tensor:
         """The points of each shape. *Shape:* ``(..., V, 3) -> (..., P, 3)``.
 
@@ -111,14 +116,16 @@ class Passengers(nn.Module):
         found = self._mixed(torch.cat([turns.flatten(2), offsets], -1))
         own = self.points - middle
         moved = (found[..., :9].unflatten(-1, (3, 3)) * own[:, None]).sum(-1) + found[..., 9:]
-        return (moved + middle).view(*shapes.shape[:-2], -1, 3)
+        return (moved + middle).view(*shapes.shape[:-2], len(self), 3)
 
+    @full_precision
     def rotations(self, shapes: Tensor) -> Tensor:
         """How the surroundings of each point turn. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``."""
         flat = self._flat(shapes)
         found = self._mixed(best_rotation(self._deformation(flat)).flatten(2)).unflatten(-1, (3, 3))
-        return _nearest_rotation(found).view(*shapes.shape[:-2], -1, 3, 3)
+        return _nearest_rotation(found).view(*shapes.shape[:-2], len(self), 3, 3)
 
+    @full_precision
     def gradients(self, shapes: Tensor) -> Tensor:
         """How they turn and stretch: the deformation gradient, whose thickness is kept. *Shape:* ``(..., P, 3, 3)``.
 
@@ -126,7 +133,7 @@ class Passengers(nn.Module):
         """
         flat = self._flat(shapes)
         found = self._mixed(self._deformation(flat).flatten(2)).unflatten(-1, (3, 3))
-        return found.view(*shapes.shape[:-2], -1, 3, 3)
+        return found.view(*shapes.shape[:-2], len(self), 3, 3)
 
     def _flat(self, shapes: Tensor) -> Tensor:
         if shapes.shape[-2:] != self.reference.shape or shapes.dtype != self.reference.dtype:
@@ -156,10 +163,10 @@ class Passengers(nn.Module):
             entries = self.weights.tocoo()
             row, column = (torch.from_numpy(part).long().to(values.device) for part in (entries.row, entries.col))
             each = values[:, column] * torch.from_numpy(entries.data).to(values)[:, None]
-            return values.new_zeros(len(values), len(self), values.shape[2]).index_add(1, row, each)
+            return values.new_zeros(values.shape[0], len(self), values.shape[2]).index_add(1, row, each)
         columns = values.movedim(0, 1).flatten(1)
         found: Tensor = _Product.apply(columns, *self._matrix(values))
-        return found.unflatten(1, (len(values), -1)).movedim(1, 0)
+        return found.unflatten(1, (len(values), values.shape[2])).movedim(1, 0)
 
     def _matrix(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The weights and their transpose, of a dtype and on a device."""

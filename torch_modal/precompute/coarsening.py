@@ -82,7 +82,8 @@ class Collapses:
     """
 
     def __init__(self, faces: IntArray) -> None:
-        self.faces = faces
+        # Copies: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
+        self.faces = faces.copy()
         self._poses: dict[int, FloatArray] = {}
         self._known: dict[tuple[int, int], Coarsening] = {}
 
@@ -94,7 +95,7 @@ class Collapses:
             keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
         """
         for place, points in zip(places, keyframes, strict=True):
-            self._poses.setdefault(place, points)
+            self._poses.setdefault(place, points.copy())
         return partial(self._at, tuple(places))
 
     def _at(self, places: tuple[int, ...], keyframe: int, n_faces: int) -> Coarsening:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import full_precision
 from torch_modal.energy.modal_energy import Derivatives
 
 # Fractions of a step that are tried, side by side, where the whole step disappoints.
@@ -137,13 +138,22 @@ class GaussNewtonStep(nn.Module):
         found = self._unless_uphill(a, energy, best, lowest, promised, derivatives)
         return found if derivatives.second_order is None else found._replace(newton=a + plain[1])
 
+    @full_precision
     def forward(self, a: Tensor, placement: Any) -> Step:
         """Take one step, trying both directions at all lengths, without a branch that depends on data.
 
         Args:
             a: Amplitudes. *Shape:* ``(B, n)``.
             placement: What the energy knows of each sample.
+
+        Raises:
+            ValueError: The amplitudes have no batch dimension, or several.
         """
+        if a.dim() != 2:
+            raise ValueError(
+                f"amplitudes have the shape (B, n), as the placement has B samples; got {tuple(a.shape)}: of one "
+                "sample, pass a[None] and place start[None]"
+            )
         derivatives = self.energy.derivatives(a, placement)
         directions = self.directions(derivatives)
         best, lowest = self.lowest(a, torch.cat([directions, self._shortened(directions)]), placement)

@@ -8,8 +8,11 @@ import ctypes
 import importlib
 import math
 import os
+import sys
+import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, Literal
 
@@ -35,6 +38,8 @@ Module = Literal[
 PACKAGE = "torch_modal.backends.warp.kernels"
 IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "references", "shell", "modal", "steps", "distortion")
 """The modules for in-betweens without gradients."""
+NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
+"""What Warp says where there is no GPU, with no setting that turns it off: in every run, it looks like an error."""
 MOST_ENTRIES = 2**31 - 1
 """Kernels index with 32 bits: no array of theirs, and no launch, may be longer."""
 
@@ -55,6 +60,8 @@ def _load(wp: Any, module: str) -> None:
     """Compile a module and those below it, several at a time, or take them from Warp's cache."""
     before, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
     try:
+        with _without_line(NO_DRIVER):
+            wp.init()
         with ProgressReport(1, "compiling kernels (once for this machine)", unit="module"):
             wp.load_module(module, device="cpu", recursive=True, max_workers=os.cpu_count())
     finally:
@@ -70,6 +77,29 @@ def load_kernels() -> None:
     _load(wp, PACKAGE)
     for name in IN_BETWEENS:
         kernels(name)
+
+
+@contextmanager
+def _without_line(start: bytes) -> Iterator[None]:
+    """Standard error of the process without the lines that begin so; all else follows at the end.
+
+    Native code writes to the file descriptor, where no setting of Python's reaches.
+    """
+    try:
+        sys.stderr.flush()
+        before = os.dup(2)
+    except (AttributeError, OSError, ValueError):  # there is none
+        yield
+        return
+    with os.fdopen(before, "wb") as whole, tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+            sys.stderr.flush()
+        finally:
+            os.dup2(before, 2)
+            caught.seek(0)
+            whole.writelines(line for line in caught if not line.startswith(start))
 
 
 class _Commands(threading.local):

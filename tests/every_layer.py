@@ -1,0 +1,145 @@
+"""Every layer and transform, with a call of it: for what must hold of all of them, in worker processes too."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from conftest import Shapes
+from torch import Tensor
+
+import torch_modal as tm
+
+DOUBLE = torch.float64
+
+
+class Case(NamedTuple):
+    """A layer or transform."""
+
+    make: Callable[[Shapes], Any]
+    """From key-frames with bases."""
+    call: Callable[[Any, Tensor], Any]
+    """From the layer and the key-frames. *Shape:* ``(3, V, 3)``."""
+
+
+class Linear(torch.nn.Module):
+    """A decoder of latents ``(B, 2)``: the first shape, and two displacements."""
+
+    def __init__(self, shapes: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("shapes", shapes)
+
+    def forward(self, z: Tensor) -> Tensor:
+        x = self.shapes.to(z)
+        return x[0] + z[:, :1, None] * (x[1] - x[0]) + z[:, 1:, None] * (x[2] - x[0])
+
+
+class Step(torch.nn.Module):
+    """Three steps of :class:`torch_modal.GaussNewtonStep` from the first shape towards the second."""
+
+    def __init__(self, shapes: Shapes) -> None:
+        super().__init__()
+        self.shell = tm.ShellEnergy(shapes.faces)
+        self.n_modes = shapes.bases[0].n_modes
+        self.step = tm.GaussNewtonStep(tm.ModalEnergy(self.shell, shapes.bases[0].modes))
+
+    def forward(self, x: Tensor, rest: Tensor) -> Tensor:
+        placement = self.step.energy.place(x, self.shell.against(rest))
+        a = x.new_zeros(x.shape[0], self.n_modes)
+        for _ in range(3):
+            a = self.step(a, placement).amplitudes
+        return a
+
+
+class Random(torch.nn.Module):
+    """A transform with the space that it draws from."""
+
+    def __init__(self, kind: type[tm.ShapeAugmentation], shapes: Shapes) -> None:
+        super().__init__()
+        self.own = kind(p=1.0, space=tm.ShapeSpace(shapes.bases, shapes.faces, times=None))
+
+    def forward(self, x: Tensor) -> Tensor:
+        torch.manual_seed(0)
+        return self.own(x)
+
+
+def in_between(shapes: Shapes, **options: Any) -> tm.InBetween:
+    """Of the first two key-frames."""
+    return tm.InBetween(shapes.bases[:2], shapes.faces, **options)
+
+
+def decoder(shapes: Shapes) -> tm.ModalDecoder:
+    """Of all key-frames, with the modes of the first."""
+    times, basis = torch.tensor([0.0, 1.0, 3.0], dtype=DOUBLE), shapes.bases[0]
+    return tm.ModalDecoder(shapes.keyframes, shapes.faces, times, basis.reference, basis.modes)
+
+
+def decoded(layer: tm.ModalDecoder, x: Tensor) -> Tensor:
+    """At two times."""
+    amplitudes = torch.linspace(-1, 1, 2 * layer.n_modes).view(2, -1).to(x)
+    return layer(amplitudes, torch.tensor([0.5, 2.5]).to(x))
+
+
+def passengers(shapes: Shapes) -> tm.Passengers:
+    """Points about the first key-frame."""
+    x = shapes.keyframes[0]
+    return tm.Passengers(x, shapes.faces, 1.01 * x[::3])
+
+
+def latent(layer: Any, x: Tensor) -> Tensor:
+    """Of a straight path of codes."""
+    return layer(Linear(x), torch.tensor([[0.0, 0.0], [0.5, 0.1], [1.0, 0.0]]).to(x))
+
+
+def pair(layer: Any, x: Tensor) -> Any:
+    """Of the first two shapes."""
+    return layer(x[:1], x[1:2])
+
+
+def pair_in_time(layer: Any, x: Tensor) -> Tensor:
+    """Of the first two shapes, at two times."""
+    return layer(x[0], x[1], torch.tensor([0.3, 0.6]).to(x))
+
+
+def set_in_time(layer: Any, x: Tensor) -> Tensor:
+    """Of all shapes, at two times."""
+    return layer(x, torch.tensor([0.5, 1.5]).to(x))
+
+
+def blended(layer: Any, x: Tensor) -> Tensor:
+    """By two sets of weights."""
+    return layer(x, torch.tensor([[0.2, 0.3, 0.5], [0.334, 0.333, 0.333]]).to(x))
+
+
+LAYERS: dict[str, Case] = {
+    "InBetween": Case(in_between, pair_in_time),
+    "InBetween, torch": Case(partial(in_between, solver=tm.Solver(backend="torch")), pair_in_time),
+    "InBetween, fast": Case(partial(in_between, preset="fast"), pair_in_time),
+    "MidShape, paper": Case(lambda s: tm.MidShape(s.bases[:2], s.faces, preset="paper"), pair),
+    "InBetween, contact": Case(partial(in_between, contact=True), pair_in_time),
+    "Blend": Case(lambda s: tm.Blend(s.bases, s.faces), blended),
+    "Path": Case(lambda s: tm.Path(s.bases, s.faces), set_in_time),
+    "Path, pairs": Case(lambda s: tm.Path(s.bases, s.faces, smooth=False), set_in_time),
+    "Path, contact": Case(lambda s: tm.Path(s.bases, s.faces, contact=True), set_in_time),
+    "ModalDecoder": Case(decoder, decoded),
+    "Passengers": Case(passengers, lambda layer, x: layer(x)),
+    "Passengers, rotations": Case(passengers, lambda layer, x: layer.rotations(x)),
+    "GaussNewtonStep": Case(Step, pair),
+    "ShellEnergy": Case(lambda s: tm.ShellEnergy(s.faces), pair),
+    "ShellLoss": Case(lambda s: tm.losses.ShellLoss(s.faces), pair),
+    "LatentElasticity": Case(lambda s: tm.losses.LatentElasticity(s.faces), latent),
+    "PathEnergy": Case(lambda s: tm.losses.PathEnergy(s.faces), latent),
+}
+
+TRANSFORMS: dict[str, Case] = {
+    kind.__name__: Case(partial(Random, kind), lambda layer, x: layer(x))
+    for kind in (
+        tm.RandomBlend,
+        tm.RandomExtrapolation,
+        tm.RandomInBetween,
+        tm.RandomModalDeformation,
+        tm.RandomRigidMotion,
+    )
+}
+
+CASES = {**LAYERS, **TRANSFORMS}
