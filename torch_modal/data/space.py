@@ -220,7 +220,7 @@ class ShapeSpace:
         if not 1 <= n <= most:
             raise ValueError(f"{len(self)} key-frames have {most} components; got n={n}")
         variation = self.variation()
-        return Components(variation.coordinates, variation.average + variation.deviations, n)
+        return Components(variation.coordinates, variation.average + variation.deviations, n, variation.origin)
 
     @kept(1)
     def variation(self) -> Variation:
@@ -273,7 +273,7 @@ class ShapeSpace:
         out = torch.empty(n, self.n_vertices, 3, dtype=self.dtype)
         for i in range(n):
             weights, factors = variation.draw(concentration, locality, generator)
-            out[i] = variation.member(weights, factors)[0]
+            out[i] = variation.member(weights, factors)[0] + variation.origin
         return out
 
     def fit(
@@ -285,7 +285,7 @@ class ShapeSpace:
         of key-frames that looks most like it. Of several sets of points, each is met on its own.
 
         Gradients reach the points. They are those of weights and rigid motion, by the implicit function theorem; the
-        elastic steps that follow, and the trust in points, are constants of the graph.
+        elastic steps that follow, and the trust in points, are constants of the graph. There are no second derivatives.
 
         Args:
             points: In the caller's units, of at least three vertices; any rigid motion is followed. *Shape:*
@@ -300,7 +300,8 @@ class ShapeSpace:
             than of a key-frame that is moved rigidly, it is that one.
 
         Raises:
-            ValueError: There is only one key-frame, or points, vertices or weights do not fit.
+            ValueError: There is only one key-frame, points, vertices or weights do not fit, or the points are in other
+                units.
             RuntimeError: The points are within a transform of ``torch.func``, or have a tangent.
         """
         if transformed(points):
@@ -309,11 +310,14 @@ class ShapeSpace:
         places = checked_observations(points, vertices, self.n_vertices)
         variation = self.variation()
         found = []
-        for own in points.reshape(-1, *points.shape[-2:]):
+        for own in points.reshape(points.shape[:-2].numel(), *points.shape[-2:]):
             known = own.to("cpu", torch.float64)
             to = Observations(known, places, torch.ones_like(known[:, 0]))
             found.append(fit(variation, to, about, robust))
-        lead = points.shape[:-2]
+        lead, v, n = points.shape[:-2], self.n_vertices, len(places)
+        if not found:
+            sizes = (v, 3), (len(self), v), (n,), (n,)
+            return Fitted(*(points.new_zeros(*lead, *shape) for shape in sizes))
         return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
 
     # ------------------------------------------------------------------------------------------- computed at first use

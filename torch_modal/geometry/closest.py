@@ -53,7 +53,7 @@ class ClosestFaces:
             np.minimum.at(nearest, at, distance)
             nearer &= distance == nearest[at]
             face[at[nearer]] = found[nearer]
-            row, node = np.repeat(row[node < n], 2), (2 * node[node < n, None] + [0, 1]).reshape(-1)
+            row, node = np.repeat(row[node < n], 2), (2 * node[node < n, None] + np.arange(2)).reshape(-1)
             left += [(row[i : i + CHUNK], node[i : i + CHUNK]) for i in range(0, len(row), CHUNK)]
         return face
 
