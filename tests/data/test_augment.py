@@ -572,7 +572,7 @@ def check_draws(shapes: Shapes, n: int) -> None:
             if kind == "deformation":
                 assert float(space.strain(y, batch.shapes).abs().max()) <= 0.2
         off = (torch.cat(ratios) - 1).abs()
-        assert float(off.max()) < 0.10, kind
+        assert float(off.max()) < 0.13, kind
         assert float(off.median()) < 0.03, kind
 
 
