@@ -1,8 +1,10 @@
 """Key-frames of one connectivity with their modes, and what augmentations compute from them at first use."""
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
@@ -16,6 +18,7 @@ from torch_modal.data.motion import Motion, Span
 from torch_modal.data.reference import KeyframeReference, keyframe_reference
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
+from torch_modal.geometry.canonical import size
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
@@ -36,6 +39,9 @@ from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.observations import Observations, checked_observations, checked_weights
 from torch_modal.statistics.variation import Variation
 from torch_modal.version import __version__
+
+# Sizes whose squares, and squares of areas, are usual numbers of float32.
+_SIZES = 1e-3, 1e6
 
 # Key-frames whose modes a mean has, at most.
 _BASES_OF_MEAN = 6
@@ -124,6 +130,8 @@ class ShapeSpace:
         self.folder = None if folder is None else Path(folder)
         self.motion = Motion.of(keyframe_times, len(self.bases), cyclic)
         self._made: dict[str, Recent] = {}
+        #: The space in the caller's units, if this is another (:meth:`in_units`).
+        self._given: ShapeSpace | None = None
 
     @classmethod
     def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
@@ -163,6 +171,27 @@ class ShapeSpace:
     @kept(4)
     def _keyframes_like(self, like: Tensor) -> Tensor:
         return torch.stack([basis.reference for basis in self.bases]).to(like)
+
+    @property
+    def unit(self) -> float:
+        """A power of two near the size of the first key-frame, or 1 where its squares are usual numbers of float32."""
+        length = self._size()
+        return 1.0 if _SIZES[0] <= length <= _SIZES[1] else 2.0 ** round(math.log2(length))
+
+    @kept(1)
+    def _size(self) -> float:
+        return size(self.bases[0].reference.double().numpy(), self.faces.numpy())
+
+    @kept(1)
+    def in_units(self) -> "ShapeSpace":
+        """The same space with key-frames divided by :attr:`unit`, for computations in float32; tables are shared."""
+        if self.unit == 1:
+            return self
+        found = copy(self)
+        found._made, found._given = {}, self
+        parts = ((b.reference / self.unit, b.eigenvalues, b.modes, b.rigid_eigenvalues) for b in self.bases)
+        found.bases = [ModalBasis(*part) for part in parts]
+        return found
 
     def nearest(self, x: Tensor) -> Tensor:
         """Index of the closest key-frame, up to a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
@@ -366,6 +395,8 @@ class ShapeSpace:
         """In-betweens of two key-frames at even times, from disk if stored. *Shape:* ``(T, V, 3)``."""
         if self.times is None:
             raise ValueError("a space of times=None solves each in-between: it has no tables")
+        if self._given is not None:
+            return self._given.table(i, j) / self._given.unit
         path, key = self._place(i, j)
         stored = None if path is None else read_table(path, key)
         if stored is not None:
