@@ -86,7 +86,10 @@ def test_convex_hessian_is_gauss_newton_and_the_stretched_edges(case: Case) -> N
             )
 
         jacobian = jacfwd(residuals)(case.x[sample]).flatten(1)
-        stretched = core.parts[0].term.tension(at[0].edge_vectors, at[0].slope, at[0].curvature)[sample] * norm(at[0].edge_vectors[0])[sample]
+        stretched = (
+            core.parts[0].term.tension(at[0].edge_vectors, at[0].slope, at[0].curvature)[sample]
+            * norm(at[0].edge_vectors[0])[sample]
+        )
 
         def lengths(x: Tensor, stretched: Tensor = stretched) -> Tensor:
             return (stretched * case.shell.measure(x).length).sum()

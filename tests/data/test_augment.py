@@ -100,6 +100,31 @@ def test_probability_zero_changes_nothing(bars: Shapes, space: tm.ShapeSpace, ki
 
 
 @each_kind
+def test_empty_batches(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
+    for options in ({}, {"same_on_batch": True}):
+        augment = KINDS[kind](p=1.0, space=space, **options)
+        for pool in (None, tm.ShapeBatch.of_keyframes(space)):
+            assert augment(bars.keyframes[:0], pool=pool).shape == (0, space.n_vertices, 3)
+    keys = ("shapes", "normals", "shape_labels")
+    whole = tm.AugmentationSequential(KINDS[kind](p=1.0), data_keys=keys, space=space)
+    assert [len(part) for part in whole(bars.keyframes[:0], None, torch.zeros(0))] == [0, 0, 0]
+
+
+@each_kind
+@pytest.mark.parametrize("scale", [2.0**-32, 1e-12, 1e12])
+def test_single_precision_in_any_units(bars: Shapes, kind: str, scale: float) -> None:
+    found = []
+    for factor in (1.0, scale):
+        bases = [tm.ModalBasis(factor * b.reference, b.eigenvalues, b.modes, b.rigid_eigenvalues) for b in bars.bases]
+        space = tm.ShapeSpace(bases, bars.faces, times=5)
+        augment = KINDS[kind](p=1.0, space=space, generator=seeded())
+        for pool in (None, tm.ShapeBatch.of_keyframes(space)):
+            found.append(augment((factor * bars.keyframes).float(), pool=pool).double() / factor)
+    for one, other in zip(found[:2], found[2:], strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
+
+
+@each_kind
 def test_copies_and_pickles(bars: Shapes, space: tm.ShapeSpace, kind: str) -> None:
     augment = KINDS[kind](p=1.0, generator=seeded(), space=space)
     clone, sent = copy.deepcopy(augment), pickle.loads(pickle.dumps(augment))
@@ -572,7 +597,7 @@ def check_draws(shapes: Shapes, n: int) -> None:
             if kind == "deformation":
                 assert float(space.strain(y, batch.shapes).abs().max()) <= 0.2
         off = (torch.cat(ratios) - 1).abs()
-        assert float(off.max()) < 0.10, kind
+        assert float(off.max()) < 0.13, kind
         assert float(off.median()) < 0.03, kind
 
 

@@ -1,5 +1,10 @@
 """Points that follow a shape: rigid motions, the surface, fingers, gradients, dtypes, errors."""
 
+import copy
+import pickle
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -10,9 +15,9 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
+from torch_modal.geometry.closest import ClosestFaces, closest_on_triangles
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rotations import exp
-from torch_modal.passengers.binding import closest_on_triangles
 
 DOUBLE = torch.float64
 TURN = exp(torch.tensor([0.4, -1.1, 2.3], dtype=DOUBLE))
@@ -39,7 +44,7 @@ def test_rigid_motions_are_followed_exactly(name: str) -> None:
         torch.testing.assert_close(found, TURN.expand(5000, 3, 3), rtol=0, atol=1e-12)
 
 
-def test_points_of_the_surface_stay_on_it(bars: Shapes) -> None:
+def test_points_of_the_surface_stay_near_it(bars: Shapes) -> None:
     x, y = bars.keyframes[:2]
     weights = torch.rand(len(bars.faces), 3, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
     weights = weights / weights.sum(1, keepdim=True)
@@ -47,10 +52,51 @@ def test_points_of_the_surface_stay_on_it(bars: Shapes) -> None:
     found = passengers(y)
     off = (found - torch.einsum("fi,fic->fc", weights, y[bars.faces])).norm(dim=1)
     edges = (y[bars.faces[:, 0]] - y[bars.faces[:, 1]]).norm(dim=1)
-    # Rounder than the facets, but for corners of triangles, by less than a tenth of an edge.
+    # Rounder than the facets, but for corners of triangles: here by less than a tenth of an edge.
     assert float(off.max()) < 0.1 * float(edges.mean())
     corners = tm.Passengers(x, bars.faces, x)
     torch.testing.assert_close(corners(y), y, rtol=0, atol=1e-12)
+
+
+def test_own_vertices_beside_long_triangles() -> None:
+    """A vertex follows its own triangles, though the centroids of others are nearer."""
+    n = 20
+    rim = torch.linspace(0, 0.02, n, dtype=DOUBLE)
+    zero = torch.zeros(n, dtype=DOUBLE)
+    near = torch.stack([rim, zero, zero], 1)
+    grid = torch.stack(torch.meshgrid(rim, rim, indexing="ij"), -1).reshape(-1, 2)
+    below = torch.cat([grid, torch.full((n * n, 1), -0.004, dtype=DOUBLE)], 1)  # a fine part under the long triangles
+    far = torch.tensor([[0.01, 5.0, 0.0]], dtype=DOUBLE)
+    i = torch.arange(n - 1)
+    fan = torch.stack([i, i + 1, torch.full_like(i, n)], 1)
+    j = (torch.arange(n - 1)[:, None] * n + i).flatten() + n + 1
+    fine = torch.cat([torch.stack([j, j + n, j + 1], 1), torch.stack([j + 1, j + n, j + n + 1], 1)])
+    x, faces = torch.cat([near, far, below]), torch.cat([fan, fine])
+    y = torch.cat([x[: n + 1], x[n + 1 :] + torch.tensor([0.0, 0.0, -1.0])])
+    assert float((tm.Passengers(x, faces, x)(y) - y).abs().max()) < 1e-12
+
+
+def test_own_vertices_of_animals(data_dir: Path) -> None:
+    for name in ("frog", "trex", "velociraptor"):
+        with np.load(data_dir / "animals" / f"{name}.npz") as body:
+            frames, faces = (torch.from_numpy(body[key]) for key in ("frames", "faces"))
+        x, y = frames[[0, len(frames) // 2]].double()
+        carried = tm.Passengers(x, faces, x)
+        for shape in (x, y):
+            assert float((carried(shape) - shape).abs().max()) < 1e-9
+
+
+def test_closest_faces_are_exact() -> None:
+    """Against all triangles, long ones among them, for points near and far."""
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.randn(300, 3, 3, generator=generator, dtype=DOUBLE)
+    corners[:200] = corners[:200, :1] + 0.05 * corners[:200]
+    points = torch.randn(500, 3, generator=generator, dtype=DOUBLE) * torch.logspace(-2, 1, 500, dtype=DOUBLE)[:, None]
+    for n in (1, 2, 3, 7, 300):
+        faces = np.arange(3 * n).reshape(n, 3)
+        found = ClosestFaces(corners.view(-1, 3).numpy(), faces)(points.numpy())
+        distances = closest_on_triangles(points[:, None].numpy(), corners[None, :n].numpy())[1]
+        np.testing.assert_array_equal(distances[np.arange(500), found], distances.min(1))
 
 
 def test_neighbours_stay_neighbours() -> None:
@@ -129,6 +175,29 @@ def test_float32_far_from_the_origin(bars: Shapes) -> None:
         passengers(y)
 
 
+def test_a_shape_that_is_not_finite_fails_alone(bars: Shapes) -> None:
+    passengers = tm.Passengers(bars.keyframes[0], bars.faces, around(bars.keyframes[0], bars.faces, 50, 0.02))
+    shapes = bars.keyframes.clone()
+    shapes[1, 3, 0] = torch.nan
+    for function in (passengers, passengers.rotations, passengers.gradients):
+        found = function(shapes)
+        assert bool(found[1].isnan().all())
+        torch.testing.assert_close(found[[0, 2]], function(bars.keyframes)[[0, 2]])
+
+
+def test_empty_batches_copies_and_inference_mode(bars: Shapes) -> None:
+    passengers = tm.Passengers(bars.keyframes[0], bars.faces, around(bars.keyframes[0], bars.faces, 50, 0.02))
+    with torch.inference_mode():
+        expected = passengers(bars.keyframes).clone()
+    for each in (passengers, copy.deepcopy(passengers), pickle.loads(pickle.dumps(passengers))):
+        assert each(bars.keyframes[:0]).shape == (0, 50, 3)
+        assert each.rotations(bars.keyframes[:0]).shape == (0, 50, 3, 3)
+        shapes = bars.keyframes.clone().requires_grad_()
+        found = each(shapes)
+        torch.testing.assert_close(found, expected)
+        found.sum().backward()
+
+
 def test_no_points(bars: Shapes) -> None:
     passengers = tm.Passengers(bars.keyframes[0], bars.faces, torch.zeros(0, 3))
     assert passengers(bars.keyframes).shape == (3, 0, 3)
@@ -140,7 +209,10 @@ def test_no_points(bars: Shapes) -> None:
         ({"points": torch.zeros(4, 2)}, "points holds finite numbers"),
         ({"points": torch.full((4, 3), torch.nan)}, "points holds finite numbers"),
         ({"reference": torch.zeros(5, 3)}, "the faces name vertex 163"),
+        ({"faces": torch.tensor([[0, 1, -2]])}, "the faces name vertex -2"),
+        ({"faces": torch.zeros(0, 3, dtype=torch.int64)}, "faces have the shape"),
         ({"anchors": torch.tensor([0])}, "anchors hold a vertex"),
+        ({"anchors": torch.tensor([0, 1, -1, -2])}, "anchors hold a vertex"),
         ({"reference": torch.ones(164, 3)}, "no face of the reference has an area"),
     ],
 )

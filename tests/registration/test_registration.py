@@ -10,6 +10,7 @@ import trimesh
 import torch_modal as tm
 from torch_modal import extras
 from torch_modal.cli import main as cli
+from torch_modal.data.samples import load_sample
 from torch_modal.extras import require
 from torch_modal.io.frames import save_mesh
 from torch_modal.registration import register as register_module
@@ -82,6 +83,20 @@ def test_truth_is_met_without_landmarks(pair: tuple[Mesh, Mesh, np.ndarray], fou
     assert not found.doubtful and not found.warnings
     assert found.to_target.mean < 0.12 and found.from_target.mean < 0.5
     assert found.flipped_area < 0.01
+
+
+def test_missing_parts_have_low_confidence(found: tm.Registration) -> None:
+    assert float((found.vertex_confidence > 0.5).double().mean()) > 0.99
+    sample = load_sample("hand")
+    x, y = sample.keyframes[:2].numpy()
+    faces = sample.faces.numpy()
+    distances = np.linalg.norm(x[faces].mean(1) - x[x[:, 0].argmin()], axis=1)
+    kept = faces[distances > np.quantile(distances, 0.13)]
+    missing = np.setdiff1d(faces, kept)
+    result = register(x, faces, y, kept, progress=False)
+    assert result.doubtful and result.warnings
+    low = result.vertex_confidence < 0.5
+    assert float(low[missing].double().mean()) > 0.8 and float(low[kept].double().mean()) < 0.05
 
 
 def test_report_measures_what_it_says(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.Registration) -> None:

@@ -10,7 +10,9 @@ from torch_modal.geometry.local_rotations import _turn_between
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import BentTriangles, bending_between, bent_sides, frames, sides
+from torch_modal.statistics.components import Components
 from torch_modal.statistics.coordinates import BendingCoordinates
+from torch_modal.statistics.variation import Variation
 
 
 def far(x: torch.Tensor, y: torch.Tensor) -> float:
@@ -27,6 +29,40 @@ def test_shapes_have_coordinates_that_give_them_back(name: str) -> None:
     found = coordinates.of(sample.keyframes @ turn.mT + 3)
     torch.testing.assert_close(found[0], torch.zeros_like(found[0]), rtol=0, atol=1e-9)
     assert max(far(x, y) for x, y in zip(coordinates.shapes(found), sample.keyframes, strict=True)) < 1e-10
+
+
+def with_second_piece(shapes: torch.Tensor, faces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """A tetrahedron that circles and turns beside each shape, and three vertices of no face that move apart."""
+    corners = 0.2 * torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=shapes.dtype)
+    first = shapes.shape[1]
+    more = []
+    for k in range(len(shapes)):
+        turn = exp(torch.tensor([0.3, 0.8, -0.4], dtype=shapes.dtype) * k)
+        piece = (corners + torch.tensor([1.5, 0.0, 2.0], dtype=shapes.dtype)) @ turn.mT
+        more.append(torch.cat([piece, corners[:3] + torch.tensor([0.0, 3.0, float(k)])]))
+    own = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]) + first
+    return torch.cat([shapes, torch.stack(more)], 1), torch.cat([faces, own])
+
+
+def test_second_pieces_and_vertices_of_no_face(bars: Shapes) -> None:
+    shapes, faces = with_second_piece(bars.keyframes, bars.faces)
+    variation = Variation(shapes + 100, faces)
+    bending = variation.average + variation.deviations
+    components = Components(variation.coordinates, bending, 2, variation.origin)
+    back = components.shapes(components.coordinates(shapes))
+    assert max(far(x, y) for x, y in zip(back, shapes, strict=True)) < 1e-9
+    assert components.coordinates(shapes[:0]).shape == (0, 2) and components.shapes(torch.zeros(0, 2)).shape[0] == 0
+
+
+def test_collapsed_triangles_turn_with_their_neighbours(bars: Shapes) -> None:
+    corners = bars.faces[40]
+    for places in ([1], [0, 1, 2]):  # in one shape, and in all
+        shapes = bars.keyframes.clone()
+        shapes[places, corners[1]] = shapes[places, corners[0]]
+        coordinates = BendingCoordinates(shapes[0], bars.faces)
+        found = coordinates.of(shapes)
+        assert bool(found.isfinite().all())
+        assert max(far(x, y) for x, y in zip(coordinates.shapes(found), shapes, strict=True)) < 0.02
 
 
 def test_a_bend_is_found_again(bars: Shapes, generator: torch.Generator) -> None:

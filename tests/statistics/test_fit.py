@@ -3,16 +3,17 @@
 import pytest
 import torch
 from conftest import Shapes
-from test_coordinates import far
+from test_coordinates import far, with_second_piece
 from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.statistics.fit import Fit, followed
+from torch_modal.statistics.fit import Fit, fit, followed
 from torch_modal.statistics.observations import Observations
 from torch_modal.statistics.patches import LocalMixtures, Patches
+from torch_modal.statistics.variation import Variation
 
 DOUBLE = torch.float64
 
@@ -126,6 +127,48 @@ def test_outliers_are_ignored_if_asked(creature: tuple[tm.ShapeSpace, Tensor]) -
 
     assert error(robust.shape) < 0.3 * error(plain.shape)
     assert float(robust.trust[[3, 17]].max()) < 0.05 and float(robust.trust.median()) > 0.5
+
+
+def test_second_pieces_and_vertices_of_no_face_are_met(bars: Shapes) -> None:
+    shapes, faces = with_second_piece(bars.keyframes, bars.faces)
+    variation, n = Variation(shapes, faces), bars.keyframes.shape[1]
+    picked = torch.cat([markers(bars.keyframes[0], 20), torch.arange(n, n + 6)])
+    points = shapes[2, picked] - variation.origin
+    found = fit(
+        variation, Observations(points, picked, torch.ones_like(points[:, 0])), torch.full((3,), 1 / 3, dtype=DOUBLE)
+    )
+    off = (found.shape - shapes[2] + variation.origin).norm(dim=-1) / variation.size
+    assert float(off.max()) < 0.01
+
+
+def test_far_from_the_origin(bars: Shapes) -> None:
+    bases = [tm.ModalBasis(b.reference + 1e6, b.eigenvalues, b.modes, b.rigid_eigenvalues) for b in bars.bases]
+    space, near = (tm.ShapeSpace(some, bars.faces, dtype=DOUBLE) for some in (bases, bars.bases))
+    picked = markers(bars.keyframes[1])
+    points = bars.keyframes[1][picked]
+    torch.testing.assert_close(space.fit(points, picked).shape, near.fit(points, picked).shape, rtol=0, atol=1e-4)
+    one, other = (each.sample(2, torch.Generator().manual_seed(0)) for each in (space, near))
+    torch.testing.assert_close(one - 1e6, other, rtol=0, atol=1e-4)
+
+
+def test_no_sets_of_points(space: tm.ShapeSpace) -> None:
+    found = space.fit(torch.zeros(2, 0, 5, 3), torch.arange(5))
+    assert [x.shape[2:] for x in found] == [(space.n_vertices, 3), (3, space.n_vertices), (5,), (5,)]
+    assert found.shape.shape[:2] == (2, 0)
+
+
+def test_second_derivatives_are_refused(space: tm.ShapeSpace, bars: Shapes) -> None:
+    picked = markers(bars.keyframes[1], 12)
+    leaf = (0.5 * (bars.keyframes[1] + bars.keyframes[2])[picked]).requires_grad_()
+    with pytest.raises(RuntimeError, match="first derivatives only"):
+        torch.autograd.grad(space.fit(leaf, picked).shape.sum(), leaf, create_graph=True)
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e-3])
+def test_points_in_other_units(space: tm.ShapeSpace, bars: Shapes, scale: float) -> None:
+    picked = markers(bars.keyframes[1], 12)
+    with pytest.raises(ValueError, match="in other units"):
+        space.fit(scale * bars.keyframes[1][picked], picked)
 
 
 def test_a_keyframe_comes_back(space: tm.ShapeSpace, bars: Shapes) -> None:

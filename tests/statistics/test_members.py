@@ -57,6 +57,12 @@ def test_a_draw_that_always_folds_is_a_key_frame(space: tm.ShapeSpace, monkeypat
     assert torch.equal(own.argmax(0), weights.argmax().expand(own.shape[1])) and torch.equal(own.sum(0), own.amax(0))
 
 
+def test_small_concentrations_draw_single_key_frames(space: tm.ShapeSpace) -> None:
+    generator = seeded()
+    largest = [float(space.variation().draw(1e-3, 0, generator)[0].max()) for _ in range(50)]
+    assert sum(value > 0.99 for value in largest) > 45
+
+
 def test_concentration_and_locality(space: tm.ShapeSpace) -> None:
     variation = space.variation()
     few, many = (torch.stack([variation.draw(c, 0.0, seeded(i))[0] for i in range(50)]) for c in (0.1, 100.0))

@@ -59,6 +59,10 @@ class ShapeBatch(NamedTuple):
         given = torch.ones(len(space), dtype=torch.bool)
         return cls(space.keyframes(like), number, given, vertex_labels, shape_labels)
 
+    def scaled(self, factor: float) -> "ShapeBatch":
+        """A copy with the shapes multiplied by a number."""
+        return self if factor == 1 else self._replace(shapes=factor * self.shapes)
+
     def located(self, space: ShapeSpace) -> "ShapeBatch":
         """A copy with the nearest key-frame of each shape."""
         nearest = space.nearest(self.shapes) if self.nearest is None else self.nearest
@@ -138,9 +142,9 @@ class ShapeAugmentation(nn.Module):
         """Transform all shapes of a batch.
 
         Args:
-            batch: The shapes, with their nearest key-frames if there is a space.
+            batch: The shapes, with their nearest key-frames if there is a space, in its units.
             params: Their parameters, on their device.
-            space: Key-frames and modes.
+            space: Key-frames and modes, of a size that float32 can square (:meth:`ShapeSpace.in_units`).
             pool: The shapes that partners are drawn from.
         """
         raise NotImplementedError
@@ -203,15 +207,20 @@ class ShapeAugmentation(nn.Module):
         own = {name: value[chosen.to(value.device)] for name, value in own.items()}
         if space is None or not self.uses_keyframes:
             return batch.put(chosen, self.apply_transform(batch.rows(chosen), own, space, Pool(batch, chosen)))
-        batch = batch.located(space)
+        unit, space = space.unit, space.in_units()
+        batch = batch.scaled(1 / unit).located(space)
         mine = batch.rows(chosen)
         if pool is None:
             others = Pool(batch, chosen)
         elif len(pool.shapes) == len(space):
-            others = Pool(pool.located(space), mine.nearest, None if space.motion is None else space.motion.neighbours)
+            others = Pool(
+                pool.scaled(1 / unit).located(space),
+                mine.nearest,
+                None if space.motion is None else space.motion.neighbours,
+            )
         else:
             raise ValueError(f"a pool holds the {len(space)} key-frames of the space; got {len(pool.shapes)} shapes")
-        return batch.put(chosen, self.apply_transform(mine, own, space, others))
+        return batch.put(chosen, self.apply_transform(mine, own, space, others)).scaled(unit)
 
     def forward(
         self,

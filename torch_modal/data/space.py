@@ -1,8 +1,10 @@
 """Key-frames of one connectivity with their modes, and what augmentations compute from them at first use."""
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
@@ -16,6 +18,7 @@ from torch_modal.data.motion import Motion, Span
 from torch_modal.data.reference import KeyframeReference, keyframe_reference
 from torch_modal.data.stored import StoredSet
 from torch_modal.data.table import interpolate, read_table, write_table
+from torch_modal.geometry.canonical import size
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
@@ -36,6 +39,9 @@ from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.observations import Observations, checked_observations, checked_weights
 from torch_modal.statistics.variation import Variation
 from torch_modal.version import __version__
+
+# Sizes whose squares, and squares of areas, are usual numbers of float32.
+_SIZES = 1e-3, 1e6
 
 # Key-frames whose modes a mean has, at most.
 _BASES_OF_MEAN = 6
@@ -124,6 +130,8 @@ class ShapeSpace:
         self.folder = None if folder is None else Path(folder)
         self.motion = Motion.of(keyframe_times, len(self.bases), cyclic)
         self._made: dict[str, Recent] = {}
+        #: The space in the caller's units, if this is another (:meth:`in_units`).
+        self._given: ShapeSpace | None = None
 
     @classmethod
     def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
@@ -163,6 +171,27 @@ class ShapeSpace:
     @kept(4)
     def _keyframes_like(self, like: Tensor) -> Tensor:
         return torch.stack([basis.reference for basis in self.bases]).to(like)
+
+    @property
+    def unit(self) -> float:
+        """A power of two near the size of the first key-frame, or 1 where its squares are usual numbers of float32."""
+        length = self._size()
+        return 1.0 if _SIZES[0] <= length <= _SIZES[1] else 2.0 ** round(math.log2(length))
+
+    @kept(1)
+    def _size(self) -> float:
+        return size(self.bases[0].reference.double().numpy(), self.faces.numpy())
+
+    @kept(1)
+    def in_units(self) -> "ShapeSpace":
+        """The same space with key-frames divided by :attr:`unit`, for computations in float32; tables are shared."""
+        if self.unit == 1:
+            return self
+        found = copy(self)
+        found._made, found._given = {}, self
+        parts = ((b.reference / self.unit, b.eigenvalues, b.modes, b.rigid_eigenvalues) for b in self.bases)
+        found.bases = [ModalBasis(*part) for part in parts]
+        return found
 
     def nearest(self, x: Tensor) -> Tensor:
         """Index of the closest key-frame, up to a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
@@ -220,7 +249,7 @@ class ShapeSpace:
         if not 1 <= n <= most:
             raise ValueError(f"{len(self)} key-frames have {most} components; got n={n}")
         variation = self.variation()
-        return Components(variation.coordinates, variation.average + variation.deviations, n)
+        return Components(variation.coordinates, variation.average + variation.deviations, n, variation.origin)
 
     @kept(1)
     def variation(self) -> Variation:
@@ -273,7 +302,7 @@ class ShapeSpace:
         out = torch.empty(n, self.n_vertices, 3, dtype=self.dtype)
         for i in range(n):
             weights, factors = variation.draw(concentration, locality, generator)
-            out[i] = variation.member(weights, factors)[0]
+            out[i] = variation.member(weights, factors)[0] + variation.origin
         return out
 
     def fit(
@@ -285,7 +314,7 @@ class ShapeSpace:
         of key-frames that looks most like it. Of several sets of points, each is met on its own.
 
         Gradients reach the points. They are those of weights and rigid motion, by the implicit function theorem; the
-        elastic steps that follow, and the trust in points, are constants of the graph.
+        elastic steps that follow, and the trust in points, are constants of the graph. There are no second derivatives.
 
         Args:
             points: In the caller's units, of at least three vertices; any rigid motion is followed. *Shape:*
@@ -300,7 +329,8 @@ class ShapeSpace:
             than of a key-frame that is moved rigidly, it is that one.
 
         Raises:
-            ValueError: There is only one key-frame, or points, vertices or weights do not fit.
+            ValueError: There is only one key-frame, points, vertices or weights do not fit, or the points are in other
+                units.
             RuntimeError: The points are within a transform of ``torch.func``, or have a tangent.
         """
         if transformed(points):
@@ -309,14 +339,14 @@ class ShapeSpace:
         places = checked_observations(points, vertices, self.n_vertices)
         variation = self.variation()
         found = []
-        for own in points.reshape(-1, *points.shape[-2:]):
+        for own in points.reshape(points.shape[:-2].numel(), *points.shape[-2:]):
             known = own.to("cpu", torch.float64)
             to = Observations(known, places, torch.ones_like(known[:, 0]))
             found.append(fit(variation, to, about, robust))
-        lead = points.shape[:-2]
+        lead, v, n = points.shape[:-2], self.n_vertices, len(places)
         if not found:
-            sizes = (self.n_vertices, 3), (len(self), self.n_vertices), points.shape[-2:-1], points.shape[-2:-1]
-            return Fitted(*(points.new_zeros(*lead, *size) for size in sizes))
+            sizes = (v, 3), (len(self), v), (n,), (n,)
+            return Fitted(*(points.new_zeros(*lead, *shape) for shape in sizes))
         return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
 
     # ------------------------------------------------------------------------------------------- computed at first use
@@ -365,6 +395,8 @@ class ShapeSpace:
         """In-betweens of two key-frames at even times, from disk if stored. *Shape:* ``(T, V, 3)``."""
         if self.times is None:
             raise ValueError("a space of times=None solves each in-between: it has no tables")
+        if self._given is not None:
+            return self._given.table(i, j) / self._given.unit
         path, key = self._place(i, j)
         stored = None if path is None else read_table(path, key)
         if stored is not None:

@@ -290,9 +290,8 @@ class SumOfEnergies(nn.Module):
     def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
         found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
-        gradient, gauss_newton, *others = (
-            None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True)
-        )
+        sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True)]
+        gradient, gauss_newton, *others = sums
         eye = torch.eye(a.shape[-1]).to(gauss_newton)
         return Derivatives(gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
 

@@ -57,12 +57,13 @@ def best_rotation(covariance: Tensor) -> Tensor:
         covariance: ``A = sum_v w_v y_v x_v^T``. *Shape:* ``(..., 3, 3)``.
 
     Returns:
-        *Shape:* ``(..., 3, 3)``, determinant one.
+        *Shape:* ``(..., 3, 3)``, determinant one; NaN where the covariance is not finite.
     """
-    u, _, vh = torch.linalg.svd(covariance.detach())
+    finite = covariance.detach().isfinite().all(-1).all(-1)[..., None, None]
+    u, _, vh = torch.linalg.svd(torch.where(finite, covariance.detach(), 0))  # raises on a NaN anywhere in a batch
     sign = torch.ones_like(u[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)
-    rotation = (u * sign[..., None, :]) @ vh
+    rotation = torch.where(finite, (u * sign[..., None, :]) @ vh, torch.nan)
     if not torch.is_grad_enabled() and (traced(covariance) or not transformed(covariance)):
         return rotation
     for _ in range(2):

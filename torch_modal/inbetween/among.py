@@ -119,7 +119,8 @@ class Among(Between):
         difference, column = space.difference(_combined(parts, fine), _combined(parts, coarse), straight)
         extras = levels.seen(space.column(difference), column) if levels.sampled else [column] * len(levels.energies)
         references = levels.among(levels.seen(fine, coarse), weights, stiffness)
-        base, starts, coarse_base = straight, (straight,), coarse_straight
+        starts: tuple[Tensor, ...] = (straight,)
+        base, coarse_base = straight, coarse_straight
         if space.blend is not None:
             base = space.blend.among(fine, weights, straight)
             starts, coarse_base = (base, straight), frame.coarsen(base)

@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.geometry.closest import ClosestFaces, closest_on_triangles
 
-# Triangles that are looked at for each point: those whose middles are nearest.
+# Triangles that are looked at for each point beside the nearest: those with the nearest centroids.
 CANDIDATES = 8
 
 # Triangles farther than the nearest by this part of its distance have no influence.
@@ -15,9 +15,6 @@ WIDTH = 1.0
 
 # Of points that are on the surface but for this part of the diagonal, the nearest triangle alone decides.
 ON_SURFACE = 1e-9
-
-# Triangles with less than this part of the area that their sides allow are lines.
-FLAT = 1e-12
 
 # Points that are bound at a time.
 CHUNK = 65_536
@@ -42,26 +39,30 @@ def binding(
     Returns:
         *Shape:* ``(P, V)``.
     """
-    corners = vertices[faces]
+    surface = ClosestFaces(vertices, faces)
     extent = float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
-    tree = cKDTree(corners.mean(1))
     touching = _touching(faces, len(vertices))
     at_vertex = None if anchors is None else _faces_at(faces, len(vertices))
     found = []
     for first in range(0, len(points), CHUNK):
         own = points[first : first + CHUNK]
-        candidates = tree.query(own, k=np.arange(1, min(CANDIDATES, len(faces)) + 1))[1]
+        candidates = surface.centroids.query(own, k=np.arange(1, min(CANDIDATES, len(faces)) + 1))[1]
+        # The centroid of a long triangle may be far from its closest point.
+        free = np.arange(len(own)) if anchors is None else np.flatnonzero(anchors[first : first + CHUNK] < 0)
+        nearest = surface(own[free])
+        missed = ~(candidates[free] == nearest[:, None]).any(1)
+        candidates[free[missed], -1] = nearest[missed]
         if anchors is not None and at_vertex is not None:
             around = at_vertex[anchors[first : first + CHUNK]]
             widest = max(around.shape[1], candidates.shape[1])
             known = around[:, :1] >= 0
             around, candidates = (_widened(rows, widest) for rows in (around, candidates))
             candidates = np.where(known, around, candidates)
-        barycentric, distance = closest_on_triangles(own[:, None], corners[candidates])
+        barycentric, distance = closest_on_triangles(own[:, None], surface.corners[candidates])
         distance[candidates < 0] = np.inf
         best = distance.argmin(1)[:, None]
-        nearest = np.take_along_axis(distance, best, 1)
-        share = np.maximum(1 - (distance - nearest) / (WIDTH * nearest + ON_SURFACE * extent), 0) ** 2
+        least = np.take_along_axis(distance, best, 1)
+        share = np.maximum(1 - (distance - least) / (WIDTH * least + ON_SURFACE * extent), 0) ** 2
         row, column = np.nonzero(share)
         closest = np.take_along_axis(candidates, best, 1)
         apart = ~_stored(touching, closest[row, 0] * len(faces) + candidates[row, column])
@@ -75,48 +76,9 @@ def binding(
     return sparse.vstack(found, format="csr") if found else sparse.csr_matrix((0, len(vertices)))
 
 
-def closest_on_triangles(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Barycentric coordinates of the closest points on triangles, and the distances.
-
-    Args:
-        points: *Shape:* ``(..., 3)``.
-        corners: *Shape:* ``(..., 3, 3)``.
-
-    Returns:
-        *Shape:* ``(..., 3)``, ``(...)``.
-    """
-    a = corners[..., 0, :]
-    first, second, to_point = corners[..., 1, :] - a, corners[..., 2, :] - a, points - a
-    along, across = _dot(first, to_point), _dot(second, to_point)
-    ff, ss, fs = _dot(first, first), _dot(second, second), _dot(first, second)
-    determinant = ff * ss - fs**2
-    tiny = np.finfo(np.float64).tiny
-    per_area = 1 / np.maximum(determinant, tiny)
-    v, w = (ss * along - fs * across) * per_area, (ff * across - fs * along) * per_area
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (determinant > FLAT * ff * ss)
-    # Else it is on a side: the nearest of three.
-    zero, third = np.zeros_like(v), second - first
-    on_first, on_second, on_third = (
-        np.clip(part / np.maximum(whole, tiny), 0, 1)
-        for part, whole in ((along, ff), (across, ss), (_dot(third, to_point - first), _dot(third, third)))
-    )
-    pairs = (on_first, zero), (zero, on_second), (1 - on_third, on_third)
-    sides = np.stack([np.stack(pair, -1) for pair in pairs], -2)  # (..., 3, 2)
-    gaps = to_point[..., None, :] - sides @ np.stack([first, second], -2)
-    nearest = _dot(gaps, gaps).argmin(-1)[..., None, None]
-    at = np.where(inside[..., None], np.stack([v, w], -1), np.take_along_axis(sides, nearest, -2)[..., 0, :])
-    gap = to_point - at[..., :1] * first - at[..., 1:] * second
-    return np.maximum(np.concatenate([1 - at.sum(-1, keepdims=True), at], -1), 0), np.sqrt(_dot(gap, gap))
-
-
 def _widened(rows: IntArray, n: int) -> IntArray:
     """Rows of this length, filled with -1."""
     return np.pad(rows, ((0, 0), (0, n - rows.shape[1])), constant_values=-1)
-
-
-def _dot(x: FloatArray, y: FloatArray) -> FloatArray:
-    product: FloatArray = np.einsum("...i,...i->...", x, y)
-    return product
 
 
 def _incidence(faces: IntArray, n_vertices: int) -> sparse.csr_matrix:

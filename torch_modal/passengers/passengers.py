@@ -27,9 +27,10 @@ class Passengers(nn.Module):
     .. math::
         p'(x) = \sum_v w_v \left(x_v + R_v(x)\, (p - \bar x_v)\right)
 
-    (embedded deformation, Sumner et al. 2007, with rotations that follow from the shape). Points on the surface stay on
-    its triangles; rigid motions are followed exactly. Parts that are near in space and not along the surface, such as
-    fingers, do not pull on each other's points. The time is linear in the number of points.
+    (embedded deformation, Sumner et al. 2007, with rotations that follow from the shape). Rigid motions are followed
+    exactly, and so are the carrier's own vertices; points within a triangle follow a surface that is rounder than it,
+    and leave it by a part of its sides where its corners turn apart. Parts that are near in space and not along the
+    surface, such as fingers, do not pull on each other's points. The time is linear in the number of points.
 
     Results have the dtype and the device of the shapes, where the module has to be too (``.to``). Gradients reach the
     shapes.
@@ -58,9 +59,14 @@ class Passengers(nn.Module):
         for name, x in (("reference", reference), ("points", points)):
             if x.dim() != 2 or x.shape[1] != 3 or not x.is_floating_point() or not bool(x.isfinite().all()):
                 raise ValueError(f"{name} holds finite numbers of the shape (n, 3); got {tuple(x.shape)} of {x.dtype}")
-        if int(corners.max()) >= len(reference):
-            raise ValueError(f"the faces name vertex {int(corners.max())}; the reference has {len(reference)}")
-        if anchors is not None and (anchors.shape != points.shape[:1] or bool((anchors >= len(reference)).any())):
+        if corners.dim() != 2 or corners.shape[1] != 3 or not len(corners):
+            raise ValueError(f"faces have the shape (F, 3), with one or more; got {tuple(corners.shape)}")
+        for number in (int(corners.min()), int(corners.max())):
+            if not 0 <= number < len(reference):
+                raise ValueError(f"the faces name vertex {number}; the reference has {len(reference)}, from 0 on")
+        if anchors is not None and (
+            anchors.shape != points.shape[:1] or bool(((anchors < -1) | (anchors >= len(reference))).any())
+        ):
             raise ValueError(f"anchors hold a vertex of {len(reference)} for each of {len(points)} points, or -1")
         own, bound = (x.detach().double().cpu() for x in (reference, points))
         first, second, _ = _sides(own.mT, corners)
@@ -103,7 +109,7 @@ class Passengers(nn.Module):
 
     @full_precision
     def forward(self, shapes: Tensor) -> Tensor:
-        """The points of each shape. *Shape:* ``(..., V, 3) -> (..., P, 3)``.
+        """The points of each shape; NaN for a shape that is not finite. *Shape:* ``(..., V, 3) -> (..., P, 3)``.
 
         Raises:
             ValueError: Shapes of another carrier, dtype or device.
@@ -143,7 +149,8 @@ class Passengers(nn.Module):
             )
         if shapes.device != self.reference.device:
             raise ValueError(f"shapes are on {shapes.device}, the passengers on {self.reference.device}; use .to()")
-        return shapes.reshape(-1, *shapes.shape[-2:])
+        flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:])
+        return torch.where(flat.isfinite().all((1, 2), keepdim=True), flat, torch.nan)
 
     def _deformation(self, x: Tensor) -> Tensor:
         """Mean deformation gradient around each vertex. *Shape:* ``(B, V, 3) -> (B, V, 3, 3)``."""
@@ -168,6 +175,7 @@ class Passengers(nn.Module):
         found: Tensor = _Product.apply(columns, *self._matrix(values))
         return found.unflatten(1, (len(values), values.shape[2])).movedim(1, 0)
 
+    @lasting
     def _matrix(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The weights and their transpose, of a dtype and on a device."""
         key = like.dtype, like.device

@@ -29,11 +29,16 @@ class Consistency:
         """Farthest-point samples and the distances to them. *Shape:* ``(m,), (n, m)``."""
         return farthest_points(self.first, N_SAMPLES)
 
-    def distortion(self, vertices: IntArray) -> float:
-        """Mean over the vertices of the largest distance error to a sample. *Shape:* ``(n_first,)``."""
+    def errors(self, vertices: IntArray) -> FloatArray:
+        """Errors of the distances from vertices to samples. *Shape:* ``(n_first,) -> (n_first, m)``."""
         samples, here = self._samples
         there = self.second.geodesics_from(vertices[samples])[vertices]
-        return float(np.abs(here - there).max(1).mean())
+        found: FloatArray = np.abs(here - there)
+        return found
+
+    def distortion(self, vertices: IntArray) -> float:
+        """Mean over the vertices of the largest distance error to a sample. *Shape:* ``(n_first,)``."""
+        return float(self.errors(vertices).max(1).mean())
 
     def repaired(self, found: Map) -> Map | None:
         """A map from the mutually consistent samples; None if they are few.

@@ -28,11 +28,11 @@ from torch_modal.registration.maps import (
     spectral_maps,
     zoom_out,
 )
-from torch_modal.registration.report import Quality, Registration, judge, measure
+from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp, support
 from torch_modal.registration.spectrum import SpectralShape, main_part
 from torch_modal.registration.surface import MeshSurface, outward, referenced
 
-VERSION = 4
+VERSION = 5
 """Part of the cache key: raise it when the algorithm changes."""
 MIN_LANDMARKS = 5
 """Minimum number of landmarks between different subjects, whose spectra do not determine the map."""
@@ -46,6 +46,8 @@ _SAME = 0.1  # 98th percentile of the distance of maps that count as equal, for 
 _REFINEMENTS = (True, True, False, False)  # whether each map is first refined by spectra
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
+_MOST = 0.8  # part of a vertex's distances that are right where the vertex is, though parts are missing
+_MISPLACED = 0.15, 0.05  # largest error of these, for a surface of unit area: no confidence, full confidence
 _RESCALED = 0.02  # logarithm of the global scale above which the fit is repeated
 
 
@@ -128,6 +130,7 @@ def register(
     corners = torch.from_numpy(np.unique(welded_goal.vertex_of.numpy(), return_index=True)[1])[found.target_corners]
     return found._replace(
         positions=welded.scatter(found.positions).to(checked.keyframes),
+        vertex_confidence=found.vertex_confidence[welded.vertex_of],
         target_faces=found.target_faces[welded.vertex_of],
         barycentric=found.barycentric[welded.vertex_of],
         target_corners=corners[welded.vertex_of],
@@ -307,14 +310,25 @@ class _RegistrationProblem:
             rows = self.template.rows(self.template.closest(self.marks))
             errors = np.linalg.norm(rows @ x - self.mark_places, axis=1) * (100 / WORKING_DIAGONAL)
         lead = float(self.mirrored - (score - distortion))
+        supported = support(self.template, x, self.target)
+        if self.same_subject:
+            # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
+            misplaced = np.quantile(self.consistency.errors(images), _MOST, axis=1)
+            near = self.first.nearest(self.template.vertices, self.template.vertex_normals)
+            supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
+        lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
+        quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
         confidence, said = judge(
             quality, score, distortion, errors, lead, same_subject=self.same_subject, landmarks=bool(len(self.marks))
         )
+        of_vertices = np.full(len(everything), confidence)
+        of_vertices[self.used] = supported
         closest = self.target.closest(everything)
         corners = self.target_vertices[self.target.faces[closest.faces]]
         return Registration(
             positions=torch.from_numpy(everything * self.unit + self.origin),
             confidence=confidence,
+            vertex_confidence=torch.from_numpy(of_vertices),
             map_score=score,
             distortion=distortion,
             **quality._asdict(),

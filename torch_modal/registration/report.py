@@ -99,6 +99,17 @@ def _unsupported(template: MeshSurface, shape: MeshSurface, target: MeshSurface)
     return found
 
 
+def support(template: MeshSurface, x: FloatArray, target: MeshSurface) -> FloatArray:
+    """Part of the area around each vertex that has a counterpart on the target. *Shape:* ``(V, 3) -> (V,)``."""
+    shape = template.moved(x)
+    areas = template.face_areas * ~_unsupported(template, shape, _without_strays(target, shape))
+    own, whole = (
+        np.bincount(template.faces.reshape(-1), np.repeat(a, 3), len(x)) for a in (areas, template.face_areas)
+    )
+    found: FloatArray = own / np.maximum(whole, np.finfo(np.float64).tiny)
+    return found
+
+
 class Registration(NamedTuple):
     """A template registered to a target. Lengths are in percent of the target's bounding-box diagonal."""
 
@@ -109,6 +120,8 @@ class Registration(NamedTuple):
     """
     confidence: float
     """From 0 to 1; below 0.5 the result is doubtful, and ``warnings`` gives the reasons."""
+    vertex_confidence: torch.Tensor
+    """From 0 to 1 for each vertex: low where the target has no part for it. *Shape:* ``(V,)``."""
     map_score: float
     """Oriented area minus three times the round-trip error of the coarse map; at most 1."""
     distortion: float
@@ -202,9 +215,9 @@ class Registration(NamedTuple):
         )
 
 
-def _ramp(value: float, bad: float, good: float) -> float:
+def ramp(value: Any, bad: float, good: float) -> Any:
     """Linear ramp from 0 at ``bad`` to 1 at ``good``."""
-    return float(np.clip((value - bad) / (good - bad), 0, 1))
+    return np.clip((value - bad) / (good - bad), 0, 1)
 
 
 def judge(
@@ -223,25 +236,25 @@ def judge(
     )
     distance = max(quality.to_target.mean, quality.from_target.mean)
     signs = [
-        (_ramp(distance, 1.0, 0.3), f"the mean distance of the surfaces is {distance:.2f} % of the diagonal"),
-        (_ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
+        (ramp(distance, 1.0, 0.3), f"the mean distance of the surfaces is {distance:.2f} % of the diagonal"),
+        (ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
         (
-            _ramp(quality.unsupported_area, 0.05, 0.02),
+            ramp(quality.unsupported_area, 0.05, 0.02),
             f"{100 * quality.unsupported_area:.1f} % of the area have no target beside them",
         ),
     ]
     if same_subject:
         said_of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
-        signs.append((_ramp(map_score - distortion, 0.32, 0.70), said_of_map))
-        signs.append((_ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"))
-        signs.append((_ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"))
+        signs.append((ramp(map_score - distortion, 0.32, 0.70), said_of_map))
+        signs.append((ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"))
+        signs.append((ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"))
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
         signs.append(
             (
-                _ramp(landmark_errors[worst], 8.0, 2.0),
+                ramp(landmark_errors[worst], 8.0, 2.0),
                 f"landmark {worst} is {landmark_errors[worst]:.1f} % off its place",
             )
         )
     said = tuple(f"{what}; {advice}" for value, what in signs if value < TRUSTED)
-    return min(value for value, _ in signs), said
+    return float(min(value for value, _ in signs)), said

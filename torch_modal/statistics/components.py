@@ -15,13 +15,14 @@ class Components:
 
     Args:
         coordinates: About the mean.
-        bending: Those of the given shapes. *Shape:* ``(K, 6, F)``.
+        bending: Those of the given shapes. *Shape:* ``(K, 6, E)``.
         n: How many, at most one less than there are shapes.
+        origin: What was subtracted from the shapes. *Shape:* ``(3,)``.
     """
 
     @lasting
-    def __init__(self, coordinates: BendingCoordinates, bending: Tensor, n: int) -> None:
-        self._coordinates = coordinates
+    def __init__(self, coordinates: BendingCoordinates, bending: Tensor, n: int, origin: Tensor) -> None:
+        self._coordinates, self._origin = coordinates, origin
         self._average = bending.mean(0)
         off = ((bending - self._average) * coordinates.shares.sqrt()).flatten(1)
         left, values, _ = torch.linalg.svd(off, full_matrices=False)
@@ -33,7 +34,7 @@ class Components:
         self.variances = values.square() / max(len(bending) - 1, 1)
         #: Part of the whole variance that each has. *Shape:* ``(n,)``.
         self.shares = values.square() / off.square().sum().clamp_min(torch.finfo(off.dtype).tiny)
-        #: Of root mean square one over the area. *Shape:* ``(n, 6, F)``.
+        #: Of root mean square one over the area. *Shape:* ``(n, 6, E)``.
         self.directions = torch.einsum(
             "kn,kjf->njf", left / values.clamp_min(torch.finfo(off.dtype).tiny), bending - self._average
         )
@@ -43,17 +44,17 @@ class Components:
 
     def coordinates(self, shapes: Tensor) -> Tensor:
         """Coordinates of shapes along the components. *Shape:* ``(..., V, 3) -> (..., n)``."""
-        flat = shapes.reshape(-1, *shapes.shape[-2:]).to(self.directions)
+        flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:]).to(self.directions)
         off = (self._coordinates.of(flat) - self._average) * self._coordinates.shares
         found = torch.einsum("bjf,njf->bn", off, self.directions)
-        return found.view(*shapes.shape[:-2], -1).to(shapes)
+        return found.view(*shapes.shape[:-2], len(self)).to(shapes)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean; zeros give the average of rotations and strains.
 
         *Shape:* ``(..., n) -> (..., V, 3)``.
         """
-        flat = coordinates.reshape(-1, coordinates.shape[-1]).to(self.directions)
+        flat = coordinates.reshape(coordinates.shape[:-1].numel(), coordinates.shape[-1]).to(self.directions)
         bending = self._average + torch.einsum("bn,njf->bjf", flat, self.directions[: flat.shape[1]])
-        found = self._coordinates.shapes(bending)
+        found = self._coordinates.shapes(bending) + self._origin
         return found.view(*coordinates.shape[:-1], *found.shape[1:]).to(coordinates)

@@ -3,10 +3,11 @@
 import torch
 from torch import Tensor
 
+from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
-from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.triangle_frames import (
     BentTriangles,
     Frames,
@@ -20,8 +21,9 @@ from torch_modal.geometry.triangle_frames import (
 # Logarithmic strains beyond this, a factor of 3,000, are those of triangles without area.
 MOST_STRAIN = 8.0
 
-# Triangles smaller than this part of the mean have no coordinates: theirs would be rounding.
-SMALLEST_AREA = 1e-9
+# Triangles smaller than this part of the mean turn as a neighbour does, from neighbour to neighbour at most so often,
+# and do not stretch: their own rotations and strains would be rounding.
+SMALLEST_AREA, FLAT_ROUNDS = 1e-9, 8
 
 
 class BendingCoordinates:
@@ -29,6 +31,10 @@ class BendingCoordinates:
 
     Sums and multiples of them are shapes again: edges keep their lengths where triangles turn. They are the
     rotation-strain coordinates of Huang et al. 2011 with finite rotations in the place of infinitesimal ones.
+
+    What no triangle says has columns of its own, after those of the triangles: for each piece but the largest, how far
+    its centre is from where the vertices that it follows take it, and for each vertex of no face, how far it moves;
+    in sizes of the mean. E is the number of all columns.
 
     Args:
         mean: The shape whose coordinates are zero, float64 on the CPU. *Shape:* ``(V, 3)``.
@@ -42,37 +48,83 @@ class BendingCoordinates:
         self.frames = self._frames(mean[None])
         areas = 0.5 * self.frames.doubled_areas[0]
         self._has_area = areas > SMALLEST_AREA * areas.mean()
-        #: Weights of squared coordinates: parts of the area, twice beside the diagonal of strains. *Shape:* ``(6, F)``.
-        self.shares = areas / areas.sum() * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
+        self.size = size(mean.numpy(), faces.numpy())
+        loose = self.reconstruction.loose
+        used = torch.zeros(len(mean), dtype=torch.bool).index_fill(0, faces.flatten(), True)
+        self._unused = torch.nonzero(~used).flatten()
+        #: Weights of the vertices in the centre of each piece but the largest. *Shape:* ``(L, V)``.
+        self.centres = mean.new_zeros(len(loose), len(mean))
+        for row, (piece, _) in zip(self.centres, loose, strict=True):
+            row[piece] = self.reconstruction.poisson.shares[piece]
+        total = self.reconstruction.areas.sum()
+        pieces = mean.new_tensor([float(self.reconstruction.areas[piece].sum() / total) for piece, _ in loose])
+        parts = torch.cat([areas / areas.sum(), pieces, mean.new_zeros(len(self._unused))])
+        #: Weights of squared coordinates: parts of the area, twice beside the diagonal of strains. *Shape:* ``(6, E)``.
+        self.shares = parts * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
 
     def _frames(self, x: Tensor) -> Frames:
         return frames(sides(x.movedim(-1, 0).contiguous(), self.faces))
 
     def of(self, shapes: Tensor) -> Tensor:
-        """The coordinates of shapes, in the pose in which they fit the mean best. *Shape:* ``(B, V, 3) -> (B, 6, F)``.
+        """The coordinates of shapes, in the pose in which they fit the mean best. *Shape:* ``(B, V, 3) -> (B, 6, E)``.
 
         Rotations of up to a full turn, that neighbours share, are distinguished from their opposites.
         """
+        found, placed = [], self.aligned(shapes)
+        for x in placed:
+            rotations = LocalRotations(self.mesh, torch.stack([self.mean, x.detach()]))
+            own = self._frames(x[None])
+            bending = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
+            turn, strain = bending.turn[:, 0], torch.stack(bending.strain)[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
+            areas = own.doubled_areas[0]
+            flat = ~self._has_area | (areas <= SMALLEST_AREA * areas.mean())
+            flat = flat | ~(turn.isfinite().all(0) & strain.isfinite().all(0))
+            strain, above = torch.where(flat, 0, strain), rotations.ancestors[0]
+            for _ in range(FLAT_ROUNDS):
+                turn, flat = torch.where(flat, turn[:, above], turn), flat & flat[above]
+            found.append(torch.cat([torch.where(flat, 0, turn), strain]))
+        on_faces = torch.stack(found) if found else placed.new_zeros(0, 6, len(self.faces))
+        beyond = [
+            (torch.einsum("v,bvi->bi", row, placed)[:, None] - centre) @ motion.rotation
+            for row, (centre, motion) in zip(self.centres, self._followed(placed), strict=True)
+        ]
+        beyond.append(placed[:, self._unused] - self.mean[self._unused])
+        offsets = (torch.cat(beyond, 1) / self.size).mT
+        return torch.cat([on_faces, torch.cat([offsets, torch.zeros_like(offsets)], 1)], 2)
+
+    def _followed(self, shapes: Tensor) -> list[tuple[Tensor, RigidMotion]]:
+        """Where the vertices that it follows take the centre of each loose piece. *Shape:* ``(B, V, 3)``."""
         found = []
-        for x in self.aligned(shapes):
-            pair = torch.stack([self.mean, x.detach()])
-            turns = LocalRotations(self.mesh, pair).turns(self.mean[None], x[None])
-            bending = bending_between(self.frames, self._frames(x[None]), turns)
-            strain = torch.stack(bending.strain).clamp(-MOST_STRAIN, MOST_STRAIN)
-            found.append(torch.cat([bending.turn, strain])[:, 0])
-        return torch.where(self._has_area, torch.stack(found), 0)
+        for row, (_, anchors) in zip(self.centres, self.reconstruction.loose, strict=True):
+            before = self.mean[anchors].expand(len(shapes), -1, -1)
+            motion = best_fit(before, shapes[:, anchors], self.mean.new_ones(len(anchors)))
+            found.append((motion.apply((row @ self.mean).expand(len(shapes), 1, -1)), motion))
+        return found
+
+    def spread(self, fields: Tensor) -> Tensor:
+        """Means of fields on the vertices, for each column. *Shape:* ``(..., V) -> (..., E)``."""
+        return torch.cat([fields[..., self.faces].mean(-1), fields @ self.centres.mT, fields[..., self._unused]], -1)
+
+    def carries(self, vertices: Tensor) -> Tensor:
+        """Whether each column beyond those of the triangles moves a vertex. *Shape:* ``(n,) -> (n, E - F)``."""
+        return torch.cat([self.centres[:, vertices].mT > 0, vertices[:, None] == self._unused], 1)
 
     def aligned(self, shapes: Tensor) -> Tensor:
         """The shapes in the pose in which they fit the mean best. *Shape:* ``(B, V, 3)``."""
         return best_fit(shapes, self.mean.expand_as(shapes), self.reconstruction.areas).apply(shapes)
 
     def sides(self, coordinates: Tensor) -> Sides:
-        """The sides that triangles ask for. *Shape:* ``(B, 6, F)``."""
-        rows = coordinates.movedim(1, 0)
+        """The sides that triangles ask for. *Shape:* ``(B, 6, E)``."""
+        rows = coordinates[..., : len(self.faces)].movedim(1, 0)
         return bent_sides(BentTriangles(rows[:3], (rows[3], rows[4], rows[5])), self.frames)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
-        """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, F) -> (B, V, 3)``."""
+        """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
         rest = self.mean.mT[:, None].expand(-1, len(coordinates), -1).contiguous()
         found = self.reconstruction(self.sides(coordinates), rest).movedim(0, -1)
-        return self.aligned(found)
+        offsets = self.size * coordinates[:, :3, len(self.faces) :].mT
+        moves = offsets[:, : len(self.centres)].unbind(1)
+        for (piece, _), (_, motion), move in zip(self.reconstruction.loose, self._followed(found), moves, strict=True):
+            found = found.index_add(1, piece, (motion.rotation @ move[..., None]).mT.expand(-1, len(piece), -1))
+        unused = self.mean[self._unused] + offsets[:, len(moves) :]
+        return self.aligned(found).index_copy(1, self._unused, unused)

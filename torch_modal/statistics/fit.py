@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from torch_modal.autograd import recorded
 from torch_modal.backends.torch.fine_steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.triangle_frames import Sides, edge_means
@@ -31,6 +31,9 @@ FIRST_ROUND, NEXT_ROUND, N_ROUNDS = (6, 40), (4, 40), 3
 
 # By so many sizes, on average, points may be missed more than by a given shape.
 SLACK = 1e-3
+
+# Points extend over more or less than the same vertices of the key-frames by this factor only in other units.
+UNITS = 8.0
 
 # Rows of the Jacobian that are made at a time.
 CHUNK = 32
@@ -91,7 +94,10 @@ class Fit:
         factors = self.descended(factors, to, self.noise, MOST_STEPS)
         for _ in range(LAST_STEPS):
             slope = torch.func.grad(self.cost)(factors, to).flatten()
-            factors = factors - self.newton(factors, to, 0.5 * slope).view_as(factors)
+            tried = factors - self.newton(factors, to, 0.5 * slope).view_as(factors)
+            if not self.cost(tried, to) <= self.cost(factors, to):  # where the Hessian is indefinite
+                break
+            factors = tried
         return factors, to.weights
 
     def descended(self, factors: Tensor, to: Observations, noise: float, n_steps: int) -> Tensor:
@@ -101,7 +107,7 @@ class Fit:
             matrix, downhill = self._system(factors, to, noise)
             for _ in range(TRIALS):
                 eye = torch.eye(len(matrix)).to(matrix)
-                tried = factors + torch.linalg.solve(matrix + damping * eye, downhill).view_as(factors)
+                tried = factors + torch.linalg.solve_ex(matrix + damping * eye, downhill).result.view_as(factors)
                 value = self.cost(tried, to, noise)
                 if value < cost:
                     break
@@ -119,12 +125,15 @@ class Fit:
         """The Jacobian of the places, and they. *Shape:* ``(3n, K n_fields), (n, 3)``."""
         own, y = self.variation, self.variation.bending(self.variation.local(factors, self.about))
         slopes = _slopes(own, y)
-        fields = own.fields[:, own.faces].mean(-1)
+        fields = own.coordinates.spread(own.fields)
         deviations = own.deviations  # centred over the shapes, as the weights are
         rows = []
-        for first, second in zip(*(part.split(CHUNK) for part in self.influence), strict=True):
-            at_faces = first[:, None, None] * slopes[0] + second[:, None, None] * slopes[1]  # (n, 3, 6, F)
-            parts = [(at_faces * deviation).sum(2) @ fields.mT for deviation in deviations]
+        moves = own.coordinates.size * torch.eye(3, 6).to(y)[..., None]
+        beyond = own.coordinates.carries(self.to.vertices).to(y)
+        for first, second, carried in zip(*(part.split(CHUNK) for part in (*self.influence, beyond)), strict=True):
+            at_faces = first[:, None, None] * slopes[0] + second[:, None, None] * slopes[1]
+            at = torch.cat([at_faces, carried[:, None, None] * moves], -1)  # (n, 3, 6, E)
+            parts = [(at * deviation).sum(2) @ fields.mT for deviation in deviations]
             rows.append(torch.stack(parts, 2).flatten(2))
         return torch.cat(rows).flatten(0, 1), to.seen(self.shape(factors))
 
@@ -154,7 +163,9 @@ class Fit:
 
     def newton(self, factors: Tensor, to: Observations, right: Tensor) -> Tensor:
         """The inverse of half the Hessian, times a vector, by conjugate gradients. *Shape:* ``(K n,)``."""
-        factor = torch.linalg.cholesky(self._system(factors, to, self.noise)[0])
+        matrix = self._system(factors, to, self.noise)[0]
+        matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
+        factor = torch.linalg.cholesky_ex(matrix).L
 
         def precondition(x: Tensor) -> Tensor:
             return torch.cholesky_solve(x[:, None], factor)[:, 0]
@@ -172,8 +183,12 @@ class _Followed(torch.autograd.Function):
         return factors.clone()
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        if recorded(grad):
+            raise RuntimeError(
+                "fits have first derivatives only: second ones would lack the elastic steps, which are constants of "
+                "the graph; take the gradient without create_graph"
+            )
         factors, points = ctx.saved_tensors
         turned = ctx.given.newton(factors, ctx.to, grad.flatten()).view_as(factors)
         with torch.enable_grad():
@@ -197,13 +212,33 @@ def fit(variation: Variation, to: Observations, about: Tensor, robust: bool = Fa
         to: The observations.
         about: The weights that are most likely. *Shape:* ``(K,)``.
         robust: Whether outliers are to be ignored.
+
+    Raises:
+        ValueError: The points are in other units than the shapes.
     """
+    _check_units(variation, to)
     given = Fit(variation, to._replace(points=to.points.detach()), about)
     factors, trust = given.solved(robust)
     to = to._replace(weights=trust)
     if torch.is_grad_enabled() and to.points.requires_grad:
         factors = followed(given, factors, to)
     return _finished(variation, to, variation.local(factors, about))
+
+
+def _check_units(variation: Variation, to: Observations) -> None:
+    """Refuse points in units other than those of the key-frames.
+
+    Raises:
+        ValueError: They extend far less, or far more, than the same vertices of all key-frames.
+    """
+    seen = torch.cat([to.points.detach()[None], variation.shapes[:, to.vertices]])
+    # By medians, which a few outliers do not change.
+    extent, *known = (seen - seen.median(1, keepdim=True).values).norm(dim=-1).median(1).values.tolist()
+    if not min(known) / UNITS <= extent <= max(known) * UNITS:
+        raise ValueError(
+            f"the points extend over {extent:.3g} around their middle, the same vertices of the key-frames over "
+            f"{min(known):.3g} to {max(known):.3g}: they are in other units; scale them to those of the key-frames"
+        )
 
 
 def _finished(variation: Variation, to: Observations, weights: Tensor) -> Fitted:
@@ -278,4 +313,5 @@ def _slopes(own: Variation, y: Tensor) -> tuple[Tensor, Tensor]:
         leaf = y.detach().requires_grad_()
         ends = torch.cat(own.coordinates.sides(leaf[None]))[:, 0]
         rows = [torch.autograd.grad(row.sum(), leaf, retain_graph=True)[0] for row in ends]
-    return torch.stack(rows[:3]), torch.stack(rows[3:])
+    found = torch.stack(rows)[..., : len(own.faces)]
+    return found[:3], found[3:]

@@ -12,7 +12,6 @@ from torch_modal.energy.shell import ALPHA, BETA, DIAGONAL, GAMMA
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
-from torch_modal.geometry.canonical import size
 from torch_modal.geometry.triangle_frames import frames, sides
 from torch_modal.geometry.vectors import pick
 from torch_modal.statistics.coordinates import BendingCoordinates
@@ -34,21 +33,26 @@ ROUNDS, SMOOTHER = 4, 0.5
 class Variation:
     """Shapes whose parts are mixed from given ones with weights of their own.
 
+    All positions are relative to :attr:`origin`.
+
     Args:
         shapes: *Shape:* ``(K, V, 3)``, float64 on the CPU.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
     """
 
     def __init__(self, shapes: Tensor, faces: Tensor) -> None:
+        #: What is subtracted from all shapes: second moments far from the origin would be rounding. *Shape:* ``(3,)``.
+        self.origin = shapes[0, faces.flatten()].mean(0)
+        shapes = shapes - self.origin
         mean = _middle(shapes, faces)
         self.coordinates = BendingCoordinates(mean, faces)
         self.faces = faces
         #: Of the mean, in the caller's units.
-        self.size = size(mean.numpy(), faces.numpy())
+        self.size = self.coordinates.size
         #: The given shapes, turned on to the mean. *Shape:* ``(K, V, 3)``.
         self.shapes = self.coordinates.aligned(shapes)
         bending = self.coordinates.of(shapes)
-        #: Mean of the coordinates of all shapes, and how each differs. *Shape:* ``(6, F)``, ``(K, 6, F)``.
+        #: Mean of the coordinates of all shapes, and how each differs. *Shape:* ``(6, E)``, ``(K, 6, E)``.
         self.average = bending.mean(0)
         self.deviations = bending - self.average
         patches = Patches(mean, self.coordinates.reconstruction)
@@ -72,9 +76,8 @@ class Variation:
         return about[:, None] + (factors - factors.mean(0)) @ self.fields
 
     def bending(self, weights: Tensor) -> Tensor:
-        """Coordinates of local weights. *Shape:* ``(K, V) -> (6, F)``."""
-        on_faces = weights[:, self.faces].mean(-1)
-        return self.average + torch.einsum("kf,kjf->jf", on_faces, self.deviations)
+        """Coordinates of local weights. *Shape:* ``(K, V) -> (6, E)``."""
+        return self.average + torch.einsum("ke,kje->je", self.coordinates.spread(weights), self.deviations)
 
     def assembled(self, weights: Tensor) -> Tensor:
         """The shape whose triangles turn and stretch so, in the pose of the mean. *Shape:* ``(K, V) -> (V, 3)``."""
@@ -104,11 +107,12 @@ class Variation:
         """Random weights, and factors of the fields over which their logarithms vary. *Shape:* ``(K,), (K, n - 1)``."""
         device = torch.device("cpu") if generator is None else generator.device
         shape = torch.full((len(self),), concentration, dtype=torch.float64, device=device)
-        drawn = torch._standard_gamma(shape, generator=generator).cpu()
-        drawn = drawn.clamp_min(torch.finfo(drawn.dtype).tiny)
+        # Gamma variates by their logarithms: those of small concentrations underflow.
+        drawn = torch._standard_gamma(shape + 1, generator=generator).log()
+        drawn = drawn + torch.rand(len(self), dtype=torch.float64, generator=generator, device=device).log() / shape
         size = len(self), len(self.fields) - 1
         factors = torch.randn(size, dtype=torch.float64, generator=generator, device=device).cpu()
-        return drawn / drawn.sum(), locality * factors
+        return torch.softmax(drawn, 0).cpu(), locality * factors
 
     def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
         """A member of the set, in the pose of the mean, and its local weights; less local, if it would fold.
