@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.backends.torch.alignment import Pair
-from torch_modal.backends.torch.fine_steps import STEP_LENGTHS
+from torch_modal.backends.torch.fine_steps import step_length
 from torch_modal.contact.search import Contacts
 from torch_modal.contact.splines import splines
 from torch_modal.energy.modal_energy import SumOfEnergies
@@ -64,9 +64,5 @@ def together(member: Between, samples: Samples, pair: Pair, x: Tensor, active: C
         if int(info):
             break
         step = -torch.cholesky_solve(gradient.reshape(-1, 1), factor).reshape(at.shape)
-        before = value(at)
-        length = next((length for length in STEP_LENGTHS if bool(value(at + length * step) < before)), 0.0)
-        at = at + length * step
-        if not length:
-            break
+        at = at + step_length(value(at), (gradient * step).sum(), value(at + step)) * step
     return torch.tensordot(every, columns.combine(at), 1)

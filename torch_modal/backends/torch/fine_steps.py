@@ -1,13 +1,11 @@
 """An energy with every vertex free: a convex Hessian that is applied without being assembled, and steps with it."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from torch_modal import trees
-from torch_modal.autograd import flattened
 from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.energy import Energy, Linearised, Reference
 
@@ -17,8 +15,8 @@ RIDGE = 1e-6
 # A symmetric block from its upper triangle.
 _UNPACKED = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 
-# The whole step, and what is tried where it goes uphill. Contacts that a step activates need the shortest ones.
-STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.003, 0.001)
+# Roundings of an energy, relative to it, that make no step shorter.
+ENERGY_ROUNDING = 64.0
 
 
 class FurtherDerivatives(NamedTuple):
@@ -151,7 +149,7 @@ def relax(
     anchors: Tensor | None = None,
     beside: Sequence[FurtherEnergy] = (),
 ) -> Tensor:
-    """Steps of a truncated Newton method on all vertices, never uphill.
+    """Steps of a truncated Newton method on all vertices, shortened where the energy would rise.
 
     Each step solves with :class:`ConvexHessian` by conjugate gradients, preconditioned by its diagonal blocks and cut
     short: what a modal space leaves to be done is local, and a few iterations see far enough. Every sample takes the
@@ -176,11 +174,33 @@ def relax(
         at, more = energy.linearise(extended, reference), [one.at(rows.movedim(0, -1).contiguous()) for one in beside]
         right = -sum((one.gradient.movedim(-1, 0) for one in more), start=energy.fold(energy.gradient(at)))
         direction = _solved(energy, ConvexHessian(energy, at), right, n_products, more)
-        moves = energy.extend(direction)
+        reached = rows + direction
+        there = reached.movedim(0, -1).contiguous()
         before = sum((one.value for one in more), start=energy.value_at(at, reference))
-        length = _downhill(energy, before, extended, moves, reference, beside)
+        after = energy.value(energy.extend(reached, fixed), reference)
+        after = sum((one.value(there) for one in beside), start=after)
+        length = step_length(before, -(right * direction).sum((0, -1)), after)
         rows = rows + length[:, None] * direction
     return rows.movedim(0, -1)
+
+
+def step_length(before: Tensor, slope: Tensor, after: Tensor) -> Tensor:
+    """Where the parabola along a step is least, at most 1: a continuous function of the step, unlike a line search.
+
+    Args:
+        before: The energy where the step starts. *Shape:* ``(B,)``.
+        slope: Its derivative along the step, at most zero. *Shape:* ``(B,)``.
+        after: The energy where the whole step leads. *Shape:* ``(B,)``.
+
+    Returns:
+        *Shape:* ``(B,)``.
+    """
+    half, finite = -0.5 * slope, after.isfinite()
+    rounding = ENERGY_ROUNDING * torch.finfo(before.dtype).eps * before.detach().abs()
+    excess = (torch.where(finite, after, 0) - before + half - rounding).clamp_min(0)
+    shorter = excess > 0
+    length = torch.where(shorter, half / torch.where(shorter, half + excess, 1), 1)
+    return torch.where(finite, length, 0)
 
 
 def _solved(
@@ -241,74 +261,3 @@ def conjugate_gradients(
         previous, size = size, dot(residual, preconditioned)
         direction = preconditioned + quotient(size, previous) * direction
     return solution
-
-
-def _downhill(
-    energy: Energy,
-    before: Tensor,
-    rows: Tensor,
-    moves: Tensor,
-    reference: Reference,
-    beside: Sequence[FurtherEnergy],
-) -> Tensor:
-    """The longest of the steps that goes downhill. *Shape:* ``(B,), (3, B, V), (3, B, V) -> (B,)``."""
-    batched = (before, rows.transpose(0, 1), moves.transpose(0, 1), *trees.leaves(reference))
-    if torch.compiler.is_compiling():
-        # It looks at numbers: a graph ends here, and another begins. No decorator: that takes a second to import.
-        return torch.compiler.disable(_Length.apply)(energy, beside, trees.skeleton(reference), *batched)
-    return _Length.apply(energy, beside, trees.skeleton(reference), *batched)
-
-
-class _Length(torch.autograd.Function):
-    """The longest of the steps that goes downhill, of each sample; 0 where none does. It has no gradient."""
-
-    @staticmethod
-    def forward(
-        energy: Energy,
-        beside: Sequence[FurtherEnergy],
-        tree: Any,
-        before: Tensor,
-        x: Tensor,
-        moves: Tensor,
-        *inputs: Tensor,
-    ) -> Tensor:
-        rows, direction, reference = x.transpose(0, 1), moves.transpose(0, 1), trees.filled(tree, inputs)
-
-        def value(rows: Tensor) -> Tensor:
-            x = rows[..., : energy.n_vertices].movedim(0, -1).contiguous()
-            return sum((one.value(x) for one in beside), start=energy.value(rows, reference))
-
-        chosen = torch.zeros_like(before)
-        searching = torch.ones_like(before, dtype=torch.bool)
-        for length in STEP_LENGTHS:
-            downhill = searching & (value(rows + length * direction) < before)
-            chosen = torch.where(downhill, length, chosen)
-            searching = searching & ~downhill
-            if not bool(searching.any()):
-                break
-        return chosen
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.mark_non_differentiable(output)
-        ctx.n_inputs = len(inputs)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
-        """Nothing has a tangent."""
-
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
-        return (None,) * ctx.n_inputs
-
-    @staticmethod
-    def vmap(
-        info: Any,
-        in_dims: tuple[Any, ...],
-        energy: Energy,
-        beside: Sequence[FurtherEnergy],
-        tree: Any,
-        *tensors: Tensor,
-    ) -> tuple[Tensor, int]:
-        flat = flattened(info.batch_size, in_dims[-len(tensors) :], tensors)
-        return _Length.apply(energy, beside, tree, *flat).unflatten(0, (info.batch_size, -1)), 0

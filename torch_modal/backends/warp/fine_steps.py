@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import applied, flattened, pushed, recorded, traced
-from torch_modal.backends.torch.fine_steps import STEP_LENGTHS, FurtherDerivatives, FurtherEnergy, relax
+from torch_modal.backends.torch.fine_steps import FurtherDerivatives, FurtherEnergy, relax, step_length
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellPoint, ShellReference, WarpShell
 
@@ -80,7 +80,7 @@ class WarpSteps(WarpShell):
     def descend(
         self, x: Tensor, to: ShellReference, others: Sequence["FurtherEnergy"], n_steps: int, n_products: int
     ) -> Tensor:
-        """Steps of all vertices with other energies beside Eq. 5, never uphill; they have no gradient.
+        """Steps of all vertices with other energies beside Eq. 5; they have no gradient.
 
         Args:
             x: Where to start, float64. *Shape:* ``(B, V, 3)``.
@@ -110,10 +110,7 @@ class WarpSteps(WarpShell):
                     form.add_((pushed * direction).sum((1, 2)))
 
             solution = self.solved(x, at, to, n_products, beyond=beyond).solution
-            down = value(x + solution) < before
-            length = down.to(x)
-            if not bool(down.all()):
-                length = _shortened(x, solution, before, length, value)
+            length = step_length(before, _slope(at, solution), value(x + solution))
             x = x + length[:, None, None] * solution
         return x
 
@@ -144,9 +141,8 @@ class WarpSteps(WarpShell):
                 energy = there[0]
             else:
                 there, energy = None, self.value(reached, to)
-            down = energy < at.energy
-            if not bool(down.all()):
-                length = lengths[k] = _shortened(x, solution, at.energy, down.to(x), partial(self.value, to=to))
+            length = lengths[k] = step_length(at.energy, _slope(at, solution), energy)
+            if bool((length < 1).any()):
                 reached = x + length[:, None, None] * solution
                 there = self.at(reached, to) if k < n_steps - 1 else None
             x = reached
@@ -283,16 +279,9 @@ class WarpSteps(WarpShell):
         return to_x
 
 
-def _shortened(
-    x: Tensor, solution: Tensor, before: Tensor, length: Tensor, value: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """The first of the shorter steps that goes downhill, where the length is still 0. *Shape:* ``(B,)``."""
-    for shorter in STEP_LENGTHS[1:]:
-        downhill = (length == 0) & (value(x + shorter * solution) < before)
-        length = torch.where(downhill, shorter, length)
-        if bool(length.all()):
-            break
-    return length
+def _slope(at: ShellPoint, direction: Tensor) -> Tensor:
+    """Derivative of the energy along a direction. *Shape:* ``(B, V, 3) -> (B,)``."""
+    return (at.gradient * direction).sum((1, 2)) + at.moment * (at.normal * direction).sum((1, 2))
 
 
 class _Iterations(NamedTuple):
@@ -352,7 +341,8 @@ class _Relaxed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, to_shape: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         lengths, *given = ctx.saved_tensors
-        if recorded(to_shape, *given):  # torch differentiates its own code once more
+        # What is differentiated once more, and the lengths of steps that were shortened, are torch's.
+        if recorded(to_shape, *given) or bool((lengths < 1).any()):
             run = partial(ctx.fused.oracle, ctx.n_steps, ctx.n_products)
             return (None,) * 4 + torch.func.vjp(run, *given)[1](to_shape)
         given = [lengths, to_shape.contiguous(), *(value.detach().contiguous() for value in given)]
