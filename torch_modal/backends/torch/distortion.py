@@ -17,6 +17,9 @@ from torch_modal.geometry.vectors import cross, inverse, norm
 # Elements of each kind that are looked at, spread evenly: the sum is then known to a few percent.
 MOST_ELEMENTS = 1024
 
+# Strain of an edge from which on its contribution is linear: of edges that have no length at rest it means nothing.
+LARGEST_STRAIN = 4.0
+
 # Bound on the weight l^2 / A of a hinge with a needle; an equilateral hinge has 1.15.
 LARGEST_WEIGHT = 8.0
 
@@ -27,7 +30,7 @@ SLIGHT = 1e-4
 class Distortion(nn.Module):
     r"""Stretching and bending of Eq. 5 against both key-frames, with a bounded contribution of each element.
 
-    .. math:: \sum_e \alpha\, |l_e - \bar l_e| \min(|l_e - \bar l_e| / \bar l_e,\, 1)
+    .. math:: \sum_e \alpha\, |l_e - \bar l_e| \min(|l_e - \bar l_e| / \bar l_e,\, 4)
         + \sum_h \beta \min(\bar l_h^2 / \bar A_h,\, 8)\, f(\theta_h - \bar\theta_h)
 
     The key-frames have the weights ``1 - t`` and ``t``, or those given. Further terms of the energy count in full.
@@ -88,7 +91,7 @@ class Distortion(nn.Module):
         for end, pull in zip(rests.shapes, rests.pulls(), strict=True):
             length, angle, weight = trees.picked(measures(end), rests.which)
             off = (lengths - length).abs()
-            stretching = (alpha * off * (off / length).clamp_max(1)).sum(-1)
+            stretching = (alpha * off * (off / length).clamp_max(LARGEST_STRAIN)).sum(-1)
             bending = (beta * weight * periodic_square(angles - angle)).sum(-1)
             total = total + pull * (self.shares[0] * stretching + self.shares[1] * bending)
         return total  # type: ignore[no-any-return]

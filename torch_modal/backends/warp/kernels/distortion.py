@@ -14,7 +14,8 @@ from torch_modal.backends.warp.kernels.elements import (
 )
 
 LARGEST_WEIGHT = wp.constant(real(8.0))
-"""As in :mod:`torch_modal.inbetween.comparison`."""
+STRAIN = wp.constant(real(4.0))
+"""Both as in :mod:`torch_modal.backends.torch.distortion`."""
 
 
 @wp.func
@@ -42,7 +43,7 @@ def cost(found: vec4, rest: vec4, stretching: real, bending: real):
     off = wp.abs(found[0] - rest[0])
     turn = turn_between(wp.vec2d(rest[1], rest[2]), wp.vec2d(found[1], found[2]))[0]
     bend = turn * (real(2.0) + turn / real(3.0))
-    return stretching * off * wp.min(off / rest[0], real(1.0)) + bending * rest[3] * bend
+    return stretching * off * wp.min(off / rest[0], STRAIN) + bending * rest[3] * bend
 
 
 @wp.kernel(enable_backward=False)
