@@ -129,9 +129,9 @@ def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None
 
 def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     case = Case(small_bars, small_bars.faces, 10.0)
-    case.given[5] *= 1e8
+    case.given[5] *= 1e5
     found, lengths = case.fused.steps(2, 4, *(value.contiguous() for value in case.given))
-    assert len(lengths.unique()) > 1 and float(lengths.min()) < 0.5, "no line search in this case"
+    assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
     torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * DIAGONAL)
 
 
@@ -154,6 +154,15 @@ def test_vmap(small_bars: Shapes) -> None:
     found = vmap(lambda x: case.by_warp(x, *case.given[1:]))(moved)
     truth = torch.stack([case.by_warp(x, *case.given[1:]) for x in moved])
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-12 * DIAGONAL)
+
+
+def along_circle(gradient: Placement, at: Placement) -> Placement:
+    """A gradient in a placement whose part in the phases of angles is tangential: they have unit length."""
+    to: Any = gradient.reference
+    phase, own = at.reference.bend[..., 1:3], to.bend[..., 1:3]  # type: ignore[attr-defined]
+    tangent = own - (own * phase).sum(-1, keepdim=True) * phase
+    bend = torch.cat([to.bend[..., :1], tangent, to.bend[..., 3:]], -1)
+    return gradient._replace(reference=to._replace(bend=bend))
 
 
 class TestModal:
@@ -196,8 +205,9 @@ class TestModal:
         a, direction = torch.randn(2, 2, 5 + extra, dtype=DOUBLE, generator=generator).mul(0.1)
         (fused, own), _ = self.both(case, extra)
         with torch.no_grad():
-            found = trees.leaves(fused.pull_back(a, direction, own))
-        assert_alike(found, trees.leaves(fused.pull_back(a, direction, own)), 1e-10)  # by torch, to be differentiated
+            found = trees.leaves(along_circle(fused.pull_back(a, direction, own), own))
+        by_torch = fused.pull_back(a, direction, own)  # to be differentiated
+        assert_alike(found, trees.leaves(along_circle(by_torch, own)), 1e-10)
 
     @pytest.mark.parametrize("extra", [False, True])
     @torch.no_grad()
@@ -364,7 +374,7 @@ class TestLayers:
         for recorded in (True, False):
             with torch.set_grad_enabled(recorded):
                 truth = torch.stack([at(value) for value in given])
-                assert float((truth[0] - truth[1]).abs().max()) > 1e-6
+                assert float((truth[0] - truth[1]).abs().max()) > 1e-7
                 torch.testing.assert_close(vmap(at)(given), truth, rtol=0, atol=1e-9)
         slopes = torch.stack([slope(value) for value in given])
         torch.testing.assert_close(vmap(slope)(given), slopes, rtol=1e-7, atol=1e-9 * float(slopes.abs().max()))

@@ -12,11 +12,10 @@ from torch.func import hessian, jacfwd, vmap
 from torch_modal.backends.torch.fine_energy import chunk_of
 from torch_modal.backends.torch.fine_steps import (
     RIDGE,
-    STEP_LENGTHS,
     ConvexHessian,
-    _downhill,
     inverse_of_symmetric,
     relax,
+    step_length,
 )
 from torch_modal.energy.energy import Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
@@ -122,15 +121,23 @@ def test_steps_go_downhill_and_many_end_at_a_minimum(small_bars: Shapes) -> None
     assert float(end_norm / start_norm) < 1e-5
 
 
-def test_a_step_is_shortened_until_the_energy_falls(case: Case) -> None:
+def test_a_step_that_goes_uphill_ends_where_the_parabola_is_least(case: Case) -> None:
     core, at = case.core, case.at(case.x)
-    before = core.value_at(at, case.reference)
-    moves = -core.extend(core.fold(core.gradient(at))) * torch.tensor([0.1, 0.01])[:, None]
-    length = _downhill(core, before, case.rows, moves, case.reference, ())
-    for sample, own in enumerate(length.tolist()):
-        reached = [float(core.value(case.rows + k * moves, case.reference)[sample]) for k in STEP_LENGTHS]
-        assert own == next(k for k, energy in zip(STEP_LENGTHS, reached, strict=True) if energy < float(before[sample]))
-    assert bool((length < 1).any()), "no step was too long: the test is too easy"
+    before, gradient = core.value_at(at, case.reference), core.fold(core.gradient(at))
+    move = -gradient * torch.tensor([1.0, 1e-5])[:, None]
+    slope, after = (gradient * move).sum((0, -1)), core.value(case.rows + core.extend(move), case.reference)
+    length = step_length(before, slope, after)
+    assert float(length[0]) < 0.1 and float(length[1]) == 1
+    shorter = case.rows + length[:, None] * core.extend(move)
+    assert bool((core.value(shorter, case.reference) < before).all())
+    torch.testing.assert_close(length[0], -0.5 * slope[0] / (after - before - slope)[0])
+
+
+def test_the_length_of_a_step_is_continuous() -> None:
+    before, slope = torch.ones(3, dtype=torch.float64), torch.full((3,), -0.2, dtype=torch.float64)
+    after = torch.tensor([0.9 - 1e-9, 0.9 + 1e-9, torch.inf], dtype=torch.float64)
+    length = step_length(before, slope, after)
+    assert float(length[0]) == 1 and 1 - 1e-7 < float(length[1]) < 1 and float(length[2]) == 0
 
 
 def test_a_minimum_stays(small_bars: Shapes) -> None:

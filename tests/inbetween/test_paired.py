@@ -9,7 +9,7 @@ from torch.func import hessian, jacfwd, jacrev
 from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.fine_energy import FineEnergy
-from torch_modal.energy.bend import Bend
+from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
@@ -34,7 +34,7 @@ class Setting:
         self.bars = bars
         self.frame = Frame(bars.keyframes[:2], bars.faces, coarse_faces)
         self.shell = ShellEnergy(self.frame.coarse.faces)
-        terms = [Stretch(500.0), Bend(10.0), Volume(1000.0)]
+        terms = [Stretch(500.0), SquaredBend(10.0), Volume(1000.0)]
         self.fine = FineEnergy(Mesh.of(bars.faces, bars.keyframes.shape[1]), terms)
         levels = Levels(self.frame, self.fine, TorchBackend())
         self.space = PairedSpace(self.frame, levels, [basis.modes for basis in bars.bases[:2]])

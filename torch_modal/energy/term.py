@@ -262,7 +262,8 @@ class PeriodicTerm(Term):
         """K rest angles by their first two trigonometric moments; arguments as in the base class."""
         whole = pulls.sum(-2)
         shares = pulls * inverse(whole, whole <= 0)[..., None, :]
-        first = measures[..., 0, :]
+        # From the heaviest, for the sake of rounding.
+        first = measures.gather(-2, pulls.argmax(-2, keepdim=True)).squeeze(-2)
         off = measures - first[..., None, :]
         parts = _versine(off), off.sin(), _versine(2 * off), (2 * off).sin()
         rows = torch.stack([first, *((shares * part).sum(-2) for part in parts)], -2)

@@ -123,7 +123,8 @@ class Between(nn.Module):
             ends = self.frame.place(*shapes[:2, None])
             references = torch.cat([ends.first, ends.second])
             blend = shared.blends.of(*places[:2]) if objective.base == "rotations" else None
-            self.space: Any = JointSpace(self.frame, levels, modes, references, blend, objective.anchor)
+            anchor = 0.0 if blend is None else objective.anchor
+            self.space: Any = JointSpace(self.frame, levels, modes, references, blend, anchor)
         else:
             self.space = PairedSpace(self.frame, levels(), modes)
 

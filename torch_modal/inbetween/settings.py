@@ -40,8 +40,8 @@ class Objective:
         mu: Weight of the similarity of Eq. 4, of no effect in the joint space: a number, or a tensor or parameter that
             broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.
-        anchor: ``rho``, the weight of the mean squared distance of the shape from its base at a size of 100, in the
-            joint space. Without it there are many minima of almost the same energy, between which shapes jump.
+        anchor: ``rho``, the weight of the mean squared distance of the shape from the base ``"rotations"``, at a size
+            of 100. Without it there are many minima of almost the same energy, between which shapes jump.
         coarse_faces: Faces of the mesh that the energy is evaluated on in the modal space.
         contact: Whether parts are kept from passing through each other (docs/contact.md). It needs the extra
             ``contact``, and the joint space.

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_modal import trees
 from torch_modal.backends.torch.coarse_energy import CoarseEnergy
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy, merged_reference, shell_reference
-from torch_modal.backends.warp.shell import WarpShell
+from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.term import Mesh
 
@@ -37,6 +37,8 @@ class WarpCoarseEnergy(CoarseEnergy):
 
     def softened(self, reference: Any, base: Tensor) -> Any:
         """As in the base class."""
+        if not isinstance(reference, ShellReference):
+            return super().softened(reference, base)
         full = self.fullness(1, base).to(reference.bend)
         factors = torch.ones_like(reference.bend[..., 0]).index_copy(1, self.shell.interior, full)
         weights, others = reference.bend.split([1, 6], -1)

@@ -188,6 +188,11 @@ def rest(
             part = real(0.0)
             if p1 + p2 > real(0.0):
                 part = p2 / (p1 + p2)
+            if part > HALF:  # from the heavier one, for the sake of rounding
+                part = real(1.0) - part
+                t0 = t1
+                t1 = t2
+                t2 = t0
             turn = turn_between(t1, t2)
             twice = doubled(turn)
             bend[out] = moments(p1 + p2, t1[0], t1[1], part * turn[0], part * turn[1], part * twice[0], part * twice[1])
