@@ -8,16 +8,30 @@ from torch.func import hessian, jacfwd
 
 from torch_modal import trees
 from torch_modal.energy import congruence
-from torch_modal.energy.modal_energy import Derivatives, ModalEnergy
-from torch_modal.energy.shell import ShellEnergy
+from torch_modal.energy.bend import Bend
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, SumOfEnergies
+from torch_modal.energy.shell import ALPHA, BETA, GAMMA, ShellEnergy
+from torch_modal.energy.term import Mesh
 
 N, BATCH = 5, 3
 MOEBIUS = [[i, (i + 1) % 7, (i + 2) % 7] if i % 2 == 0 else [(i + 1) % 7, i, (i + 2) % 7] for i in range(7)]
 FINS = [[0, 1, 2], [1, 0, 3], [0, 1, 4]]
 
 
+class SmoothShell(ShellEnergy):
+    """Eq. 5 with the periodic function of angles that in-betweens have."""
+
+    def __init__(self, faces: Tensor, alpha: float = ALPHA, beta: float = BETA, gamma: float = GAMMA) -> None:
+        super().__init__(faces, alpha, beta, gamma)
+        self.terms[1] = Bend(beta)
+        self.energy = Energy(Mesh.of(self.faces, int(faces.max()) + 1), [*self.terms])
+
+
 class Case:
     """A shell in a random space, away from rest, with two references of different pull."""
+
+    kind: type[ShellEnergy] = ShellEnergy
 
     def __init__(self, faces: Tensor, x: Tensor, extra: bool, seed: int = 0, **stiffness: float) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -26,7 +40,7 @@ class Case:
             return torch.randn(*shape, dtype=torch.float64, generator=generator)
 
         size = float(x[faces.unique()].std())
-        self.shell = ShellEnergy(faces, **stiffness)
+        self.shell = self.kind(faces, **stiffness)
         self.columns = random(N, *x.shape)
         self.modal = ModalEnergy(self.shell, self.columns)
         self.base = base = x + 0.05 * size * random(BATCH, *x.shape)
@@ -106,6 +120,41 @@ def test_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) ->
     assert relative(got.gauss_newton, truth) > 1e-2, "at rest there would be nothing to see"
     assert got.second_order is not None
     assert relative(got.gauss_newton + got.second_order, truth) < 1e-11
+
+
+class SmoothCase(Case):
+    kind = SmoothShell
+
+
+@pytest.mark.parametrize("extra", [False, True])
+def test_a_periodic_function_of_angles_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) -> None:
+    """Gauss-Newton's Hessian takes the largest curvature of the function; both terms together are the true one."""
+    case = SmoothCase(*surface_of, extra)
+    torch.testing.assert_close(case.modal.value(case.a, case.placement), case.energy_by_hand(case.a))
+    gradient = torch.autograd.functional.jacobian(lambda a: case.energy_by_hand(a).sum(), case.a)
+    got, truth = case.derivatives(), case.hessian_by_autograd()
+    assert relative(got.gradient, gradient) < 1e-12
+    assert torch.linalg.eigvalsh(got.gauss_newton).amin() > 0
+    assert got.second_order is not None
+    assert relative(got.gauss_newton + got.second_order, truth) < 1e-11
+    along = torch.randn(case.a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    leaves = [leaf.clone().requires_grad_() for leaf in trees.leaves(case.placement)]
+    slope = (case.modal.derivatives(case.a, trees.filled(case.placement, leaves), False).gradient * along).sum()
+    pulled = torch.autograd.grad(slope, leaves, allow_unused=True, materialize_grads=True)
+    for value, wanted in zip(trees.leaves(case.modal.pull_back(case.a, along, case.placement)), pulled, strict=True):
+        assert float((value - wanted).norm()) <= 1e-11 * float(wanted.norm())
+
+
+def test_the_anchor_is_part_of_the_energy(small_bars: Shapes) -> None:
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, False)
+    anchored, place = SumOfEnergies(case.modal, anchor=7.0), [case.placement]
+    gain = 3.5 * case.a.square().sum(-1)
+    torch.testing.assert_close(anchored.value(case.a, place), case.energy_by_hand(case.a) + gain)
+    free, held = case.derivatives(), anchored.derivatives(case.a, place)
+    torch.testing.assert_close(held.gradient, free.gradient + 7 * case.a)
+    torch.testing.assert_close(held.gauss_newton, free.gauss_newton + 7 * torch.eye(N, dtype=torch.float64))
+    value, gradient = anchored.value_and_gradient(case.a, place)
+    torch.testing.assert_close((value, gradient), (anchored.value(case.a, place), held.gradient))
 
 
 @pytest.mark.parametrize("extra", [False, True])

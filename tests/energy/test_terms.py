@@ -1,5 +1,6 @@
 """Terms of an energy: those of Eq. 5 by ``torch.func``, and terms of one's own all the way through the layers."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.term import Mesh, Term
+from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 from torch_modal.energy.volume import Volume
 from torch_modal.inbetween.levels import coarse_values
 
@@ -111,6 +112,28 @@ def test_closed_forms_agree_with_torch_func(surface: tuple[Mesh, Tensor], genera
         found.append([*derivatives, pulled.base, *pulled.reference.measures, relax(energy, x[1:3], reference, 2, 4)])
     for mine, truth in zip(*found, strict=True):
         assert float((mine - truth).norm()) < 1e-10 * float(truth.norm())
+
+
+def test_angles_of_any_number_of_shapes_are_one_reference(generator: torch.Generator) -> None:
+    """Five rows stand for K rest angles exactly, wherever they lie, and the energy has no kink at half a turn."""
+    angles, weights = (torch.rand(5, 40, dtype=DOUBLE, generator=generator) for _ in range(2))
+    angles = 20 * angles - 10
+    term, at = PeriodicTerm(), torch.linspace(-4, 4, 40, dtype=DOUBLE)
+    merged = term.merged(angles, weights)
+    versine = 1 - (at - angles).cos()
+    truth = (weights * (2 * versine + versine**2 / 3)).sum(0)
+    torch.testing.assert_close(term.energies(at, merged.measures, merged.weights), truth)
+    slope = lambda x: term.slopes(x, merged.measures, merged.weights)  # noqa: E731
+    rate = lambda x: term.energies(x, merged.measures, merged.weights).sum()  # noqa: E731
+    torch.testing.assert_close(slope(at), torch.func.grad(rate)(at))
+    bound, beyond = term.curvatures(at, merged.measures, merged.weights)
+    torch.testing.assert_close(bound + beyond, torch.func.grad(lambda x: slope(x).sum())(at))
+    assert bool((beyond <= 1e-12).all())
+    alone = term.merged(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
+    half_a_turn = math.pi + torch.tensor([-1e-9, 0, 1e-9], dtype=DOUBLE)
+    assert float(term.slopes(half_a_turn, alone.measures, alone.weights).abs().max()) < 1e-8
+    small = torch.tensor([1e-5, 0.1, math.radians(60)], dtype=DOUBLE)
+    assert float((term.energies(small, alone.measures, alone.weights) / small**2 - 1).abs().max()) < 0.013
 
 
 @pytest.mark.parametrize("kind", ["area", "spring"])

@@ -132,7 +132,7 @@ Preset = Literal["accurate", "fast", "paper"]
 
 PRESETS = {
     "accurate": Settings(Objective(), Solver()),
-    "fast": Settings(Objective(anchor=10_000.0, coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
+    "fast": Settings(Objective(anchor=30_000.0, coarse_faces=300), Solver(tolerance=1e-5, local_steps=0)),
     "paper": Settings(Objective(space="paired"), Solver(local_steps=0)),
 }
 """The presets; docs/layer.md compares them."""

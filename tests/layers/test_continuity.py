@@ -1,0 +1,132 @@
+"""The in-between is one continuous function: no jumps in time or in the key-frames, nothing that others decide."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+from torch.autograd import gradcheck
+
+import torch_modal as tm
+from torch_modal.data.samples import load_sample
+from torch_modal.inbetween.comparison import SLACK, no_worse
+
+DOUBLE = torch.float64
+
+
+def shapes_of(keyframes: Tensor, faces: Tensor, n_modes: int) -> Shapes:
+    return Shapes(keyframes, faces, tm.extract_bases(keyframes, faces, n_modes, progress=False))
+
+
+@pytest.fixture(scope="module")
+def hand(data_dir: Path) -> Shapes:
+    """Open and fist: the angles of many hinges differ by half a turn, and coarse triangles are near collapse."""
+    keyframes, faces = tm.load_keyframes([data_dir / "mh-hand" / f"{name}.obj" for name in ("00-open", "02-fist")])
+    return shapes_of(keyframes.double(), faces, 15)
+
+
+@pytest.fixture(scope="module")
+def trex(data_dir: Path) -> Shapes:
+    """Two frames of a run, of a mesh with needles, whose steps of all vertices are shortened; one more frame."""
+    with np.load(data_dir / "animals" / "trex.npz") as stored:
+        start = int(stored["clip_starts"][stored["clip_names"].tolist().index("TRex_Run")])
+        frames = torch.tensor(stored["frames"][start : start + 17 : 8]).double()
+        return shapes_of(frames, torch.tensor(stored["faces"]).long(), 15)
+
+
+@pytest.fixture(scope="module")
+def creature() -> Shapes:
+    sample = load_sample("creature")
+    return shapes_of(sample.keyframes[:3].double(), sample.faces, 15)
+
+
+def apart(x: Tensor, y: Tensor) -> float:
+    """Largest distance of vertices over the diagonal."""
+    return float((x - y).norm(dim=-1).max() / (x.amax(-2) - x.amin(-2)).norm(dim=-1).max())
+
+
+def largest_jump(layer: tm.InBetween, x_a: Tensor, x_b: Tensor, n: int) -> float:
+    """The largest change between even times that is far above those beside it, after bisection."""
+    times = torch.linspace(0, 1, n, dtype=DOUBLE)
+    shapes = torch.cat([layer(x_a, x_b, some) for some in times.split(20)])
+    steps = torch.stack([(y - x).norm(dim=-1).max() for x, y in pairwise(shapes)])
+    usual = torch.stack([steps[max(0, i - 3) : i + 4].median() for i in range(len(steps))])
+    found = 0.0
+    for i in (steps / usual).topk(3).indices.tolist():
+        low, high, x, y = times[i], times[i + 1], shapes[i], shapes[i + 1]
+        for _ in range(16):
+            middle = 0.5 * (low + high)
+            z = layer(x_a, x_b, middle)
+            left = (z - x).norm(dim=-1).max() > (y - z).norm(dim=-1).max()
+            low, high, x, y = (low, middle, x, z) if left else (middle, high, z, y)
+        found = max(found, apart(x, y))
+    return found
+
+
+@pytest.mark.parametrize("preset", ["accurate", "fast"])
+class TestOneFunction:
+    @torch.no_grad()
+    def test_of_time_across_known_jumps(self, hand: Shapes, preset: Any) -> None:
+        """The minimiser that is not anchored jumps by 5 % of the diagonal at 0.5679."""
+        layer = tm.InBetween(hand.bases, hand.faces, preset)
+        assert largest_jump(layer, *hand.keyframes, 61) < 1e-4
+
+    @torch.no_grad()
+    def test_of_time_where_steps_are_shortened(self, trex: Shapes, preset: Any) -> None:
+        layer = tm.InBetween(trex.bases[:2], trex.faces, preset)
+        assert largest_jump(layer, *trex.keyframes[:2], 61) < 1e-4
+
+    @torch.no_grad()
+    def test_of_the_keyframes(self, hand: Shapes, preset: Any, generator: torch.Generator) -> None:
+        layer = tm.InBetween(hand.bases, hand.faces, preset)
+        size = (hand.keyframes[0].amax(0) - hand.keyframes[0].amin(0)).norm()
+        noise = 1e-10 * size * torch.randn(hand.keyframes.shape, dtype=DOUBLE, generator=generator)
+        for t in (0.3333, 0.5679, 0.9115):
+            assert apart(layer(*hand.keyframes, t), layer(*(hand.keyframes + noise), t)) < 1e-6
+
+    @torch.no_grad()
+    def test_what_other_bases_there_are_changes_nothing(self, creature: Shapes, preset: Any) -> None:
+        whole = tm.InBetween(creature.bases, creature.faces, preset)
+        pair = tm.InBetween(creature.bases[1:], creature.faces, preset)
+        ends = creature.keyframes[1:]
+        assert apart(whole(*ends, 0.37, pair=1), pair(*ends, 0.37)) < 1e-9
+
+    @torch.no_grad()
+    def test_reversed(self, creature: Shapes, preset: Any) -> None:
+        x_a, x_b = creature.keyframes[:2]
+        forth = tm.InBetween(creature.bases[:2], creature.faces, preset)
+        back = tm.InBetween(creature.bases[:2][::-1], creature.faces, preset)
+        assert apart(forth(x_a, x_b, 0.37), back(x_b, x_a, 0.63)) < 1e-6
+
+
+class TestComparison:
+    def test_shapes_are_blended_into_their_start(self) -> None:
+        x, start = torch.zeros(200, 1, 3, dtype=DOUBLE), torch.ones(200, 1, 3, dtype=DOUBLE)
+        own = torch.linspace(1, 1.3, 200, dtype=DOUBLE)
+        found, replaced = no_worse(x, [start], torch.stack([own, torch.ones_like(own)]), torch.zeros_like(own))
+        parts = found[:, 0, 0]
+        assert float(parts[0]) == 0 and float(parts[-1]) == 1 and bool((parts.diff() >= 0).all())
+        assert float(parts.diff().max()) < 0.03, "no step is larger than the slope of the blend"
+        assert torch.equal(replaced, own >= SLACK) and bool((parts[own < 1.1] == 0).all())
+
+    def test_gradient_of_the_blend(self) -> None:
+        x = torch.randn(2, 4, 3, dtype=DOUBLE, generator=torch.Generator().manual_seed(0)).requires_grad_()
+
+        def blended(x: Tensor) -> Tensor:
+            own = 1 + 0.2 * torch.sigmoid(x.sum((1, 2)))
+            distortion = torch.stack([own, torch.ones_like(own)])
+            return no_worse(x, [torch.ones_like(x)], distortion, torch.zeros_like(own))[0]
+
+        assert gradcheck(blended, x)
+
+    def test_nothing_is_worse_where_nothing_is_strained(self, hand: Shapes) -> None:
+        """Rigid motions: the in-betweens have distortions of rounding, and no status but CONVERGED."""
+        x = hand.keyframes[0]
+        turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -1, 0.3], [1, 0, 0.2], [-0.3, -0.2, 0]], dtype=DOUBLE))
+        layer = tm.InBetween([hand.bases[0]] * 2, hand.faces)
+        found = layer.solve(x, x @ turn.mT + 3.0, torch.linspace(0, 1, 11, dtype=DOUBLE))
+        assert bool(found.solution.converged.all())
