@@ -126,7 +126,7 @@ def test_a_step_that_goes_uphill_ends_where_the_parabola_is_least(case: Case) ->
     before, gradient = core.value_at(at, case.reference), core.fold(core.gradient(at))
     move = -gradient * torch.tensor([1.0, 1e-5])[:, None]
     slope, after = (gradient * move).sum((0, -1)), core.value(case.rows + core.extend(move), case.reference)
-    length = step_length(before, slope, after)
+    length = step_length(before, slope, after, torch.ones_like(before))
     assert float(length[0]) < 0.1 and float(length[1]) == 1
     shorter = case.rows + length[:, None] * core.extend(move)
     assert bool((core.value(shorter, case.reference) < before).all())
@@ -136,7 +136,7 @@ def test_a_step_that_goes_uphill_ends_where_the_parabola_is_least(case: Case) ->
 def test_the_length_of_a_step_is_continuous() -> None:
     before, slope = torch.ones(3, dtype=torch.float64), torch.full((3,), -0.2, dtype=torch.float64)
     after = torch.tensor([0.9 - 1e-9, 0.9 + 1e-9, torch.inf], dtype=torch.float64)
-    length = step_length(before, slope, after)
+    length = step_length(before, slope, after, torch.ones_like(before))
     assert float(length[0]) == 1 and 1 - 1e-7 < float(length[1]) < 1 and float(length[2]) == 0
 
 

@@ -12,7 +12,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torch_modal.energy.assembly import PairBlocks
-from torch_modal.energy.bend import Bend
+from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.energy import Energy, Linearised, Reference, Rest
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.stretch import Stretch
@@ -110,13 +110,13 @@ def full_space(
     if start is not None:
         x = motion.inverse().apply(start.detach().cpu().double() * scale)
 
-    energy = Energy(Mesh.of(faces, len(first)), [Stretch(), Bend(), Volume()])
+    energy = Energy(Mesh.of(faces, len(first)), [Stretch(), SquaredBend(), Volume()])
     at_t = torch.tensor([t], dtype=torch.float64)
     rests = [energy.rest(energy.extend(y.T[:, None].contiguous())) for y in (first, aligned)]
     stiffness = [alpha, beta, gamma]
-    reference = energy.between(rests[0], rests[1], at_t, stiffness)
+    reference = energy.among(rests, torch.stack([1 - at_t, at_t], -1), stiffness)
     if example_based:
-        reference = Energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
+        reference = energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
     start_rows = x.T[:, None].contiguous()
     fixed = torch.zeros(len(first), dtype=torch.bool) if fixed is None else fixed
     rows, energies, stagnated, n_held = _minimise(energy, faces, start_rows, reference, fixed, max_steps, tolerance)

@@ -105,7 +105,7 @@ def test_term_is_one_sided(generator: torch.Generator) -> None:
     x[:, 3, 2] = torch.tensor([-0.1, 0.1, 0.3])
     energy = Energy(Mesh.of(faces, 4), [Contact(elements, gap=0.2)], sampled=True)
     gaps = torch.full((3, 1, 1), 0.2, dtype=DOUBLE)
-    reference = Reference((gaps,), (torch.full_like(gaps, 5.0),), torch.zeros(3, dtype=DOUBLE))
+    reference = Reference((gaps,), (torch.full_like(gaps[:, 0], 5.0),), torch.zeros(3, dtype=DOUBLE))
     rows = energy.extend(x.movedim(-1, 0))
     assert energy.value(rows, reference).tolist() == pytest.approx([5 * 0.3**2, 5 * 0.1**2, 0])
     (at,) = energy.linearise(rows, reference)
@@ -241,7 +241,7 @@ def test_the_round_with_the_fewest_crossings_is_kept(hand: Shapes, monkeypatch: 
 
     def worsening(self: ContactRounds, batch: Any, x: Tensor, active: Contacts) -> Tensor:
         # Most of a push first; then back to the shape without contact.
-        taken.append(torch.lerp(x, step(self, batch, x, active), 0.7) if not taken else start[0])
+        taken.append(torch.lerp(x, step(self, batch, x, active), 0.9) if not taken else start[0])
         return taken[-1]
 
     found, start = ContactRounds.found, []

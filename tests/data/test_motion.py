@@ -171,4 +171,4 @@ def test_a_dataset_draws_from_the_path_of_a_stored_motion(bar_motion: Shapes, tm
     found = distances()
     assert largest(found.amin(1)) < 2e-3
     assert set(found.argmin(1).tolist()) == {0, 1, 2, 3}
-    assert float(distances(keyframe_times=None).amin(1).min()) > 2e-2
+    assert float(distances(keyframe_times=None).amin(1).min()) > 1e-2

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.energy.energy import merged, on_one_branch
+from torch_modal.energy.term import PeriodicTerm, Term
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotation_means import mean
 from torch_modal.geometry.rotations import about, arc, conjugate, power, product
@@ -401,13 +401,13 @@ class TestParts:
 
     def test_parabolas_add_up_to_one(self, generator: torch.Generator) -> None:
         w, q = (torch.rand(4, 3, generator=generator, dtype=DOUBLE) for _ in range(2))
-        whole, value, least = merged(w, q)
+        (value,), whole, least = Term().merged(q, w)
         at = pulls(0.3, -2.0, 5.0)
         torch.testing.assert_close(whole * (at - value) ** 2 + least, (w * (at - q) ** 2).sum(0))
 
     def test_angles_come_round(self) -> None:
         angles = pulls(3.1, -3.1, 3.0)[:, None]
-        found = on_one_branch(angles, torch.ones_like(angles))
+        found = PeriodicTerm().on_one_branch(angles, torch.ones_like(angles))
         assert float(found.amax() - found.amin()) < 0.2
 
 

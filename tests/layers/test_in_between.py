@@ -183,16 +183,27 @@ class TestValues:
         assert torch.equal(x[2], x_b)
         torch.testing.assert_close(layer(x_a, x_a + 1, 0.5), x_a + 0.5, rtol=0, atol=1e-9)
 
-    def test_a_blend_that_is_worse_than_straight_lines_is_not_taken(
+    def test_where_the_blend_is_far_worse_than_straight_lines_they_are_returned(
         self, bars: Shapes, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        layer, without = (
-            InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, rotations=r)) for r in (True, False)
+        layer, start = (
+            InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, rotations=True, max_steps=n))
+            for n in (80, 0)
         )
-        for spoilt in (lambda x, *_: 3 * x, lambda x, *_: x * torch.nan):
-            monkeypatch.setattr(type(layer.members[0].space.blend), "forward", lambda self, *args, f=spoilt: f(*args))
-            found = layer(*bars.keyframes[1:], 0.4)
-            torch.testing.assert_close(found, without(*bars.keyframes[1:], 0.4), rtol=0, atol=1e-6)
+        blend = type(layer.members[0].space.blend)
+        monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: straight)
+        straight = start.solve(*bars.keyframes[1:], 0.4)
+        monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: 3 * straight)
+        found = layer.solve(*bars.keyframes[1:], 0.4)
+        assert found.solution.status == Status.FELL_BACK
+        torch.testing.assert_close(found.shapes, straight.shapes, rtol=0, atol=1e-9)
+
+    def test_a_blend_that_is_not_finite_is_straight(self, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+        layer = InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, rotations=True))
+        poisson = type(layer.members[0].space.blend.poisson)
+        monkeypatch.setattr(poisson, "forward", lambda self, edges, near: torch.nan * near)
+        found = layer.solve(*bars.keyframes[1:], 0.4)
+        assert found.shapes.isfinite().all() and found.solution.converged
 
     @pytest.mark.parametrize("polish", [-1, 1.5])
     def test_a_number_of_steps_is_whole(self, bars: Shapes, polish: float) -> None:
@@ -723,9 +734,10 @@ def test_modes_that_span_all_shapes() -> None:
     for method in ("solid", "shell"):
         bases = tm.extract_bases(torch.stack([first, second]), faces, 30, method=method, cache=False)
         for preset in ("accurate", "fast"):
-            found.append(tm.InBetween(bases, faces, preset)(first, second, 0.5))
+            free = replace(tm.PRESETS[preset].objective, anchor=0.0)
+            found.append(tm.InBetween(bases, faces, preset, objective=free)(first, second, 0.5))
     for one in found:
-        torch.testing.assert_close(one, found[0], rtol=0, atol=1e-5)
+        torch.testing.assert_close(one, found[0], rtol=0, atol=1e-4)
 
 
 @pytest.mark.xfail(

@@ -79,7 +79,7 @@ def test_energy_is_below_linear_interpolation_and_at_a_minimum(bent: Shapes, gen
         return 0.5 * sum(shell(scale * x, scale * end) for end in bent.keyframes)
 
     straight = linear(*bent.keyframes, bent.faces)
-    assert float(energy(found.shapes)) == pytest.approx(float(found.solution.energy), rel=1e-9)
+    assert float(energy(found.shapes)) == pytest.approx(float(found.solution.energy), rel=1e-6)
     assert float(energy(found.shapes)) < 0.8 * float(energy(straight))
     # No direction of the space goes down.
     x = found.shapes.clone().requires_grad_()
@@ -198,7 +198,8 @@ def test_bases_are_constants(layer: MidShape) -> None:
 def test_state_dict_and_functional_call(layer: MidShape, middle: Tensor, bent: Shapes, space: str) -> None:
     """What is saved are the bases; what follows from them is made anew when others are loaded."""
     before = [basis.reference.clone() for basis in bent.bases]
-    other = MidShape(bent.bases[::-1], bent.faces, space, **modal(coarse_faces=200))
+    bases = [replace(basis, modes=basis.modes.roll(1, 1)) for basis in bent.bases]
+    other = MidShape(bases, bent.faces, space, **modal(coarse_faces=200))
     buffers, own = dict(layer.named_buffers()), other(*bent.keyframes)
     assert largest(own - middle) > 1e-6
     torch.testing.assert_close(functional_call(other, buffers, tuple(bent.keyframes)), middle, rtol=0, atol=1e-9)
@@ -287,7 +288,7 @@ def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    ("ends", "truth", "bound"), [((0, 4), 2, 0.05), ((0, 2), 1, 0.011), ((2, 4), 3, 0.016)], ids=["0-8", "0-4", "4-8"]
+    ("ends", "truth", "bound"), [((0, 4), 2, 0.05), ((0, 2), 1, 0.011), ((2, 4), 3, 0.018)], ids=["0-8", "0-4", "4-8"]
 )
 def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands: Shapes) -> None:
     """Linear interpolation: 27.5 %, 6.2 %, 8.2 %. Measured here: 4.0 %, 0.90 %, 1.5 %, in about 20 steps.

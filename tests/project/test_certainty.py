@@ -178,13 +178,14 @@ class TestDistortion:
         for x in collapsed:
             x[:, i] = x[:, j] + 1e-3
         after = distortion(shapes, Rests(tuple(collapsed), None, t, stiffness, None))
-        assert (after < 3 * before).all(), "the faces around it were pulled out of shape, too"
+        assert (after < 4 * before).all(), "the faces around it were pulled out of shape, too"
         shell = tm.ShellEnergy(bars.faces)
         assert shell(shapes[0], collapsed[0]) > 100 * shell(shapes[0], ends[0])
 
     def test_the_best_of_the_starts_is_taken(self) -> None:
         x, starts = torch.zeros(3, 4, 3), [torch.full((3, 4, 3), value) for value in (1.0, 2.0)]
-        found, worse = no_worse(x, starts, torch.tensor([[9.0, 9.0, 1.0], [1.0, 3.0, 1.0], [2.0, 2.0, 1.0]]))
+        distortion = torch.tensor([[9.0, 9.0, 1.0], [1.0, 3.0, 1.0], [2.0, 2.0, 1.0]])
+        found, worse = no_worse(x, starts, distortion, torch.zeros(3))
         assert worse.tolist() == [True, True, False] and found[:, 0, 0].tolist() == [1.0, 2.0, 0.0]
 
     def test_needles_have_a_bounded_weight(self) -> None:
@@ -195,7 +196,7 @@ class TestDistortion:
 
     def test_what_is_not_finite_is_worse(self) -> None:
         x, start = torch.zeros(2, 4, 3), torch.ones(2, 4, 3)
-        found, worse = no_worse(x, [start], torch.tensor([[torch.nan, 1.0], [1.0, 1.0]]))
+        found, worse = no_worse(x, [start], torch.tensor([[torch.nan, 1.0], [1.0, 1.0]]), torch.zeros(2))
         assert worse.tolist() == [True, False] and torch.equal(found[0], start[0]) and torch.equal(found[1], x[1])
 
 

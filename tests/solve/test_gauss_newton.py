@@ -180,13 +180,12 @@ def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes) -> None:
     a = torch.zeros(1, layer.space.n_unknowns, dtype=torch.float64)
     rests = [frame.coarsen(x) for x in pair[:2]]
     shell = ShellEnergy(frame.coarse.faces)
-    full = layer.space.levels.parts[0].fullness(1, frame.coarsen(torch.lerp(*pair[:2], 0.5)))[0]
 
     def towards(x: Tensor, rest: Tensor) -> Tensor:
         """Residuals of Eq. 5, with the periodic function of angles in the place of the square."""
         found, turn = shell.residuals(x, rest)[0], (shell.measure(x).angle - shell.measure(rest).angle)[0]
         n = len(shell.measure(x).length[0])
-        bend = found[n:-1] * (full * periodic_square(turn) / turn**2).sqrt()
+        bend = found[n:-1] * (periodic_square(turn) / turn**2).sqrt()
         return torch.cat([found[:n], bend, found[-1:]])
 
     def residuals(a: Tensor) -> Tensor:

@@ -87,8 +87,9 @@ class Contacts(NamedTuple):
 
     def joined(self, reference: Reference) -> Reference:
         """A reference with that of the term, which comes last."""
-        measures, weights = self.gaps[:, None], self.weights[:, None]
-        return Reference((*reference.measures, measures), (*reference.weights, weights), reference.constant)
+        return Reference(
+            (*reference.measures, self.gaps[:, None]), (*reference.weights, self.weights), reference.constant
+        )
 
     def modal(self, mesh: Mesh, columns: Tensor) -> ModalEnergy:
         """The term in the amplitudes of fine columns. *Shape:* ``(n, V, 3)``."""

@@ -64,5 +64,6 @@ def together(member: Between, samples: Samples, pair: Pair, x: Tensor, active: C
         if int(info):
             break
         step = -torch.cholesky_solve(gradient.reshape(-1, 1), factor).reshape(at.shape)
-        at = at + step_length(value(at), (gradient * step).sum(), value(at + step)) * step
+        length = step_length(value(at), (gradient * step).sum(), value(at + step), step.abs().amax())
+        at = at + length * step
     return torch.tensordot(every, columns.combine(at), 1)

@@ -120,12 +120,12 @@ class Among(Between):
         extras = levels.seen(space.column(difference), column) if levels.sampled else [column] * len(levels.energies)
         references = levels.among(levels.seen(fine, coarse), weights, stiffness)
         starts: tuple[Tensor, ...] = (straight,)
-        base, coarse_base = straight, coarse_straight
+        base, seen = straight, levels.seen(straight, coarse_straight)
         if space.blend is not None:
             base = space.blend.among(fine, weights, straight)
-            starts, coarse_base = (base, straight), frame.coarsen(base)
-        seen = levels.seen(base, coarse_base)
-        placement = levels.place(space.energy, seen, levels.softened(references, seen), extras, anchors)
+            starts, seen = (base, straight), levels.seen(base, frame.coarsen(base))
+            references = levels.softened(references, seen)
+        placement = levels.place(space.energy, seen, references, extras, anchors)
         return JointProblem(placement, None, base, starts, difference)
 
     def _brought(self, group: Group) -> Tensor | None:

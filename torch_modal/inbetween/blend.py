@@ -71,7 +71,9 @@ class RotationBlend(nn.Module):
         return self._reached(self.rotations.bent_along(trajectory, t, bending), straight)
 
     def _reached(self, edges: Tensor, near: Tensor) -> Tensor:
-        return self.poisson(edges, near.movedim(-1, 0)).movedim(0, -1)
+        """The shape of edge vectors; where that is not finite, the one near it. *Shape:* ``(3, B, E), (B, V, 3)``."""
+        found = self.poisson(edges, near.movedim(-1, 0)).movedim(0, -1)
+        return torch.where(found.isfinite().flatten(1).all(1)[:, None, None], found, near)
 
 
 class Blends:

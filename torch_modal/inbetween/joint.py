@@ -157,8 +157,7 @@ class JointSpace(nn.Module):
             base = starts[0]
             coarse = self.frame.coarsen(base)
             seen = levels.seen(base, coarse)
-            references = levels.softened(levels.against(base, coarse, stiffness), seen)
-            placement = levels.place(self.energy, seen, references, extras, anchors)
+            placement = levels.place(self.energy, seen, levels.against(base, coarse, stiffness), extras, anchors)
             return JointProblem(placement, start, base, starts, difference)
         seen_first, seen_second = levels.seen(pair.first, coarse_first), levels.seen(pair.second, coarse_second)
         references = levels.between(seen_first, seen_second, index, t, stiffness)
@@ -168,11 +167,12 @@ class JointSpace(nn.Module):
         straight = torch.lerp(first, second, t[:, None, None])
         if self.blend is None:
             base, starts, coarse = straight, (straight,), torch.lerp(coarse_first, coarse_second, t[:, None, None])
+            seen = levels.seen(base, coarse)
         else:
             base = self.blend(first, second, t, straight)
-            starts, coarse = (base, straight), self.frame.coarsen(base)
-        seen = levels.seen(base, coarse)
-        placement = levels.place(self.energy, seen, levels.softened(references, seen), extras, anchors)
+            starts, seen = (base, straight), levels.seen(base, self.frame.coarsen(base))
+            references = levels.softened(references, seen)
+        placement = levels.place(self.energy, seen, references, extras, anchors)
         if self.modal.guess is not None:
             with torch.no_grad():
                 start = self.modal.guess(coarse_first, coarse_second, extras[0], t)

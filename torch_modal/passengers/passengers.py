@@ -1,5 +1,6 @@
 """Points that follow a shape."""
 
+import math
 import warnings
 from typing import Any
 
@@ -149,7 +150,8 @@ class Passengers(nn.Module):
             )
         if shapes.device != self.reference.device:
             raise ValueError(f"shapes are on {shapes.device}, the passengers on {self.reference.device}; use .to()")
-        flat = shapes.reshape(shapes.shape[:-2].numel(), *shapes.shape[-2:])
+        # Unlike the shape's numel(), this keeps the batch of an export dynamic.
+        flat = shapes.reshape(math.prod(shapes.shape[:-2]), *shapes.shape[-2:])
         return torch.where(flat.isfinite().all((1, 2), keepdim=True), flat, torch.nan)
 
     def _deformation(self, x: Tensor) -> Tensor:

@@ -8,12 +8,16 @@ from torch import Tensor
 
 from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.energy import Energy, Linearised, Reference
+from torch_modal.energy.shell import DIAGONAL
 
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
 
 # A symmetric block from its upper triangle.
 _UNPACKED = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+
+# Where steps are small, the curvature along them is rounding of energies.
+SLIGHT = 1e-5 * DIAGONAL
 
 # Roundings of an energy, relative to it, that make no step shorter.
 ENERGY_ROUNDING = 64.0
@@ -179,27 +183,30 @@ def relax(
         before = sum((one.value for one in more), start=energy.value_at(at, reference))
         after = energy.value(energy.extend(reached, fixed), reference)
         after = sum((one.value(there) for one in beside), start=after)
-        length = step_length(before, -(right * direction).sum((0, -1)), after)
+        length = step_length(before, -(right * direction).sum((0, -1)), after, direction.abs().amax((0, -1)))
         rows = rows + length[:, None] * direction
     return rows.movedim(0, -1)
 
 
-def step_length(before: Tensor, slope: Tensor, after: Tensor) -> Tensor:
+def step_length(before: Tensor, slope: Tensor, after: Tensor, largest: Tensor) -> Tensor:
     """Where the parabola along a step is least, at most 1: a continuous function of the step, unlike a line search.
 
     Args:
         before: The energy where the step starts. *Shape:* ``(B,)``.
         slope: Its derivative along the step, at most zero. *Shape:* ``(B,)``.
         after: The energy where the whole step leads. *Shape:* ``(B,)``.
+        largest: Largest coordinate of the step; none below :data:`SLIGHT` is shortened, and one of ten times
+            that in full. *Shape:* ``(B,)``.
 
     Returns:
         *Shape:* ``(B,)``.
     """
     half, finite = -0.5 * slope, after.isfinite()
     rounding = ENERGY_ROUNDING * torch.finfo(before.dtype).eps * before.detach().abs()
-    excess = (torch.where(finite, after, 0) - before + half - rounding).clamp_min(0)
-    shorter = excess > 0
-    length = torch.where(shorter, half / torch.where(shorter, half + excess, 1), 1)
+    surplus = (torch.where(finite, after, 0) - before + half - rounding).clamp_min(0)
+    counts = ((largest / SLIGHT - 1) / 9).clamp(0, 1)
+    shorter = (surplus > 0) & (counts > 0)
+    length = torch.where(shorter, 1 - counts * surplus / torch.where(shorter, half + surplus, 1), 1)
     return torch.where(finite, length, 0)
 
 

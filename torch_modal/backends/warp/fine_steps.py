@@ -110,7 +110,7 @@ class WarpSteps(WarpShell):
                     form.add_((pushed * direction).sum((1, 2)))
 
             solution = self.solved(x, at, to, n_products, beyond=beyond).solution
-            length = step_length(before, _slope(at, solution), value(x + solution))
+            length = step_length(before, _slope(at, solution), value(x + solution), solution.abs().amax((1, 2)))
             x = x + length[:, None, None] * solution
         return x
 
@@ -141,7 +141,7 @@ class WarpSteps(WarpShell):
                 energy = there[0]
             else:
                 there, energy = None, self.value(reached, to)
-            length = lengths[k] = step_length(at.energy, _slope(at, solution), energy)
+            length = lengths[k] = step_length(at.energy, _slope(at, solution), energy, solution.abs().amax((1, 2)))
             if bool((length < 1).any()):
                 reached = x + length[:, None, None] * solution
                 there = self.at(reached, to) if k < n_steps - 1 else None
