@@ -26,6 +26,7 @@ from .data.stored import open_set as open_set
 from .data.stored import write_set as write_set
 from .energy.modal_energy import ModalEnergy as ModalEnergy
 from .energy.shell import ShellEnergy as ShellEnergy
+from .energy.term import PeriodicTerm as PeriodicTerm
 from .energy.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
