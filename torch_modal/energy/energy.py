@@ -26,7 +26,7 @@ class Rest(NamedTuple):
 
 
 class Reference(NamedTuple):
-    r"""The reference of an energy, :math:`\sum_m W_m (q_m - Q_m)^2 + c`; angles have four rows ``Q``."""
+    r"""The reference of an energy, :math:`\sum_m W_m (q_m - Q_m)^2 + c`; angles have five rows ``Q``."""
 
     measures: tuple[Tensor, ...]
     """``Q``, of :meth:`torch_modal.energy.term.Term.merged`. *Shape of each:* ``(..., R, M)``."""

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from torch_modal.backends.torch.distortion import LARGEST_STRAIN, LARGEST_WEIGHT
 from torch_modal.backends.warp.kernels.elements import (
     is_flat,
     length_of,
@@ -13,9 +14,8 @@ from torch_modal.backends.warp.kernels.elements import (
     vec4,
 )
 
-LARGEST_WEIGHT = wp.constant(real(8.0))
-STRAIN = wp.constant(real(4.0))
-"""Both as in :mod:`torch_modal.backends.torch.distortion`."""
+WEIGHT = wp.constant(real(LARGEST_WEIGHT))
+STRAIN = wp.constant(real(LARGEST_STRAIN))
 
 
 @wp.func
@@ -34,7 +34,7 @@ def measured(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
             found[1] = phase[0]
             found[2] = phase[1]
             weight = real(2.0) * wp.dot(e, e) / (wp.length(n1) + wp.length(n2))
-            found[3] = wp.min(weight, LARGEST_WEIGHT)
+            found[3] = wp.min(weight, WEIGHT)
     return found
 
 
