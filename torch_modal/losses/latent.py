@@ -116,7 +116,7 @@ class LatentElasticity(nn.Module):
         each = [energy.rates(at, self.shell._rows(scale * field)) for field in along]
         gram = x.new_zeros(len(x), len(along), len(along))
         for weights, *rates in zip(reference.weights, *each, strict=True):
-            scaled = torch.stack(rates, 1) * weights.sqrt()  # (B, k, M)
+            scaled = torch.stack(rates, 1) * weights.sqrt()[:, None]  # (B, k, M)
             gram = gram + scaled @ scaled.mT
         return gram
 
