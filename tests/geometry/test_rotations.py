@@ -67,18 +67,24 @@ def test_pieces_have_a_sense_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("kind", [LocalRotations, WarpRotations])
-def test_shapes_that_turn_alike_keep_together_half_a_turn_from_the_reference(kind: type[LocalRotations]) -> None:
-    """By 170, 190 and 200 degrees, which are 170, -170 and -160; a second piece does not turn."""
+@pytest.mark.parametrize(
+    ("degrees", "weights", "wanted"),
+    [((170, 190, 200), (0.3, 0.5, 0.2), 186), ((-80, 60, 120), (0.1, 0.45, 0.45), 73)],
+)
+def test_shapes_that_turn_alike_keep_together_half_a_turn_from_the_reference(
+    kind: type[LocalRotations], degrees: tuple[float, ...], weights: tuple[float, ...], wanted: float
+) -> None:
+    """190 and 200 degrees are -170 and -160; the first may be far from one of the others. A second piece is at rest."""
     x, faces = ribbon(0.0)
     mesh = Connectivity(torch.cat([faces, faces + len(x)]).numpy())
 
-    def shape(degrees: float) -> Tensor:
-        return torch.cat([x @ exp(math.radians(degrees) * torch.tensor([0.0, 0.6, 0.8]).double()).mT, x])
+    def shape(angle: float) -> Tensor:
+        return torch.cat([x @ exp(math.radians(angle) * torch.tensor([0.0, 0.6, 0.8]).double()).mT, x])
 
     rotations = kind(mesh, shape(0).expand(2, -1, -1))
-    shapes = torch.stack([shape(170), shape(190), shape(200)])
-    found = rotations.among(shapes[None], torch.tensor([[0.3, 0.5, 0.2]], dtype=torch.float64))[:, 0].mT
-    torch.testing.assert_close(found, edges(shape(186), mesh), rtol=0, atol=1e-12)
+    shapes = torch.stack([shape(each) for each in degrees])
+    found = rotations.among(shapes[None], torch.tensor([weights], dtype=torch.float64))[:, 0].mT
+    torch.testing.assert_close(found, edges(shape(wanted), mesh), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("fused", [False, True])

@@ -156,6 +156,7 @@ def test_what_encloses_a_volume() -> None:
     assert encloses(sphere, Connectivity(open_faces))  # a small hole
     assert not encloses(sphere, Connectivity(sphere_faces[sphere.numpy()[sphere_faces].mean(1)[:, 2] > 0]))
     assert not encloses(sphere * torch.tensor([1.0, 1.0, 0.0]), Connectivity(sphere_faces))
+    assert encloses(sphere * torch.tensor([1.0, 1.0, 0.02]), Connectivity(sphere_faces))  # thin, and still a body
     assert not encloses(roll(1), Connectivity(strip()[1]))
 
 

@@ -183,3 +183,15 @@ class TestPathEnergy:
     def test_one_code(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
         with pytest.raises(ValueError, match="two codes or more"):
             tm.losses.PathEnergy(bars.faces)(decoder, z[:1])
+
+    def test_decoders_in_half_precision(self, bars: Shapes) -> None:
+        """As under autocast: the shapes, not their energies, are rounded."""
+
+        def decoder(z: Tensor) -> Tensor:
+            return ((1 + z[:, :, None]) * bars.keyframes[0]).half()
+
+        codes = torch.tensor([[0.0], [0.01]])
+        rest, x = decoder(codes).float()
+        expected = tm.losses.ShellLoss(bars.faces).to(torch.float32)(x, rest)
+        found = tm.losses.PathEnergy(bars.faces).to(torch.float32)(decoder, codes)
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)

@@ -122,3 +122,25 @@ def test_other_shapes(bars: Shapes, shape: tuple[int, ...]) -> None:
     loss = tm.losses.ShellLoss(bars.faces)
     with pytest.raises(ValueError, match="164 vertices that the faces name"):
         loss(torch.zeros(shape), bars.keyframes[0])
+
+
+@pytest.mark.parametrize("height", [1.0, 0.1])
+def test_thin_bodies_have_a_volume(height: float) -> None:
+    """That of a pancake is a hundredth of a sphere's for its area, and its changes count in full."""
+    ball = trimesh.creation.icosphere(3)
+    rest = torch.from_numpy(ball.vertices.copy()) * torch.tensor([1.0, 1.0, height])
+    terms = tm.losses.ShellLoss(torch.from_numpy(ball.faces.copy())).terms_of(1.1 * rest, rest)
+    assert float(terms.volume) == pytest.approx((1.1**3 - 1) ** 2)
+
+
+def test_stiffnesses_are_about_the_papers() -> None:
+    """At a size of 100, bending has about the same part of the energy as in Eq. 5."""
+    sample = load_sample("hand")
+    a, b = sample.keyframes[:2]
+    scale = 100 / float((a.amax(0) - a.amin(0)).norm())
+    bends, stretches = (
+        [float(kind(sample.faces, **none)(scale * b, scale * a)) for kind in (tm.losses.ShellLoss, tm.ShellEnergy)]
+        for none in ({"alpha": 0.0, "gamma": 0.0}, {"beta": 0.0, "gamma": 0.0})
+    )
+    parts = [bend / stretch for bend, stretch in zip(bends, stretches, strict=True)]
+    assert 1 / 3 < parts[0] / parts[1] < 3

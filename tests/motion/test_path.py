@@ -496,3 +496,49 @@ def test_times_in_a_list_reach_the_key_frames(motion: Shapes) -> None:
     path = Path(motion.bases[:3], motion.faces, [0.1, 0.3, 0.7])
     with torch.no_grad():
         assert torch.equal(path(motion.keyframes[:3], times(0.1, 0.3, 0.7)), motion.keyframes[:3])
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_what_an_inserted_key_frame_changes_is_computed_again(bars: Shapes, cyclic: bool) -> None:
+    """The intervals around it that shapes were known of already, too."""
+    own = bars.pick(0, 1, 2, 1, 0)
+    editor = tm.PathEditor(Path(own.bases, own.faces, cyclic=cyclic), own.keyframes, steps=3)
+    before = editor.shapes()
+    editor.insert(1.5, own.keyframes[0] + 0.1)
+    whole = editor.path(editor.keyframes, editor.times())
+    torch.testing.assert_close(editor.shapes(), whole, rtol=0, atol=1e-9)
+    assert largest(whole[:6] - before[:6]) > 1e-3, "the intervals before it depend on it"
+
+
+def test_times_of_an_editor_are_even(motion: Shapes) -> None:
+    path = Path(motion.bases[:3], motion.faces, [0.0, 1.0, 4.0])
+    editor = tm.PathEditor(path, motion.keyframes[:3], steps=4)
+    assert editor.times().tolist() == [0, 0.25, 0.5, 0.75, 1, 1.75, 2.5, 3.25, 4]
+
+
+def test_key_frames_may_be_close_in_time(path: Path) -> None:
+    assert path.insert(2.0 + 1e-9).times.tolist() == [0, 1, 2, 2.0 + 1e-9, 3, 4]
+
+
+def test_an_inserted_key_frame_borrows_the_modes_around_it(motion: Shapes) -> None:
+    x, path = motion.keyframes, Path(motion.bases, motion.faces, smooth=False)
+    pinned = path(x, 1.3) + 0.05
+    found = path.insert(1.3)(torch.cat([x[:2], pinned[None], x[2:]]), times(1.15, 1.65))
+    for shape, ends in zip(found, ((x[1], pinned), (pinned, x[2])), strict=True):
+        torch.testing.assert_close(shape, path.layer(*ends, 0.5, 1), rtol=0, atol=1e-9)
+
+
+def test_each_motion_has_its_own_times(path: Path, motion: Shapes) -> None:
+    many, at = torch.stack([motion.keyframes, 1.1 * motion.keyframes]), times(1.2, 1.7)
+    for shape, keyframes, t in zip(path(many, at), many, at, strict=True):
+        torch.testing.assert_close(shape, path(keyframes, t), rtol=0, atol=1e-9)
+
+
+def test_a_path_scheme_outlasts_an_insert(motion: Shapes) -> None:
+    """One in which every key-frame is a rest."""
+    path = Path(motion.bases, motion.faces, smooth=lambda before, *_: torch.zeros_like(before))
+    keyframes = torch.cat([motion.keyframes[:2], path(motion.keyframes, 1.5)[None], motion.keyframes[2:]])
+    near = path.insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3, 2.0, 2.0 + 1e-3))
+    assert largest(near[1::2] - near[::2]) < 1e-4
+    away = Path(motion.bases, motion.faces).insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3))
+    assert largest(away[1] - away[0]) > 3e-4, "without it, the motion goes on"

@@ -53,6 +53,8 @@ def largest(x: Tensor) -> float:
         ({"n_frames": 101}, [0, 50, 100]),
         ({"n_frames": 10, "cyclic": True}, [0, 3, 7, 10]),
         ({"n_frames": 3, "cyclic": True}, [0, 1, 2, 3]),
+        ({"n_frames": 10, "times": [0.0, 0.1, 10.0]}, [0, 1, 9]),
+        ({"n_frames": 10, "times": [0.0, 9.9, 10.0]}, [0, 8, 9]),
     ],
 )
 def test_places_by_hand(options: dict[str, Any], places: list[int]) -> None:

@@ -18,6 +18,7 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.closest import ClosestFaces, closest_on_triangles
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rotations import exp
+from torch_modal.passengers import binding as bound
 
 DOUBLE = torch.float64
 TURN = exp(torch.tensor([0.4, -1.1, 2.3], dtype=DOUBLE))
@@ -236,3 +237,66 @@ def test_closest_points_on_triangles() -> None:
     torch.testing.assert_close((found - points).norm(dim=1), torch.from_numpy(distances))
     ends = torch.minimum(*((points[480:] - corners[480:, k]).norm(dim=1) for k in (0, 1)))
     assert bool((torch.from_numpy(distances[480:]) <= ends + 1e-12).all())
+
+
+def test_all_sides_of_a_pit_are_followed_alike() -> None:
+    """A point on the axis is equally near to all eight."""
+    angle = torch.arange(8, dtype=DOUBLE) * torch.pi / 4
+    rim = torch.stack([angle.cos(), angle.sin(), torch.ones_like(angle)], 1)
+    i = torch.arange(8)
+    faces = torch.stack([torch.full_like(i, 8), i, (i + 1) % 8], 1)
+    x = torch.cat([rim, torch.zeros(1, 3, dtype=DOUBLE)])
+    weights = tm.Passengers(x, faces, torch.tensor([[0.0, 0.0, 0.8]], dtype=DOUBLE)).weights.toarray()[0]
+    np.testing.assert_allclose(weights[:8], weights[0], rtol=1e-9)
+    assert weights[0] > 0.01
+
+
+def test_many_points_are_bound_in_parts(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    x, points = bars.keyframes[0], around(bars.keyframes[0], bars.faces, 50, 0.02)
+    anchors = torch.randint(-1, len(x), (50,), generator=torch.Generator().manual_seed(0))
+    whole = tm.Passengers(x, bars.faces, points, anchors).weights.toarray()
+    monkeypatch.setattr(bound, "CHUNK", 7)
+    np.testing.assert_array_equal(tm.Passengers(x, bars.faces, points, anchors).weights.toarray(), whole)
+
+
+def test_rotations_are_rotations() -> None:
+    sample = load_sample("hand")
+    passengers = tm.Passengers(sample.keyframes[0], sample.faces, around(sample.keyframes[0], sample.faces, 500, 0.02))
+    found = passengers.rotations(sample.keyframes[1])
+    torch.testing.assert_close(found @ found.mT, torch.eye(3).double().expand(500, 3, 3), rtol=0, atol=1e-9)
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones(500, dtype=DOUBLE))
+
+
+def test_triangles_without_area_have_no_say(bars: Shapes) -> None:
+    x = bars.keyframes[0].clone()
+    x[bars.faces[40, 1]] = x[bars.faces[40, 0]]
+    points = around(x, bars.faces, 100, 0.02)
+    passengers = tm.Passengers(x, bars.faces, points)
+    torch.testing.assert_close(passengers(x @ TURN.mT + 3), points @ TURN.mT + 3, rtol=0, atol=1e-12)
+
+
+def test_a_triangle_cut_in_two_has_the_same_say() -> None:
+    """A vertex turns as the surface around it, however that is cut into triangles."""
+    x = torch.tensor([[0, 0, 0], [2, 0, 0], [0, 2, 0], [-2, -1, 0], [1, 1, 0]], dtype=DOUBLE)
+    y = x + torch.tensor([[0, 0, 0], [0, 0, 0.5], [0, 0, -0.2], [0, 0.3, 0.4], [0, 0, 0.15]], dtype=DOUBLE)
+    whole, cut = [[0, 1, 2], [0, 2, 3], [0, 3, 1]], [[0, 1, 4], [0, 4, 2], [0, 2, 3], [0, 3, 1]]
+    one, other = (
+        tm.Passengers(x[:n], torch.tensor(faces), x[:1]).gradients(y[:n]) for n, faces in ((4, whole), (5, cut))
+    )
+    torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("along", [0.0, 0.3, 0.55])
+def test_the_other_side_of_a_groove_fades_out(along: float) -> None:
+    """Two walls at a right angle: that at twice the distance of the nearer one has no influence any more."""
+    y = torch.linspace(0, 4, 5, dtype=DOUBLE)
+    floor = torch.stack([*torch.meshgrid(y, y, indexing="ij"), torch.zeros(5, 5, dtype=DOUBLE)], -1).view(-1, 3)
+    wall = floor[:, [2, 1, 0]]
+    i = torch.arange(20).view(4, 5)[:, :4].flatten()
+    one = torch.cat([torch.stack([i, i + 5, i + 1], 1), torch.stack([i + 1, i + 5, i + 6], 1)])
+    vertices, number = torch.cat([floor, wall]).unique(dim=0, return_inverse=True)
+    height = 0.5
+    point = torch.tensor([[height * (1 + 2 * along), 2.1, height]], dtype=DOUBLE)
+    weights = tm.Passengers(vertices, number[torch.cat([one, one + 25])], point).weights.toarray()[0]
+    share = float(weights[(vertices[:, 2] > 0).numpy()].sum())
+    assert (share > 0) == (along < 0.5) and share < 0.51

@@ -12,7 +12,7 @@ import torch_modal as tm
 from torch_modal.cli import main as cli
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.frames import save_frames
-from torch_modal.passengers.proxy import Proxy
+from torch_modal.passengers.proxy import Proxy, proxy_size
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +84,29 @@ def test_the_command(rough: tuple[Tensor, Tensor], tmp_path: Path, capsys: pytes
     assert "moved by a proxy of 30" in capsys.readouterr().out
     frames = tm.load_keyframes(sorted((tmp_path / "out").glob("frame-*.obj"))).keyframes
     assert len(frames) == 3 and torch.equal(frames[[0, 2]], keyframes[:2])
+
+
+def test_detail_of_the_last_interval_of_a_cycle(rough: tuple[Tensor, Tensor]) -> None:
+    """From the last key-frame's to the first one's."""
+    keyframes, faces = rough
+    proxy = Proxy(keyframes[:2], faces, 300)
+    found = proxy.carried(proxy.keyframes[[0, 0, 0, 0]], [0, 2, 4], keyframes[:2])
+    first, last = (passengers(proxy.keyframes[0]) for passengers in proxy.passengers)
+    torch.testing.assert_close(found[3], 0.5 * (last + first))
+
+
+def test_each_vertex_follows_its_own_part() -> None:
+    """Of two spheres, one just within the other, where facets of the outer reach below the inner."""
+    ball = trimesh.creation.icosphere(3)
+    x, faces = torch.from_numpy(ball.vertices.copy()), torch.from_numpy(ball.faces.copy())
+    both = torch.cat([x, 0.995 * x])
+    proxy = Proxy(both[None], torch.cat([faces, faces + len(x)]), 150)
+    piece = torch.tensor(Connectivity(proxy.faces.numpy()).vertex_pieces)
+    inner = piece != piece[proxy.keyframes[0].norm(dim=1).argmax()]
+    moved = proxy.keyframes[0] + torch.tensor([0.0, 0.0, 5.0]) * inner[:, None]
+    found = proxy.passengers[0](moved) - both
+    torch.testing.assert_close(found[: len(x)], torch.zeros_like(x), rtol=0, atol=1e-9)
+
+
+def test_large_meshes_have_a_proxy() -> None:
+    assert [proxy_size(None, n) for n in (100_000, 100_001)] == [0, 20_000]

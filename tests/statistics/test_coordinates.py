@@ -1,5 +1,7 @@
 """Rotations and strains of triangles as coordinates, and principal components in them."""
 
+import dataclasses
+
 import pytest
 import torch
 from conftest import Shapes
@@ -81,6 +83,13 @@ def test_a_bend_is_found_again(bars: Shapes, generator: torch.Generator) -> None
         torch.testing.assert_close(one, other_one, rtol=0, atol=1e-9)
 
 
+def test_large_stretches_are_kept(bars: Shapes) -> None:
+    x = bars.keyframes[0]
+    coordinates = BendingCoordinates(x, bars.faces)
+    found = coordinates.of(5 * x[None])
+    assert far(coordinates.shapes(found)[0], 5 * x) < 1e-9
+
+
 class TestComponents:
     def test_all_of_them_span_the_keyframes(self, bars: Shapes) -> None:
         components = tm.ShapeSpace(bars.bases, bars.faces).components()
@@ -102,6 +111,19 @@ class TestComponents:
         wanted = 0.5 * (lengths[0] + lengths[1])
         bent, straight = (float((one - wanted).abs().mean()) for one in lengths[2:])
         assert bent < 0.3 * straight
+
+    def test_the_farthest_shape_is_on_the_positive_side(self, bars: Shapes) -> None:
+        for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
+            own = bars.pick(*order)
+            found = tm.ShapeSpace(own.bases, own.faces).components().coordinates(own.keyframes)
+            assert bool((found.gather(0, found.abs().argmax(0, keepdim=True)) > 0).all())
+
+    def test_the_corner_that_faces_begin_with_changes_nothing(self, bars: Shapes) -> None:
+        rolled = torch.stack([face.roll(i % 3) for i, face in enumerate(bars.faces)])
+        shapes = bars.keyframes * torch.tensor([[1.0, 1, 1], [1.3, 1, 1], [1, 1.2, 1]])[:, None]
+        bases = [dataclasses.replace(b, reference=x) for b, x in zip(bars.bases, shapes, strict=True)]
+        one, other = (tm.ShapeSpace(bases, faces).components() for faces in (bars.faces, rolled))
+        torch.testing.assert_close(one.variances, other.variances)
 
     def test_too_many(self, bars: Shapes) -> None:
         space = tm.ShapeSpace(bars.bases, bars.faces)

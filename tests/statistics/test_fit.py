@@ -11,8 +11,8 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.statistics.fit import Fit, fit, followed
-from torch_modal.statistics.observations import Observations
-from torch_modal.statistics.patches import LocalMixtures, Patches
+from torch_modal.statistics.observations import Observations, Pulls
+from torch_modal.statistics.patches import MOST_BELOW_ZERO, LocalMixtures, Patches, bounded
 from torch_modal.statistics.variation import Variation
 
 DOUBLE = torch.float64
@@ -175,6 +175,34 @@ def test_a_keyframe_comes_back(space: tm.ShapeSpace, bars: Shapes) -> None:
     picked = markers(bars.keyframes[1])
     for near in (None, 1, torch.tensor([0.0, 1.0, 0.0])):
         assert far(space.fit(bars.keyframes[1][picked], picked, near=near).shape, bars.keyframes[1]) < 0.01
+
+
+@pytest.mark.parametrize("near", [0, 1, 2, -1])
+def test_what_points_leave_open_is_as_in_the_likely_key_frame(space: tm.ShapeSpace, bars: Shapes, near: int) -> None:
+    """Three corners of one triangle say where the shape is and nothing of its pose."""
+    picked = bars.faces[0]
+    found = space.fit(bars.keyframes[near][picked], picked, near=near)
+    assert far(found.shape, bars.keyframes[near]) < 0.02
+
+
+def test_pulls_are_the_derivatives_of_their_energy(generator: torch.Generator) -> None:
+    x, points = (torch.randn(n, 3, generator=generator, dtype=DOUBLE) for n in (6, 4))
+    to = Observations(points, torch.tensor([1, 4, 4, 0]), torch.tensor([1.0, 0.5, 2.0, 1.0], dtype=DOUBLE))
+    pulls = Pulls(to, 3.0)
+    at = pulls.at(x[None])
+    torch.testing.assert_close(at.value, pulls.value(x[None]))
+    slope = torch.func.grad(lambda y: pulls.value(y).sum())
+    torch.testing.assert_close(at.gradient, slope(x[None]))
+    field = torch.randn(1, 6, 3, generator=generator, dtype=DOUBLE)
+    torch.testing.assert_close(at.product(field), torch.func.jvp(slope, (x[None],), (field,))[1])
+
+
+def test_weights_far_below_zero_come_nearer_to_even_ones() -> None:
+    weights = torch.tensor([[5.0, 1.5, 0.2], [-3.0, -0.5, 0.3], [-1.0, 0.0, 0.5]], dtype=DOUBLE)
+    found = bounded(weights)
+    torch.testing.assert_close(found.sum(0), torch.ones(3, dtype=DOUBLE))
+    assert float(found[:, 0].clamp_max(0).sum()) >= -MOST_BELOW_ZERO
+    torch.testing.assert_close(found[:, 1:], weights[:, 1:])  # within the bound
 
 
 def test_what_no_mixture_meets_falls_back_to_a_keyframe(

@@ -37,6 +37,16 @@ def test_edges_keep_the_lengths_of_the_keyframes(space: tm.ShapeSpace, bars: Sha
     assert max(variation.folds(x) for x in members) <= most
 
 
+def test_folds_are_counted(space: tm.ShapeSpace, bars: Shapes) -> None:
+    """A corner of a triangle that is laid on the opposite corner of its neighbour."""
+    x, variation = bars.keyframes[0].clone(), space.variation()
+    assert variation.folds(x) == 0
+    first, second, own, other = Connectivity(bars.faces.numpy()).hinges[100]
+    middle = 0.5 * (x[first] + x[second])
+    x[own] = middle + 0.9 * (x[other] - middle)
+    assert variation.folds(x) > 0
+
+
 def test_a_draw_that_folds_is_made_less_local(space: tm.ShapeSpace, monkeypatch: pytest.MonkeyPatch) -> None:
     variation = space.variation()
     weights, factors = variation.draw(1.0, 3.0, seeded())
