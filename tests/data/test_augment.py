@@ -15,6 +15,7 @@ import torch_modal as tm
 from torch_modal.data.deformation import deform, linear_strain
 from torch_modal.data.samples import load_sample
 from torch_modal.data.table import interpolate
+from torch_modal.geometry.canonical import size
 from torch_modal.geometry.rigid import best_fit
 
 F64 = torch.float64
@@ -249,6 +250,12 @@ def test_nearest_key_frame_is_found_through_rigid_motions(bars: Shapes, space: t
     assert space.nearest(between).tolist() == [2]
 
 
+def test_in_betweens_are_the_same_from_either_end(bars: Shapes, space: tm.ShapeSpace) -> None:
+    x, y = 1.01 * bars.keyframes[:1], bars.keyframes[2:] + 0.01
+    t = torch.tensor([0.2], dtype=F64)
+    torch.testing.assert_close(space.in_between(y, x, 1 - t, 2, 0), space.in_between(x, y, t, 0, 2))
+
+
 def test_times_and_partners_are_uniform(space: tm.ShapeSpace) -> None:
     params = tm.RandomInBetween(t=(0.2, 0.6), p=0.3, space=space).forward_parameters(4000, generator=seeded())
     t = params["t"]
@@ -321,6 +328,20 @@ def test_amplitudes_are_thermal(bars: Shapes, space: tm.ShapeSpace) -> None:
     correlation = torch.corrcoef(found) - torch.eye(basis.n_modes, dtype=F64)
     assert float(correlation.abs().max()) < 0.12
     assert float(space.strain(x + moved, x).square().mean().sqrt()) == pytest.approx(strain, rel=0.03)
+
+
+def test_the_strain_of_a_sheet_is_that_of_its_sides() -> None:
+    """Bent to a cylinder: half the thickness, a hundredth of the size, over the radius."""
+    n = torch.linspace(0, 1, 31, dtype=F64)
+    x = torch.stack([*torch.meshgrid(n, n, indexing="ij"), torch.zeros(31, 31, dtype=F64)], -1).view(-1, 3)
+    i = torch.arange(930).view(30, 31)[:, :30].flatten()
+    faces = torch.cat([torch.stack([i, i + 31, i + 1], 1), torch.stack([i + 1, i + 31, i + 32], 1)])
+    mode = torch.zeros_like(x)
+    mode[:, 2] = 0.5 * x[:, 0] ** 2
+    basis = tm.ModalBasis(x, torch.ones(1, dtype=F64), mode[None], torch.zeros(6, dtype=F64))
+    reference = tm.ShapeSpace(basis, faces).reference(0, x)
+    curvature = float(reference.modes.view(3, -1)[2].max()) / 0.5  # of a strain of one
+    assert curvature * size(x.numpy(), faces.numpy()) == pytest.approx(1 / 0.005, rel=0.3)
 
 
 def test_strain_is_bounded_and_the_bound_reached(bars: Shapes, space: tm.ShapeSpace) -> None:

@@ -542,3 +542,10 @@ def test_a_path_scheme_outlasts_an_insert(motion: Shapes) -> None:
     assert largest(near[1::2] - near[::2]) < 1e-4
     away = Path(motion.bases, motion.faces).insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3))
     assert largest(away[1] - away[0]) > 3e-4, "without it, the motion goes on"
+
+
+def test_key_frames_may_be_counted_from_the_end(motion: Shapes, path: Path) -> None:
+    editor = tm.PathEditor(path, motion.keyframes, steps=2)
+    editor.shapes()
+    editor.replace(-1, motion.keyframes[-1] + 0.1)
+    torch.testing.assert_close(editor.shapes(), path(editor.keyframes, editor.times()), rtol=0, atol=1e-9)
