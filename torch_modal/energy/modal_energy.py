@@ -33,12 +33,10 @@ class Derivatives(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """The affine space of each sample, ``x(a) = base + columns a[:n] (+ extra a[n])``, and its reference."""
+    """The affine space of each sample, ``x(a) = base + columns a``, and its reference."""
 
     base: Tensor
     """Components before vertices, extended. *Shape:* ``(B, 3, V)``."""
-    extra: Tensor | None
-    """An additional column of each sample. *Shape:* ``(B, 3, V)``."""
     reference: Reference
 
 
@@ -93,32 +91,28 @@ class ModalEnergy(nn.Module):
         """The tables through which derivatives are gathered."""
         return self._tables
 
-    def place(
-        self, base: Tensor, reference: Reference, extra: Tensor | None = None, anchors: Tensor | None = None
-    ) -> Placement:
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes, n."""
+        return len(self.columns)
+
+    def place(self, base: Tensor, reference: Reference, anchors: Tensor | None = None) -> Placement:
         """The space of each sample.
 
         Args:
             base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
             reference: What is compared with, for example of :meth:`torch_modal.ShellEnergy.against`.
-            extra: One more direction, of each sample's own. *Shape:* ``(B, V, 3)``.
             anchors: Of the energy's terms, where there are some; by default those of a
                 :class:`torch_modal.ShellEnergy` as they are. *Shape:* ``(B, P, 3)``.
         """
         if anchors is None and self.unscaled and self.energy.anchors is not None:
             anchors = self.energy.anchors.to(base)[None]
-        return Placement(self._extended(base, anchors), None if extra is None else self._extended(extra), reference)
-
-    def _extended(self, x: Tensor, anchors: Tensor | None = None) -> Tensor:
         fixed = None if anchors is None else anchors.movedim(-1, 0)
-        return self.energy.extend(x.movedim(-1, 0), fixed).movedim(0, -2)
+        return Placement(self.energy.extend(base.movedim(-1, 0), fixed).movedim(0, -2), reference)
 
     def rows(self, a: Tensor, placement: Placement) -> Tensor:
         """The shape ``x(a)``, components first. *Shape:* ``(..., B, n) -> (3, ..., B, V)``."""
-        n = len(self.columns)
-        x = placement.base + (a[..., :n] @ self.columns.flatten(1)).unflatten(-1, (3, -1))
-        if placement.extra is not None:
-            x = x + a[..., n, None, None] * placement.extra
+        x = placement.base + (a @ self.columns.flatten(1)).unflatten(-1, (3, -1))
         return x.movedim(-2, 0).contiguous()
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
@@ -136,22 +130,16 @@ class ModalEnergy(nn.Module):
         energy = self.energy
         x = self.rows(a, placement)
         at = energy.linearise(x, placement.reference)
-        extra = None if placement.extra is None else placement.extra.transpose(0, 1)
-        gradient, gauss_newton = [], []
-        for part, one, columns in zip(energy.parts, at, self.tables.edge_vectors, strict=True):
-            if columns is None:
-                slope, product = self._of_total(one, extra)
-            else:
-                own = None if extra is None else part.edge_vectors(extra).flatten(0, 1)
-                slope, product = _normal_equations(one, columns, own)
-            gradient.append(slope)
-            gauss_newton.append(product)
-        inner = reduce(torch.add, gauss_newton)
+        each = [
+            self._of_total(one) if columns is None else _normal_equations(one, columns)
+            for one, columns in zip(at, self.tables.edge_vectors, strict=True)
+        ]
+        gradient, inner = (reduce(torch.add, parts) for parts in zip(*each, strict=True))
         stiffness = sum(one.curvature.sum(-1) for one in at)
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((0, -1))
-        curved = self._curved(at, extra) if second_order else None
-        return Derivatives(reduce(torch.add, gradient), inner, curved, rounding * (stiffest * stiffness).sqrt())
+        curved = self.tables.congruence(self.curvature.of(energy, at)) if second_order else None
+        return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
@@ -159,18 +147,13 @@ class ModalEnergy(nn.Module):
         given = a, *trees.leaves(placement)
         if torch.is_inference_mode_enabled() or traced(a) or any(transformed(x) or x.is_inference() for x in given):
             at = self.energy.linearise(self.rows(a, placement), placement.reference)
-            gradient = along_columns(self.energy.gradient(at).transpose(0, 1), self.columns, placement.extra)
+            gradient = self.energy.gradient(at).transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
             return self.energy.value_at(at, placement.reference), gradient
         with torch.enable_grad():
             leaf = a.detach().requires_grad_()
             value = self.value(leaf, placement)
             (gradient,) = torch.autograd.grad(value.sum(), leaf)
         return value.detach(), gradient
-
-    def second_order(self, a: Tensor, placement: Placement) -> Tensor:
-        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
-        at = self.energy.linearise(self.rows(a, placement), placement.reference)
-        return self._curved(at, None if placement.extra is None else placement.extra.transpose(0, 1))
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
         """Gradient of ``direction . dE/da`` in all that the placement holds, at amplitudes that stay.
@@ -183,16 +166,12 @@ class ModalEnergy(nn.Module):
         Returns:
             One gradient in the place of each tensor.
         """
-        energy, n = self.energy, len(self.columns)
+        energy = self.energy
         at = energy.linearise(self.rows(a, placement), placement.reference)
         moved = self.rows(direction, placement._replace(base=torch.zeros_like(placement.base)))
         rates = energy.rates(at, moved)
         pushed = energy.gather(at, [one.curvature * rate for one, rate in zip(at, rates, strict=True)])
         pushed = pushed + self.curvature.push(self.curvature.of(energy, at), moved)
-        to_base, to_extra = pushed.transpose(0, 1), None
-        if placement.extra is not None:
-            own = energy.gradient(at).transpose(0, 1)
-            to_extra = a[:, n, None, None] * to_base + direction[:, n, None, None] * own
         to_measures, to_weights = [], []
         measures, weights, constant = placement.reference
         for part, one, rest, weight, rate in zip(energy.parts, at, measures, weights, rates, strict=True):
@@ -200,24 +179,12 @@ class ModalEnergy(nn.Module):
             to_measures.append(pulled[0])
             to_weights.append(pulled[1])
         to_constant = torch.zeros_like(constant) if isinstance(constant, Tensor) else constant
-        return Placement(to_base, to_extra, Reference(tuple(to_measures), tuple(to_weights), to_constant))
+        return Placement(pushed.transpose(0, 1), Reference(tuple(to_measures), tuple(to_weights), to_constant))
 
-    def _of_total(self, one: Linearised, extra: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _of_total(self, one: Linearised) -> tuple[Tensor, Tensor]:
         """Contribution of a total to the gradient and to Gauss-Newton's Hessian."""
         row = one.gradients.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
-        if extra is not None:
-            row = torch.cat([row, (one.gradients * extra).sum((0, -1))[:, None]], -1)
         return one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
-
-    def _curved(self, at: Sequence[Linearised], extra: Tensor | None) -> Tensor:
-        """The second-order term. *Shape:* ``(B, n, n)``."""
-        blocks = self.curvature.of(self.energy, at)
-        inner = self.tables.congruence(blocks)
-        if extra is None:
-            return inner
-        pushed = self.curvature.push(blocks, extra)
-        border = pushed.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
-        return _bordered(inner, border, (extra * pushed).sum((0, -1)))
 
 
 def _edge_vectors_of_rows(values: Tensor, corners: Tensor) -> Tensor:
@@ -229,44 +196,22 @@ def _edge_vectors_of_rows(values: Tensor, corners: Tensor) -> Tensor:
     return torch.cat([other - first for other in others], 1)
 
 
-def _normal_equations(one: Linearised, columns: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor]:
+def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Contribution of one term to the gradient and to Gauss-Newton's Hessian.
 
     Args:
         one: The term.
         columns: Edge vectors in each direction of the space. *Shape:* ``(M, c, n)``.
-        extra: Edge vectors in each sample's own direction. *Shape:* ``(c, B, M)``.
 
     Returns:
-        *Shape:* ``(B, n)``, ``(B, n, n)``; with an own direction, one more of each.
+        *Shape:* ``(B, n)``, ``(B, n, n)``.
     """
     # Rows of the Jacobian are scaled before they pass through the columns, where they are few numbers.
     root = one.curvature.clamp_min(torch.finfo(one.curvature.dtype).tiny).sqrt()
     local = root * one.gradients.flatten(0, 1)
     # Products of tiny matrices are fast in one dense block only: any other layout is copied matrix by matrix.
     jacobian = (local.permute(2, 1, 0).contiguous() @ columns).transpose(0, 1)
-    residual = one.slope / root
-    inner = jacobian.mT @ jacobian
-    if extra is None:
-        return (jacobian.mT @ residual[..., None]).squeeze(-1), inner
-    # The own direction is one row and column more; put beside the others, it would copy them all.
-    own = (local * extra).sum(0)
-    gradient, border = (jacobian.mT @ torch.stack([residual, own], -1)).unbind(-1)
-    last = (own * residual).sum(-1, keepdim=True)
-    return torch.cat([gradient, last], -1), _bordered(inner, border, (own * own).sum(-1))
-
-
-def along_columns(x: Tensor, columns: Tensor, extra: Tensor | None) -> Tensor:
-    """Inner products with columns and an extra one. *Shape:* ``(B, ...), (m, ...), (B, ...) -> (B, n)``."""
-    found = x.flatten(1) @ columns.flatten(1).mT
-    return found if extra is None else torch.cat([found, (x * extra).flatten(1).sum(-1, keepdim=True)], -1)
-
-
-def _bordered(inner: Tensor, border: Tensor, corner: Tensor) -> Tensor:
-    """A symmetric matrix with one row and column more. *Shape:* ``(B, n, n), (B, n), (B,) -> (B, n+1, n+1)``."""
-    upper = torch.cat([inner, border[..., None]], -1)
-    lower = torch.cat([border, corner[:, None]], -1)
-    return torch.cat([upper, lower[:, None]], 1)
+    return (jacobian.mT @ (one.slope / root)[..., None]).squeeze(-1), jacobian.mT @ jacobian
 
 
 class SumOfEnergies(nn.Module):
@@ -281,6 +226,11 @@ class SumOfEnergies(nn.Module):
         super().__init__()
         self.parts: Any = nn.ModuleList(parts)
         self.anchor = anchor
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes, n."""
+        return self.parts[0].n_amplitudes  # type: ignore[no-any-return]
 
     def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
@@ -301,10 +251,6 @@ class SumOfEnergies(nn.Module):
         values, gradients = zip(*found, strict=True)
         value = reduce(torch.add, values) + 0.5 * self.anchor * a.square().sum(-1)
         return value, reduce(torch.add, gradients) + self.anchor * a
-
-    def second_order(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
-        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
-        return reduce(torch.add, [part.second_order(a.to(own.base.dtype), own) for part, own in self._each(placement)])
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Sequence[Placement]) -> list[Placement]:
         """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""

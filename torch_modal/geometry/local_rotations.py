@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
-from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, tangent_offset
 from torch_modal.geometry.rotation_means import agreeing, mean
 from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import (
@@ -32,7 +31,7 @@ SHORTEST = 1e-9
 
 
 class Trajectory(NamedTuple):
-    """How triangles move between two shapes of a motion. Components first."""
+    """Cubics of the triangles between two shapes of a motion. Components first."""
 
     e1: Tensor
     """The frames of the shape at 0. *Shape:* ``(3, P, F)``."""
@@ -41,16 +40,14 @@ class Trajectory(NamedTuple):
     size: Tensor
     """Entries of the stretch at 0. *Shape:* ``(3, P, F)``."""
     step: Tensor
-    """To the shape at 1: axis times angle in the coordinates of the frames, then the growth of the stretch over the
-    mean size, so that all are turns or strains. *Shape:* ``(6, P, F)``."""
+    """To the shape at 1, of :meth:`LocalRotations.step`. *Shape:* ``(6, P, F)``."""
     first: Tensor
-    """The tangent offset of the step at the start. *Shape:* ``(6, P, F)``."""
+    """How far the velocity at the start is from the step. *Shape:* ``(6, P, F)``."""
     last: Tensor
-    unit: Tensor
-    """The mean size. *Shape:* ``(P, F)``."""
+    """How far that at the end is. *Shape:* ``(6, P, F)``."""
 
     def rows(self, index: Tensor) -> "Trajectory":
-        """Of some of the shapes."""
+        """Those of some of the pairs."""
         return Trajectory._make(part.index_select(-2, index) for part in self)
 
 
@@ -164,47 +161,26 @@ class LocalRotations(nn.Module):
         areas = (a.doubled_areas + b.doubled_areas).squeeze(0)
         return _turn_between(a, b).squeeze(1), areas, self.ancestors, self.piece
 
-    def trajectory(
-        self, before: Tensor | None, first: Tensor, second: Tensor, after: Tensor | None, spacing: Spacing
-    ) -> Trajectory:
-        """A smooth trajectory through four shapes, between the two in the middle. *Shape of each:* ``(P, V, 3)``.
+    def step(self, a: Frames, b: Frames) -> Tensor:
+        """The step of each triangle from one shape to another.
 
-        Args:
-            before: The shape before the first; None where there is none.
-            first: The shape at 0.
-            second: The shape at 1.
-            after: The shape after the second.
-            spacing: Durations of the three intervals. *Shape of each:* ``(P,)``.
+        Axis times angle in the coordinates of the frame, which are the same in both frames, then the growth of the
+        entries of the stretch. *Shape:* ``(6, B, F)``.
         """
-        earlier, a, b, later = (None if x is None else _frames(x, self.faces) for x in (before, first, second, after))
-        assert a is not None and b is not None
-        unit = 0.5 * (a.size + b.size)
-        unit = torch.maximum(unit, SHORTEST * unit.mean(-1, keepdim=True))
+        turn = turn_of(self._signed(a, b))
+        turns = [(turn * axis).sum(0) for axis in (a.e1, a.e2, a.normal)]
+        return torch.stack([*turns, *(y - x for x, y in zip(a[3:], b[3:], strict=True))])
 
-        def step(p: Frames | None, q: Frames | None, at: Frames) -> Tensor | None:
-            if p is None or q is None:
-                return None
-            turn = turn_of(self._signed(p, q))
-            # The axis has the same coordinates in either frame.
-            turns = [(turn * axis).sum(0) for axis in (at.e1, at.e2, at.normal)]
-            return torch.stack([*turns, *((y - x) / unit for x, y in zip(p[3:], q[3:], strict=True))])
-
-        own = step(a, b, a)
-        assert own is not None
-        wide = spacing.mapped(lambda h: h[:, None])
-
-        def squared(x: Tensor) -> Tensor:
-            return x.square().sum(0) + x[4].square()  # twice the entry beside the diagonal, as in the norm of a matrix
-
-        bend = tangent_offset(own, step(earlier, a, a), step(b, later, b), wide, squared)
-        return Trajectory(a.e1, a.e2, a.normal, torch.stack(a[3:]), own, *bend, unit)
+    def frames(self, x: Tensor) -> Frames:
+        """The frames of the triangles of shapes. *Shape:* ``(B, V, 3)``."""
+        return _frames(x, self.faces)
 
     def along(self, trajectory: Trajectory, which: Tensor, t: Tensor) -> Tensor:
-        """Edge vectors on courses, components first.
+        """Edge vectors of shapes on trajectories, components first.
 
         Args:
             trajectory: Of P pairs of shapes.
-            which: Of which of them. *Shape:* ``(B,)``.
+            which: The pair of each shape. *Shape:* ``(B,)``.
             t: Times. *Shape:* ``(B,)``.
 
         Returns:
@@ -213,7 +189,7 @@ class LocalRotations(nn.Module):
         return self._along(trajectory.rows(which), t, None)
 
     def bent_along(self, trajectory: Trajectory, t: Tensor, bending: Tensor) -> Tensor:
-        """The same of one pair of shapes, whose triangles also bend: they are strained, then turned, and carried along.
+        """Edge vectors of shapes on the trajectory of one pair, whose triangles are strained and turned beforehand.
 
         Args:
             trajectory: Of one pair.
@@ -228,8 +204,9 @@ class LocalRotations(nn.Module):
 
     def _along(self, trajectory: Trajectory, t: Tensor, bending: Tensor | None) -> Tensor:
         u = t[:, None]
-        straight, bent = u * trajectory.step, beyond(TangentOffset(trajectory.first, trajectory.last), u)
-        xx, xy, yy = trajectory.size + trajectory.unit * (straight + bent)[3:]
+        straight = u * trajectory.step
+        bent = u * (1 - u) * ((1 - u) * trajectory.first - u * trajectory.last)
+        xx, xy, yy = trajectory.size + (straight + bent)[3:]
         flat = torch.zeros_like(xx)
 
         def placed(x: Tensor, y: Tensor) -> Tensor:
@@ -238,8 +215,7 @@ class LocalRotations(nn.Module):
             x, y, z = turned(straight[:3], turned(bent[:3], side))
             return x * trajectory.e1 + y * trajectory.e2 + z * trajectory.normal
 
-        end = trajectory.size + trajectory.unit * trajectory.step[3:]
-        areas = doubled_areas(*trajectory.size) + doubled_areas(*end)
+        areas = doubled_areas(*trajectory.size) + doubled_areas(*(trajectory.size + trajectory.step[3:]))
         first, second = mapped(xx, xy, xy, yy) if bending is None else stretched(bending[3:], xx, xy, yy)
         return self._edges(Sides(placed(*first), placed(*second)), areas)
 

@@ -12,6 +12,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
+from torch_modal.backends.torch.distortion import Distortion
+from torch_modal.backends.torch.energies import RestShapes
+from torch_modal.solve.minimise import Solution, Status
 
 # A shape has at most this many times the distortion of its starts. Below, the volume error, which is not measured and
 # which the starts have more of, and the choice of elements decide more than the shapes do.
@@ -25,18 +28,47 @@ MARGIN = 0.5
 
 
 def no_worse(
-    x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = SLACK
-) -> tuple[Tensor, Tensor]:
+    x: Tensor, starts: Sequence[Tensor], solution: Solution, distortion: Distortion, rests: RestShapes, slack: float
+) -> tuple[Tensor, Solution]:
     """Shapes, blended into their starts as far as they have more distortion.
 
-    The result is a continuous function of the shapes, and differentiable if the distortions are.
+    The result is a continuous function of the shapes, and differentiable.
+
+    Args:
+        x: *Shape:* ``(B, V, 3)``.
+        starts: *Shape of each:* ``(B, V, 3)``.
+        solution: Of the shapes.
+        distortion: Measures the shapes.
+        rests: What they are compared with.
+        slack: How many times as much distortion as its start a shape may have.
+
+    Returns:
+        The shapes, and the solution, in which those that a start has replaced are marked.
+    """
+    if not len(x):
+        return x, solution
+    # Added to the distortions of the starts: where nothing is strained, nothing is worse.
+    shapes, slight = [x, *starts], distortion.slight(rests.stiffness, x)
+    with torch.no_grad():
+        found = distortion(shapes, rests)
+    if torch.is_grad_enabled() and _needs_gradient(found, slight, slack):
+        found = distortion(shapes, rests)
+    x, replaced = blended(x, starts, found, slight, slack)
+    fell = replaced & (solution.status != Status.INVALID)
+    return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
+
+
+def blended(
+    x: Tensor, starts: Sequence[Tensor], distortion: Tensor, slight: Tensor, slack: float = SLACK
+) -> tuple[Tensor, Tensor]:
+    """Shapes, blended into their starts by their distortions.
 
     Args:
         x: *Shape:* ``(B, V, 3)``.
         starts: *Shape of each:* ``(B, V, 3)``.
         distortion: Of ``x`` and of the starts. *Shape:* ``(1 + S, B)``.
-        slight: Added to those of the starts: where nothing is strained, nothing is worse. *Shape:* ``(B,)``.
-        slack: How many times as much distortion as its start a shape may have.
+        slight: Added to those of the starts. *Shape:* ``(B,)``.
+        slack: As for :func:`no_worse`.
 
     Returns:
         The shapes, *shape* ``(B, V, 3)``; where a start has replaced one, *shape* ``(B,)``, bool.
@@ -54,8 +86,8 @@ def no_worse(
     return x, replaced
 
 
-def needs_gradient(distortion: Tensor, slight: Tensor, slack: float) -> bool:
-    """Whether :func:`no_worse` depends on the distortions to first order. *Shape:* ``(1 + S, B), (B,)``."""
+def _needs_gradient(distortion: Tensor, slight: Tensor, slack: float) -> bool:
+    """True where the blend depends on the distortions to first order. *Shape:* ``(1 + S, B), (B,)``."""
     if traced(distortion) or transformed(distortion):
         return True
     parts = _part(distortion[:1], distortion[1:] + slight, slack)

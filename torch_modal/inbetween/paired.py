@@ -6,12 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal import trees
-from torch_modal.backends.torch.alignment import Pair
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.energy.modal_energy import Derivatives, Placement, SumOfEnergies
-from torch_modal.inbetween.columns import Columns
-from torch_modal.inbetween.frame import Frame
-from torch_modal.inbetween.levels import Levels
+from torch_modal.inbetween.multilevel import MultilevelEnergy
+from torch_modal.inbetween.subspace import SubspaceBasis
 
 
 class PairedPlacement(NamedTuple):
@@ -27,44 +25,34 @@ class PairedPlacement(NamedTuple):
     """Weight of the similarity. *Shape:* ``(B,)``."""
 
 
-class PairedProblem(NamedTuple):
-    """The mid-shape of each sample as a minimisation."""
-
-    placement: PairedPlacement
-    """The inputs that the minimiser depends on."""
-    start: None
-    """At zeros, which are the key-frames, as in the paper."""
-    first: Tensor
-    """*Shape:* ``(B, V, 3)``."""
-    second: Tensor
-    """*Shape:* ``(B, V, 3)``."""
-    starts: tuple[Tensor, ...]
-    """Linear interpolation, which the result must not be worse than. *Shape of each:* ``(B, V, 3)``."""
-
-
 class PairedEnergy(nn.Module):
     r"""Eq. 4: :math:`d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)` in the amplitudes of both shapes.
 
     Args:
         energies: The energy of either shape in its own amplitudes.
-        ends: Columns of both spaces.
-        used: Which of the fine vertices the similarity is taken over. *Shape:* ``(V,)``, bool.
+        ends: Bases of both subspaces.
+        used: The fine vertices that the similarity is taken over. *Shape:* ``(V,)``, bool.
     """
 
     gap: Tensor
     gap_gram: Tensor
 
-    def __init__(self, energies: Sequence[SumOfEnergies], ends: Sequence[Columns], used: Tensor) -> None:
+    def __init__(self, energies: Sequence[SumOfEnergies], ends: Sequence[SubspaceBasis], used: Tensor) -> None:
         super().__init__()
         self.first, self.second = energies
-        self.n_first = len(ends[0])
         gap = (torch.cat([ends[0].fine, -ends[1].fine]) * used[:, None]).flatten(1)
         self.register_buffer("gap", gap, persistent=False)
         self.register_buffer("gap_gram", gap @ gap.mT, persistent=False)
 
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes of both."""
+        return len(self.gap)
+
     def split(self, a: Tensor) -> tuple[Tensor, Tensor]:
         """Amplitudes of the two shapes."""
-        return a[..., : self.n_first], a[..., self.n_first :]
+        n = self.first.n_amplitudes
+        return a[..., :n], a[..., n:]
 
     def value(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
@@ -75,12 +63,13 @@ class PairedEnergy(nn.Module):
 
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
-        first, second = (energy.derivatives(part, place, False) for energy, part, place in self._ends(a, placement))
+        ends = self._ends(a, placement)
+        first, second = (energy.derivatives(part, place, second_order) for energy, part, place in ends)
         gradient = torch.cat([first.gradient, second.gradient], -1)
         gradient = gradient + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
-        curved = self.second_order(a, placement) if second_order else None
+        curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
         return Derivatives(gradient, gauss_newton, curved, first.resolution + second.resolution)
 
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
@@ -101,10 +90,6 @@ class PairedEnergy(nn.Module):
         to_linear = 2 * placement.mu[:, None] * direction
         return PairedPlacement(first, second, to_linear, torch.zeros_like(placement.constant), to_mu)
 
-    def second_order(self, a: Tensor, placement: PairedPlacement) -> Tensor:
-        """The second-order term of the full Hessian. *Shape:* ``(B, n, n)``."""
-        return _block_diagonal(*(energy.second_order(part, place) for energy, part, place in self._ends(a, placement)))
-
     def _ends(
         self, a: Tensor, placement: PairedPlacement
     ) -> Iterator[tuple[SumOfEnergies, Tensor, tuple[Placement, ...]]]:
@@ -118,60 +103,40 @@ class PairedSpace(nn.Module):
     paper's method, kept for comparison; the joint space is the better choice.
 
     Args:
-        frame: Frame of the two bases.
-        levels: The energies of the modal solve.
-        modes: Modes of both ends. *Shape of each:* ``(k, V, 3)``.
+        levels: The energy of the modal solve.
+        ends: Bases of both subspaces.
+        used: The vertices of faces. *Shape:* ``(V,)``, bool.
     """
 
-    def __init__(self, frame: Frame, levels: Levels, modes: Sequence[Tensor]) -> None:
+    used: Tensor
+
+    def __init__(self, levels: MultilevelEnergy, ends: Sequence[SubspaceBasis], used: Tensor) -> None:
         super().__init__()
-        self.frame, self.levels = frame, levels
-        self.first, self.second = (frame.elastic_columns(end) for end in frame.modes(*modes))
-        ends = (self.first, self.second)
-        self.energy = PairedEnergy([levels.modal(end) for end in ends], ends, frame.weights > 0)
+        self.levels = levels
+        self.ends = nn.ModuleList(ends)
+        self.register_buffer("used", used, persistent=False)
+        self.energy = PairedEnergy([levels.modal(end) for end in ends], ends, used)
 
-    @property
-    def n_unknowns(self) -> int:
-        """Number of amplitudes."""
-        return len(self.energy.gap)
+    def place(self, base: Tensor, rests: RestShapes, mu: Tensor) -> PairedPlacement:
+        """The two shapes of each sample, each with its key-frame as base and as rest shape.
 
-    def problem(
-        self,
-        pair: Pair,
-        index: Tensor | None,
-        t: Tensor,
-        stiffness: list[list[Tensor]],
-        mu: Tensor,
-        anchors: Tensor | None,
-    ) -> PairedProblem:
-        """Set up the mid-shapes of a batch; Eq. 4 knows the time 1/2 only. Arguments as for the joint space."""
-        ends = (pair.first, pair.second)
-        first, second = trees.picked(ends, index)
-
-        def place(x: Tensor, modal: SumOfEnergies) -> tuple[Placement, ...]:
-            coarse = self.frame.coarsen(x)
-            references = self.levels.against(x, coarse, stiffness)
-            return self.levels.place(modal, self.levels.seen(x, coarse), references, None, anchors)
-
-        places = place(first, self.energy.first), place(second, self.energy.second)
-        difference = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)
-        placement = PairedPlacement(places[0], places[1], difference @ self.energy.gap.mT, (difference**2).sum(-1), mu)
-        return PairedProblem(placement, None, first, second, (torch.lerp(first, second, t[:, None, None]),))
-
-    @staticmethod
-    def require(t: Tensor) -> None:
-        """The time 1/2.
-
-        Raises:
-            ValueError: Another time.
+        Args:
+            base: Plays no part.
+            rests: The key-frames. *Shape:* ``(B, 2, V, 3)``.
+            mu: *Shape:* ``(B,)``.
         """
-        if bool((t != 0.5).any()):
-            raise ValueError("the paired space (Eq. 4) is defined at t = 1/2 only; use space='joint' for other times")
+        placed = []
+        for k, energy in enumerate((self.energy.first, self.energy.second)):
+            own = rests._replace(shapes=rests.shapes[:, k : k + 1], weights=torch.ones_like(rests.weights[:, :1]))
+            placed.append(self.levels.place(energy, rests.shapes[:, k], own, soften=False))
+        difference = ((rests.shapes[:, 0] - rests.shapes[:, 1]) * self.used[:, None]).flatten(1)
+        return PairedPlacement(placed[0], placed[1], difference @ self.energy.gap.mT, (difference**2).sum(-1), mu)
 
-    def lift(self, a: Tensor, problem: PairedProblem) -> Tensor:
-        """The fine mid-shape of given amplitudes. *Shape:* ``(B, n) -> (B, V, 3)``."""
-        a1, a2 = self.energy.split(a)
-        return 0.5 * (problem.first + self.first.combine(a1) + problem.second + self.second.combine(a2))
+    def lift(self, a: Tensor, base: Tensor) -> Tensor:
+        """The fine mid-shape of amplitudes; the base is the linear one. *Shape:* ``(B, n) -> (B, V, 3)``."""
+        for end, own in zip(self.ends, self.energy.split(a), strict=True):
+            base = end.added(base, 0.5 * own)
+        return base
 
 
 def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:

@@ -31,8 +31,6 @@ class Objective:
     Attributes:
         space: ``"joint"`` (one shape in the sum of both modal spaces) or ``"paired"`` (Eq. 4 of the paper: one near
             each key-frame, pulled together, and the mean of both; t = 1/2 only).
-        base: The shape that the modes are added to in the joint space: ``"rotations"`` (a blend by local rotations of
-            the triangles, which leaves less for the modes to do) or ``"linear"`` (linear interpolation).
         alpha: Stretching stiffness of Eq. 5: a number, or a tensor or parameter whose last dimension counts the edges,
             or is 1, and whose others broadcast against the samples. *Shape:* ``()``, ``(..., E)`` or ``(..., 1)``.
         beta: Bending stiffness, likewise with the hinges. *Shape:* ``()``, ``(..., H)`` or ``(..., 1)``.
@@ -40,10 +38,10 @@ class Objective:
         mu: Weight of the similarity of Eq. 4, of no effect in the joint space: a number, or a tensor or parameter that
             broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.
-        anchor: ``rho``, the weight of the mean squared distance of the shape from the base ``"rotations"``, at a size
-            of 100. Without it there are many minima of almost the same energy, between which shapes jump.
+        anchor: ``rho``, the weight of the mean squared distance of the shape from the blend by local rotations, at a
+            size of 100, in the joint space. Without it there are many minima of almost the same energy, between which shapes jump.
         coarse_faces: Faces of the mesh that the energy is evaluated on in the modal space.
-        contact: Whether parts are kept from passing through each other (docs/contact.md). It needs the extra
+        contact: True to keep parts from passing through each other (docs/contact.md). It needs the extra
             ``contact``, and the joint space.
 
     Raises:
@@ -51,7 +49,6 @@ class Objective:
     """
 
     space: Literal["joint", "paired"] = "joint"
-    base: Literal["rotations", "linear"] = "rotations"
     alpha: float | Tensor = ALPHA
     beta: float | Tensor = BETA
     gamma: float | Tensor = GAMMA
@@ -63,7 +60,6 @@ class Objective:
 
     def __post_init__(self) -> None:
         _choice("space", self.space, ("joint", "paired"))
-        _choice("base", self.base, ("rotations", "linear"))
         _whole("coarse_faces", self.coarse_faces, 4)
         if not 0 <= self.anchor < math.inf:
             raise ValueError(f"anchor is a finite number, 0 or more; got {self.anchor!r}")
@@ -155,6 +151,6 @@ def settings(
 
 
 def with_space(chosen: Settings, space: str | None, mu: float | Tensor | None) -> Settings:
-    """The same with another space or ``mu``, where they are given."""
+    """Settings with another space or ``mu``, where they are given."""
     changes = {name: value for name, value in (("space", space), ("mu", mu)) if value is not None}
     return chosen._replace(objective=replace(chosen.objective, **changes))  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from torch import Tensor, nn
 
-from torch_modal.inbetween.samples import InBetweenResult
+from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings, with_space
 from torch_modal.layers.in_between import InBetween
 from torch_modal.precompute.basis import ModalBasis
@@ -48,12 +48,7 @@ class MidShape(nn.Module):
     @property
     def space(self) -> Any:
         """The joint or paired space."""
-        return self.in_between.members[0].space
-
-    @property
-    def step(self) -> Any:
-        """The :class:`GaussNewtonStep` that is repeated."""
-        return self.in_between.members[0].step
+        return self.in_between.core.space
 
     def solve(self, x_a: Tensor, x_b: Tensor) -> InBetweenResult:
         """The mid-shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""

@@ -6,6 +6,9 @@ from torch import Tensor
 from torch_modal.autograd import lasting
 from torch_modal.motion.path import Path
 
+SLIGHT = 1e-6
+"""An interval is computed again where an edit moves its shapes by more than about this part of the diagonal."""
+
 
 class PathEditor:
     """The dense shapes of a path while its key-frames change.
@@ -30,7 +33,8 @@ class PathEditor:
         self.path = path
         self.keyframes = keyframes.clone()
         self.steps = steps
-        self._shapes: list[Tensor | None] = [None] * len(path.members)
+        # The shapes of each interval, with what they were made of.
+        self._made: list[tuple[Tensor, list[Tensor]] | None] = [None] * (len(path.times) - 1)
 
     def replace(self, i: int, shape: Tensor) -> None:
         """Put another shape in the place of a key-frame.
@@ -46,7 +50,6 @@ class PathEditor:
         if not -len(self.keyframes) <= i < len(self.keyframes):
             raise IndexError(f"there are {len(self.keyframes)} key-frames; got the number {i}")
         self.keyframes[i] = self._checked(shape)
-        self._forget(i % len(self.keyframes))
 
     @lasting
     def insert(self, t: float, shape: Tensor | None = None) -> int:
@@ -68,9 +71,8 @@ class PathEditor:
         path = self.path.insert(t)
         i = int((path.times[:-1] == self.path.times).cumprod(0).sum())  # up to there, all times are as before
         self.keyframes = torch.cat([self.keyframes[:i], shape[None], self.keyframes[i:]])
-        self._shapes = [*self._shapes[:i], None, *self._shapes[i:]]
+        self._made = [*self._made[: i - 1], None, None, *self._made[i:]]
         self.path = path
-        self._forget(i)
         return i
 
     def times(self) -> Tensor:
@@ -82,21 +84,30 @@ class PathEditor:
 
     def shapes(self) -> Tensor:
         """All shapes; intervals that no change has touched are those of the last time. *Shape:* ``(T, V, 3)``."""
-        at = self.times()
-        for i, kept in enumerate(self._shapes):
-            if kept is None:
+        at, found = self.times(), []
+        for i, (made, needed) in enumerate(zip(self._made, self._needed(), strict=True)):
+            if made is None or not _alike(made[1], needed):
                 own = at[i * self.steps : (i + 1) * self.steps]
-                self._shapes[i] = lasting(self.path)(self.keyframes, own)
-        found = [part for part in self._shapes if part is not None]
+                made = lasting(self.path)(self.keyframes, own), needed
+                self._made[i] = made
+            found.append(made[0])
         return torch.cat(found if self.path.cyclic else [*found, self.keyframes[-1:]])
 
-    def _forget(self, i: int) -> None:
-        """The intervals that depend on a key-frame: two on either side of it, where the motion is smooth."""
-        reach = 2 if self.path.smooth else 1
-        n = len(self._shapes)
-        for j in range(i - reach, i + reach):
-            if self.path.cyclic or 0 <= j < n:
-                self._shapes[j % n] = None
+    @lasting
+    def _needed(self) -> list[list[Tensor]]:
+        """What the shapes of each interval follow from, in units in which a change of one is visible."""
+        n, path = len(self._made), self.path
+        size = (self.keyframes.amax(1) - self.keyframes.amin(1)).norm(dim=-1).amax()
+        closed = torch.cat([self.keyframes, self.keyframes[:1]]) / size
+        needed = [[closed[i], closed[i + 1]] for i in range(n)]
+        if path.smooth:
+            knots = path.spline.knots(self.keyframes[None].to(path.dtype))
+            scale = 1 / knots.shapes.abs().amax()
+            for i, own in enumerate(needed):
+                for tangent in (1, 2):
+                    turns, growth = knots.triangles[tangent][i].split(3)
+                    own += [turns, growth * scale, knots.turns[tangent][i], knots.moves[tangent][i] / size]
+        return needed
 
     def _checked(self, shape: Tensor) -> Tensor:
         if shape.shape != self.keyframes.shape[1:] or not bool(shape.isfinite().all()):
@@ -105,3 +116,9 @@ class PathEditor:
                 f"{tuple(shape.shape)}"
             )
         return shape.to(self.keyframes)
+
+
+def _alike(a: list[Tensor], b: list[Tensor]) -> bool:
+    """True where the key-frames, which come first, are the same, and velocities differ slightly at most."""
+    same = all(torch.equal(x, y) for x, y in zip(a[:2], b[:2], strict=True))
+    return same and all(bool((x - y).abs().amax() <= SLIGHT) for x, y in zip(a[2:], b[2:], strict=True))

@@ -1,9 +1,4 @@
-r"""Motion through many key-frames: smooth in time, at any time, differentiable.
-
-Between two key-frames of a path, the rotations and sizes of triangles and the rigid motion follow a cubic through four
-key-frames (:mod:`torch_modal.geometry.hermite`) in the place of a straight step between two, and a Poisson system makes
-a shape of it. Nothing is minimised unless there are terms beyond Eq. 5, which then compares with that shape.
-"""
+"""Motion through many key-frames: smooth in time, at any time, differentiable."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,57 +7,53 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_modal import trees
 from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers
-from torch_modal.contact.search import refuse_transforms
-from torch_modal.contact.trajectory import push_apart
+from torch_modal.backends.choice import choose
+from torch_modal.backends.torch.energies import RestShapes
+from torch_modal.energy.shell import ALPHA, BETA
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import require_contact
-from torch_modal.geometry.hermite import Tangents, around, located, wrapped
-from torch_modal.inbetween.samples import InBetweenResult, Samples
+from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
+from torch_modal.inbetween.results import InBetweenResult, unminimised, warn_of_starts, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
+from torch_modal.keyframes.arrays import as_faces
+from torch_modal.keyframes.check import checked_surface
 from torch_modal.keyframes.times import checked_times
-from torch_modal.layers.in_between import InBetween, joined, unflattened, with_exact_ends
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.solve.solver import Solution
-
-# Even times between two key-frames at which a path looks for contacts.
-N_SEARCHED = 31
+from torch_modal.layers.base import Bases, BasisBuffers, basis_buffers
+from torch_modal.layers.blend import Blend
+from torch_modal.layers.in_between import InBetween
+from torch_modal.motion.cubics import Scheme, located, wrapped
+from torch_modal.motion.spline import Knots, Spline
+from torch_modal.solve.implicit import Report
+from torch_modal.solve.minimise import Solution
 
 # Times that differ by no more than rounding, relative to the larger one, are the same.
 SAME_TIME = 2e-15
 
 
-class _OfPath(InBetween):
-    """Pairs of a path."""
-
-    shares = True
-
-
-class _Lazy(_OfPath):
-    """Pairs of a smooth path, which minimises nothing: the tables of the minimisation are made on first use."""
-
-    def prepare(self) -> None:
-        """Nothing."""
-
-
 class Path(nn.Module):
     """Shapes at any time of a motion through key-frames.
 
-    Velocities are continuous at the key-frames, which are reproduced exactly. They are limited to three times the
-    slower one of both sides, triangle by triangle, so that what stops does stop. The ends have no acceleration.
+    With three key-frames or more, the rotations and sizes of triangles and the rigid motion follow splines
+    (:mod:`torch_modal.motion.spline`): nothing is minimised, and no modes are needed, unless there are contacts or
+    terms beyond Eq. 5. Velocities are continuous at the key-frames, which are reproduced exactly. They are limited to
+    three times the slower one of both sides, triangle by triangle, so that what stops does stop. The ends have no
+    acceleration. Between two key-frames alone the shapes are those of :class:`torch_modal.InBetween`.
 
     Args:
-        bases: The basis of each key-frame, two or more (:func:`torch_modal.extract_bases`).
+        bases: The key-frames, *shape* ``(K, V, 3)``, or, where modes are needed or wanted, the basis of each
+            (:func:`torch_modal.extract_bases`).
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         times: When the key-frames are, ascending; if cyclic, one more, when the first comes again. Default: 0, 1, 2,
             and so on. *Shape:* ``(K,)``, or ``(K + 1,)`` if cyclic.
-        cyclic: Whether the last key-frame leads on to the first. Times are then taken modulo the period.
-        smooth: Whether neighbours in time have a say; False treats each pair alone. A function is another path scheme:
-            :data:`torch_modal.geometry.hermite.Tangents` (docs/extending.md).
+        cyclic: True where the last key-frame leads on to the first. Times are then taken modulo the period.
+        smooth: False treats each pair of key-frames alone. A function is another path scheme:
+            :data:`torch_modal.motion.cubics.Scheme` (docs/extending.md).
         preset: As for :class:`torch_modal.InBetween`; not ``"paper"``, which knows the middle of a pair only.
-        objective: What is minimised, in the place of the preset's.
+        objective: What is minimised, in the place of the preset's. With further terms, the shapes on the spline are
+            minimised with these, each compared with itself.
         solver: How it is solved, in the place of the preset's.
-        contact: Whether parts are kept from passing through each other, in the place of what the objective says
+        contact: True to keep parts from passing through each other, in the place of what the objective says
             (docs/contact.md; extra ``contact``). Shapes are searched at 31 times between any two key-frames, and
             pushed apart by one displacement that is smooth in time. It is a constant of the graph: gradients are those
             of the shapes without contact, and not exact where something touches. Those of ``InBetween`` are.
@@ -73,15 +64,16 @@ class Path(nn.Module):
     """
 
     times: Tensor
+    bases: Any
 
     @lasting
     def __init__(
         self,
-        bases: Sequence[ModalBasis],
+        bases: Bases,
         faces: Tensor,
         times: Tensor | Sequence[float] | None = None,
         cyclic: bool = False,
-        smooth: bool | Tangents = True,
+        smooth: bool | Scheme = True,
         preset: Preset = "accurate",
         *,
         objective: Objective | None = None,
@@ -89,71 +81,99 @@ class Path(nn.Module):
         contact: bool | None = None,
     ) -> None:
         super().__init__()
-        n = len(bases)
+        own = basis_buffers(bases)
+        n = len(own)
         if n < 2:
-            raise ValueError(f"a path needs two key-frames or more, got {n} bases")
-        objective, solver = settings(preset, objective, solver, contact)
+            raise ValueError(f"a path needs two key-frames or more, got {n}")
+        objective, self.solver = settings(preset, objective, solver, contact)
         if objective.space == "paired":
             raise ValueError("the paired space (Eq. 4) knows the middle of a pair only; a path needs space='joint'")
-        self.register_buffer("times", checked_times(times, n, cyclic))
-        #: Whether shapes are pushed apart. The layer does not: what it did at each time alone would jump.
+        #: True where shapes are pushed apart. No layer does that: what it did at each time alone would jump.
         self.contact = objective.contact
         if self.contact:
             require_contact()
-        objective = replace(objective, contact=False)
-        pairs = [(i, (i + 1) % n) for i in range(n if cyclic else n - 1)]
-        kind = _Lazy if smooth and n > 2 and not objective.terms else _OfPath
-        self.layer = kind(list(bases), faces, objective=objective, solver=solver, pairs=pairs)
-        self.cyclic = cyclic
-        self.smooth = bool(smooth)
+        self.objective = replace(objective, contact=False)
+        self.register_buffer("times", checked_times(times, n, cyclic))
+        self.bases = nn.ModuleList(own)
+        self.faces = torch.from_numpy(as_faces(faces))
+        self.cyclic, self.smooth = cyclic, bool(smooth) and (n > 2 or cyclic)
         #: The path scheme; None for the default.
-        self.tangents = smooth if callable(smooth) else None
-        #: Which pair of bases each interval has the modes of.
-        self.members = list(range(len(pairs)))
+        self.scheme = smooth if callable(smooth) else None
+        given: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
+        #: In-betweens of each interval; of a smooth path none, or, with further terms, what minimises them.
+        self.layers: Any = nn.ModuleList()
+        if not self.smooth:
+            self.layers.extend(InBetween([own[i], own[j]], self.faces, **given) for i, j in self._pairs())
+        elif self.objective.terms:
+            self.layers.append(Blend(own, self.faces, **given))
+        self._build()
+        self.register_load_state_dict_post_hook(lambda path, _: path._build())
+
+    @lasting
+    def _build(self) -> None:
+        """Build the spline of the bases' references, on their device and in their dtype."""
+        like = self.bases[0].reference
+        references = torch.stack([basis.reference.double().cpu() for basis in self.bases])
+        connectivity = checked_surface(list(references), self.faces)[1]
+        self.faces = torch.tensor(connectivity.faces)
+        backend = choose(self.solver.backend)
+        self.spline = Spline(connectivity, references, self.times.cpu(), self.scheme, backend).to(like)
+        self.distortion = backend.distortion(Mesh(connectivity), None).to(like)
 
     @property
     def n_keyframes(self) -> int:
         """Number of key-frames, K."""
-        return len(self.members) + (not self.cyclic)
+        return len(self.bases)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The dtype of the computation."""
+        return self.spline.alignment.scale.dtype
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """The key-frames of each interval."""
+        n = len(self.bases)
+        return [(i, (i + 1) % n) for i in range(n if self.cyclic else n - 1)]
 
     @lasting
     def insert(self, t: float) -> "Path":
-        """The same motion with one more key-frame, which borrows the modes of those around it, as in the paper.
+        """The same motion with one more key-frame, which borrows the modes of the nearer of those around it.
 
         Args:
             t: When it is, between the others; modulo the period, if cyclic.
 
         Returns:
-            A path of one more key-frame, with the same layer.
+            A path of one more key-frame.
 
         Raises:
             ValueError: The time is outside, not finite, or that of a key-frame.
         """
         at = self.times.new_tensor([t])
-        i = int(located(at, self.times, self.cyclic)[0])
+        segment, u = located(at, self.times, self.cyclic)
         if self.cyclic:
             at = wrapped(at, self.times)
         # Modulo the period, a key-frame's time comes out with rounding.
         scale = torch.maximum(self.times.abs().amax(), self.times.new_tensor(abs(t)))
         if bool(((self.times - at).abs() <= SAME_TIME * scale).any()):
             raise ValueError(f"there is a key-frame at {t:g} already; replace it in the keyframes that are passed")
-        other = Path.__new__(Path)
-        nn.Module.__init__(other)
-        other.layer, other.cyclic, other.contact = self.layer, self.cyclic, self.contact
-        other.smooth, other.tangents = self.smooth, self.tangents
-        other.members = [*self.members[: i + 1], *self.members[i:]]
-        other.register_buffer("times", torch.cat([self.times[: i + 1], at, self.times[i + 1 :]]))
-        return other
+        i, own = int(segment[0]), [BasisBuffers(basis.reference, basis.modes) for basis in self.bases]
+        nearest = own[self._pairs()[i][int(u[0] > 0.5)]]
+        passed = self(torch.stack([basis.reference for basis in own]).to(self.dtype), t)
+        own.insert(i + 1, BasisBuffers(passed, nearest.modes))
+        times = torch.cat([self.times[: i + 1], at, self.times[i + 1 :]])
+        given: dict[str, Any] = {"objective": self.objective, "solver": self.solver, "contact": self.contact}
+        other = Path(own, self.faces, times, self.cyclic, self.scheme or self.smooth, **given)
+        return other.to(self.bases[0].reference)
 
     def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
         """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        return self._batched(keyframes, t, None)
+        return self._solved(keyframes, t, None)
 
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
 
         Args:
-            keyframes: Near those that the bases were made from. *Shape:* ``(..., K, V, 3)``.
+            keyframes: Near those that the path was made from. *Shape:* ``(..., K, V, 3)``.
             t: Times, broadcast against the leading dimensions of the key-frames. *Shape:* ``(...)``, or a number.
 
         Returns:
@@ -163,19 +183,62 @@ class Path(nn.Module):
             ValueError: Shapes that do not fit, or a time before the first or after the last key-frame.
             ConvergenceError: As for :class:`torch_modal.InBetween`.
         """
-        return self._batched(keyframes, t, self.layer.report()).shapes
+        return self._solved(keyframes, t, self.layers[0].report() if self.layers else warn_of_starts).shapes
 
     @full_precision
-    def _batched(
-        self, keyframes: Tensor, t: Tensor | float, report: Callable[[Solution], None] | None
-    ) -> InBetweenResult:
-        layer = self.layer
+    def _solved(self, keyframes: Tensor, t: Tensor | float, report: Report | None) -> InBetweenResult:
+        flat, which, segment, u, lead = self._located(keyframes, t)
+        knots = self.spline.knots(flat) if self.smooth else None
+
+        def of_interval(i: int, rows: Tensor | slice) -> InBetweenResult:
+            own, at = which[rows], u[rows]
+            ends = flat[own][:, list(self._pairs()[i])]
+            if knots is None:
+                return self.layers[i].solved(ends, torch.stack([1 - at, at], -1), at.shape, report)
+            found = self._on_spline(knots, i, own, at, report)
+            return self._in_contact(knots, flat, i, own, at, found) if self.contact else found
+
+        result = by_interval(segment, len(self._pairs()), of_interval)
+        if self.layers and self.smooth:
+            # Each shape is compared with itself.
+            x = result.shapes[:, None]
+            result = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape, report)
+        pairs = torch.tensor(self._pairs(), device=segment.device)[segment]
+        ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
+        exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
+        return result._replace(shapes=exact).unflattened(lead)
+
+    def _on_spline(self, knots: Knots, i: int, which: Tensor, u: Tensor, report: Report | None) -> InBetweenResult:
+        """Shapes of one interval. *Shape:* ``(B,), (B,) -> (B, V, 3)``."""
+        spline = self.spline
+        straight = spline.straight(knots, i, which, u)
+        x = spline(knots, i, which, u, straight=straight)
+        usable = knots.usable[which]
+        ends, weights = knots.shapes[i : i + 2, which].movedim(0, 1), torch.stack([1 - u, u], -1)
+        stiffness = [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
+        rests = RestShapes(ends, weights, stiffness, None)
+        x, solution = no_worse(x, [straight], unminimised(x, usable), self.distortion, rests, SLACK_OF_PATHS)
+        if report is not None:
+            warn_of_starts(solution)
+        shapes = spline.restore(x, spline.pose(knots, i, which, u))
+        return InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution)
+
+    def _located(
+        self, keyframes: Tensor, t: Tensor | float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
+        """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
         require_numbers("Path", keyframes)
-        if keyframes.dim() < 3 or keyframes.shape[-3] != self.n_keyframes:
+        reference = self.spline.alignment.reference
+        if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point():
+            got = keyframes.dtype if isinstance(keyframes, Tensor) else type(keyframes).__name__
+            raise ValueError(f"keyframes are a floating-point tensor; got {got}")
+        wanted = (self.n_keyframes, *reference.shape)
+        if keyframes.shape[-3:] != wanted:
             raise ValueError(
-                f"keyframes of this path have the shape (..., {self.n_keyframes}, V, 3); got {tuple(keyframes.shape)}"
+                f"keyframes of this path have the shape (..., {wanted[0]}, {wanted[1]}, 3); got {tuple(keyframes.shape)}"
             )
-        layer.check(keyframes[..., 0, :, :], keyframes[..., -1, :, :], 0.0)
+        if keyframes.device != reference.device:
+            raise ValueError(f"keyframes are on {keyframes.device}, the path on {reference.device}; move one with .to()")
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         own = keyframes.shape[:-3]
@@ -186,69 +249,40 @@ class Path(nn.Module):
                 f"t of shape {tuple(t.shape)} does not broadcast against motions of {tuple(own)}; for all times of all "
                 "motions pass keyframes[:, None]"
             ) from None
-        flat = keyframes.reshape(-1, *keyframes.shape[-3:])
+        flat = keyframes.to(self.dtype).reshape(-1, *keyframes.shape[-3:])
         which = torch.arange(len(flat), device=t.device).reshape(own).expand(lead).reshape(-1)
         segment, u = located(t.expand(lead).reshape(-1), self.times, self.cyclic, rounding)
-        order, parts = [], []
-        intervals = in_use(segment, len(self.members)) or [0]  # of nothing, nothing
-        if mapped(segment):
-            # Of each interval all shapes, of which some are taken.
-            every = torch.arange(len(which), device=which.device)
-            order = [place * len(which) + every for place in range(len(intervals))]
-            whole = joined([self._between(flat, i, which, u, report) for i in intervals], order)
-            place = sum((segment == i) * place for place, i in enumerate(intervals))
-            return unflattened(trees.rows(whole, place * len(which) + every), lead)
-        for i in intervals:
-            mine = torch.nonzero(segment == i).flatten()
-            order.append(mine)
-            parts.append(self._between(flat, i, which[mine], u[mine], report))
-        return unflattened(joined(parts, order), lead)
+        return flat, which, segment, u.to(flat), lead
 
-    def _between(
-        self,
-        keyframes: Tensor,
-        i: int,
-        which: Tensor,
-        u: Tensor,
-        report: Callable[[Solution], None] | None,
-    ) -> InBetweenResult:
-        """Shapes of one interval. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
-        member = self.layer.members[self.members[i]]
-        samples = self.samples(keyframes, i, which, u)
-        result = member(samples, report)
-        if self.contact:
-            result = self._in_contact(keyframes, i, samples, result)
-        ends = keyframes[which, i], keyframes[which, (i + 1) % self.n_keyframes]
-        return InBetweenResult(with_exact_ends(result.shapes, *ends, samples.t), result.solution)
 
-    def samples(self, keyframes: Tensor, i: int, which: Tensor, u: Tensor) -> Samples:
-        """Times of one interval as a batch. *Shape:* ``(L, K, V, 3), (B,), (B,)``."""
-        layer, n = self.layer, self.n_keyframes
-        x = keyframes.to(layer.dtype)
-        neighbours: dict[str, Any] = {}
-        if self.smooth and n > 2:
-            before, after, spacing = around(i, self.times, self.cyclic)
-            neighbours["before"], neighbours["after"] = (None if j is None else x[:, j] for j in (before, after))
-            neighbours["spacing"] = spacing.mapped(lambda h: h.to(x).expand(len(x)))._replace(tangents=self.tangents)
-        u = u.to(x)
-        stiffness = layer.stiffness_of(u, u.shape)
-        return Samples(x[:, i], x[:, (i + 1) % n], which, u, layer.mu_of(u, u.shape), stiffness, **neighbours)
+def by_interval(
+    segment: Tensor, n: int, of_interval: Callable[[int, Tensor | slice], InBetweenResult]
+) -> InBetweenResult:
+    """Shapes whose intervals are computed one after the other.
 
-    def _in_contact(self, keyframes: Tensor, i: int, samples: Samples, result: InBetweenResult) -> InBetweenResult:
-        """Shapes of one interval pushed apart, by a displacement found at even times of each motion."""
-        refuse_transforms(result.shapes)
-        member = self.layer.members[self.members[i]]
-        even = torch.arange(1, N_SEARCHED + 1).to(samples.t) / (N_SEARCHED + 1)
-        shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)
-        which = samples.which
-        assert which is not None
-        for motion in which.unique().tolist():
-            own = keyframes[motion : motion + 1]
-            grid = self.samples(own, i, torch.zeros(len(even), dtype=torch.int64, device=which.device), even)
-            with torch.no_grad():
-                found = push_apart(member, grid, member(grid, None).shapes)
-            mine = torch.nonzero(which == motion).flatten()
-            at = self.samples(own, i, torch.zeros_like(mine), samples.t[mine])
-            pushed, left[mine] = found.apply(member, at, result.shapes[mine])
-            shapes = shapes.index_copy(0, mine, pushed)
-        return InBetweenResult(shapes, result.solution._replace(n_crossing=left))
+    Args:
+        segment: The interval of each shape. *Shape:* ``(B,)``.
+        n: Number of intervals.
+        of_interval: Computes some rows of the batch, which are in one interval.
+    """
+    intervals = in_use(segment, n) or [0]  # of nothing, nothing
+    if mapped(segment):  # of each interval all shapes, of which some are taken
+        every = [of_interval(i, slice(None)) for i in intervals]
+        place = sum((segment == i) * place for place, i in enumerate(intervals))
+        return joined(every, place * len(segment) + torch.arange(len(segment), device=segment.device))
+    rows = [torch.nonzero(segment == i).flatten() for i in intervals]
+    return joined([of_interval(i, own) for i, own in zip(intervals, rows, strict=True)], torch.argsort(torch.cat(rows)))
+
+
+def joined(parts: Sequence[InBetweenResult], order: Tensor) -> InBetweenResult:
+    """Flat batches as one.
+
+    Args:
+        parts: One or more. Where numbers of modes differ, zeros follow the amplitudes.
+        order: Where each shape of the whole stands among the parts. *Shape:* ``(B,)``.
+    """
+    widest = max(part.solution.amplitudes.shape[-1] for part in parts)
+    wide = [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]
+    columns = [wide, *zip(*(part.solution[1:] for part in parts), strict=True)]
+    values = [None if column[0] is None else torch.cat(list(column))[order] for column in columns]
+    return InBetweenResult(torch.cat([part.shapes for part in parts])[order], Solution(*values))

@@ -53,34 +53,37 @@ def subdivide(
 ) -> Tensor:
     """Fill a sequence of key-frames with physically plausible shapes.
 
-    Smooth in time, the shapes are those of :class:`torch_modal.Path`. Otherwise each level inserts a mid-shape between
-    all neighbours, which then serves as a key-frame of the next level (section 3.3 of the paper), with the modes of the
+    With three key-frames or more, the shapes are those of :class:`torch_modal.Path`, smooth in time: a spline, which
+    needs no modes unless there are contacts or terms beyond Eq. 5. Otherwise each level inserts a mid-shape between all
+    neighbours, which then serves as a key-frame of the next level (section 3.3 of the paper), with the modes of the
     key-frames around it: of both in the joint space, of the nearest in the paired space.
 
     Args:
         keyframes: Vertex positions, two key-frames or more, in any units. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         levels: How often the number of intervals doubles.
-        bases: The basis of each key-frame. Default: :func:`torch_modal.extract_bases`, cached on disk.
-        n_modes: Modes of each key-frame where the bases are not given.
-        cyclic: Whether the last key-frame leads on to the first. The sequence then ends one frame before it would
+        bases: The basis of each key-frame. Default: :func:`torch_modal.extract_bases`, cached on disk, where modes are
+            needed.
+        n_modes: Modes of each key-frame where the bases are not given. 0: none; mid-shapes are then the blend by local
+            rotations, with the steps of all vertices alone.
+        cyclic: True where the last key-frame leads on to the first. The sequence then ends one frame before it would
             repeat the first key-frame.
         n_frames: Number of frames of the result, evenly in time. The key-frames keep their places in it
             (:func:`keyframe_places`): frames are even within each interval. Pairs alone are filled linearly between
             their subdivided shapes, along the geodesic of the rigid motion. Default: ``2**levels`` to each interval.
         times: When the key-frames are, as for :class:`torch_modal.Path`. Default: evenly.
-        smooth: Whether neighbours in time have a say. Default: where there are three key-frames or more, in the joint
-            space.
+        smooth: False treats each pair of key-frames alone. Default: True where there are three key-frames or more, in
+            the joint space.
         preset: As for :class:`torch_modal.InBetween`.
         objective: What is minimised, in the place of the preset's.
         solver: How it is solved, in the place of the preset's.
-        contact: Whether parts are kept from passing through each other, in the place of what the objective says
+        contact: True to keep parts from passing through each other, in the place of what the objective says
             (docs/contact.md; extra ``contact``). The shapes between two key-frames are pushed apart together, by a
             displacement that is smooth in time.
         proxy: Vertices of a coarser mesh, by the same edge collapses in all key-frames, that moves in the place of the
             mesh and carries its detail (docs/passengers.md). 0: none. Default: 20,000 for meshes of more than 100,000
             vertices whose bases are not given.
-        progress: What is said while it goes on: see :data:`torch_modal.progress.Progress`.
+        progress: Reports progress: see :data:`torch_modal.progress.Progress`.
 
     Returns:
         The sequence in the caller's coordinates, dtype and device, the key-frames bit for bit at their places. *Shape:*
@@ -132,10 +135,13 @@ def subdivide(
         smooth = n_keys > 2 and chosen.objective.space == "joint"
     if smooth and chosen.objective.space == "paired":
         raise ValueError("the paired space (Eq. 4) knows pairs only: smooth=True needs space='joint'")
-    if bases is None:
+    needs_modes = contacts is not None or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
+    if bases is None and n_modes and needs_modes:
         bases = bases_of_checked(
             keyframes, working_faces, n_modes, progress=progress, meanwhile=choose(chosen.solver.backend).load
         )
+    if bases is None:
+        bases = keyframes.detach()
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])

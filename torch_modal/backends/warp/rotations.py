@@ -85,13 +85,12 @@ class WarpRotations(LocalRotations):
         """As the other's."""
         if traced(t):
             return super().along(trajectory, which, t)
-        packed = torch.cat([part if part.dim() > 2 else part[None] for part in trajectory])
-        return applied(_OnTrajectory, self, packed.movedim(0, -1).double(), which, t.double())[0].to(trajectory.unit)
+        packed = torch.cat([*trajectory, torch.ones_like(trajectory.size[:1])])
+        return applied(_OnTrajectory, self, packed.movedim(0, -1).double(), which, t.double())[0].to(trajectory.size)
 
     def trajectory_oracle(self, packed: Tensor, which: Tensor, t: Tensor) -> Tensor:
         """Edges on a packed trajectory, by torch. *Shape:* ``(P, F, 31)``."""
-        parts = packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6, 1])
-        return super().along(Trajectory._make([*parts[:-1], parts[-1][0]]), which, t)
+        return super().along(Trajectory._make(packed.movedim(-1, 0).split([3, 3, 3, 3, 6, 6, 6, 1])[:-1]), which, t)
 
     def trajectory_sums(self, which: Tensor, packed: Tensor, t: Tensor) -> Tensor:
         """Sides on courses by area, summed on the edges, and areas. *Shape:* ``(B, E, 4)``."""

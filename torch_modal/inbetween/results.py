@@ -1,4 +1,4 @@
-"""Flat batches of inputs and results of one pair of bases; warnings about samples that did not converge."""
+"""Flat batches of in-betweens, their results, and warnings about those that did not converge."""
 
 import warnings
 from typing import NamedTuple
@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
-from torch_modal.geometry.hermite import Spacing
-from torch_modal.solve.adjoint import ConvergenceWarning
-from torch_modal.solve.solver import Solution, Status
+from torch_modal.solve.implicit import ConvergenceWarning
+from torch_modal.solve.minimise import Solution, Status
 
 
 class ConvergenceError(RuntimeError):
@@ -24,34 +23,33 @@ class InBetweenResult(NamedTuple):
     solution: Solution
     """One value per shape: energy, relative gradient norm, number of steps, status."""
 
+    def unflattened(self, lead: torch.Size) -> "InBetweenResult":
+        """A flat batch with these leading dimensions."""
+        values = (None if value is None else value.reshape(lead + value.shape[1:]) for value in self.solution)
+        return InBetweenResult(
+            self.shapes.reshape(*lead, *self.shapes.shape[1:]),
+            Solution(*values),  # type: ignore[arg-type]
+        )
+
 
 class Samples(NamedTuple):
-    """A flat batch of in-betweens."""
+    """A flat batch of weighted in-betweens; of a pair, the weights are ``(1 - t, t)``."""
 
-    x_a: Tensor
-    """Key-frames at 0. *Shape:* ``(P, V, 3)``."""
-    x_b: Tensor
-    """Key-frames at 1. *Shape:* ``(P, V, 3)``."""
-    which: Tensor | None
-    """Which of the P pairs each sample lies between; each its own where None. *Shape:* ``(B,)``."""
-    t: Tensor
-    """*Shape:* ``(B,)``."""
+    keyframes: Tensor
+    """*Shape:* ``(B, K, V, 3)``."""
+    weights: Tensor
+    """They add up to one. *Shape:* ``(B, K)``."""
     mu: Tensor
     """*Shape:* ``(B,)``."""
     stiffness: list[Tensor]
     """Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
-    before: Tensor | None = None
-    """The key-frames before those at 0, for trajectories that are smooth in time. *Shape:* ``(P, V, 3)``."""
-    after: Tensor | None = None
-    """The key-frames after those at 1. *Shape:* ``(P, V, 3)``."""
-    spacing: Spacing | None = None
-    """Durations of the three intervals; None for the pair alone. *Shape of each:* ``(P,)``."""
 
-    def rows(self, some: Tensor) -> "Samples":
-        """Some of the samples, of the same pairs. *Shape:* ``(S,)``."""
-        of = torch.arange(len(self.t), device=some.device) if self.which is None else self.which
-        stiffness = [values[some] for values in self.stiffness]
-        return self._replace(which=of[some], t=self.t[some], mu=self.mu[some], stiffness=stiffness)
+
+def unminimised(x: Tensor, usable: Tensor) -> Solution:
+    """The solution where there is nothing to minimise. *Shape:* ``(B, V, 3), (B,)``."""
+    number = x.detach().new_zeros(len(x))
+    status = torch.where(usable, Status.CONVERGED, Status.INVALID)
+    return Solution(number.new_zeros(len(x), 0), number, number.clone(), torch.zeros_like(status), status)
 
 
 def report(solution: Solution, max_steps: int, forbid: bool) -> None:
@@ -60,7 +58,7 @@ def report(solution: Solution, max_steps: int, forbid: bool) -> None:
     Args:
         solution: One value per sample.
         max_steps: The limit of the solver.
-        forbid: Whether it is an error.
+        forbid: True to raise.
 
     Raises:
         ConvergenceError: Something did not converge, and that is an error.
@@ -81,7 +79,7 @@ def report(solution: Solution, max_steps: int, forbid: bool) -> None:
 
 
 def warn_of_starts(solution: Solution) -> None:
-    """Say how many shapes are the ones that they started from.
+    """Warn about shapes that are the ones that they started from.
 
     Args:
         solution: One value per sample.
@@ -96,3 +94,24 @@ def warn_of_starts(solution: Solution) -> None:
         ConvergenceWarning,
         stacklevel=2,
     )
+
+
+def with_exact_keyframes(shapes: Tensor, keyframes: Tensor, weights: Tensor) -> Tensor:
+    """In-betweens, and key-frames to the last bit where they have all the weight; gradients stay as they are.
+
+    Non-finite in-betweens contribute neither value nor gradient there.
+
+    Args:
+        shapes: *Shape:* ``(..., V, 3)``.
+        keyframes: The result has their dtype. *Shape:* ``(..., K, V, 3)``.
+        weights: *Shape:* ``(..., K)``.
+    """
+    shapes = shapes.to(keyframes.dtype)
+    alone = (weights != 0).sum(-1, keepdim=True) == 1
+    for x, there in zip(keyframes.unbind(-3), ((weights == 1) & alone).unbind(-1), strict=True):
+        exactly = x.detach()
+        if torch.is_grad_enabled() or transformed(shapes):
+            known = shapes.detach()
+            exactly = exactly + torch.where(known.isfinite(), shapes - known, 0)
+        shapes = torch.where(there[..., None, None], exactly, shapes)
+    return shapes

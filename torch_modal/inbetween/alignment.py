@@ -1,0 +1,184 @@
+"""Between the caller's coordinates and the frame of a layer: key-frames centred, scaled and turned on to each other."""
+
+import warnings
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.autograd import traced, transformed
+from torch_modal.energy.shell import DIAGONAL
+from torch_modal.errors import MeshWarning
+from torch_modal.geometry.canonical import size
+from torch_modal.geometry.connectivity import Connectivity, vertex_areas
+from torch_modal.geometry.rigid import best_rotation, centroid
+from torch_modal.geometry.rotation_means import agreeing, mean
+from torch_modal.geometry.rotations import quaternion, rotate
+from torch_modal.geometry.vectors import cross, pick
+from torch_modal.geometry.winding import looks_mirrored
+
+# Rounds in which more than two key-frames are turned on to their mean, and the last of them, which have derivatives: of
+# the poses of a gallop, each leaves a tenth.
+ROUNDS, LAST_ROUNDS = 6, 5
+
+# A key-frame smaller than this part of the reference is a point.
+SMALLEST_SIZE = 1e-6
+
+# A key-frame that is larger or smaller than the reference by this factor is in other units, or another body.
+OTHER_SIZE = 3.0
+
+
+class AlignedKeyframes(NamedTuple):
+    """K key-frames of each sample, centred, scaled and turned on to each other."""
+
+    shapes: Tensor
+    """*Shape:* ``(B, K, V, 3)``."""
+    rotation: Tensor
+    """From the frame to the weighted mean of the poses of the key-frames. *Shape:* ``(B, 3, 3)``."""
+    centre: Tensor
+    """Weighted mean of the centroids in the caller's coordinates. *Shape:* ``(B, 3)``."""
+
+
+class KeyframeAlignment(nn.Module):
+    """The scale of 100, and the alignment of key-frames.
+
+    Args:
+        references: Shapes near the key-frames, float64 on the CPU. *Shape:* ``(K, V, 3)``.
+        mesh: Their connectivity.
+    """
+
+    scale: Tensor
+    weights: Tensor
+    references: Tensor
+    turns: Tensor
+    faces: Tensor
+
+    def __init__(self, references: Tensor, mesh: Connectivity) -> None:
+        super().__init__()
+        faces = torch.tensor(mesh.faces)
+        sizes = [size(x.numpy(), mesh.faces) for x in references]
+        scale = torch.tensor(DIAGONAL * len(sizes) / sum(sizes), dtype=references.dtype)
+        weights = mean_areas(references, faces)
+        centred = references - centroid(references, weights)[:, None]
+        self.register_buffer("scale", scale, persistent=False)
+        #: Of the vertices, adding up to one. *Shape:* ``(V,)``.
+        self.register_buffer("weights", weights, persistent=False)
+        covariances = (centred[0] * weights[:, None]).mT @ centred
+        turns = torch.cat([torch.eye(3).to(weights)[None], best_rotation(covariances[1:])])
+        #: From the references to the frame, for vectors such as modes. *Shape:* ``(K, 3, 3)``.
+        self.register_buffer("turns", turns, persistent=False)
+        #: The references in the frame, turned on to the first. *Shape:* ``(K, V, 3)``.
+        self.register_buffer("references", centred @ turns.mT * scale, persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
+        self.closed = len(mesh.boundary_edges) == 0
+        self.size_warned = False
+
+    @property
+    def reference(self) -> Tensor:
+        """The first reference in the frame. *Shape:* ``(V, 3)``."""
+        return self.references[0]
+
+    def forward(self, keyframes: Tensor, weights: Tensor) -> tuple[AlignedKeyframes, Tensor]:
+        """Key-frames in the frame, and which samples have an in-between.
+
+        Samples have none with key-frames or weights that are not finite, that are a point, or, of closed surfaces,
+        mirror images of each other; key-frames without a weight do not count. The reference stands in for these.
+
+        Args:
+            keyframes: *Shape:* ``(B, K, V, 3)``.
+            weights: *Shape:* ``(B, K)``.
+
+        Returns:
+            The second, *shape* ``(B,)``, bool.
+        """
+        weights, known = torch.where(weights.isfinite(), weights, 1 / weights.shape[1]), weights.isfinite()
+        x, usable = self.checked(keyframes)
+        aligned = self._aligned(x, weights)
+        usable = usable & ~self.mirrored(aligned.shapes.detach(), weights)
+        return aligned, ((usable | (weights == 0)) & known).all(1)
+
+    def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
+        """Key-frames that are finite and have a size, the reference in the place of others; which those are.
+
+        *Shape:* ``(B, K, V, 3) -> (B, K, V, 3), (B, K)``.
+        """
+        rows = keyframes.detach().movedim(-1, 0).contiguous()
+        sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=0) * self.scale
+        usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * DIAGONAL)  # what is not finite has no extent
+        self._warn_of_size(sizes)
+        return torch.where(usable[..., None, None], keyframes, self.reference / self.scale), usable
+
+    def _aligned(self, keyframes: Tensor, weights: Tensor) -> AlignedKeyframes:
+        """Key-frames turned on to their weighted mean, and this to the reference.
+
+        Generalised Procrustes analysis: the weighted squared distances of all pairs are least. Of two, it is their best
+        fit.
+        """
+        centres = centroid(keyframes, self.weights)
+        centred = (keyframes - centres[..., None, :]) * self.scale
+        reference = self.reference.expand(len(keyframes), 1, -1, -1)
+        rows = (torch.cat([reference, centred], 1) * self.weights.sqrt()[:, None]).mT.flatten(1, 2)
+        products = (rows @ rows.mT).unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)
+        to_reference, among = products[:, 0, 1:], products[:, 1:, 1:]  # (B, K, 3, 3), (B, K, K, 3, 3)
+        pulls = weights[..., None, None]
+        if weights.shape[1] > 2:
+            with torch.no_grad():
+                turns = best_rotation(to_reference)
+                for _ in range(ROUNDS):
+                    turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
+            turns = turns.detach()  # forward mode goes through no_grad
+            for _ in range(LAST_ROUNDS):
+                turns = best_rotation(((pulls * turns)[:, :, None] @ among).sum(1))
+        else:
+            turns = torch.cat([torch.eye(3).to(among).expand(len(among), 1, 3, 3), best_rotation(among[:, 0, 1:])], 1)
+        turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
+        poses = quaternion(turns.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
+        signs = agreeing(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
+        pose = mean((signs * poses)[..., None], weights[..., None])
+        rotation = rotate(pose, torch.eye(3).to(poses)[:, None]).movedim(0, 1)
+        return AlignedKeyframes(centred @ turns.mT, rotation, (weights[..., None] * centres).sum(1))
+
+    def restore(self, x: Tensor, aligned: AlignedKeyframes) -> Tensor:
+        """Shapes of the frame in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
+        return (x / self.scale) @ aligned.rotation.mT + aligned.centre[:, None]
+
+    def bring(self, points: Tensor, aligned: AlignedKeyframes) -> Tensor:
+        """The inverse of :meth:`restore`. *Shape:* ``(B, P, 3)``."""
+        return (points - aligned.centre[:, None]) @ aligned.rotation * self.scale
+
+    def mirrored(self, shapes: Tensor, weights: Tensor) -> Tensor:
+        """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""
+        if not self.closed:
+            return torch.zeros_like(weights, dtype=torch.bool)
+        rows = shapes.movedim(-1, 0).contiguous()
+        a, b, c = (pick(rows, corner) for corner in self.faces.unbind(1))
+        volumes = (a * cross(b, c)).sum((0, -1))
+        heaviest = weights.argmax(1, keepdim=True)
+        turned = volumes * volumes.gather(1, heaviest) < 0
+        if not traced(turned) and not transformed(turned) and not turned.any():
+            return turned
+        first = shapes.take_along_dim(heaviest[..., None, None], 1).expand_as(shapes)
+        return turned & looks_mirrored(first.flatten(0, 1), shapes.flatten(0, 1), self.faces).view_as(turned)
+
+    def _warn_of_size(self, sizes: Tensor) -> None:
+        """Say, once for a layer, that key-frames and bases seem to be in different units."""
+        if self.size_warned or traced(sizes) or transformed(sizes):
+            return
+        ratios = sizes / (self.reference.amax(0) - self.reference.amin(0)).norm()
+        other = (ratios > SMALLEST_SIZE) & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE)) & ratios.isfinite()
+        if not bool(other.any()):
+            return
+        self.size_warned = True
+        warnings.warn(
+            f"key-frames are {float(ratios[other][0]):.3g} times as large as the shapes that the bases were made from; "
+            "Eq. 5 depends on the size, so that the in-betweens differ from those of bases in the same units: "
+            "scale the key-frames, or make the bases from them",
+            MeshWarning,
+            stacklevel=2,
+        )
+
+
+def mean_areas(shapes: Tensor, faces: Tensor) -> Tensor:
+    """Vertex areas as parts of the whole, averaged over shapes. *Shape:* ``(K, V, 3), (F, 3) -> (V,)``."""
+    areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), faces.numpy())) for x in shapes])
+    return (areas / areas.sum(1, keepdim=True)).mean(0)

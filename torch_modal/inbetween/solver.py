@@ -1,0 +1,131 @@
+"""The in-between of K key-frames with weights, top to bottom; all layers use it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.backends.choice import choose
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.energies import RestShapes
+from torch_modal.energy.energy import Energy
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.term import Mesh, Term
+from torch_modal.inbetween.alignment import KeyframeAlignment
+from torch_modal.inbetween.blend import RotationBlend
+from torch_modal.inbetween.coarse import CoarseMesh
+from torch_modal.inbetween.comparison import SLACK, no_worse
+from torch_modal.inbetween.joint import JointSpace
+from torch_modal.inbetween.multilevel import MultilevelEnergy
+from torch_modal.inbetween.paired import PairedSpace
+from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised, warn_of_starts
+from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.inbetween.subspace import elastic_subspace
+from torch_modal.solve.implicit import Report, solve_implicit, solve_unrolled
+from torch_modal.solve.minimise import Solution, Status
+
+# Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
+# of the gap in energy between linear interpolation and the optimum over all vertices, and often 99 % (docs/quality.md).
+LOCAL_PRODUCTS = 4
+POLISH_PRODUCTS = 20
+
+
+class InBetweenSolver(nn.Module):
+    r"""Shapes of least :math:`\sum_k w_k\, d(x_k, x)` in the sum of the modal spaces of some bases.
+
+    The result depends on the key-frames and their weights as on a set of weighted points: not on their order, nor on
+    key-frames without a weight, nor on whether one stands there twice with half of its weight.
+
+    Args:
+        references: Of the bases, float64 on the CPU. *Shape:* ``(K, V, 3)``.
+        modes: Of the bases; without any, the shapes are the base and the steps of all vertices alone. *Shape of each:*
+            ``(k, V, 3)``.
+        mesh: The caller's mesh.
+        terms: Of the energy, those of Eq. 5 first; the layer owns them.
+        objective: What is minimised.
+        solver: How.
+    """
+
+    def __init__(
+        self,
+        references: Tensor,
+        modes: Sequence[Tensor],
+        mesh: Mesh,
+        terms: Sequence[Term],
+        objective: Objective,
+        solver: Solver,
+    ) -> None:
+        super().__init__()
+        backend, others = choose(solver.backend), terms[N_SHELL_TERMS:]
+        self.solver, self.mesh, self.backend = solver, mesh, backend
+        self.alignment = KeyframeAlignment(references, mesh.connectivity)
+        self.fine = backend.fine_energy(mesh, terms)
+        self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
+        self.blend = RotationBlend(mesh.connectivity, self.alignment.references, backend)
+        if objective.space == "paired":
+            self.blend = None
+        self.space: Any = self._space(modes, objective) if any(len(own) for own in modes) else None
+
+    def _space(self, modes: Sequence[Tensor], objective: Objective) -> JointSpace | PairedSpace:
+        """The space that the modal solve minimises in."""
+        alignment, turns = self.alignment, self.alignment.turns
+        turned = [own @ turn.mT for own, turn in zip(modes, turns, strict=True)]
+        coarse = CoarseMesh(
+            alignment.references, self.mesh.faces, objective.coarse_faces, alignment.weights, turned
+        )
+        # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
+        by_kernels = objective.space == "joint" and self.solver.gradient == "implicit"
+        levels = MultilevelEnergy(coarse, self.fine, self.backend if by_kernels else TorchBackend())
+        if objective.space == "joint":
+            return JointSpace(levels, elastic_subspace(turned, alignment, coarse), objective.anchor)
+        ends = [elastic_subspace([own], alignment, coarse) for own in turned]
+        return PairedSpace(levels, ends, alignment.weights > 0)
+
+    def forward(self, samples: Samples, report: Report | None) -> InBetweenResult:
+        """Solve.
+
+        Args:
+            samples: The batch.
+            report: Receives the solution.
+        """
+        aligned, usable = self.alignment(samples.keyframes, samples.weights)
+        shapes, weights = aligned.shapes, samples.weights
+        anchors = self.fine.energy.anchors
+        if anchors is not None:
+            anchors = self.alignment.bring(anchors.to(weights).expand(len(weights), -1, -1), aligned)
+        rests = RestShapes(shapes, weights, samples.stiffness, anchors)
+        straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
+        base = straight if self.blend is None else self.blend(shapes, weights, straight)
+        starts = [straight] if self.blend is None else [base, straight]
+        x, solution = self.minimised(base, rests, samples.mu, usable, report)
+        x = self.relaxed(x, rests)
+        # No shape is better for being far from a key-frame with a weight below zero.
+        compared = rests._replace(weights=weights.clamp_min(0))
+        x, solution = no_worse(x, starts, solution, self.distortion, compared, SLACK)
+        if report is not None:
+            warn_of_starts(solution)
+        valid = (solution.status != Status.INVALID)[:, None, None]
+        return InBetweenResult(torch.where(valid, self.alignment.restore(x, aligned), torch.nan), solution)
+
+    def minimised(
+        self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor, report: Report | None
+    ) -> tuple[Tensor, Solution]:
+        """Shapes of least energy in the modal space. *Shape:* ``(B, V, 3)``, of ``mu`` and ``usable`` ``(B,)``."""
+        if self.space is None:
+            return base, unminimised(base, usable)
+        solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
+        placement = self.space.place(base, rests, mu)
+        limits = self.solver.max_steps, self.solver.tolerance
+        solution = solve(self.space.energy, placement, usable, *limits, report)
+        # Kernels compute in float64, whatever goes in and comes out.
+        values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
+        solution = Solution(*values)
+        return self.space.lift(solution.amplitudes, base), solution
+
+    def relaxed(self, x: Tensor, rests: RestShapes) -> Tensor:
+        """Local steps and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
+        if not len(x) or not (self.solver.local_steps or self.solver.polish):
+            return x
+        stages = (self.solver.local_steps, LOCAL_PRODUCTS), (self.solver.polish, POLISH_PRODUCTS)
+        return self.fine.relax(x, rests, stages)

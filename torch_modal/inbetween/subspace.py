@@ -1,0 +1,95 @@
+"""The subspace that an in-between is sought in: modes of all bases, without rigid motions, on both meshes."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.inbetween.alignment import KeyframeAlignment
+from torch_modal.inbetween.coarse import CoarseMesh
+
+# Combinations of modes whose squared norm is below this part of the largest are rounding, not directions.
+DEPENDENT = 1e-9
+
+
+class SubspaceBasis(nn.Module):
+    """Directions that amplitudes belong to, on the fine and on the coarse mesh.
+
+    Args:
+        fine: *Shape:* ``(n, V, 3)``.
+        coarse: Orthonormal under the weights of the coarse vertices. *Shape:* ``(n, V_coarse, 3)``.
+    """
+
+    fine: Tensor
+    coarse: Tensor
+
+    def __init__(self, fine: Tensor, coarse: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("fine", fine, persistent=False)
+        self.register_buffer("coarse", coarse, persistent=False)
+
+    def __len__(self) -> int:
+        """Number of directions, n."""
+        return len(self.fine)
+
+    def added(self, x: Tensor, a: Tensor) -> Tensor:
+        """Fine shapes displaced by amplitudes. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
+        return torch.addmm(x.flatten(1), a, self.fine.flatten(1)).view_as(x)
+
+    def combine(self, a: Tensor) -> Tensor:
+        """Fine displacements of amplitudes. *Shape:* ``(..., n) -> (..., V, 3)``."""
+        return (a @ self.fine.flatten(1)).unflatten(-1, (-1, 3))
+
+
+def elastic_subspace(
+    modes: Sequence[Tensor], alignment: KeyframeAlignment, coarse: CoarseMesh
+) -> SubspaceBasis:
+    """Independent combinations of modes, without rigid motions, orthonormal on the coarse mesh.
+
+    The energy does not see translations, and rotations only to second order: left in, they are null directions of its
+    Hessian. Modes of two key-frames are partly the same: what is dependent is dropped here, explicitly.
+
+    Args:
+        modes: In the frame, of any scale. *Shape of each:* ``(k, V, 3)``.
+        alignment: The frame.
+        coarse: The coarse mesh.
+
+    Returns:
+        No more directions than two of the bases have modes: of more bases, what most of them have in common.
+    """
+    fine = torch.cat(list(modes))
+    most = sum(sorted(len(own) for own in modes)[-2:])
+    rigid = _rigid_fields(alignment.references.mean(0))
+    rigid_coarse = coarse.restrict(rigid)
+    mix = _orthonormal(rigid_coarse, coarse.weights)
+    rigid, rigid_coarse = _mixed(mix, rigid), _mixed(mix, rigid_coarse)
+    restricted = coarse.restrict(fine)
+    parts = restricted.flatten(1) @ (rigid_coarse * coarse.weights[:, None]).flatten(1).mT
+    elastic = restricted - _mixed(parts, rigid_coarse)
+    sizes = elastic.flatten(1).norm(dim=1)[:, None].clamp_min(torch.finfo(elastic.dtype).tiny)
+    mix = _orthonormal(elastic / sizes[:, None], coarse.weights, most) / sizes.T
+    return SubspaceBasis(_mixed(mix, fine).sub_(_mixed(mix @ parts, rigid)), _mixed(mix, elastic))
+
+
+def _mixed(mix: Tensor, fields: Tensor) -> Tensor:
+    """*Shape:* ``(n, m), (m, V, 3) -> (n, V, 3)``."""
+    return (mix @ fields.flatten(1)).unflatten(1, (-1, 3))
+
+
+def _orthonormal(fields: Tensor, weights: Tensor, most: int | None = None) -> Tensor:
+    """Combinations that are orthonormal; dependent ones are dropped. *Shape:* ``(m, V, 3), (V,) -> (n, m)``.
+
+    Args:
+        fields: *Shape:* ``(m, V, 3)``.
+        weights: Of the vertices. *Shape:* ``(V,)``.
+        most: Number of combinations at most: those that the fields have most in common.
+    """
+    values, vectors = torch.linalg.eigh((fields * weights[:, None]).flatten(1) @ fields.flatten(1).mT)
+    keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)
+    return (vectors[:, keep] / values[keep].sqrt()).mT[-most if most else None :]
+
+
+def _rigid_fields(x: Tensor) -> Tensor:
+    """Translations and infinitesimal rotations of a shape. *Shape:* ``(V, 3) -> (6, V, 3)``."""
+    axes = torch.eye(3, dtype=x.dtype, device=x.device)[:, None].expand(3, *x.shape)
+    return torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape))])

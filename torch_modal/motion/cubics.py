@@ -1,0 +1,152 @@
+r"""Cubic splines in time through key-frames, relative to the straight steps between them.
+
+Of any quantity that steps by ``d`` from one key-frame to the next, in the time ``h``, the cubic with the velocities
+``m_0`` and ``m_1`` at both is
+
+.. math::
+    q(u) = q_0 + u\, d + u (1 - u) \bigl((1 - u)\, e_0 - u\, e_1\bigr), \qquad e_i = h\, m_i - d,
+
+with ``u`` from 0 to 1 (Hermite). Quantities may be vectors, or rotations, whose steps are axis times angle in
+coordinates that turn along.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.autograd import made_outside, traced
+
+# Velocities are cut from this many times the slower one of the steps before and after on, and never reach three times:
+# what stops, stops, and no quantity that grows overshoots (Fritsch and Carlson 1980).
+LIMIT = 2.75
+
+Squared = Callable[[Tensor], Tensor]
+"""The squared size of a quantity, which broadcasts against it."""
+
+Scheme = Callable[[Tensor, Tensor, bool, Squared], Tensor]
+"""A path scheme: the velocities at all key-frames, from the mean velocities between them.
+
+Arguments: mean velocities, *shape* ``(N, ...)``; the durations, *shape* ``(N,)``; True for a cycle; the squared size of
+a quantity, whose components are in a dimension that this function knows. Result: *shape* ``(N + 1, ...)``.
+"""
+
+
+class Cubics(NamedTuple):
+    """A quantity between key-frames: its steps, and how far the velocities at both ends are from them.
+
+    *Shape of each:* ``(N, ...)``.
+    """
+
+    step: Tensor
+    first: Tensor
+    last: Tensor
+
+
+def cubics(
+    steps: Tensor, durations: Tensor, cyclic: bool, squared: Squared = torch.square, scheme: Scheme | None = None
+) -> Cubics:
+    """The cubics of given steps.
+
+    Args:
+        steps: *Shape:* ``(N, ...)``.
+        durations: *Shape:* ``(N,)``.
+        cyclic: True where the last step leads back to the first key-frame.
+        squared: The squared size of a quantity.
+        scheme: The path scheme. Default: :func:`limited_spline`.
+    """
+    h = durations.to(steps).view(-1, *[1] * (steps.dim() - 1))
+    velocities = (scheme or limited_spline)(steps / h, durations, cyclic, squared)
+    return Cubics(steps, h * velocities[:-1] - steps, h * velocities[1:] - steps)
+
+
+def limited_spline(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squared) -> Tensor:
+    r"""Velocities of the cubic spline with continuous acceleration, limited at each key-frame (:data:`LIMIT`).
+
+    .. math:: h_i\, m_{i-1} + 2 (h_{i-1} + h_i)\, m_i + h_{i-1}\, m_{i+1} = 3 (h_i\, s_{i-1} + h_{i-1}\, s_i)
+
+    with the mean velocities ``s`` between the key-frames. Ends have no acceleration. Arguments as for :data:`Scheme`.
+    """
+    n = len(speeds)
+    if n == 1 and not cyclic:
+        return torch.cat([speeds, speeds])
+    h, inner = durations.double(), torch.arange(0 if cyclic else 1, n, device=durations.device)
+    size, before = n + (not cyclic), (inner - 1) % n
+    matrix, right = h.new_zeros(size, size), h.new_zeros(size, n)
+    for rows, column, value in (
+        (matrix, before, h[inner]),
+        (matrix, inner, 2 * (h[before] + h[inner])),
+        (matrix, (inner + 1) % size, h[before]),
+        (right, before, 3 * h[inner]),
+        (right, inner, 3 * h[before]),
+    ):
+        rows.index_put_((inner, column), value, accumulate=True)
+    if not cyclic:
+        matrix[0, :2], matrix[-1, -2:] = torch.tensor([[2.0, 1], [1, 2]]).to(h)
+        right[0, 0] = right[-1, -1] = 3
+    velocities = torch.tensordot(torch.linalg.solve(matrix, right).to(speeds), speeds, 1)
+    found = limited(velocities[inner], speeds[before], speeds[inner], squared)
+    if cyclic:
+        return torch.cat([found, found[:1]])
+    return torch.cat([1.5 * speeds[:1] - 0.5 * found[:1], found, 1.5 * speeds[-1:] - 0.5 * found[-1:]])
+
+
+def limited(velocities: Tensor, before: Tensor, after: Tensor, squared: Squared) -> Tensor:
+    """Velocities, shortened where they exceed the geometric mean of those before and after by :data:`LIMIT`."""
+    slow, fast, found = squared(before), squared(after), squared(velocities)
+    both = slow + fast
+    most = LIMIT**2 * slow * fast / torch.where(both > 0, both, 1)
+    # Up to the limit nothing changes; beyond it, velocities fall so that no corner is left, there or at rest.
+    cut = most < found
+    part = torch.where(cut, most, 1) / torch.where(cut, found, 1)
+    return velocities * (part * (2 - part))
+
+
+def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
+    """The difference between a cubic and the straight step at ``u``, which broadcasts against the others."""
+    return u * (1 - u) * ((1 - u) * first - u * last)
+
+
+def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
+    """The interval between key-frames that each time lies in, and how far along it is.
+
+    Args:
+        t: *Shape:* ``(B,)``.
+        times: Of the key-frames, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``.
+        cyclic: True where times are taken modulo the period.
+        rounding: Relative. Times so near to a key-frame are taken for its own: 0.3 in float32 is beside 0.3 in float64,
+            and would miss the key-frame, or lie after the last.
+
+    Returns:
+        *Shape of each:* ``(B,)``.
+
+    Raises:
+        ValueError: A time is before the first or after the last.
+    """
+    scale = torch.maximum(t.detach().abs(), times.abs().amax())
+    if cyclic:
+        t = wrapped(t, times)
+    if rounding:
+        differences = times - t.detach()[:, None]
+        to_nearest = differences.gather(1, differences.abs().argmin(1, keepdim=True))[:, 0]
+        t = t + torch.where(to_nearest.abs() <= 2 * rounding * scale, to_nearest, 0.0)
+    if not traced(t):
+        made_outside(_check_times, t, times)
+    segment = (torch.searchsorted(times, t.detach().contiguous(), right=True) - 1).clamp(0, len(times) - 2)
+    return segment, (t - times[segment]) / (times[segment + 1] - times[segment])
+
+
+def _check_times(t: Tensor, times: Tensor) -> None:
+    outside = ~((t >= times[0]) & (t <= times[-1]))
+    if bool(outside.any()):
+        raise ValueError(
+            f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
+            f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
+        )
+
+
+def wrapped(t: Tensor, times: Tensor) -> Tensor:
+    """Times modulo the period of a cycle. *Shape:* ``(B,)``."""
+    period = times[-1] - times[0]
+    return t - period * torch.floor((t.detach() - times[0]) / period)

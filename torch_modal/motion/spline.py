@@ -1,0 +1,209 @@
+"""The smooth motion through key-frames: splines of triangle rotations and sizes, then one Poisson solve."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.local_rotations import LocalRotations, Trajectory, weights_per_length
+from torch_modal.geometry.rigid import best_rotation, centroid
+from torch_modal.geometry.rotations import exp, log
+from torch_modal.geometry.vectors import pick
+from torch_modal.inbetween.alignment import KeyframeAlignment
+from torch_modal.motion.cubics import Cubics, Scheme, cubics, offset
+
+# Strains are relative to the mean size of a triangle, of which the smallest is this part of the mean.
+SMALLEST = 1e-9
+
+
+class Knots(NamedTuple):
+    """Key-frames of L motions and the velocities there; N intervals, of which a cycle has as many as key-frames."""
+
+    usable: Tensor
+    """False for motions with a key-frame that is not finite, a point, or a mirror image. *Shape:* ``(L,)``, bool."""
+    shapes: Tensor
+    """Centred, scaled, and turned on to each other in a row. *Shape:* ``(N + 1, L, V, 3)``."""
+    rotations: Tensor
+    """From these shapes to the caller's. *Shape:* ``(N + 1, L, 3, 3)``."""
+    centres: Tensor
+    """Centroids in the caller's coordinates. *Shape:* ``(N + 1, L, 3)``."""
+    triangles: Cubics
+    """Of :meth:`~torch_modal.geometry.local_rotations.LocalRotations.step`. *Shape of each:* ``(N, 6, L, F)``."""
+    vertices: Cubics
+    """Of the shapes. *Shape of each:* ``(N, L, V, 3)``."""
+    turns: Cubics
+    """Rotations of the caller's shapes, axis times angle. *Shape of each:* ``(N, L, 3)``."""
+    moves: Cubics
+    """Of the centroids. *Shape of each:* ``(N, L, 3)``."""
+
+
+class Spline(nn.Module):
+    """Shapes of a motion through key-frames.
+
+    Every triangle turns and stretches along a cubic with continuous velocities (:mod:`torch_modal.motion.cubics`), and
+    so does the rigid motion; a Poisson system makes shapes of the triangles. An interval in which parts turn by more
+    than a full turn has no single axis of each triangle: there, triangles turn evenly from one shape to the other.
+
+    Args:
+        mesh: The connectivity.
+        references: Shapes near the key-frames, float64 on the CPU. *Shape:* ``(K, V, 3)``.
+        times: Of the key-frames; of a cycle one more, when the first comes again. *Shape:* ``(K,)`` or ``(K + 1,)``.
+        scheme: The path scheme.
+        backend: Makes the parts.
+    """
+
+    times: Tensor
+
+    def __init__(
+        self, mesh: Connectivity, references: Tensor, times: Tensor, scheme: Scheme | None, backend: TorchBackend
+    ) -> None:
+        super().__init__()
+        n = len(references)
+        self.scheme, self.cyclic = scheme, len(times) > n
+        self.alignment = KeyframeAlignment(references, mesh)
+        self.register_buffer("times", times.clone(), persistent=False)
+        pairs = [(i, (i + 1) % n) for i in range(len(times) - 1)]
+        self.poisson = backend.poisson(mesh, weights_per_length(mesh, references))
+        #: Of each interval; most share one.
+        self.rotations = nn.ModuleList(_rotations(mesh, references, pairs, backend))
+
+    def knots(self, keyframes: Tensor) -> Knots:
+        """The velocities at all key-frames. *Shape:* ``(L, K, V, 3)``."""
+        weights, reference = self.alignment.weights, self.alignment.reference
+        x, usable = self.alignment.checked(keyframes)
+        x = x.movedim(1, 0)
+        x = torch.cat([x, x[:1]]) if self.cyclic else x
+        centres = centroid(x, weights)
+        centred = x - centres[..., None, :]
+        weighted = (centred * weights[:, None]).mT
+        turns = [best_rotation(reference.mT @ weighted[0].mT)]
+        back = best_rotation(weighted[:-1] @ centred[1:])  # from each key-frame to the one before
+        for step in back:
+            turns.append(turns[-1] @ step)
+        rotations = torch.stack(turns).mT
+        shapes = self.alignment.scale * centred @ rotations
+        flat = shapes.detach().movedim(0, 1)
+        usable = usable.all(1) & ~self.alignment.mirrored(flat, torch.ones_like(flat[..., 0, 0])).any(1)
+        durations = self.times.diff()
+
+        def through(steps: Tensor, dim: int = -1) -> Cubics:
+            def squared(v: Tensor) -> Tensor:
+                found = v.square().sum(dim, keepdim=True)
+                return found + v[:, 4:5].square() if dim == 1 else found  # the entry beside the diagonal counts twice
+
+            return cubics(steps, durations, self.cyclic, squared, self.scheme)
+
+        here, steps = self.rotations[0].frames(shapes[0]), []
+        unit = here.size / len(shapes)
+        for rotations_of, shape in zip(self.rotations, shapes[1:], strict=True):
+            there = rotations_of.frames(shape)
+            steps.append(rotations_of.step(here, there))
+            here, unit = there, unit + there.size / len(shapes)
+        unit = torch.maximum(unit, SMALLEST * unit.mean(-1, keepdim=True))
+        unit = torch.cat([torch.ones_like(unit)[None].expand(3, -1, -1), unit[None].expand(3, -1, -1)])
+        triangles = Cubics(*(unit * part for part in through(torch.stack(steps) / unit, 1)))
+        return Knots(
+            usable,
+            shapes,
+            rotations,
+            centres,
+            triangles,
+            through(shapes.diff(dim=0)),
+            through(log(back.mT)),
+            through(centres.diff(dim=0)),
+        )
+
+    def trajectory(self, knots: Knots, i: int) -> Trajectory:
+        """The cubics of the triangles in one interval."""
+        own = self.rotations[i].frames(knots.shapes[i])
+        return Trajectory(own.e1, own.e2, own.normal, torch.stack(own[3:]), *(part[i] for part in knots.triangles))
+
+    def straight(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Tensor:
+        """Shapes whose vertices move along cubics. Arguments as for :meth:`forward`."""
+        step, first, last = (part[i][which] for part in knots.vertices)
+        wide = u[:, None, None]
+        return knots.shapes[i][which] + wide * step + offset(first, last, wide)
+
+    def forward(
+        self,
+        knots: Knots,
+        i: int,
+        which: Tensor,
+        u: Tensor,
+        trajectory: Trajectory | None = None,
+        straight: Tensor | None = None,
+        bending: Tensor | None = None,
+    ) -> Tensor:
+        """Shapes of one interval, in the coordinates of the knots' shapes.
+
+        Args:
+            knots: Of :meth:`knots`.
+            i: The interval.
+            which: The motion of each shape. *Shape:* ``(B,)``.
+            u: Times, 0 to 1. *Shape:* ``(B,)``.
+            trajectory: Of :meth:`trajectory`, where it is known.
+            straight: Shapes whose pieces have the centres of those of the result. Default: of :meth:`straight`.
+                *Shape:* ``(B, V, 3)``.
+            bending: What the triangles do beforehand, of one motion. *Shape:* ``(6, B, F)``.
+
+        Returns:
+            *Shape:* ``(B, V, 3)``.
+        """
+        rotations = self.rotations[i]
+        trajectory = self.trajectory(knots, i) if trajectory is None else trajectory
+        straight = self.straight(knots, i, which, u) if straight is None else straight
+        if bending is not None:
+            edges = rotations.bent_along(trajectory, u, bending)
+        elif rotations.clusters is not None:
+            ends = knots.shapes[i : i + 2, which].movedim(0, 1)
+            edges = rotations(ends, torch.stack([1 - u, u], -1))
+        else:
+            edges = rotations.along(trajectory, which, u)
+        found = self.poisson(edges, straight.movedim(-1, 0)).movedim(0, -1)
+        return torch.where(found.isfinite().flatten(1).all(1)[:, None, None], found, straight)
+
+    def pose(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations and centroids at times of one interval. *Shape:* ``(B, 3, 3)``, ``(B, 3)``."""
+        wide = u[:, None]
+        start = knots.rotations[i][which]
+        step, first, last = ((part[i][which][:, None] @ start).squeeze(1) for part in knots.turns)
+        end = (knots.turns.last[i][which] + knots.turns.step[i][which])[:, None] @ knots.rotations[i + 1][which]
+        last = end.squeeze(1) - step
+        rotation = start @ exp(wide * step) @ exp(offset(first, last, wide))
+        move, first, last = (part[i][which] for part in knots.moves)
+        return rotation, knots.centres[i][which] + wide * move + offset(first, last, wide)
+
+    def restore(self, x: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
+        """Shapes in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
+        rotation, centre = pose
+        return (x / self.alignment.scale) @ rotation.mT + centre[:, None]
+
+    def bring(self, points: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
+        """The inverse of :meth:`restore`. *Shape:* ``(B, P, 3)``."""
+        rotation, centre = pose
+        return (points - centre[:, None]) @ rotation * self.alignment.scale
+
+
+def _rotations(
+    mesh: Connectivity, references: Tensor, pairs: Sequence[tuple[int, int]], backend: TorchBackend
+) -> list[LocalRotations]:
+    """The local rotations of each interval.
+
+    The tree of the first serves all intervals in which neighbours have the same quaternion sign by it, and so by every
+    tree, and in which nothing goes beyond a full turn.
+    """
+    others = [k for k in range(len(references)) if k not in pairs[0]]
+    first = backend.rotations(mesh, references[[*pairs[0], *others]])
+    one, other = torch.tensor(mesh.face_neighbours).unbind(1)
+    found = [first]
+    for pair in pairs[1:]:
+        ends = references[list(pair)]
+        plain = first.clusters is None and not first.is_beyond_a_turn(*ends)
+        if plain:
+            turns = first.turns(ends[:1], ends[1:])[:, 0]
+            plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
+        found.append(first if plain else backend.rotations(mesh, ends))
+    return found

@@ -1,0 +1,205 @@
+"""Minimisation in modal amplitudes by quasi-Newton steps from Gauss-Newton's Hessian.
+
+The start is near the minimum as a rule. One Hessian and a dozen gradients then take less time than the three or four
+Hessians of a Newton method, and need no second-order term.
+"""
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal import trees
+from torch_modal.solve.gauss_newton import AmplitudeEnergy, gradient_floor, ridged
+
+# Evaluations of the gradient with one Hessian of Gauss and Newton. Samples that need more get another.
+MOST_EVALUATIONS = 40
+
+# Steps shorter than this part of the quasi-Newton step make no progress worth an evaluation.
+SHORTEST = 0.02
+
+# Roundings of an energy, relative to it, by which it may rise.
+ENERGY_ROUNDING = 64.0
+
+
+class Status(IntEnum):
+    """How the minimisation of a sample ended."""
+
+    CONVERGED = 0
+    """The gradient is within the tolerance, or as small as rounding lets it be."""
+    OUT_OF_STEPS = 1
+    """There was more to gain."""
+    STALLED = 2
+    """No step went downhill any more."""
+    INVALID = 3
+    """No in-between exists: NaN or infinite entries, no size, or one key-frame of a closed mesh is a mirror image."""
+    FELL_BACK = 4
+    """The minimiser is worse than its start, which is returned: the blend by local rotations, or linear
+    interpolation. Gradients are those of the returned shape; amplitudes and energy are those of the minimiser."""
+
+
+class Solution(NamedTuple):
+    """Result of :func:`minimise`, one value per sample."""
+
+    amplitudes: Tensor
+    """*Shape:* ``(B, n)``."""
+    energy: Tensor
+    """*Shape:* ``(B,)``."""
+    gradient_norm: Tensor
+    """Relative to the gradient norm at the start. *Shape:* ``(B,)``."""
+    n_steps: Tensor
+    """Steps taken. *Shape:* ``(B,)``, int64."""
+    status: Tensor
+    """A :class:`Status` for each. *Shape:* ``(B,)``, int64."""
+    n_crossing: Tensor | None = None
+    """With contact, the pairs of triangles of parts that still go through each other. *Shape:* ``(B,)``, int64."""
+
+    @property
+    def usable(self) -> Tensor:
+        """True where the shape converged, or is what it started from. *Shape:* ``(B,)``, bool."""
+        return self.converged | (self.status == Status.FELL_BACK)
+
+    @property
+    def converged(self) -> Tensor:
+        """True where the gradient is within the tolerance. *Shape:* ``(B,)``, bool."""
+        return self.status == Status.CONVERGED
+
+
+class _State(NamedTuple):
+    """The state of each sample. Vectors have a last dimension of 1, for matrix products."""
+
+    row: Tensor
+    """Which sample of the batch it is. *Shape:* ``(B,)``."""
+    a: Tensor
+    """*Shape:* ``(B, n, 1)``."""
+    energy: Tensor
+    """*Shape:* ``(B,)``."""
+    gradient: Tensor
+    """*Shape:* ``(B, n, 1)``."""
+    norm: Tensor
+    """Of the gradient. *Shape:* ``(B,)``."""
+    inverse: Tensor
+    """The approximate inverse of the Hessian. *Shape:* ``(B, n, n)``."""
+    length: Tensor
+    """Of the next step, relative to the quasi-Newton step; 0 of converged samples. *Shape:* ``(B,)``."""
+    goal: Tensor
+    """The gradient norm at which it has converged. *Shape:* ``(B,)``."""
+    n_steps: Tensor
+    """Steps taken. *Shape:* ``(B,)``, int64."""
+    placement: Any
+    """The arguments of the energy for each sample."""
+
+
+def minimise(
+    energy: AmplitudeEnergy, a: Tensor, placement: Any, max_steps: int = 80, tolerance: float = 3e-7
+) -> Solution:
+    """Minimise by BFGS from the Gauss-Newton Hessian.
+
+    A step is taken if the energy falls; otherwise the next one is half as long. A converged sample takes one more step,
+    whose gradient is not evaluated: the gradient norm of the solution is the one before. Samples that have not
+    converged after :data:`MOST_EVALUATIONS` start again where they are, with the Hessian there. A sample's result does
+    not depend on its batch.
+
+    Args:
+        energy: The energy of the amplitudes.
+        a: Where to start. *Shape:* ``(B, n)``.
+        placement: What the energy knows of each sample: nested tuples of tensors. *Shape of each:* ``(B, ...)``.
+        max_steps: Evaluations of the gradient at most.
+        tolerance: Bound on the gradient norm, relative to the one at the start.
+    """
+    whole = found, reached, norm, n_steps = (
+        a.clone(),
+        energy.value(a, placement),
+        a.new_zeros(len(a)),
+        torch.zeros(len(a), dtype=torch.int64, device=a.device),
+    )
+    start, goal = norm.clone(), norm.clone()
+    drowned = torch.zeros_like(norm, dtype=torch.bool)
+    rows, left = torch.arange(len(a), device=a.device), max_steps
+    while left > 0 or left == max_steps:
+        some = placement if len(rows) == len(a) else trees.rows(placement, rows)
+        derivatives = energy.derivatives(found[rows], some, second_order=False)
+        if left == max_steps:
+            start = derivatives.gradient.norm(dim=-1)
+            norm.copy_(start)
+            goal = torch.maximum(tolerance * start, gradient_floor(derivatives))
+        factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
+        gradient = derivatives.gradient[..., None]
+        own_norm = derivatives.gradient.norm(dim=-1)
+        regular = (info == 0) & own_norm.isfinite() & reached[rows].isfinite()
+        eye = torch.eye(a.shape[-1], dtype=factor.dtype, device=a.device)
+        inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye))
+        length = (regular & (own_norm > goal[rows])).to(start)
+        state = _State(
+            rows, found[rows, :, None], reached[rows], gradient, own_norm, inverse, length, goal[rows], n_steps[rows], some
+        )
+        for _ in range(min(MOST_EVALUATIONS, left)):
+            n_active = int(torch.count_nonzero(state.length))
+            if not n_active:
+                break
+            left -= 1
+            if 2 * n_active <= len(state.row):
+                _put(whole, drowned, state)
+                state = trees.rows(state, torch.nonzero(state.length).flatten())
+            state = _advanced(energy, state)
+        before = n_steps[rows]
+        _put(whole, drowned, state)
+        # Those that go on, of which a Hessian at the new place may help.
+        again = (norm[rows] > goal[rows]) & (n_steps[rows] > before)
+        rows = rows[again]
+        if not len(rows):
+            break
+    status = torch.where(left <= 0, Status.OUT_OF_STEPS, Status.STALLED) * torch.ones_like(n_steps)
+    status = torch.where((norm <= goal) | drowned, Status.CONVERGED, status)
+    status = torch.where(norm.isfinite() & reached.isfinite(), status, Status.INVALID)
+    return Solution(found, reached, norm / start.clamp_min(torch.finfo(start.dtype).tiny), n_steps, status)
+
+
+def _put(whole: tuple[Tensor, ...], drowned: Tensor, state: _State) -> None:
+    """Write the amplitudes, energies, gradient norms and numbers of steps of some samples into those of all."""
+    step = torch.bmm(state.inverse, state.gradient)
+    # At a start that has converged there is nothing to gain, and perhaps only rounding to follow.
+    ended = ((state.norm <= state.goal) & (state.n_steps > 0))[:, None, None]
+    parts = torch.where(ended, state.a - step, state.a).squeeze(-1), state.energy, state.norm, state.n_steps
+    for values, own in zip(whole, parts, strict=True):
+        values[state.row] = own
+    # Where all that is left to gain is less than the rounding of the energy, nothing compares steps any more.
+    gain = 0.5 * (state.gradient * step).sum((1, 2))
+    drowned[state.row] = gain <= ENERGY_ROUNDING * torch.finfo(gain.dtype).eps * state.energy.abs()
+
+
+def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
+    """One evaluation: a step where the energy falls, a shorter one next where it does not."""
+    a, gradient, inverse, length = state.a, state.gradient, state.inverse, state.length
+    move = torch.bmm(inverse, gradient).mul_(-length[:, None, None])
+    there = a + move
+    value, slope = energy.value_and_gradient(there.squeeze(-1), state.placement)
+    slope = slope[..., None]
+    # Energies are sums of squares. They may rise by their rounding.
+    better = (length > 0) & (value <= state.energy * (1 + ENERGY_ROUNDING * torch.finfo(value.dtype).eps))
+    change = slope - gradient
+    if bool(better.all()):
+        length = torch.ones_like(length)
+    else:
+        taken = better[:, None, None]
+        there, move, change = torch.where(taken, there, a), move * taken, torch.where(taken, change, 0)
+        value, slope = torch.where(better, value, state.energy), torch.where(taken, slope, gradient)
+        shorter = torch.where(length > SHORTEST, 0.5 * length, 0)
+        length = torch.where(better, 1, shorter)
+    # The update keeps the inverse positive definite where the gradient grows along the step; elsewhere it is left out.
+    pushed, across = torch.bmm(inverse, change), change.mT
+    curvature = torch.bmm(across, move)
+    share = torch.where(curvature > 0, curvature.reciprocal(), 0)
+    half = torch.bmm(across, pushed).mul_(share).add_(1).mul_(0.5)
+    other, scaled = torch.addcmul(pushed, half, move, value=-1), move * share
+    norm = torch.linalg.vector_norm(slope, dim=(1, 2))
+    return state._replace(
+        a=there,
+        energy=value,
+        gradient=slope,
+        norm=norm,
+        inverse=inverse.baddbmm_(scaled, other.mT, alpha=-1).baddbmm_(other, scaled.mT, alpha=-1),
+        length=length * (norm > state.goal),
+        n_steps=state.n_steps + better,
+    )
