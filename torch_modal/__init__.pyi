@@ -31,8 +31,8 @@ from .energy.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
 from .geometry.normals import vertex_normals as vertex_normals
-from .inbetween.samples import ConvergenceError as ConvergenceError
-from .inbetween.samples import InBetweenResult as InBetweenResult
+from .inbetween.results import ConvergenceError as ConvergenceError
+from .inbetween.results import InBetweenResult as InBetweenResult
 from .inbetween.settings import PRESETS as PRESETS
 from .inbetween.settings import Objective as Objective
 from .inbetween.settings import Solver as Solver
@@ -47,7 +47,7 @@ from .keyframes.seams import weld_seams as weld_seams
 from .layers.blend import Blend as Blend
 from .layers.in_between import InBetween as InBetween
 from .layers.mid_shape import MidShape as MidShape
-from .layers.modal_decoder import ModalDecoder as ModalDecoder
+from .motion.decoder import ModalDecoder as ModalDecoder
 from .motion.editor import PathEditor as PathEditor
 from .motion.path import Path as Path
 from .motion.subdivide import frame_times as frame_times
@@ -65,10 +65,10 @@ from .registration.landmarks import suggest_landmarks as suggest_landmarks
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register
 from .registration.report import Registration as Registration
-from .solve.adjoint import ConvergenceWarning as ConvergenceWarning
+from .solve.implicit import ConvergenceWarning as ConvergenceWarning
 from .solve.gauss_newton import GaussNewtonStep as GaussNewtonStep
-from .solve.solver import Solution as Solution
-from .solve.solver import Status as Status
+from .solve.minimise import Solution as Solution
+from .solve.minimise import Status as Status
 from .statistics.components import Components as Components
 from .statistics.fit import Fitted as Fitted
 from .view.animation import save_animation as save_animation

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import log
-from torch_modal.layers.modal_decoder import Interval, ModalDecoder, moved
+from torch_modal.motion.decoder import Interval, ModalDecoder, moved
 
 MAX_STEPS = 6
 MIN_GAIN = 0.01

@@ -15,7 +15,7 @@ from torch_modal.codec.fit import FittedFrames, fit
 from torch_modal.codec.modes import ReproducibleModes, reproducible_modes
 from torch_modal.codec.selection import FrameSequence, choose_keyframes, with_worst
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.layers.modal_decoder import ModalDecoder
+from torch_modal.motion.decoder import ModalDecoder
 from torch_modal.progress import Progress, ProgressReport
 
 ERROR = 0.002

@@ -23,7 +23,7 @@ from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.vectors import norm, pick
-from torch_modal.inbetween.samples import InBetweenResult
+from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.io.cache import CacheWarning
 from torch_modal.io.content import ContentError, code_digest, content_digest
@@ -32,8 +32,8 @@ from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.path import Path as MotionPath
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.solve.adjoint import ConvergenceWarning
-from torch_modal.solve.solver import Status
+from torch_modal.solve.implicit import ConvergenceWarning
+from torch_modal.solve.minimise import Status
 from torch_modal.statistics.components import Components
 from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.observations import Observations, checked_observations, checked_weights

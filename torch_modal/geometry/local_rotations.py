@@ -1,4 +1,4 @@
-"""Between two shapes by local rotations: every triangle turns at constant speed."""
+"""Means of shapes by local rotations: between two of them, every triangle turns at constant speed."""
 
 from functools import reduce
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.rotation_means import agreeing, mean
-from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
+from torch_modal.geometry.rotations import quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
     Sides,
@@ -67,7 +67,6 @@ class LocalRotations(nn.Module):
             avoids what is a sliver in any. *Shape:* ``(K, V, 3)``.
     """
 
-    reference: Tensor
     faces: Tensor
     sides: Tensor
     side_signs: Tensor
@@ -85,8 +84,6 @@ class LocalRotations(nn.Module):
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
-        #: The first reference, from which :meth:`among` measures rotations. *Shape:* ``(1, V, 3)``.
-        self.register_buffer("reference", references[:1].clone(), persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
@@ -110,18 +107,11 @@ class LocalRotations(nn.Module):
         parents, piece = spanning_forest(len(mesh.faces), mesh.face_neighbours, costs.numpy())
         return torch.from_numpy(parents), torch.from_numpy(piece)
 
-    def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """Edge vectors at the time ``t``, components first. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (3, B, E)``."""
-        a, b = (_frames(x, self.faces) for x in (first, second))
-        areas, t = a.doubled_areas + b.doubled_areas, t[:, None]
-        turn = power(self._signed(a, b), t) if self.clusters is None else self.clusters(_turn_between(a, b), t)
-        return self._edges(_turned(turn, a, *(torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))), areas)
-
-    def among(self, shapes: Tensor, weights: Tensor) -> Tensor:
+    def forward(self, shapes: Tensor, weights: Tensor) -> Tensor:
         """Edge vectors of the weighted mean of K shapes, components first.
 
-        The rotation of a triangle is the mean of those of the shapes, its stretch the weighted sum. Of two references,
-        this is :meth:`forward` at the time of the second weight.
+        The rotation of a triangle is the mean of those of the shapes, of two the geodesic; its stretch is the weighted
+        sum. An edge takes the mean of its triangles by their areas in the references.
 
         Args:
             shapes: They turn by less than a full turn from each other, unless the references do. *Shape:*
@@ -131,16 +121,19 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        start, own = _frames(self.reference, self.faces), _frames(shapes.flatten(0, 1), self.faces)
-        turns = _turn_between(start, own)
+        own = Frames(*(x.unflatten(-2, weights.shape) for x in _frames(shapes.flatten(0, 1), self.faces)))
+        start = Frames(*(x[..., 0, :] for x in own))
+        turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
         if self.clusters is None:
-            signs = self.sign(turns.detach().movedim(0, -1), own.doubled_areas.detach())
-            turns = (signs * turns).unflatten(1, weights.shape)
+            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), own.doubled_areas.detach().flatten(0, 1))
+            turns = signs.view(turns.shape[1:]) * turns
             turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
-            turn = self.clusters.among(turns.unflatten(1, weights.shape), weights[..., None])
-        wanted = _turned(turn, start, *((weights[..., None] * x.unflatten(0, weights.shape)).sum(-2) for x in own[3:]))
-        return self._edges(wanted, self.areas.expand(len(weights), -1))
+            turn = self.clusters(turns, weights[..., None])
+        return self._edges(
+            _turned(turn, start, *((weights[..., None] * x).sum(-2) for x in own[3:])),
+            self.areas.expand(len(weights), -1),
+        )
 
     def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.

@@ -11,13 +11,10 @@ import torch
 from torch import Tensor
 
 from torch_modal.backends.choice import choose
-from torch_modal.contact.trajectory import push_apart
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
-from torch_modal.inbetween.between import Between
-from torch_modal.inbetween.samples import Samples
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.keyframes.times import checked_times
@@ -292,7 +289,7 @@ class _ContactReport:
     def __init__(self) -> None:
         self.n_before = self.n_left = self.n_searched = 0
 
-    def __call__(self, member: Between, samples: Samples, shapes: Tensor) -> Tensor:
+    def __call__(self, member: Any, samples: Any, shapes: Tensor) -> Tensor:
         """The shapes between two key-frames, of their times. *Shape:* ``(T, V, 3)``."""
         given = shapes.to(samples.x_a)
         found = push_apart(member, samples, given)
@@ -350,7 +347,7 @@ class _Segment:
         ]
         return torch.stack(mids)
 
-    def samples(self, shapes: Tensor) -> tuple[Between, Samples]:
+    def samples(self, shapes: Tensor) -> Any:
         """The in-betweens of the joint space, and the times of even shapes, without the first and the last."""
         layer = self._layer(0, 1).in_between
         t = torch.linspace(0, 1, len(shapes), dtype=layer.dtype, device=shapes.device)[1:-1]

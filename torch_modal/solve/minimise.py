@@ -108,65 +108,56 @@ def minimise(
         max_steps: Evaluations of the gradient at most.
         tolerance: Bound on the gradient norm, relative to the one at the start.
     """
-    whole = found, reached, norm, n_steps = (
-        a.clone(),
-        energy.value(a, placement),
-        a.new_zeros(len(a)),
-        torch.zeros(len(a), dtype=torch.int64, device=a.device),
-    )
-    start, goal = norm.clone(), norm.clone()
-    drowned = torch.zeros_like(norm, dtype=torch.bool)
-    rows, left = torch.arange(len(a), device=a.device), max_steps
-    while left > 0 or left == max_steps:
+    found, reached, norm = a.clone(), energy.value(a, placement), a.new_zeros(len(a))
+    n_steps = torch.zeros(len(a), dtype=torch.int64, device=a.device)
+    start, goal, drowned = norm.clone(), norm.clone(), norm > 0
+    eye, rows = torch.eye(a.shape[-1]).to(a), torch.arange(len(a), device=a.device)
+    for used in range(0, max(max_steps, 1), MOST_EVALUATIONS):
         some = placement if len(rows) == len(a) else trees.rows(placement, rows)
         derivatives = energy.derivatives(found[rows], some, second_order=False)
-        if left == max_steps:
-            start = derivatives.gradient.norm(dim=-1)
-            norm.copy_(start)
-            goal = torch.maximum(tolerance * start, gradient_floor(derivatives))
-        factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
-        gradient = derivatives.gradient[..., None]
         own_norm = derivatives.gradient.norm(dim=-1)
+        if not used:
+            start, goal = own_norm, torch.maximum(tolerance * own_norm, gradient_floor(derivatives))
+        factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
         regular = (info == 0) & own_norm.isfinite() & reached[rows].isfinite()
-        eye = torch.eye(a.shape[-1], dtype=factor.dtype, device=a.device)
         inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye))
-        length = (regular & (own_norm > goal[rows])).to(start)
-        state = _State(
-            rows, found[rows, :, None], reached[rows], gradient, own_norm, inverse, length, goal[rows], n_steps[rows], some
-        )
-        for _ in range(min(MOST_EVALUATIONS, left)):
+        own = found[rows, :, None], reached[rows], derivatives.gradient[..., None], own_norm, inverse
+        length, before = (regular & (own_norm > goal[rows])).to(a), n_steps[rows]
+        state = _State(rows, *own, length, goal[rows], before, some)
+        whole = found, reached, norm, n_steps, drowned
+        for _ in range(min(MOST_EVALUATIONS, max_steps - used)):
             n_active = int(torch.count_nonzero(state.length))
             if not n_active:
                 break
-            left -= 1
             if 2 * n_active <= len(state.row):
-                _put(whole, drowned, state)
+                _put(whole, state)
                 state = trees.rows(state, torch.nonzero(state.length).flatten())
             state = _advanced(energy, state)
-        before = n_steps[rows]
-        _put(whole, drowned, state)
-        # Those that go on, of which a Hessian at the new place may help.
-        again = (norm[rows] > goal[rows]) & (n_steps[rows] > before)
-        rows = rows[again]
+        _put(whole, state)
+        # A Hessian at the new place may help the others, if they have moved.
+        rows = rows[(norm[rows] > goal[rows]) & ~drowned[rows] & (n_steps[rows] > before)]
         if not len(rows):
             break
-    status = torch.where(left <= 0, Status.OUT_OF_STEPS, Status.STALLED) * torch.ones_like(n_steps)
+    status = torch.full_like(n_steps, Status.STALLED)
+    status[rows] = Status.OUT_OF_STEPS
     status = torch.where((norm <= goal) | drowned, Status.CONVERGED, status)
     status = torch.where(norm.isfinite() & reached.isfinite(), status, Status.INVALID)
     return Solution(found, reached, norm / start.clamp_min(torch.finfo(start.dtype).tiny), n_steps, status)
 
 
-def _put(whole: tuple[Tensor, ...], drowned: Tensor, state: _State) -> None:
-    """Write the amplitudes, energies, gradient norms and numbers of steps of some samples into those of all."""
+def _put(whole: tuple[Tensor, ...], state: _State) -> None:
+    """Write the amplitudes, energies, gradient norms and numbers of steps of some samples into those of all.
+
+    The last says where all that is left to gain is less than the rounding of the energy: nothing compares steps then.
+    """
     step = torch.bmm(state.inverse, state.gradient)
     # At a start that has converged there is nothing to gain, and perhaps only rounding to follow.
     ended = ((state.norm <= state.goal) & (state.n_steps > 0))[:, None, None]
-    parts = torch.where(ended, state.a - step, state.a).squeeze(-1), state.energy, state.norm, state.n_steps
-    for values, own in zip(whole, parts, strict=True):
-        values[state.row] = own
-    # Where all that is left to gain is less than the rounding of the energy, nothing compares steps any more.
     gain = 0.5 * (state.gradient * step).sum((1, 2))
-    drowned[state.row] = gain <= ENERGY_ROUNDING * torch.finfo(gain.dtype).eps * state.energy.abs()
+    drowned = gain <= ENERGY_ROUNDING * torch.finfo(gain.dtype).eps * state.energy.abs()
+    a = torch.where(ended, state.a - step, state.a).squeeze(-1)
+    for values, own in zip(whole, (a, state.energy, state.norm, state.n_steps, drowned), strict=True):
+        values[state.row] = own
 
 
 def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:

@@ -8,9 +8,11 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import applied, flattened, made_outside, pushed, recorded, traced, transformed
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
-from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
+from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 
 # Columns that a kernel takes at a time.
@@ -29,6 +31,11 @@ def shell_reference(shell: WarpShell, first: Tensor, second: Tensor, t: Tensor, 
     return shell.reference_by_torch(*given) if traced(t) else ShellReference(*applied(_Referred, shell, *given))
 
 
+def reference_of(shell: WarpShell, rests: RestShapes) -> ShellReference:
+    """The reference towards the terms of Eq. 5 of rest shapes."""
+    return merged_reference(shell, rests.shapes, rests.weights, *rests.stiffness[:N_SHELL_TERMS])
+
+
 def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffness: Tensor) -> ShellReference:
     """The reference towards K rest shapes of each sample: Eq. 8 for any number of them.
 
@@ -39,6 +46,8 @@ def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffne
         stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
     """
     flat, n = shapes.flatten(0, 1), shapes.shape[1]
+    if n == 2:
+        return shell_reference(shell, *shapes.unbind(1), weights[:, 1], *stiffness)
     alone = (value.repeat_interleave(n, 0) for value in stiffness)
     own = shell_reference(shell, flat, flat, flat.new_zeros(len(flat)), *alone)
     stretch, bend, hard, volume, _ = (value.unflatten(0, weights.shape) for value in own)
@@ -154,42 +163,35 @@ class WarpModalEnergy(ModalEnergy):
         """The kernels."""
         return self._shell[0]
 
-    def place(
-        self, base: Tensor, reference: Any, extra: Tensor | None = None, anchors: Tensor | None = None
-    ) -> Placement:
+    def place(self, base: Tensor, reference: Any, anchors: Tensor | None = None) -> Placement:
         """As in the base class."""
         if not isinstance(reference, ShellReference):
-            return super().place(base, reference, extra, anchors)
-        return Placement(base.double(), None if extra is None else extra.double(), reference)  # type: ignore[arg-type]
+            return super().place(base, reference, anchors)
+        return Placement(base.double(), reference)
 
     def _plain(self, placement: Placement, direction: Tensor | None = None) -> Placement | None:
         """The placement for torch; None where it, and a direction in the amplitudes, are for kernels."""
         if not isinstance(placement.reference, ShellReference):
             return placement
-        values = placement.base, placement.extra, *placement.reference, direction
+        values = placement.base, *placement.reference, direction
         if torch.is_grad_enabled() or any(x is not None and (traced(x) or transformed(x)) for x in values):
-            base, extra, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
-            return super().place(base, self.shell.unpacked(reference), extra)
+            base, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
+            return super().place(base, self.shell.unpacked(reference))
         return None
 
     # ------------------------------------------------------------------------------------------------------- the shapes
-    def _shapes(self, a: Tensor, base: Tensor, extra: Tensor | None) -> Tensor:
+    def _shapes(self, a: Tensor, base: Tensor) -> Tensor:
         """*Shape:* ``(..., B, n) -> (D * B, V, 3)``."""
-        n = len(self.columns)
         a, flat = a.double(), self.flat.double()
         if a.dim() == 2:
-            x = torch.addmm(base.flatten(1), a[:, :n], flat).view_as(base)
-        else:
-            x = (a[..., :n] @ flat).unflatten(-1, (-1, 3)) + base
-        if extra is not None:
-            x = torch.addcmul(x, a[..., n, None, None], extra)
-        return x.flatten(0, -3)
+            return torch.addmm(base.flatten(1), a, flat).view_as(base)
+        return ((a @ flat).unflatten(-1, (-1, 3)) + base).flatten(0, -3)
 
     def rows(self, a: Tensor, placement: Placement) -> Tensor:
         """As in the base class."""
         if not isinstance(placement.reference, ShellReference):
             return super().rows(a, placement)
-        x = self._shapes(a, placement.base, placement.extra).unflatten(0, a.shape[:-1])
+        x = self._shapes(a, placement.base).unflatten(0, a.shape[:-1])
         return self.energy.extend(x.movedim(-1, 0))
 
     def value(self, a: Tensor, placement: Placement) -> Tensor:
@@ -198,7 +200,7 @@ class WarpModalEnergy(ModalEnergy):
         if plain is not None:
             return super().value(a.to(plain.base), plain).to(placement.base)
         to: Any = placement.reference
-        found = self.shell.value(self._shapes(a, placement.base, placement.extra), to)
+        found = self.shell.value(self._shapes(a, placement.base), to)
         return found.unflatten(0, a.shape[:-1]) + to.constant
 
     def derivatives(self, a: Tensor, placement: Placement, second_order: bool = True) -> Derivatives:
@@ -226,22 +228,22 @@ class WarpModalEnergy(ModalEnergy):
 
     def _derivatives(self, a: Tensor, placement: Placement, second_order: bool) -> Derivatives:
         to: Any = placement.reference
-        x, extra, shell = self._shapes(a, placement.base, placement.extra), placement.extra, self.shell
+        x, shell = self._shapes(a, placement.base), self.shell
         (b, n), blocks = (len(x), len(self.columns)), self.blocks.double()
-        n_all, n_measures = n + (extra is not None), len(shell.record) + len(shell.interior)
+        n_measures = len(shell.record) + len(shell.interior)
         # One row for each measure, the last for the volume; the residuals are a column like the others.
         jacobian, stiffness = x.new_empty(b, n_measures + 1, blocks.shape[1]), to.stiffness.clone()
-        given = [x, shell.record, shell.hinge, to.stretch, to.bend, blocks, extra, shell.n_vertices, n]
+        given = [x, shell.record, shell.hinge, to.stretch, to.bend, blocks, None, shell.n_vertices, n]
         given += [blocks.shape[1] // _BLOCK, n_measures + 1, jacobian, jacobian, stiffness]
         launch(kernels("modal").jacobian, (b, len(shell.record)), given)
         volume, normal = shell.volume(x)
         root, off, last = to.stiffness.sqrt()[:, None], volume - to.volume, jacobian[:, -1]
-        last[:, :n_all] = along_columns(normal, self.flat.double(), extra)
-        last[:, n_all] = off
+        last[:, :n] = normal.flatten(1) @ self.flat.double().mT
+        last[:, n] = off
         last *= root
-        last[:, n_all + 1 :] = 0
+        last[:, n + 1 :] = 0
         products = gram(jacobian)
-        gradient, inner = products[:, :n_all, n_all], products[:, :n_all, :n_all]
+        gradient, inner = products[:, :n, n], products[:, :n, :n]
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
         curved = self._second(x, to.stiffness * off, placement) if second_order else None
@@ -254,20 +256,8 @@ class WarpModalEnergy(ModalEnergy):
             value, gradient = super().value_and_gradient(a.to(plain.base), plain)
             return value.to(placement.base), gradient.to(placement.base)
         to: Any = placement.reference
-        value, x = self.shell.value_and_gradient(self._shapes(a, placement.base, placement.extra), to)
-        return value + to.constant, along_columns(x, self.flat.double(), placement.extra)
-
-    def second_order(self, a: Tensor, placement: Placement) -> Tensor:
-        """As in the base class."""
-        plain = self._plain(placement)
-        if plain is not None:
-            return super().second_order(a.to(plain.base), plain).to(placement.base)
-        found = []
-        for own, there in self._chunks(a, placement):
-            x, to = self._shapes(own, there.base, there.extra), there.reference
-            volume, _ = self.shell.volume(x)
-            found.append(self._second(x, to.stiffness * (volume - to.volume), there))  # type: ignore[attr-defined]
-        return found[0] if len(found) == 1 else torch.cat(found)
+        value, x = self.shell.value_and_gradient(self._shapes(a, placement.base), to)
+        return value + to.constant, x.flatten(1) @ self.flat.double().mT
 
     def _second(self, x: Tensor, moment: Tensor, placement: Placement) -> Tensor:
         to: Any = placement.reference
@@ -277,18 +267,11 @@ class WarpModalEnergy(ModalEnergy):
         launch(kernels("modal").curved_edges, (len(x), len(shell.record)), given)
         given = [x, shell.centre(x), shell.capped_faces, moment, self.face_slots, shell.n_vertices, 2 * n_pairs, found]
         launch(kernels("modal").curved_faces, (len(x), len(shell.capped_faces)), given)
-        extra, columns, n = placement.extra, self.blocks.double(), len(self.columns)
-        if extra is not None:
-            extra = torch.cat([extra, shell.mean(extra)[:, None]], 1)
+        columns, n = self.blocks.double(), len(self.columns)
         pushed = x.new_zeros(len(x), *columns.shape)
-        given = [self.pairs, found, columns, extra, len(columns) // 3, n, columns.shape[1] // _BLOCK, pushed, pushed]
+        given = [self.pairs, found, columns, None, len(columns) // 3, n, columns.shape[1] // _BLOCK, pushed, pushed]
         launch(kernels("modal").curved_columns, (len(x), n_pairs), given)
-        n_all = n + (extra is not None)
-        curved = (columns.mT @ pushed)[:, :n_all, :n_all]
-        if extra is not None:  # a column of zeros so far on the left side
-            curved[:, n, :n] = curved[:, :n, n]
-            curved[:, n, n] = (extra.flatten(1) * pushed[..., n]).sum(-1)
-        return curved
+        return (columns.mT @ pushed)[:, :n, :n]
 
     def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
         """As in the base class."""
@@ -299,16 +282,12 @@ class WarpModalEnergy(ModalEnergy):
         if plain is not None:
             pulled = super().pull_back(a.to(plain.base), direction.to(plain.base), plain)
             return self._repacked(pulled, placement)
-        base, extra, shell = placement.base, placement.extra, self.shell
-        x, moved = self._shapes(a, base, extra), self._shapes(direction, torch.zeros_like(base), extra)
+        base, shell = placement.base, self.shell
+        x, moved = self._shapes(a, base), self._shapes(direction, torch.zeros_like(base))
         at = shell.at(x, to)
         to_base, to_reference = torch.zeros_like(x), ShellReference(*(torch.zeros_like(value) for value in to))
         shell.from_point(x, at, to, moved, to_base, to_reference)
-        to_extra = None
-        if extra is not None:
-            own = torch.addcmul(at.gradient, at.moment[:, None, None], at.normal)
-            to_extra = a[:, -1, None, None] * to_base + direction[:, -1, None, None] * own
-        return Placement(to_base, to_extra, to_reference)  # type: ignore[arg-type]
+        return Placement(to_base, to_reference)  # type: ignore[arg-type]
 
     def _repacked(self, found: Placement, placement: Placement) -> Placement:
         """Gradients in a placement for torch as those in the one for kernels that it was made of."""
