@@ -99,13 +99,20 @@ def compared(name: str, now: dict[str, Any], then: dict[str, Any]) -> tuple[list
     """A row of the table; ratios of edge errors, and of distances."""
     first = now["ends"][0]
     diagonal = float((first.amax(0) - first.amin(0)).norm())
-    shapes = [key for key in then if key == "shapes" or (key.endswith(("0", "1", "2", "3", "5")) and "truth" not in key)]
+    shapes = [
+        key for key in then if key == "shapes" or (key.endswith(("0", "1", "2", "3", "5")) and "truth" not in key)
+    ]
     apart = 100 * max(float((now[key] - then[key]).norm(dim=-1).max()) for key in shapes) / diagonal
     gradient = max(
-        (float((a - b).norm() / b.norm()) for a, b in zip(now.get("gradients", ()), then.get("gradients", ()), strict=True)),
+        (
+            float((a - b).norm() / b.norm())
+            for a, b in zip(now.get("gradients", ()), then.get("gradients", ()), strict=True)
+        ),
         default=math.nan,
     )
-    changed = [f"{int(then[k])} -> {int(now[k])}" for k in then if k.endswith("status") and not torch.equal(now[k], then[k])]
+    changed = [
+        f"{int(then[k])} -> {int(now[k])}" for k in then if k.endswith("status") and not torch.equal(now[k], then[k])
+    ]
     edges, distances = [], []
     for key in shapes:
         truth = then.get("truth", then.get(f"truth {key.split()[-1]}"))
@@ -136,7 +143,9 @@ def main() -> None:
         for all_of_them, found in zip(ratios, compared(name, now, then[name]), strict=True):
             all_of_them.extend(found)
     for what, values in zip(("edge errors of pairs", "distances of motions"), ratios, strict=True):
-        print(f"{what}: geometric mean {math.exp(sum(map(math.log, values)) / len(values)):.3f}, worst {max(values):.3f}")
+        print(
+            f"{what}: geometric mean {math.exp(sum(map(math.log, values)) / len(values)):.3f}, worst {max(values):.3f}"
+        )
 
 
 if __name__ == "__main__":

@@ -7,9 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.energies import CoarseEnergy
-from torch_modal.backends.torch.energies import FineEnergy
-from torch_modal.backends.torch.energies import RestShapes
+from torch_modal.backends.torch.energies import CoarseEnergy, FineEnergy, RestShapes
 from torch_modal.energy.energy import Energy, OnMesh
 from torch_modal.energy.modal_energy import Placement, SumOfEnergies
 from torch_modal.energy.shell import N_SHELL_TERMS
@@ -51,9 +49,7 @@ class MultilevelEnergy(nn.Module):
         each = zip(self.parts, self._seen(basis.fine, basis.coarse), strict=True)
         return SumOfEnergies(*(part.modal(directions) for part, directions in each), anchor=anchor)
 
-    def place(
-        self, modal: SumOfEnergies, base: Tensor, rests: RestShapes, soften: bool
-    ) -> tuple[Placement, ...]:
+    def place(self, modal: SumOfEnergies, base: Tensor, rests: RestShapes, soften: bool) -> tuple[Placement, ...]:
         """The affine space of each sample, as each energy sees it, and the reference there.
 
         Args:

@@ -1,7 +1,7 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -113,7 +113,7 @@ class PairedSpace(nn.Module):
     def __init__(self, levels: MultilevelEnergy, ends: Sequence[SubspaceBasis], used: Tensor) -> None:
         super().__init__()
         self.levels = levels
-        self.ends = nn.ModuleList(ends)
+        self.ends: Any = nn.ModuleList(ends)
         self.register_buffer("used", used, persistent=False)
         self.energy = PairedEnergy([levels.modal(end) for end in ends], ends, used)
 
@@ -139,7 +139,7 @@ class PairedSpace(nn.Module):
         return base
 
 
-def _block_diagonal(first: Tensor, second: Tensor) -> Tensor:
+def _block_diagonal(first: Any, second: Any) -> Tensor:
     """*Shape:* ``(B, m, m), (B, n, n) -> (B, m + n, m + n)``."""
     m, n = first.shape[-1], second.shape[-1]
     return torch.cat([nn.functional.pad(first, (0, n)), nn.functional.pad(second, (m, 0))], -2)

@@ -62,18 +62,15 @@ class InBetweenSolver(nn.Module):
         self.alignment = KeyframeAlignment(references, mesh.connectivity)
         self.fine = backend.fine_energy(mesh, terms)
         self.distortion = backend.distortion(mesh, Energy(mesh, others) if others else None)
-        self.blend = RotationBlend(mesh.connectivity, self.alignment.references, backend)
-        if objective.space == "paired":
-            self.blend = None
+        joint = objective.space == "joint"
+        self.blend = RotationBlend(mesh.connectivity, self.alignment.references, backend) if joint else None
         self.space: Any = self._space(modes, objective) if any(len(own) for own in modes) else None
 
     def _space(self, modes: Sequence[Tensor], objective: Objective) -> JointSpace | PairedSpace:
         """The space that the modal solve minimises in."""
         alignment, turns = self.alignment, self.alignment.turns
         turned = [own @ turn.mT for own, turn in zip(modes, turns, strict=True)]
-        coarse = CoarseMesh(
-            alignment.references, self.mesh.faces, objective.coarse_faces, alignment.weights, turned
-        )
+        coarse = CoarseMesh(alignment.references, self.mesh.faces, objective.coarse_faces, alignment.weights, turned)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
         by_kernels = objective.space == "joint" and self.solver.gradient == "implicit"
         levels = MultilevelEnergy(coarse, self.fine, self.backend if by_kernels else TorchBackend())

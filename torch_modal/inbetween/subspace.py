@@ -41,9 +41,7 @@ class SubspaceBasis(nn.Module):
         return (a @ self.fine.flatten(1)).unflatten(-1, (-1, 3))
 
 
-def elastic_subspace(
-    modes: Sequence[Tensor], alignment: KeyframeAlignment, coarse: CoarseMesh
-) -> SubspaceBasis:
+def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coarse: CoarseMesh) -> SubspaceBasis:
     """Independent combinations of modes, without rigid motions, orthonormal on the coarse mesh.
 
     The energy does not see translations, and rotations only to second order: left in, they are null directions of its

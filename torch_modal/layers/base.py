@@ -18,6 +18,7 @@ from torch_modal.keyframes.check import checked_surface
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.implicit import Report
 
+
 class BasisBuffers(nn.Module):
     """The buffers that a layer keeps of a basis; all else follows from them.
 
@@ -93,7 +94,9 @@ class InBetweenLayer(nn.Module):
     def _build(self) -> None:
         """Build everything that follows from the bases, in float64 on the CPU, and bring it to their dtype and device."""
         like = self.bases[0].reference
-        references, modes = ([getattr(basis, name).double().cpu() for basis in self.bases] for name in ("reference", "modes"))
+        references, modes = (
+            [getattr(basis, name).double().cpu() for basis in self.bases] for name in ("reference", "modes")
+        )
         connectivity = checked_surface(references, self.faces.cpu())[1]
         self.faces = torch.tensor(connectivity.faces)
         #: True where there is a volume to be kept: not in sheets, whose energy has two terms.

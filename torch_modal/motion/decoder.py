@@ -87,7 +87,9 @@ class ModalDecoder(nn.Module):
         self.register_buffer("columns", _bounded(convected(bend(sides(displaced, self.faces), own), own), own))
         #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
         several = int(self._mesh.vertex_pieces.max()) > 0
-        centres = self.spline.poisson.centres(displaced) * self.spline.alignment.scale if several else displaced[..., :0]
+        centres = (
+            self.spline.poisson.centres(displaced) * self.spline.alignment.scale if several else displaced[..., :0]
+        )
         self.register_buffer("moves", centres.permute(1, 2, 0).flatten(1).contiguous())
         self.register_load_state_dict_post_hook(lambda decoder, _: decoder._build())
 

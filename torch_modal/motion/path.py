@@ -223,9 +223,7 @@ class Path(nn.Module):
         shapes = spline.restore(x, spline.pose(knots, i, which, u))
         return InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution)
 
-    def _located(
-        self, keyframes: Tensor, t: Tensor | float
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
+    def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:
         """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
         require_numbers("Path", keyframes)
         reference = self.spline.alignment.reference
@@ -238,7 +236,9 @@ class Path(nn.Module):
                 f"keyframes of this path have the shape (..., {wanted[0]}, {wanted[1]}, 3); got {tuple(keyframes.shape)}"
             )
         if keyframes.device != reference.device:
-            raise ValueError(f"keyframes are on {keyframes.device}, the path on {reference.device}; move one with .to()")
+            raise ValueError(
+                f"keyframes are on {keyframes.device}, the path on {reference.device}; move one with .to()"
+            )
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         own = keyframes.shape[:-3]

@@ -1,7 +1,7 @@
 """The smooth motion through key-frames: splines of triangle rotations and sizes, then one Poisson solve."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -68,7 +68,7 @@ class Spline(nn.Module):
         pairs = [(i, (i + 1) % n) for i in range(len(times) - 1)]
         self.poisson = backend.poisson(mesh, weights_per_length(mesh, references))
         #: Of each interval; most share one.
-        self.rotations = nn.ModuleList(_rotations(mesh, references, pairs, backend))
+        self.rotations: Any = nn.ModuleList(_rotations(mesh, references, pairs, backend))
 
     def knots(self, keyframes: Tensor) -> Knots:
         """The velocities at all key-frames. *Shape:* ``(L, K, V, 3)``."""

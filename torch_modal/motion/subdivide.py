@@ -1,9 +1,7 @@
 """From key-frames to a dense sequence: recursive subdivision (section 3.3 of the paper) and linear fill."""
 
-import logging
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +13,7 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
+from torch_modal.inbetween.results import warn_of_starts
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.keyframes.times import checked_times
@@ -24,8 +23,6 @@ from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.modes import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
-
-logger = logging.getLogger(__name__)
 
 MAX_LEVELS = 12
 
@@ -122,88 +119,108 @@ def subdivide(
         )
         return carrier.carried(shapes, places, keyframes)
     chosen = settings(preset, objective, solver, contact)
-    contacts = None
-    if chosen.objective.contact:
-        require_contact()
-        contacts = _ContactReport()
-        # Not each shape on its own: what was done at one time would not fit what was done at the next.
-        chosen = chosen._replace(objective=replace(chosen.objective, contact=False))
     if smooth is None:
         smooth = n_keys > 2 and chosen.objective.space == "joint"
     if smooth and chosen.objective.space == "paired":
         raise ValueError("the paired space (Eq. 4) knows pairs only: smooth=True needs space='joint'")
-    needs_modes = contacts is not None or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
+    if chosen.objective.contact:
+        require_contact()
+    needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
     if bases is None and n_modes and needs_modes:
         bases = bases_of_checked(
             keyframes, working_faces, n_modes, progress=progress, meanwhile=choose(chosen.solver.backend).load
         )
-    if bases is None:
-        bases = keyframes.detach()
+    bases = keyframes.detach() if bases is None else bases
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
+    # With contact, pairs are not subdivided either: what was done at one time would not fit what was done at the next.
+    by_path = smooth or chosen.objective.contact
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
-    total = len(places) - 1 if smooth else (len(places) - 1) * levels
+    total = (len(places) - 1) * (1 if by_path else levels)
     with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
-        if smooth:
-            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, chosen, contacts)
+        if by_path:
+            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, smooth, chosen)
         else:
-            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar, contacts)
+            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar)
         for i, shapes in enumerate(parts):
             sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
-            bar.update(smooth)
+            bar.update(int(by_path))
         sequence[-1] = keyframes[-1]
-    if contacts is not None:
-        contacts.report(keyframes, working_faces)
     return sequence[:-1] if cyclic else sequence
 
 
 def _along_path(
     keyframes: Tensor,
     faces: Tensor,
-    bases: Sequence[ModalBasis],
+    bases: Sequence[ModalBasis] | Tensor,
     places: Sequence[int],
     times: Tensor | Sequence[float] | None,
     cyclic: bool,
+    smooth: bool,
     chosen: Settings,
-    contacts: "_ContactReport | None",
 ) -> Iterator[Tensor]:
-    """Shapes between the key-frames of each interval, smooth in time."""
-    path = Path(bases, faces.cpu(), times, cyclic, objective=chosen.objective, solver=chosen.solver)
+    """Shapes between the key-frames of each interval."""
+    path = Path(bases, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
     path.to(keyframes.device)
-    for i, when in enumerate(_times_of_intervals(path.times, places)):
-        shapes = path(keyframes, when[1:-1])
-        if contacts is not None and len(shapes):
-            u = (when[1:-1] - when[0]) / (when[-1] - when[0])
-            samples = path.samples(keyframes[None], i, torch.zeros_like(u, dtype=torch.int64), u)
-            shapes = contacts(path.layer.members[path.members[i]], samples, shapes)
-        yield shapes
+    left = total = 0
+    for when in _times_of_intervals(path.times, places):
+        path.n_searched = len(when) - 2
+        result = path.solve(keyframes, when[1:-1])
+        warn_of_starts(result.solution)
+        if chosen.objective.contact:
+            total += len(when) - 2
+            left += int((result.solution.n_crossing > 0).sum())
+        yield result.shapes
+    if chosen.objective.contact:
+        _report_contacts(keyframes, faces, left, total)
 
 
 def _by_recursion(
     keyframes: Tensor,
     faces: Tensor,
-    bases: Sequence[ModalBasis],
+    bases: Sequence[ModalBasis] | Tensor,
     places: Sequence[int],
     levels: int,
     n_frames: int | None,
     chosen: Settings,
     bar: ProgressReport,
-    contacts: "_ContactReport | None",
 ) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval, of the pair alone."""
     weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
+    edges = torch.tensor(Connectivity(faces.cpu().numpy(), keyframes.shape[1]).edges, device=keyframes.device)
     for i, n in enumerate(b - a for a, b in pairwise(places)):
-        j = (i + 1) % len(keyframes)
-        segment = _Segment((bases[i], bases[j]), faces, chosen, keyframes.device)
-        shapes = torch.stack([keyframes[i], keyframes[j]])
+        ends = (i, (i + 1) % len(keyframes))
+        layers: dict[tuple[int, int], MidShape] = {}
+
+        def layer(
+            a: int, b: int, ends: tuple[int, int] = ends, layers: dict[tuple[int, int], MidShape] = layers
+        ) -> MidShape:
+            if (a, b) not in layers:
+                own = [bases[ends[a]], bases[ends[b]]]
+                own = torch.stack(own) if isinstance(bases, Tensor) else own
+                made = MidShape(own, faces.cpu(), objective=chosen.objective, solver=chosen.solver)
+                layers[a, b] = made.to(keyframes.device)
+            return layers[a, b]
+
+        shapes = keyframes[list(ends)]
         for _ in range(levels):
-            pairs = torch.stack([shapes[:-1], segment.mid_shapes(shapes)], 1)
-            shapes = torch.cat([pairs.flatten(0, 1), shapes[-1:]])
+            if chosen.objective.space == "joint":
+                mids = layer(0, 1)(shapes[:-1], shapes[1:])
+            else:
+                nearest = _nearest(shapes, edges)
+                each = zip(nearest[:-1], nearest[1:], shapes[:-1], shapes[1:], strict=True)
+                mids = torch.stack([layer(a, b)(x, y) for a, b, x, y in each])
+            shapes = torch.cat([torch.stack([shapes[:-1], mids], 1).flatten(0, 1), shapes[-1:]])
             bar.update()
         shapes = shapes if n_frames is None else _resample(shapes, n, weights)
-        if contacts is not None and len(shapes) > 2:
-            shapes[1:-1] = contacts(*segment.samples(shapes), shapes[1:-1])
         yield shapes[1:-1]
+
+
+def _nearest(shapes: Tensor, edges: Tensor) -> list[int]:
+    """The end, 0 or 1, that each shape is nearer to in its edge lengths, which no rigid motion changes."""
+    lengths = torch.linalg.norm(shapes[:, edges[:, 0]] - shapes[:, edges[:, 1]], dim=-1)
+    to_first, to_last = ((lengths - lengths[end]).norm(dim=-1) for end in (0, -1))
+    return (to_last < to_first).long().tolist()
 
 
 def keyframe_places(
@@ -283,91 +300,26 @@ def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
     return torch.cat(parts if cyclic else [*parts, keyframes[-1:]])
 
 
-class _ContactReport:
-    """Pushes the shapes of each interval apart, and counts the crossings that are left."""
-
-    def __init__(self) -> None:
-        self.n_before = self.n_left = self.n_searched = 0
-
-    def __call__(self, member: Any, samples: Any, shapes: Tensor) -> Tensor:
-        """The shapes between two key-frames, of their times. *Shape:* ``(T, V, 3)``."""
-        given = shapes.to(samples.x_a)
-        found = push_apart(member, samples, given)
-        self.n_searched += len(found.n_crossing)
-        self.n_before += int((found.n_before > 0).sum())
-        self.n_left += int((found.n_crossing > 0).sum())
-        return found.apply(member, samples, given)[0].to(shapes)
-
-    def report(self, keyframes: Tensor, faces: Tensor) -> None:
-        """Warn about key-frames that pass through themselves, and crossings that are left."""
-        mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
-        for i, shape in enumerate(keyframes.detach().double().cpu().numpy()):
-            pairs = Crossings(mesh, shape[None]).pairs(shape)
-            if len(pairs):
-                where = ", ".join(f"{c:.4g}" for c in shape[mesh.faces[pairs[0]]].mean((0, 1)))
-                warnings.warn(
-                    f"key-frame {i} passes through itself: {len(pairs)} pairs of triangles, the first "
-                    f"{pairs[0].tolist()} near ({where}); beside it that is tolerated",
-                    MeshWarning,
-                    stacklevel=3,
-                )
-        counts = (self.n_before, self.n_searched, self.n_left)
-        logger.info("parts went through each other in %d of %d in-betweens looked at, and do in %d still", *counts)
-        if self.n_left:
+def _report_contacts(keyframes: Tensor, faces: Tensor, left: int, total: int) -> None:
+    """Warn about key-frames that pass through themselves, and about in-betweens that still do."""
+    mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
+    for i, shape in enumerate(keyframes.detach().double().cpu().numpy()):
+        pairs = Crossings(mesh, shape[None]).pairs(shape)
+        if len(pairs):
+            where = ", ".join(f"{c:.4g}" for c in shape[mesh.faces[pairs[0]]].mean((0, 1)))
             warnings.warn(
-                f"in {self.n_left} of {self.n_searched} in-betweens looked at, parts still go through each other "
-                f"(without contact in {self.n_before}): a key-frame between those around them may help",
+                f"key-frame {i} passes through itself: {len(pairs)} pairs of triangles, the first "
+                f"{pairs[0].tolist()} near ({where}); beside it that is tolerated",
                 MeshWarning,
-                stacklevel=3,
+                stacklevel=5,
             )
-
-
-class _Segment:
-    """Mid-shapes between neighbours of one interval of key-frames."""
-
-    def __init__(
-        self,
-        bases: tuple[ModalBasis, ModalBasis],
-        faces: Tensor,
-        chosen: Settings,
-        device: torch.device,
-    ) -> None:
-        self.bases, self.faces, self.chosen, self.device = bases, faces.cpu(), chosen, device
-        self.layers: dict[tuple[int, int], MidShape] = {}
-        self.edges = torch.tensor(Connectivity(self.faces.numpy()).edges, device=device)
-
-    def mid_shapes(self, shapes: Tensor) -> Tensor:
-        """Between each shape and the next. *Shape:* ``(n + 1, V, 3) -> (n, V, 3)``."""
-        if self.chosen.objective.space == "joint":
-            return self._layer(0, 1)(shapes[:-1], shapes[1:])
-        nearest = self._nearest(shapes)
-        mids = [
-            self._layer(a, b)(x, y)
-            for a, b, x, y in zip(nearest[:-1], nearest[1:], shapes[:-1], shapes[1:], strict=True)
-        ]
-        return torch.stack(mids)
-
-    def samples(self, shapes: Tensor) -> Any:
-        """The in-betweens of the joint space, and the times of even shapes, without the first and the last."""
-        layer = self._layer(0, 1).in_between
-        t = torch.linspace(0, 1, len(shapes), dtype=layer.dtype, device=shapes.device)[1:-1]
-        which = torch.zeros(len(t), dtype=torch.int64, device=t.device)
-        ends = shapes[:1].to(layer.dtype), shapes[-1:].to(layer.dtype)
-        stiffness = layer.stiffness_of(t, t.shape)
-        return layer.members[0], Samples(*ends, which, t, layer.mu_of(t, t.shape), stiffness)
-
-    def _layer(self, a: int, b: int) -> MidShape:
-        if (a, b) not in self.layers:
-            objective, solver = self.chosen
-            layer = MidShape((self.bases[a], self.bases[b]), self.faces, objective=objective, solver=solver)
-            self.layers[a, b] = layer.to(self.device)
-        return self.layers[a, b]
-
-    def _nearest(self, shapes: Tensor) -> list[int]:
-        """Which key-frame, 0 or 1, each shape is nearer to in its edge lengths, which no rigid motion changes."""
-        lengths = torch.linalg.norm(shapes[:, self.edges[:, 0]] - shapes[:, self.edges[:, 1]], dim=-1)
-        to_first, to_last = ((lengths - lengths[end]).norm(dim=-1) for end in (0, -1))
-        return (to_last < to_first).long().tolist()
+    if left:
+        warnings.warn(
+            f"in {left} of {total} in-betweens, parts still go through each other: a key-frame between those around "
+            "them may help",
+            MeshWarning,
+            stacklevel=5,
+        )
 
 
 def _resample(shapes: Tensor, intervals: int, weights: Tensor) -> Tensor:
