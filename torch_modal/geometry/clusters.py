@@ -1,7 +1,5 @@
 """Rotations of more than a full turn: triangles follow the rotations of clusters, each relative to the one before."""
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from scipy.sparse import coo_matrix
@@ -10,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import conjugate, power, product, turn_of
+from torch_modal.geometry.rotations import conjugate, product, turn_of
 from torch_modal.geometry.vectors import pick
 
 # Rotation of the triangles of a cluster relative to its root, in radians. Above half a turn, the direction is unknown.
@@ -56,24 +54,17 @@ class Clusters(nn.Module):
         #: By 1, 2, 4, ... generations. *Shape:* ``(J, C + 1)``.
         self.register_buffer("ancestors", torch.from_numpy(np.stack(generations)), persistent=False)
 
-    def forward(self, turns: Tensor, t: Tensor) -> Tensor:
-        """The rotations at the time ``t``, of those at 1. *Shape:* ``(4, B, F), (B, 1) -> (4, B, F)``."""
-        return self._followed(turns, lambda between: power(between, t))
-
-    def among(self, turns: Tensor, weights: Tensor) -> Tensor:
+    def forward(self, turns: Tensor, weights: Tensor) -> Tensor:
         """The weighted means of K rotations. *Shape:* ``(4, B, K, F), (B, K, 1) -> (4, B, F)``."""
-        return self._followed(turns, lambda between: mean(between, weights))
-
-    def _followed(self, turns: Tensor, part: Callable[[Tensor], Tensor]) -> Tensor:
-        """Rotations of which each takes a part of the way from the cluster, or its parent."""
         roots = pick(turns, self.roots)
         still = torch.zeros_like(roots[..., :1])
         still[0] = 1
         roots = torch.cat([roots, still], -1)
-        followed = part(self._between(pick(roots, self.ancestors[0]), roots))
+        followed = mean(self._between(pick(roots, self.ancestors[0]), roots), weights)
         for ancestors in self.ancestors:
             followed = product(pick(followed, ancestors), followed)
-        return product(pick(followed, self.cluster), part(self._between(pick(roots, self.cluster), turns)))
+        own = mean(self._between(pick(roots, self.cluster), turns), weights)
+        return product(pick(followed, self.cluster), own)
 
     @staticmethod
     def _between(start: Tensor, end: Tensor) -> Tensor:

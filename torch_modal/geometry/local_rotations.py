@@ -1,4 +1,4 @@
-"""Between two shapes by local rotations: every triangle turns at constant speed."""
+"""Means of shapes by local rotations: between two of them, every triangle turns at constant speed."""
 
 from functools import reduce
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
 from torch_modal.geometry.hermite import Spacing, TangentOffset, beyond, tangent_offset
 from torch_modal.geometry.rotation_means import agreeing, mean
-from torch_modal.geometry.rotations import power, quaternion, rotate, turn_of, turned
+from torch_modal.geometry.rotations import quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
     Sides,
@@ -88,11 +88,11 @@ class LocalRotations(nn.Module):
         ancestors = [parents]
         while 2 ** len(ancestors) < len(parents):
             ancestors.append(ancestors[-1][ancestors[-1]])
-        #: The first reference, from which :meth:`among` measures rotations. *Shape:* ``(1, V, 3)``.
-        self.register_buffer("reference", references[:1].clone(), persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
+        #: The first reference, from which rotations are measured. *Shape:* ``(1, V, 3)``.
+        self.register_buffer("reference", references[:1].clone(), persistent=False)
         #: Twice the sums of those of the references. *Shape:* ``(F,)``.
         self.register_buffer("areas", torch.cat([x.doubled_areas for x in every]).sum(0), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
@@ -113,18 +113,11 @@ class LocalRotations(nn.Module):
         parents, piece = spanning_forest(len(mesh.faces), mesh.face_neighbours, costs.numpy())
         return torch.from_numpy(parents), torch.from_numpy(piece)
 
-    def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """Edge vectors at the time ``t``, components first. *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (3, B, E)``."""
-        a, b = (_frames(x, self.faces) for x in (first, second))
-        areas, t = a.doubled_areas + b.doubled_areas, t[:, None]
-        turn = power(self._signed(a, b), t) if self.clusters is None else self.clusters(_turn_between(a, b), t)
-        return self._edges(_turned(turn, a, *(torch.lerp(p, q, t) for p, q in zip(a[3:], b[3:], strict=True))), areas)
-
-    def among(self, shapes: Tensor, weights: Tensor) -> Tensor:
+    def forward(self, shapes: Tensor, weights: Tensor) -> Tensor:
         """Edge vectors of the weighted mean of K shapes, components first.
 
-        The rotation of a triangle is the mean of those of the shapes, its stretch the weighted sum. Of two references,
-        this is :meth:`forward` at the time of the second weight.
+        The rotation of a triangle is the mean of those of the shapes, of two the geodesic; its stretch is the weighted
+        sum. An edge takes the mean of its triangles by their areas in the references.
 
         Args:
             shapes: They turn by less than a full turn from each other, unless the references do. *Shape:*
@@ -141,9 +134,9 @@ class LocalRotations(nn.Module):
             turns = (signs * turns).unflatten(1, weights.shape)
             turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
-            turn = self.clusters.among(turns.unflatten(1, weights.shape), weights[..., None])
-        wanted = _turned(turn, start, *((weights[..., None] * x.unflatten(0, weights.shape)).sum(-2) for x in own[3:]))
-        return self._edges(wanted, self.areas.expand(len(weights), -1))
+            turn = self.clusters(turns.unflatten(1, weights.shape), weights[..., None])
+        stretches = ((weights[..., None] * x.unflatten(0, weights.shape)).sum(-2) for x in own[3:])
+        return self._edges(_turned(turn, start, *stretches), self.areas.expand(len(weights), -1))
 
     def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.

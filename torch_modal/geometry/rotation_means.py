@@ -6,7 +6,7 @@ Quaternions have their real part first; components come first. Their signs tell 
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rotations import SMALL, about, arc, conjugate, product
+from torch_modal.geometry.rotations import SMALL, about, arc, conjugate, power, product
 from torch_modal.geometry.vectors import cross
 
 # Newton steps from the mean of quaternions, before the one that has derivatives. Rotations within 90 degrees of a point
@@ -19,9 +19,9 @@ LEAST = 0.1
 
 
 def mean(rotations: Tensor, weights: Tensor) -> Tensor:
-    """The weighted mean of K rotations; of two, the point on the way from one to the other.
+    """The weighted mean of K rotations; of two, the point on the geodesic from one to the other.
 
-    It has first derivatives only.
+    Of more than two it has first derivatives only.
 
     Args:
         rotations: Quaternions whose signs are those of :func:`agreeing`. *Shape:* ``(4, ..., K, F)``.
@@ -30,6 +30,9 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(4, ..., F)``.
     """
+    if rotations.shape[-2] == 2:
+        first, second = rotations.unbind(-2)
+        return product(first, power(product(conjugate(first), second), weights[..., 1, :]))
     with torch.no_grad():
         found = (weights * rotations).sum(-2)
         found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.rests import Rests
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.geometry.rigid import RigidMotion, best_rotation, centroid
 from torch_modal.geometry.rotation_means import agreeing, mean
@@ -76,10 +76,10 @@ class Among(Between):
         solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         start = weights.new_zeros(len(weights), space.n_unknowns)
         solution = solve(minimisation, problem.placement, start, usable, weights[:, 0])
-        rests = Rests(group.shapes.unbind(1), None, weights, stiffness, anchors)
+        rests = RestShapes(group.shapes, weights, stiffness, anchors)
         x = self.refined(space.lift(solution.amplitudes, problem), rests)
         # No shape is better for being far from a key-frame with a weight below zero.
-        compared = rests._replace(t=weights.clamp_min(0))
+        compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = self.judged(x, problem.starts, solution, compared, SLACK)
         if report is not None:
             warn_of_starts(solution)
@@ -118,11 +118,11 @@ class Among(Between):
         parts = _largest_difference(coarse - coarse_straight[:, None], frame.coarse.weights, weights)
         difference, column = space.difference(_combined(parts, fine), _combined(parts, coarse), straight)
         extras = levels.seen(space.column(difference), column) if levels.sampled else [column] * len(levels.energies)
-        references = levels.among(levels.seen(fine, coarse), weights, stiffness)
+        references = levels.references(levels.seen(fine, coarse), weights, stiffness)
         starts: tuple[Tensor, ...] = (straight,)
         base, seen = straight, levels.seen(straight, coarse_straight)
         if space.blend is not None:
-            base = space.blend.among(fine, weights, straight)
+            base = space.blend(fine, weights, straight)
             starts, seen = (base, straight), levels.seen(base, frame.coarsen(base))
             references = levels.softened(references, seen)
         placement = levels.place(space.energy, seen, references, extras, anchors)

@@ -13,8 +13,7 @@ from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.backends.torch.fine_energy import FineEnergy
-from torch_modal.backends.torch.rests import Rests
+from torch_modal.backends.torch.energies import FineEnergy, RestShapes
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
@@ -115,7 +114,7 @@ class Between(nn.Module):
         self.fine, self.distortion = shared.fine, shared.distortion
         collapses = partial(shared.collapses, places)
         self.frame = Frame(shapes, mesh.faces, objective.coarse_faces, shared.weights, collapses, modes)
-        self.placing = Placing(self.frame, self.fine, self.backend)
+        self.placing = Placing(self.frame, self.fine)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
         modal = objective.space == "joint" and solver.gradient == "implicit"
         levels = partial(Levels, self.frame, self.fine, self.backend if modal else TorchBackend())
@@ -169,7 +168,7 @@ class Between(nn.Module):
             limits = self.solver.max_steps, self.solver.tolerance
             minimisation = Minimisation(self.step, *limits, problem.start is not None, space.require, report)
             x, solution = self.solved(Batch(problem, minimisation, start, usable, pair, samples, anchors))
-        shapes = self.backend.restore(self.frame, x, placed, t)
+        shapes = self.frame.restore(x, placed, t)
         if report is not None:
             warn_of_starts(solution)
         valid = solution.status != Status.INVALID
@@ -191,11 +190,17 @@ class Between(nn.Module):
         anchors: Tensor | None,
     ) -> tuple[Tensor, Solution]:
         """Replace shapes that are worse than their starts, and mark their solutions."""
-        ends = Rests((pair.first, pair.second), samples.which, samples.t, samples.stiffness, anchors)
-        return self.judged(x, starts, solution, ends, SLACK if pair.around is None else SLACK_OF_PATHS)
+        rests = self.ends(samples, pair, anchors)
+        return self.judged(x, starts, solution, rests, SLACK if pair.around is None else SLACK_OF_PATHS)
+
+    @staticmethod
+    def ends(samples: Samples, pair: Pair, anchors: Tensor | None) -> RestShapes:
+        """The key-frames of each sample as its rest shapes."""
+        weights = torch.stack([1 - samples.t, samples.t], -1)
+        return RestShapes(trees.picked(pair.shapes, samples.which), weights, samples.stiffness, anchors)
 
     def judged(
-        self, x: Tensor, starts: Sequence[Tensor], solution: Solution, rests: Rests, slack: float
+        self, x: Tensor, starts: Sequence[Tensor], solution: Solution, rests: RestShapes, slack: float
     ) -> tuple[Tensor, Solution]:
         """The same with what shapes are compared with."""
         if not starts or not len(x):
@@ -221,7 +226,9 @@ class Between(nn.Module):
         """The pairs of key-frames in the frame, with their neighbours in time."""
         return self.placing(samples)[0]
 
-    def rests(self, samples: Samples, pair: Pair, anchors: Tensor | None, trajectory: Tensor | None = None) -> Rests:
+    def rests(
+        self, samples: Samples, pair: Pair, anchors: Tensor | None, trajectory: Tensor | None = None
+    ) -> RestShapes:
         """What the steps of all vertices compare with, of key-frames that are placed.
 
         Args:
@@ -230,27 +237,22 @@ class Between(nn.Module):
             anchors: Of the terms. *Shape:* ``(B, P, 3)``.
             trajectory: The shapes on a smooth path, where they are known. *Shape:* ``(B, V, 3)``.
         """
-        t, stiffness = samples.t, samples.stiffness
         if pair.around is None:
-            return Rests((pair.first, pair.second), samples.which, t, stiffness, anchors)
+            return self.ends(samples, pair, anchors)
         if trajectory is None:
-            trajectory = self.space.on_trajectory(pair, samples.which, t)[0]
-        return Rests((trajectory,), None, t, stiffness, anchors)
+            trajectory = self.space.on_trajectory(pair, samples.which, samples.t)[0]
+        return RestShapes(trajectory[:, None], torch.ones_like(samples.t)[:, None], samples.stiffness, anchors)
 
-    def rests_of(self, batch: Batch) -> Rests:
+    def rests_of(self, batch: Batch) -> RestShapes:
         """The same of a batch."""
         trajectory = None if batch.pair.around is None else batch.problem.base
         return self.rests(batch.samples, batch.pair, batch.anchors, trajectory)
 
     def coarse_reference(self, samples: Samples, pair: Pair) -> Any:
         """The reference of Eq. 5 on the coarse mesh."""
-        levels = self.space.levels
-        stiffness = levels.stiffness(samples.stiffness)
-        if pair.around is not None:
-            trajectory = self.space.on_trajectory(pair, samples.which, samples.t)[0]
-            return levels.against(trajectory, self.frame.coarsen(trajectory), stiffness)[0]
-        ends = [levels.seen(x, self.frame.coarsen(x)) for x in (pair.first, pair.second)]
-        return levels.between(*ends, samples.which, samples.t, stiffness)[0]
+        levels, rests = self.space.levels, self.rests(samples, pair, None)
+        seen = levels.seen(rests.shapes, self.frame.coarsen(rests.shapes))
+        return levels.references(seen, rests.weights, levels.stiffness(samples.stiffness))[0]
 
     def problem(self, pair: Pair, samples: Samples, anchors: Tensor | None = None) -> Any:
         """The minimisation of each sample, of key-frames that are placed."""
@@ -262,7 +264,7 @@ class Between(nn.Module):
         """The Gauss-Newton step. It has no state: registered, it would name all buffers of the energy twice."""
         return GaussNewtonStep(self.space.energy)
 
-    def refined(self, x: Tensor, rests: Rests) -> Tensor:
+    def refined(self, x: Tensor, rests: RestShapes) -> Tensor:
         """Local interpolation and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""
         if not len(x) or not (self.solver.local_steps or self.solver.polish):
             return x

@@ -33,19 +33,7 @@ class RotationBlend(nn.Module):
         self.rotations = backend.rotations(mesh, references)
         self.poisson = backend.poisson(mesh, weights_per_length(mesh, references)) if poisson is None else poisson
 
-    def forward(self, first: Tensor, second: Tensor, t: Tensor, straight: Tensor | None = None) -> Tensor:
-        """The shape at the time ``t``.
-
-        Args:
-            first: *Shape:* ``(B, V, 3)``.
-            second: *Shape:* ``(B, V, 3)``.
-            t: *Shape:* ``(B,)``.
-            straight: What linear interpolation gives, where it is known. *Shape:* ``(B, V, 3)``.
-        """
-        near = torch.lerp(first, second, t[:, None, None]) if straight is None else straight
-        return self._reached(self.rotations(first, second, t), near)
-
-    def among(self, shapes: Tensor, weights: Tensor, straight: Tensor) -> Tensor:
+    def forward(self, shapes: Tensor, weights: Tensor, straight: Tensor) -> Tensor:
         """The weighted mean of K shapes.
 
         Args:
@@ -53,7 +41,7 @@ class RotationBlend(nn.Module):
             weights: *Shape:* ``(B, K)``.
             straight: Their weighted sum. *Shape:* ``(B, V, 3)``.
         """
-        return self._reached(self.rotations.among(shapes, weights), straight)
+        return self._reached(self.rotations(shapes, weights), straight)
 
     def along(self, trajectory: Trajectory, which: Tensor, straight: Tensor, t: Tensor) -> Tensor:
         """The shape at the time ``t`` of a trajectory.

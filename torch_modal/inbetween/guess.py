@@ -35,25 +35,25 @@ class Guess(nn.Module):
         weights = self.per_length.repeat_interleave(3)[:, None]
         self.register_buffer("gram", vectors.mT @ (vectors * weights), persistent=False)
 
-    def forward(self, first: Tensor, second: Tensor, extra: Tensor, t: Tensor) -> Tensor:
+    def forward(self, shapes: Tensor, weights: Tensor, extra: Tensor) -> Tensor:
         """The amplitudes; linear interpolation has zeros.
 
         Args:
-            first: Key-frames at 0. *Shape:* ``(B, V, 3)``.
-            second: Key-frames at 1. *Shape:* ``(B, V, 3)``.
+            shapes: Key-frames. *Shape:* ``(B, K, V, 3)``.
+            weights: *Shape:* ``(B, K)``.
             extra: One more direction, of each sample's own. *Shape:* ``(B, V, 3)``.
-            t: Times. *Shape:* ``(B,)``.
 
         Returns:
             NaN where key-frames are not finite. *Shape:* ``(B, n + 1)``.
         """
-        straight, own = self._vectors(torch.lerp(first, second, t[:, None, None])), self._vectors(extra)
+        straight = self._vectors(torch.einsum("bk,bkvi->bvi", weights, shapes))
+        own = self._vectors(extra)
         columns = self.edge_columns
-        missing = self.rotations(first, second, t) - straight
+        missing = self.rotations(shapes, weights) - straight
         per_length = self.per_length
         missing, weighted, own = (x.permute(1, 2, 0).flatten(1) for x in (missing * per_length, own * per_length, own))
         border = weighted @ columns
-        upper = torch.cat([self.gram.expand(len(t), -1, -1), border[..., None]], -1)
+        upper = torch.cat([self.gram.expand(len(weights), -1, -1), border[..., None]], -1)
         lower = torch.cat([border, (weighted * own).sum(-1, True)], -1)
         gram = torch.cat([upper, lower[:, None]], 1)
         right = torch.cat([missing @ columns, (missing * own).sum(-1, True)], -1)

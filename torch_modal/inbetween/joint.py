@@ -155,27 +155,26 @@ class JointSpace(nn.Module):
         if pair.around is not None:
             starts = self.on_trajectory(pair, index, t)
             base = starts[0]
-            coarse = self.frame.coarsen(base)
-            seen = levels.seen(base, coarse)
-            placement = levels.place(self.energy, seen, levels.against(base, coarse, stiffness), extras, anchors)
-            return JointProblem(placement, start, base, starts, difference)
-        seen_first, seen_second = levels.seen(pair.first, coarse_first), levels.seen(pair.second, coarse_second)
-        references = levels.between(seen_first, seen_second, index, t, stiffness)
-        first, second, coarse_first, coarse_second = trees.picked(
-            (pair.first, pair.second, coarse_first, coarse_second), index
-        )
-        straight = torch.lerp(first, second, t[:, None, None])
+            seen = levels.seen(base, self.frame.coarsen(base))
+            references = levels.references([x[:, None] for x in seen], torch.ones_like(t)[:, None], stiffness)
+            return JointProblem(
+                levels.place(self.energy, seen, references, extras, anchors), start, base, starts, difference
+            )
+        shapes, coarse = trees.picked((pair.shapes, torch.stack([coarse_first, coarse_second], 1)), index)
+        weights = torch.stack([1 - t, t], -1)
+        references = levels.references(levels.seen(shapes, coarse), weights, stiffness)
+        straight = torch.lerp(shapes[:, 0], shapes[:, 1], t[:, None, None])
         if self.blend is None:
-            base, starts, coarse = straight, (straight,), torch.lerp(coarse_first, coarse_second, t[:, None, None])
-            seen = levels.seen(base, coarse)
+            base, starts = straight, (straight,)
+            seen = levels.seen(base, torch.lerp(coarse[:, 0], coarse[:, 1], t[:, None, None]))
         else:
-            base = self.blend(first, second, t, straight)
+            base = self.blend(shapes, weights, straight)
             starts, seen = (base, straight), levels.seen(base, self.frame.coarsen(base))
             references = levels.softened(references, seen)
         placement = levels.place(self.energy, seen, references, extras, anchors)
         if self.modal.guess is not None:
             with torch.no_grad():
-                start = self.modal.guess(coarse_first, coarse_second, extras[0], t)
+                start = self.modal.guess(coarse, weights, extras[0])
         return JointProblem(placement, start, base, starts, difference)
 
     def on_trajectory(self, pair: Pair, index: Tensor | None, t: Tensor) -> tuple[Tensor, ...]:
@@ -194,8 +193,8 @@ class JointSpace(nn.Module):
             return (straight,)
         if self.blend.rotations.clusters is not None:
             # Beyond a full turn, no single axis tells how a triangle goes on: it turns evenly from one to the other.
-            ends = (x.expand(len(t), -1, -1) for x in (first, second))
-            return self.blend(*ends, t, straight), straight
+            ends = torch.stack([first, second], 1).expand(len(t), -1, -1, -1)
+            return self.blend(ends, torch.stack([1 - t, t], -1), straight), straight
         trajectory = self.blend.rotations.trajectory(
             around.before, pair.first, pair.second, around.after, around.spacing
         )

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.coarse_energy import CoarseEnergy
-from torch_modal.backends.torch.fine_energy import FineEnergy
-from torch_modal.energy.energy import Energy, OnMesh, Reference
+from torch_modal.backends.torch.energies import CoarseEnergy, FineEnergy, RestShapes
+from torch_modal.energy.energy import Energy, OnMesh
 from torch_modal.energy.modal_energy import Placement, SumOfEnergies
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh
@@ -79,56 +78,29 @@ class Levels(nn.Module):
         return found
 
     def seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
-        """A fine shape and its coarse one as each energy sees them. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
+        """Fine shapes and their coarse ones as each energy sees them. *Shape:* ``(..., V, 3), (..., V_coarse, 3)``."""
         return [x[..., energy.vertices, :] if energy.sampled else coarse for energy in self.energies]
 
-    def between(
-        self,
-        first: Sequence[Tensor],
-        second: Sequence[Tensor],
-        index: Tensor | None,
-        t: Tensor,
-        stiffness: Sequence[Sequence[Tensor]],
-    ) -> list[Any]:
-        """References of in-betweens at the times ``t``, of the pairs ``index`` (each its own where None).
-
-        Args:
-            first: Rest shapes as each energy sees them, of the weight ``1 - t``. *Shape of each:* ``(P, V, 3)``.
-            second: Of the weight ``t``. *Shape of each:* ``(P, V, 3)``.
-            index: *Shape:* ``(B,)``.
-            t: *Shape:* ``(B,)``.
-            stiffness: Of :meth:`stiffness`.
-
-        Returns:
-            What each energy compares with.
-        """
-        parts = zip(self.parts, first, second, stiffness, strict=True)
-        return [part.between(a, b, index, t, own) for part, a, b, own in parts]
-
-    def among(self, shapes: Sequence[Tensor], weights: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Any]:
-        """References towards K shapes of each sample.
+    def references(self, shapes: Sequence[Tensor], weights: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Any]:
+        """References towards K rest shapes of each sample, one for each energy.
 
         Args:
             shapes: As each energy sees them. *Shape of each:* ``(B, K, V, 3)``.
             weights: *Shape:* ``(B, K)``.
             stiffness: Of :meth:`stiffness`.
         """
-        return [part.among(x, weights, own) for part, x, own in zip(self.parts, shapes, stiffness, strict=True)]
+        parts = zip(self.parts, shapes, stiffness, strict=True)
+        return [part.reference(RestShapes(x, weights, own)) for part, x, own in parts]
 
     def softened(self, references: Sequence[Any], bases: Sequence[Tensor]) -> list[Any]:
         """References with less bending stiffness at needles of a shape, as each energy sees it."""
         return [part.softened(own, x) for part, own, x in zip(self.parts, references, bases, strict=True)]
 
-    def against(self, x: Tensor, coarse: Tensor, stiffness: Sequence[Sequence[Tensor]]) -> list[Reference]:
-        """Shapes as references. *Shape:* ``(B, V, 3), (B, V_coarse, 3)``."""
-        parts = zip(self.energies, self.seen(x, coarse), stiffness, strict=True)
-        return [energy.against(energy.rest_of(own), factors) for energy, own, factors in parts]
-
     def place(
         self,
         modal: SumOfEnergies,
         bases: Sequence[Tensor],
-        references: Sequence[Reference],
+        references: Sequence[Any],
         extras: Sequence[Tensor | None] | None,
         anchors: Tensor | None,
     ) -> tuple[Placement, ...]:

@@ -149,9 +149,9 @@ class PairedSpace(nn.Module):
         first, second = trees.picked(ends, index)
 
         def place(x: Tensor, modal: SumOfEnergies) -> tuple[Placement, ...]:
-            coarse = self.frame.coarsen(x)
-            references = self.levels.against(x, coarse, stiffness)
-            return self.levels.place(modal, self.levels.seen(x, coarse), references, None, anchors)
+            seen = self.levels.seen(x, self.frame.coarsen(x))
+            references = self.levels.references([own[:, None] for own in seen], torch.ones_like(t)[:, None], stiffness)
+            return self.levels.place(modal, seen, references, None, anchors)
 
         places = place(first, self.energy.first), place(second, self.energy.second)
         difference = ((first - second) * (self.frame.weights > 0)[:, None]).flatten(1)

@@ -2,12 +2,12 @@
 
 import warnings
 
+import torch
 from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.alignment import Pair
-from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.fine_energy import FineEnergy
+from torch_modal.backends.torch.energies import FineEnergy
 from torch_modal.energy.shell import DIAGONAL
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.winding import looks_mirrored
@@ -27,11 +27,10 @@ class Placing:
     Args:
         frame: The frame.
         fine: The energy on the caller's mesh.
-        backend: Aligns.
     """
 
-    def __init__(self, frame: Frame, fine: FineEnergy, backend: TorchBackend) -> None:
-        self.frame, self.fine, self.backend = frame, fine, backend
+    def __init__(self, frame: Frame, fine: FineEnergy) -> None:
+        self.frame, self.fine = frame, fine
         self.closed = len(fine.mesh.connectivity.boundary_edges) == 0
         self.size_warned = False
 
@@ -40,9 +39,13 @@ class Placing:
 
         Those have not that are not finite, a point, or, where the surface is closed, mirror images. *Shape:* ``(P,)``.
         """
-        pair, usable, sizes = self.backend.place(self.frame, samples.x_a, samples.x_b)
+        (x_a, finite_a), (x_b, finite_b) = self.frame.finite(samples.x_a), self.frame.finite(samples.x_b)
+        pair = self.frame.place(x_a, x_b)
+        # Rows that lie together in memory are looked through several times as fast.
+        ends = [x.detach().movedim(-1, 0).contiguous() for x in (pair.first, pair.second)]
+        sizes = torch.minimum(*((x.amax(-1) - x.amin(-1)).norm(dim=0) for x in ends))
         self.warn_of_size(sizes)
-        usable = usable & (sizes > SMALLEST_SIZE * DIAGONAL)
+        usable = finite_a & finite_b & (sizes > SMALLEST_SIZE * DIAGONAL)
         if self.closed:
             usable = usable & ~self.mirrored(pair.first, pair.second)
         if samples.spacing is None:
@@ -76,7 +79,7 @@ class Placing:
 
     def mirrored(self, first: Tensor, second: Tensor) -> Tensor:
         """Pairs with a mirrored key-frame, among those whose volumes differ in sign. *Shape:* ``(P, V, 3) -> (P,)``."""
-        turned = self.fine.volumes(first, second).prod(-1) < 0
+        turned = self.fine.volumes(first) * self.fine.volumes(second) < 0
         if not traced(turned) and not transformed(turned) and not turned.any():
             return turned
         return turned & looks_mirrored(first, second, self.frame.faces)

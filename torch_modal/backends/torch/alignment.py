@@ -39,20 +39,15 @@ class Pair(NamedTuple):
     around: Around | None = None
     """The tangent offsets from the neighbours in time, for smooth trajectories."""
 
+    @property
+    def shapes(self) -> Tensor:
+        """Both key-frames. *Shape:* ``(B, 2, V, 3)``."""
+        return torch.stack([self.first, self.second], 1)
+
     def motions(self) -> "Pair":
         """The same without vertices, for the way back to the caller's coordinates."""
         around = None if self.around is None else self.around._replace(before=None, after=None)
         return self._replace(first=self.first[:, :0], second=self.second[:, :0], around=around)
-
-
-class PlacedPairs(NamedTuple):
-    """Pairs of key-frames in the frame."""
-
-    pair: Pair
-    finite: Tensor
-    """Whether both ends are; otherwise the reference stands in for them. *Shape:* ``(P,)``, bool."""
-    sizes: Tensor
-    """Diagonal of the bounding box of the smaller end. *Shape:* ``(P,)``."""
 
 
 class Alignment(nn.Module):

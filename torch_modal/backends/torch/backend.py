@@ -2,14 +2,11 @@
 
 from collections.abc import Callable, Sequence
 
-import torch
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.backends.torch.alignment import Alignment, Pair, PlacedPairs
-from torch_modal.backends.torch.coarse_energy import CoarseEnergy
 from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.backends.torch.fine_energy import FineEnergy
+from torch_modal.backends.torch.energies import CoarseEnergy, FineEnergy
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
@@ -18,7 +15,7 @@ from torch_modal.geometry.poisson import Poisson
 
 
 class TorchBackend:
-    """Makes the parts of in-betweens, all in torch.
+    """Makes the parts of in-betweens, all in torch. Each takes K shapes of every sample with their weights.
 
     This is the reference: it serves all dtypes, devices, gradients and transforms. Another backend overrides the parts
     that it is faster at, and returns to these where it cannot serve; both give the same numbers, up to rounding.
@@ -26,19 +23,6 @@ class TorchBackend:
 
     def load(self) -> None:
         """Load what takes long, so that nobody waits for it later."""
-
-    def place(self, frame: Alignment, x_a: Tensor, x_b: Tensor) -> PlacedPairs:
-        """Bring pairs of key-frames into a frame. *Shape of each:* ``(P, V, 3)``."""
-        (x_a, finite_a), (x_b, finite_b) = frame.finite(x_a), frame.finite(x_b)
-        pair = frame.place(x_a, x_b)
-        # Rows that lie together in memory are looked through several times as fast.
-        ends = [x.detach().movedim(-1, 0).contiguous() for x in (pair.first, pair.second)]
-        sizes = [(x.amax(-1) - x.amin(-1)).norm(dim=0) for x in ends]
-        return PlacedPairs(pair, finite_a & finite_b, torch.minimum(*sizes))
-
-    def restore(self, frame: Alignment, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
-        """Bring shapes back to the caller (:meth:`Alignment.restore`). *Shape:* ``(B, V, 3)``."""
-        return frame.restore(x, pair, t)
 
     def rotations(self, mesh: Connectivity, references: Tensor) -> LocalRotations:
         """Local rotations of triangles between shapes near references. *Shape:* ``(K, V, 3)``."""

@@ -1,18 +1,15 @@
-"""How far shapes are from two key-frames, bounded for each element."""
+"""Distortion of shapes against their rest shapes, with a bounded contribution of each element."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal import trees
-from torch_modal.backends.torch.fine_steps import FurtherTerms
-from torch_modal.backends.torch.rests import Rests
+from torch_modal.backends.torch.energies import FurtherTerms, RestShapes
 from torch_modal.energy.bend import collapsed, dihedral_angle
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.term import Mesh, periodic_square
-from torch_modal.geometry.vectors import cross, inverse, norm
+from torch_modal.geometry.vectors import cross, inverse, norm, pick
 
 # Elements of each kind that are looked at, spread evenly: the sum is then known to a few percent.
 MOST_ELEMENTS = 1024
@@ -28,37 +25,39 @@ SLIGHT = 1e-4
 
 
 class Distortion(nn.Module):
-    r"""Stretching and bending of Eq. 5 against both key-frames, with a bounded contribution of each element.
+    r"""Stretching and bending of Eq. 5 against K rest shapes, with a bounded contribution of each element.
 
     .. math:: \sum_e \alpha\, |l_e - \bar l_e| \min(|l_e - \bar l_e| / \bar l_e,\, 4)
         + \sum_h \beta \min(\bar l_h^2 / \bar A_h,\, 8)\, f(\theta_h - \bar\theta_h)
 
-    The key-frames have the weights ``1 - t`` and ``t``, or those given. Further terms of the energy count in full.
+    The sum over the rest shapes is weighted. Further terms of the energy count in full.
 
     Args:
         mesh: The mesh.
         further: Terms beyond Eq. 5.
     """
 
-    edges: Tensor
+    vertices: Tensor
     edge: Tensor
-    hinges: Tensor
+    edges: Tensor
     hinge: Tensor
-    has_hinge: Tensor
+    hinges: Tensor
 
     def __init__(self, mesh: Mesh, further: Energy | None) -> None:
         super().__init__()
         interior = torch.tensor(mesh.connectivity.counts == 2)
         n_edges, n_hinges = len(interior), int(interior.sum())
         edge = torch.linspace(0, n_edges - 1, min(n_edges, MOST_ELEMENTS), dtype=torch.float64).round().long()
-        has_hinge = interior[edge]
-        hinge = interior.cumsum(0)[edge] - 1
+        hinge = (interior.cumsum(0) - 1)[edge[interior[edge]]]
+        edges, hinges = mesh.edges[edge], mesh.hinges[hinge]
+        vertices, places = torch.cat([edges.flatten(), hinges.flatten()]).unique(return_inverse=True)
+        own_edges, own_hinges = places.split([edges.numel(), hinges.numel()])
         buffers = {
+            "vertices": vertices,
             "edge": edge,
-            "edges": mesh.edges[edge].T.contiguous(),
-            "hinge": hinge[has_hinge],
-            "has_hinge": has_hinge,
-            "hinges": mesh.hinges[hinge[has_hinge]].T.contiguous(),
+            "edges": own_edges.view_as(edges).T.contiguous(),
+            "hinge": hinge,
+            "hinges": own_hinges.view_as(hinges).T.contiguous(),
         }
         for name, values in buffers.items():
             self.register_buffer(name, values, persistent=False)
@@ -66,50 +65,48 @@ class Distortion(nn.Module):
         self.shares = n_edges / len(edge), n_hinges / max(len(self.hinge), 1)
         self.further = further
 
-    def forward(self, shapes: Sequence[Tensor], rests: Rests) -> Tensor:
+    def forward(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """The distortion of S shapes of each sample. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
         total = self.of_shell(shapes, rests)
         if self.further is not None:
-            terms = FurtherTerms(self.further, rests.further())
+            terms = FurtherTerms(self.further, rests)
             total = total + torch.stack([terms.value(x) for x in shapes])
         return total
 
-    def of_shell(self, shapes: Sequence[Tensor], rests: Rests) -> Tensor:
+    def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Stretching and bending. *Shape of each:* ``(B, V, 3) -> (S, B)``."""
-
-        def measures(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            edge_vectors = _edge_vectors(x, self.hinges)
-            return norm(_edge_vectors(x, self.edges)[0]), dihedral_angle(edge_vectors), _weights(edge_vectors)
-
-        found = [measures(x) for x in shapes]
-        lengths, angles = (torch.stack([each[i] for each in found]) for i in (0, 1))
+        # All shapes at once: the cost of so few elements is that of the number of operations.
+        rows = self._rows(*shapes, *rests.shapes.unbind(1))
+        hinges = _edge_vectors(rows, self.hinges)
+        n, lengths, angles = len(shapes), norm(_edge_vectors(rows, self.edges)[0]), dihedral_angle(hinges)
         alpha, beta = (
             values if values.shape[-1] == 1 else values[:, own]
             for values, own in zip(rests.stiffness[:2], (self.edge, self.hinge), strict=True)
         )
-        total: Any = 0.0
-        for end, pull in zip(rests.shapes, rests.pulls(), strict=True):
-            length, angle, weight = trees.picked(measures(end), rests.which)
-            off = (lengths - length).abs()
-            stretching = (alpha * off * (off / length).clamp_max(LARGEST_STRAIN)).sum(-1)
-            bending = (beta * weight * periodic_square(angles - angle)).sum(-1)
-            total = total + pull * (self.shares[0] * stretching + self.shares[1] * bending)
-        return total  # type: ignore[no-any-return]
+        off = (lengths[:n, None] - lengths[n:]).abs()
+        stretching = (alpha * off * (off / lengths[n:]).clamp_max(LARGEST_STRAIN)).sum(-1)
+        bending = (beta * _weights(hinges[:, :, n:]) * periodic_square(angles[:n, None] - angles[n:])).sum(-1)
+        return (rests.weights.mT * (self.shares[0] * stretching + self.shares[1] * bending)).sum(1)
 
     def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
         """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""
-        lengths = norm(_edge_vectors(like.detach(), self.edges)[0]).sum(-1)
+        lengths = norm(_edge_vectors(self._rows(like.detach()), self.edges)[0]).sum((0, -1))
         return self.shares[0] * stiffness[0].detach().mean(-1) * lengths * SLIGHT**2
 
+    def _rows(self, *shapes: Tensor) -> Tensor:
+        """The vertices of the elements, components first. *Shape of each:* ``(B, V, 3) -> (3, S, B, n)``."""
+        picked = torch.stack([x.index_select(-2, self.vertices) for x in shapes])
+        return picked.movedim(-1, 0).contiguous()
 
-def _edge_vectors(x: Tensor, corners: Tensor) -> Tensor:
-    """Vectors from the first vertex of each element to the others. *Shape:* ``(B, V, 3) -> (n-1, 3, B, M)``."""
-    first, *others = (x.index_select(-2, corner).movedim(-1, 0) for corner in corners)
+
+def _edge_vectors(rows: Tensor, corners: Tensor) -> Tensor:
+    """Vectors from the first vertex of each element to the others. *Shape:* ``(3, ..., V) -> (n-1, 3, ..., M)``."""
+    first, *others = (pick(rows, corner) for corner in corners)
     return torch.stack([other - first for other in others])
 
 
 def _weights(edge_vectors: Tensor) -> Tensor:
-    """The bounded weights of hinges; 0 where a triangle has collapsed. *Shape:* ``(3, 3, B, H) -> (B, H)``."""
+    """The bounded weights of hinges; 0 where a triangle has collapsed. *Shape:* ``(3, 3, ..., H) -> (..., H)``."""
     e, a, b = edge_vectors
     n1, n2 = cross(e, a), cross(b, e)
     weight = 2 * (e * e).sum(0) * inverse(norm(n1) + norm(n2), collapsed(e, n1) | collapsed(e, n2))

@@ -6,7 +6,6 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.rests import Rests
 from torch_modal.energy.energy import Energy, Linearised, Reference
 from torch_modal.energy.shell import DIAGONAL
 
@@ -94,40 +93,6 @@ class ConvexHessian:
         blocks = torch.cat(on_corners, -1)
         summed = blocks.new_zeros(*blocks.shape[:-1], self.energy.n_extended)
         return summed.index_add(-1, self.energy.corners, blocks)
-
-
-class FurtherTerms(FurtherEnergy):
-    """Terms in torch as an energy beside Eq. 5.
-
-    Args:
-        energy: Of these terms.
-        rests: What shapes are compared with.
-    """
-
-    def __init__(self, energy: Energy, rests: Rests) -> None:
-        self.energy, self.reference = energy, rests.reference(energy)
-        self.anchors = None if rests.anchors is None else rests.anchors.movedim(-1, 0)
-
-    def _extended(self, x: Tensor) -> Tensor:
-        return self.energy.extend(x.movedim(-1, 0).contiguous(), self.anchors)
-
-    def value(self, x: Tensor) -> Tensor:
-        """*Shape:* ``(B, V, 3) -> (B,)``."""
-        return self.energy.value(self._extended(x), self.reference)
-
-    def at(self, x: Tensor) -> FurtherDerivatives:
-        """*Shape:* ``(B, V, 3)``."""
-        energy, n = self.energy, x.shape[1]
-        at = energy.linearise(self._extended(x), self.reference)
-        hessian = ConvexHessian(energy, at)
-        packed = hessian.diagonal().flatten(0, 1)[[0, 1, 2, 4, 5, 8], ..., :n].movedim(0, -1)
-
-        def product(field: Tensor) -> Tensor:
-            rows = energy.extend(field.movedim(-1, 0).contiguous())
-            return energy.fold(hessian(rows)).movedim(0, -1)
-
-        gradient = energy.fold(energy.gradient(at)).movedim(0, -1)
-        return FurtherDerivatives(energy.value_at(at, self.reference), gradient, packed, product)
 
 
 def inverse_of_symmetric(blocks: Tensor) -> Tensor:

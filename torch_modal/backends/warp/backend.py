@@ -8,17 +8,11 @@ from functools import cache
 from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.backends.torch.alignment import Alignment, Pair, PlacedPairs
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.coarse_energy import CoarseEnergy
-from torch_modal.backends.torch.fine_energy import FineEnergy
-from torch_modal.backends.warp import alignment
-from torch_modal.backends.warp.coarse_energy import WarpCoarseEnergy
+from torch_modal.backends.torch.energies import CoarseEnergy, FineEnergy
 from torch_modal.backends.warp.crossings import WarpPairs
-from torch_modal.backends.warp.distortion import WarpDistortion
-from torch_modal.backends.warp.fine_energy import WarpFineEnergy
+from torch_modal.backends.warp.energies import WarpCoarseEnergy, WarpFineEnergy
 from torch_modal.backends.warp.launch import kernels, load_kernels
-from torch_modal.backends.warp.poisson import WarpPoisson
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
@@ -50,39 +44,21 @@ class WarpBackend(TorchBackend):
         """As in the base class: the kernels of in-betweens."""
         load_kernels()
 
-    def place(self, frame: Alignment, x_a: Tensor, x_b: Tensor) -> PlacedPairs:
-        """As in the base class."""
-        placed = alignment.place(frame, x_a, x_b) if alignment.serves(x_a, x_b) else None
-        return super().place(frame, x_a, x_b) if placed is None else placed
-
-    def restore(self, frame: Alignment, x: Tensor, pair: Pair, t: Tensor) -> Tensor:
-        """As in the base class."""
-        serves = alignment.serves(x, pair.first, t)
-        return alignment.restore(frame, x, pair, t) if serves else super().restore(frame, x, pair, t)
-
     def rotations(self, mesh: Connectivity, references: Tensor) -> WarpRotations:
-        """As in the base class."""
+        """Overrides the base class."""
         return WarpRotations(mesh, references)
 
-    def poisson(self, mesh: Connectivity, weights: Tensor) -> WarpPoisson:
-        """As in the base class."""
-        return WarpPoisson(mesh, weights)
-
     def coarse_energy(self, energy: Energy, mesh: Mesh) -> CoarseEnergy:
-        """As in the base class."""
+        """Overrides the base class."""
         serves = _are_of_shell([part.term for part in energy.parts])
         return WarpCoarseEnergy(energy, mesh) if serves else super().coarse_energy(energy, mesh)
 
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
-        """As in the base class."""
+        """Overrides the base class."""
         return WarpFineEnergy(mesh, terms) if _are_of_shell(terms) else super().fine_energy(mesh, terms)
 
-    def distortion(self, mesh: Mesh, further: Energy | None) -> WarpDistortion:
-        """As in the base class."""
-        return WarpDistortion(mesh, further)
-
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
-        """As in the base class."""
+        """Overrides the base class."""
         return WarpPairs(mesh, shape[None])
 
 

@@ -19,48 +19,25 @@ class WarpSteps(WarpShell):
     It computes in float64, whatever comes in.
     """
 
-    def forward(
-        self,
-        x: Tensor,
-        first: Tensor,
-        second: Tensor,
-        t: Tensor,
-        stiffness: Sequence[Tensor],
-        n_steps: int,
-        n_products: int,
-        chunk: int,
-    ) -> Tensor:
+    def forward(self, x: Tensor, to: ShellReference, n_steps: int, n_products: int) -> Tensor:
         """Steps of all vertices.
 
         Args:
-            x: Where to start. *Shape:* ``(B, V, 3)``.
-            first: Rest shapes of the weight ``1 - t``. *Shape:* ``(B, V, 3)``.
-            second: Rest shapes of the weight ``t``. *Shape:* ``(B, V, 3)``.
-            t: *Shape:* ``(B,)``.
-            stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
+            x: Initial shapes. *Shape:* ``(B, V, 3)``.
+            to: The reference.
             n_steps: Newton steps.
             n_products: Iterations of conjugate gradients in each.
-            chunk: Samples at a time: more do not fit into caches.
 
         Returns:
             *Shape:* ``(B, V, 3)``.
         """
-        return self.towards(x, (first, second, t, *stiffness), n_steps, n_products, chunk)
-
-    def towards(self, x: Tensor, rest: Sequence[Tensor], n_steps: int, n_products: int, chunk: int) -> Tensor:
-        """The same towards what :meth:`reference` takes, or a :class:`ShellReference`."""
         if not n_steps:
             return x
         if traced(x):
-            return self.oracle(n_steps, n_products, x, *rest)
-        given = [value.double() for value in (x, *rest)]
-        # What fits into a cache is kept for the way back; of more, the steps are taken once more.
-        if len(x) <= chunk:
-            keep = torch.is_grad_enabled() and any(value.requires_grad for value in given)
-            return applied(_Relaxed, self, n_steps, n_products, [] if keep else None, *given)[0].to(x)
-        every = range(0, len(x), chunk)
-        parts = [applied(_Relaxed, self, n_steps, n_products, None, *(v[i : i + chunk] for v in given)) for i in every]
-        return torch.cat([moved for moved, _ in parts]).to(x)
+            return self.oracle(n_steps, n_products, x, *to)
+        given = [value.double() for value in (x, *to)]
+        keep = torch.is_grad_enabled() and any(value.requires_grad for value in given)
+        return applied(_Relaxed, self, n_steps, n_products, [] if keep else None, *given)[0].to(x)
 
     def _referred(self, rest: Sequence[Tensor]) -> ShellReference:
         """The reference of what :meth:`reference` takes, or that is one."""

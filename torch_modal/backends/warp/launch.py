@@ -23,7 +23,6 @@ from torch_modal.extras import uncollected
 from torch_modal.progress import ProgressReport
 
 Module = Literal[
-    "alignment",
     "references",
     "shell",
     "modal",
@@ -33,10 +32,9 @@ Module = Literal[
     "rotations_adjoint",
     "adjoints",
     "crossings",
-    "distortion",
 ]
 PACKAGE = "torch_modal.backends.warp.kernels"
-IN_BETWEENS: tuple[Module, ...] = ("alignment", "rotations", "references", "shell", "modal", "steps", "distortion")
+IN_BETWEENS: tuple[Module, ...] = ("rotations", "references", "shell", "modal", "steps")
 """The modules for in-betweens without gradients."""
 NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 """What Warp says where there is no GPU, with no setting that turns it off: in every run, it looks like an error."""

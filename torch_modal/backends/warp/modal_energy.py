@@ -8,9 +8,11 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import applied, flattened, made_outside, pushed, recorded, traced, transformed
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement, along_columns
+from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 
 # Columns that a kernel takes at a time.
@@ -29,6 +31,11 @@ def shell_reference(shell: WarpShell, first: Tensor, second: Tensor, t: Tensor, 
     return shell.reference_by_torch(*given) if traced(t) else ShellReference(*applied(_Referred, shell, *given))
 
 
+def reference_of(shell: WarpShell, rests: RestShapes) -> ShellReference:
+    """The reference towards the terms of Eq. 5 of rest shapes."""
+    return merged_reference(shell, rests.shapes, rests.weights, *rests.stiffness[:N_SHELL_TERMS])
+
+
 def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffness: Tensor) -> ShellReference:
     """The reference towards K rest shapes of each sample: Eq. 8 for any number of them.
 
@@ -39,6 +46,8 @@ def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffne
         stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
     """
     flat, n = shapes.flatten(0, 1), shapes.shape[1]
+    if n == 2:
+        return shell_reference(shell, *shapes.unbind(1), weights[:, 1], *stiffness)
     alone = (value.repeat_interleave(n, 0) for value in stiffness)
     own = shell_reference(shell, flat, flat, flat.new_zeros(len(flat)), *alone)
     stretch, bend, hard, volume, _ = (value.unflatten(0, weights.shape) for value in own)

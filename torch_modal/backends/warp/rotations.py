@@ -30,17 +30,6 @@ class WarpRotations(LocalRotations):
             self.register_buffer(f"_{name}", values.int().contiguous(), persistent=False)
         self.register_buffer("_signs", self.side_signs.unflatten(0, (3, -1)).T.contiguous(), persistent=False)
 
-    def forward(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """As the other's."""
-        if traced(first) or self.clusters is not None:
-            return self.oracle(first, second, t)
-        given = [value.double() for value in (first, second, t)]
-        return applied(_Turned, self, *given)[0].to(first)
-
-    def oracle(self, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        """The same by torch."""
-        return super().forward(first, second, t)
-
     def turns(self, first: Tensor, second: Tensor) -> Tensor:
         """As the other's."""
         found = self._turned(first.contiguous(), second.contiguous())
@@ -56,7 +45,7 @@ class WarpRotations(LocalRotations):
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """The sign of the quaternion of each triangle. *Shape:* ``(B, F)``."""
         module, b = kernels("rotations"), len(areas)
-        if areas.device.type != "cpu" or transformed(areas):  # the walk down the tree is one thread's
+        if areas.device.type != "cpu" or traced(areas) or transformed(areas):  # the walk down the tree is one thread's
             return self._sign_votes(quaternions.movedim(-1, 0), areas)
         n_pieces = self.n_pieces
         quaternions, weights = quaternions.double().contiguous(), areas.double()

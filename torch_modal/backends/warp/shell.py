@@ -175,10 +175,6 @@ class WarpShell(nn.Module):
         """Lengths of all edges together, volume and area of both ends. *Shape of each:* ``(B, 2)``."""
         return self._sizes(first, second, self.record)
 
-    def volumes(self, first: Tensor, second: Tensor) -> Tensor:
-        """Volumes of both ends alone. *Shape:* ``(B, 2)``."""
-        return self._sizes(first, second, self.record[:0])[1]
-
     def _sizes(self, first: Tensor, second: Tensor, record: Tensor) -> tuple[Tensor, ...]:
         found = first.new_zeros(3, len(first), 2).unbind()
         dim = len(first), len(record) + len(self.capped_faces)
