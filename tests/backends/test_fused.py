@@ -20,13 +20,13 @@ import torch_modal as tm
 from torch_modal import trees
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.fine_energy import FineEnergy
-from torch_modal.backends.warp import alignment as fused_alignment
+from torch_modal.backends.torch.energies import FineEnergy, RestShapes
+from torch_modal.backends.torch.fine_steps import relax
 from torch_modal.backends.warp import backend, launch
 from torch_modal.backends.warp import modal_energy as fused_modal
-from torch_modal.backends.warp.fine_energy import WarpFineEnergy
+from torch_modal.backends.warp.energies import WarpFineEnergy
 from torch_modal.backends.warp.fine_steps import WarpSteps
-from torch_modal.backends.warp.modal_energy import WarpModalEnergy, shell_reference
+from torch_modal.backends.warp.modal_energy import WarpModalEnergy, reference_of, shell_reference
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.backends.warp.shell import WarpShell
 from torch_modal.energy.bend import Bend
@@ -38,9 +38,7 @@ from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.hermite import Spacing
-from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.rotations import exp
-from torch_modal.inbetween.frame import Frame
+from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.inbetween.settings import PRESETS
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
@@ -68,12 +66,15 @@ class Case:
         start = start + roughness * torch.randn(start.shape, dtype=DOUBLE, generator=generator)
         self.given = [start, x[:2].clone(), x[1:3].clone(), t, *stiffness]
 
-    def by_torch(self, *given: Tensor) -> Tensor:
-        return self.fused.oracle(2, 4, *given)
+    @staticmethod
+    def rests(first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> RestShapes:
+        return RestShapes(torch.stack([first, second], 1), torch.stack([1 - t, t], -1), stiffness)
 
-    def by_warp(self, *given: Tensor, chunk: int = 1) -> Tensor:
-        x, first, second, t, *stiffness = given
-        return self.fused(x, first, second, t, stiffness, 2, 4, chunk)
+    def by_torch(self, x: Tensor, *rests: Tensor) -> Tensor:
+        return relax(self.energy, x, self.rests(*rests).reference(self.energy), 2, 4)
+
+    def by_warp(self, x: Tensor, *rests: Tensor) -> Tensor:
+        return self.fused(x, reference_of(self.fused, self.rests(*rests)), 2, 4)
 
 
 @pytest.fixture(params=["closed", "open", "flat"])
@@ -113,7 +114,6 @@ def test_local_steps(case: Case) -> None:
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-8 * DIAGONAL)
     truth = gradients(case.by_torch, case.given)
     assert_alike(gradients(case.by_warp, case.given), truth, 1e-6)
-    assert_alike(gradients(partial(case.by_warp, chunk=2), case.given), truth, 1e-6)  # steps are kept
 
 
 def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None:
@@ -130,7 +130,8 @@ def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None
 def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     case = Case(small_bars, small_bars.faces, 10.0)
     case.given[5] *= 1e5
-    found, lengths = case.fused.steps(2, 4, *(value.contiguous() for value in case.given))
+    to = reference_of(case.fused, case.rests(*case.given[1:]))
+    found, lengths = case.fused.steps(2, 4, *(value.contiguous() for value in (case.given[0], *to)))
     assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
     torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * DIAGONAL)
 
@@ -247,20 +248,34 @@ class TestModal:
         assert_alike(gradients(flat(by_kernels), given, True), gradients(flat(by_torch), given, True), 1e-7)
 
 
+def turned(rotations: LocalRotations) -> Any:
+    """Edge vectors of pairs at times."""
+
+    def run(first: Tensor, second: Tensor, t: Tensor) -> Tensor:
+        return rotations(torch.stack([first, second], 1), torch.stack([1 - t, t], -1))
+
+    return run
+
+
 class TestRotations:
     @pytest.fixture
     def rotations(self, small_bars: Shapes) -> WarpRotations:
         mesh = Mesh.of(small_bars.faces, small_bars.keyframes.shape[1])
         return WarpRotations(mesh.connectivity, small_bars.keyframes[:2])
 
+    @staticmethod
+    def oracle(rotations: WarpRotations) -> Any:
+        """The same by torch."""
+        return turned(partial(LocalRotations.forward, rotations))  # type: ignore[arg-type]
+
     def test_between_two(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes
         given = [x[:2].clone(), x[1:3].clone(), torch.tensor([0.3, 0.8], dtype=DOUBLE)]
-        torch.testing.assert_close(rotations(*given), rotations.oracle(*given), rtol=0, atol=1e-12)
-        assert_alike(gradients(rotations, given), gradients(rotations.oracle, given), 1e-9)
-        assert_alike(gradients(rotations, given, True), gradients(rotations.oracle, given, True), 1e-7)
-        found = vmap(lambda t: rotations(*given[:2], t.expand(2)))(given[2])
-        torch.testing.assert_close(found[1], rotations(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
+        torch.testing.assert_close(turned(rotations)(*given), self.oracle(rotations)(*given), rtol=0, atol=1e-12)
+        assert_alike(gradients(turned(rotations), given), gradients(self.oracle(rotations), given), 1e-9)
+        assert_alike(gradients(turned(rotations), given, True), gradients(self.oracle(rotations), given, True), 1e-7)
+        found = vmap(lambda t: turned(rotations)(*given[:2], t.expand(2)))(given[2])
+        torch.testing.assert_close(found[1], turned(rotations)(*given[:2], given[2][1].expand(2)), rtol=0, atol=1e-12)
 
     def test_beyond_half_a_turn(self) -> None:
         # A strip that is rolled up: its far end turns by 300 degrees, which only its neighbours tell from -60.
@@ -275,15 +290,15 @@ class TestRotations:
         faces = torch.cat([torch.stack([i, i + 1, i + n], 1), torch.stack([i + 1, i + n + 1, i + n], 1)])
         rotations = WarpRotations(Mesh.of(faces, 2 * n).connectivity, shapes)
         given = [shapes[:1].clone(), shapes[1:].clone(), torch.tensor([0.5], dtype=DOUBLE)]
-        truth = rotations.oracle(*given)
+        truth = self.oracle(rotations)(*given)
         assert float(truth[0].min()) < -0.5 / (n - 1), "nothing turns by more than 90 degrees half-way"
-        torch.testing.assert_close(rotations(*given), truth, rtol=0, atol=1e-12)
-        assert_alike(gradients(rotations, given), gradients(rotations.oracle, given), 1e-9)
+        torch.testing.assert_close(turned(rotations)(*given), truth, rtol=0, atol=1e-12)
+        assert_alike(gradients(turned(rotations), given), gradients(self.oracle(rotations), given), 1e-9)
 
     def test_the_same_shape(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes[:1]
         given = [x.clone(), x.clone(), torch.tensor([0.3], dtype=DOUBLE)]
-        assert_alike(gradients(rotations, given)[:2], gradients(rotations.oracle, given)[:2], 1e-7)
+        assert_alike(gradients(turned(rotations), given)[:2], gradients(self.oracle(rotations), given)[:2], 1e-7)
 
     def test_on_a_course(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes
@@ -306,29 +321,6 @@ class TestRotations:
         assert_alike(gradients(by_warp, given, True), gradients(by_torch, given, True), 1e-7)
         found = vmap(lambda t: by_warp(*given[:2], t))(torch.stack([t, 0.5 * t]))
         torch.testing.assert_close(found[1], by_warp(*given[:2], 0.5 * t), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("turn", [0.0, 2.0, math.pi])
-def test_alignment(small_bars: Shapes, turn: float) -> None:
-    """Into the frame and back; at half a turn the same sense is taken."""
-    shapes = small_bars.keyframes
-    frame = Frame(shapes[:2], small_bars.faces, 20)
-    x = shapes[1:3] + torch.tensor([5.0, -2.0, 1.0], dtype=DOUBLE)
-    other = x if turn == math.pi else shapes[:2]  # half a turn to the last bit
-    y = other @ exp(turn * torch.tensor([-0.6, 0.8, 0.0], dtype=DOUBLE)).mT
-    t = torch.tensor([0.3, 0.9], dtype=DOUBLE)
-    with torch.no_grad():
-        assert fused_alignment.serves(x, y, t)
-        pair, finite, sizes = fused_alignment.place(frame, x, y)
-        assert finite.all()
-        truth = frame.place(x, y)
-        for got, wanted in zip(trees.leaves(tuple(pair[:4])), trees.leaves(tuple(truth[:4])), strict=True):
-            torch.testing.assert_close(got, wanted, rtol=0, atol=1e-11)
-        extents = [(end.amax(1) - end.amin(1)).norm(dim=1) for end in truth[:2]]
-        torch.testing.assert_close(sizes, torch.minimum(*extents))
-        back = fused_alignment.restore(frame, truth.first, truth, t)
-        torch.testing.assert_close(back, frame.restore(truth.first, truth, t), rtol=0, atol=1e-11)
-        assert fused_alignment.place(frame, x, y.index_fill(1, torch.tensor(3), torch.inf)) is None
 
 
 class TestLayers:
@@ -426,7 +418,12 @@ class TestLayers:
         member = layer.members[0]
         with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
             x = mode.from_tensor(small_bars.keyframes[:1])
-            assert member.space.blend.rotations(x, x, mode.from_tensor(torch.zeros(1, dtype=DOUBLE))).shape[0] == 3
+            assert (
+                member.space.blend.rotations(
+                    torch.stack([x, x], 1), mode.from_tensor(torch.zeros(1, 2, dtype=DOUBLE))
+                ).shape[0]
+                == 3
+            )
 
 
 def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
@@ -442,24 +439,6 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
     with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):
         launch._length(huge, 3, DOUBLE)
     assert launch._length(huge[1:], 3, DOUBLE) == 2**31 - 1
-
-
-def test_the_first_of_a_thread_may_have_nothing_to_do(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warp gives no command for no threads, so there was none to use again."""
-    shell = tm.InBetween(bars.bases[:2], bars.faces).members[0].fine.steps
-    none = bars.keyframes[:0]
-    given: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(
-        "torch_modal.backends.warp.shell.launch", lambda *call: given.append(call) or launch.launch(*call)
-    )
-    launch._COMMANDS.known.clear()
-    assert shell.volumes(none, none).shape == (0, 2)
-    assert given and not launch._COMMANDS.known
-    # The same kernels take what they are given here.
-    some = bars.keyframes[:2].contiguous()
-    truth = torch.tensor([signed_volume(x.numpy(), bars.faces.numpy()) for x in some], dtype=DOUBLE)
-    torch.testing.assert_close(shell.volumes(some, some), truth[:, None].expand(2, 2).clone())
-    assert len(launch._COMMANDS.known) == 1
 
 
 class TestBackend:

@@ -25,6 +25,11 @@ def strip(turns: float, time: float = 1.0) -> Tensor:
     return torch.from_numpy(x)
 
 
+def pair(first: Tensor, second: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Two shapes of each sample, and their weights."""
+    return torch.stack([first, second], 1), torch.stack([1 - t, t], -1)
+
+
 @pytest.fixture(scope="module")
 def mesh() -> Connectivity:
     return Connectivity(rectangle(6.0, 1.0, 0.25)[1])
@@ -36,7 +41,7 @@ def test_plates_turn_at_constant_speed(turns: float) -> None:
     turn = 2 * math.pi * turns
     (x_a, faces), (x_b, _) = ribbon(0.0, 60), ribbon(turn, 60)
     rotations, mesh = rotations_of(x_a, x_b, faces)
-    found = rotations(x_a.expand(len(T), -1, -1), x_b.expand(len(T), -1, -1), T).movedim(0, -1)
+    found = rotations(*pair(x_a.expand(len(T), -1, -1), x_b.expand(len(T), -1, -1), T)).movedim(0, -1)
     for t, row in zip(T, found, strict=True):
         wanted = edges(ribbon(float(t) * turn, 60)[0], mesh)
         torch.testing.assert_close(row @ best_rotation(wanted.mT @ row).mT, wanted, rtol=0, atol=1e-11)
@@ -56,7 +61,7 @@ def test_the_pose_of_a_key_frame_does_not_matter(mesh: Connectivity) -> None:
     lengths = []
     for second in (strip(TURNS), strip(TURNS) @ turn):
         rotations = LocalRotations(mesh, torch.stack([strip(0), second]))
-        lengths.append(rotations(strip(0)[None], second[None], half).norm(dim=0))
+        lengths.append(rotations(*pair(strip(0)[None], second[None], half)).norm(dim=0))
     torch.testing.assert_close(*lengths, rtol=1e-11, atol=0)
     assert LocalRotations(mesh, torch.stack([strip(0), strip(0.9) @ turn])).clusters is None
 
@@ -67,13 +72,13 @@ def test_a_roll_keeps_its_lengths(mesh: Connectivity, kind: type[LocalRotations]
     """At all times of a batch, as alone; below 2 % at eight edges a turn."""
     rotations = kind(mesh, torch.stack([strip(0), strip(TURNS)])).to(dtype)
     x_a, x_b, t = strip(0).to(dtype), strip(TURNS).to(dtype), T.to(dtype)
-    found = rotations(x_a.expand(4, -1, -1), x_b.expand(4, -1, -1), t)
+    found = rotations(*pair(x_a.expand(4, -1, -1), x_b.expand(4, -1, -1), t))
     assert found.dtype == dtype
     for k, time in enumerate(t):
         wanted = edges(strip(TURNS, float(time)), mesh).norm(dim=-1)
         assert ((found[:, k].norm(dim=0) - wanted).abs() / wanted).mean() < 0.02
-        torch.testing.assert_close(rotations(x_a[None], x_b[None], t[k : k + 1])[:, 0], found[:, k])
-    mapped = torch.vmap(lambda t: rotations(x_a[None], x_b[None], t[None])[:, 0], out_dims=1)(t)
+        torch.testing.assert_close(rotations(*pair(x_a[None], x_b[None], t[k : k + 1]))[:, 0], found[:, k])
+    mapped = torch.vmap(lambda t: rotations(*pair(x_a[None], x_b[None], t[None]))[:, 0], out_dims=1)(t)
     torch.testing.assert_close(mapped, found)
 
 
@@ -84,7 +89,7 @@ def test_gradients(mesh: Connectivity, kind: type[LocalRotations]) -> None:
     noise = 0.01 * torch.randn(2, len(strip(0)), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x_a, x_b = strip(0) + noise[0], strip(TURNS) + noise[1]
     given = [value.clone().requires_grad_() for value in (x_a[None], x_b[None], T[1:2])]
-    assert torch.autograd.gradcheck(rotations, given, fast_mode=True)
+    assert torch.autograd.gradcheck(lambda *given: rotations(*pair(*given)), given, fast_mode=True)
 
 
 def test_other_pairs_have_clusters_of_their_own(mesh: Connectivity) -> None:

@@ -8,7 +8,7 @@ from torch.func import hessian, jacfwd, jacrev
 
 from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.fine_energy import FineEnergy
+from torch_modal.backends.torch.energies import FineEnergy
 from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.stretch import Stretch

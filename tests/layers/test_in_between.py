@@ -191,9 +191,9 @@ class TestValues:
             for n in (80, 0)
         )
         blend = type(layer.members[0].space.blend)
-        monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: straight)
+        monkeypatch.setattr(blend, "forward", lambda self, shapes, weights, straight: straight)
         straight = start.solve(*bars.keyframes[1:], 0.4)
-        monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: 3 * straight)
+        monkeypatch.setattr(blend, "forward", lambda self, shapes, weights, straight: 3 * straight)
         found = layer.solve(*bars.keyframes[1:], 0.4)
         assert found.solution.status == Status.FELL_BACK
         torch.testing.assert_close(found.shapes, straight.shapes, rtol=0, atol=1e-9)

@@ -11,9 +11,8 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.backends.torch.distortion import Distortion, _weights
-from torch_modal.backends.torch.rests import Rests
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.warp.backend import WarpBackend
-from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.comparison import no_worse
 from torch_modal.inbetween.settings import PRESETS
@@ -140,47 +139,36 @@ def test_nothing_falls_back_at_a_key_frame(bars: Shapes) -> None:
 class TestDistortion:
     """What results are judged by."""
 
-    def given(self, bars: Shapes) -> tuple[list[Tensor], tuple[Tensor, Tensor], Tensor, list[Tensor]]:
+    def given(self, bars: Shapes) -> tuple[list[Tensor], Tensor, Tensor, list[Tensor]]:
         straight, bent, twisted = bars.keyframes[:, None] * 20
         shapes = [torch.lerp(bent, twisted, 0.5), straight, bent + 0.2 * torch.sin(straight), 3.0 * bent]
         stiffness = [torch.tensor([[value]], dtype=torch.float64) for value in (500.0, 10.0, 1000.0)]
-        return shapes, (bent, twisted), torch.tensor([0.3], dtype=torch.float64), stiffness
+        return shapes, torch.stack([bent, twisted], 1), torch.tensor([[0.7, 0.3]], dtype=torch.float64), stiffness
 
     def test_is_eq_5_without_volume_where_strains_are_small(self, bars: Shapes) -> None:
-        _, (bent, _), _, stiffness = self.given(bars)
+        _, ends, _, stiffness = self.given(bars)
+        bent = ends[:, 0]
         x = bent + 1e-3 * torch.sin(3 * bent)
         mesh = Mesh.of(bars.faces, bent.shape[1])
-        rests = Rests((bent, bent), None, torch.tensor([0.5]).double(), stiffness, None)
+        rests = RestShapes(bent[:, None], torch.ones(1, 1, dtype=torch.float64), stiffness)
         distortion = Distortion(mesh, None)([x], rests)
         shell = tm.ShellEnergy(bars.faces, alpha=500.0, beta=10.0, gamma=0.0)
         # Beside that, Eq. 5 counts a relative strain squared, and the distortion the same.
         assert float(distortion) == pytest.approx(float(shell(x, bent)), rel=1e-9)
 
-    def test_kernels_and_torch_agree(self, bars: Shapes) -> None:
-        if not WarpBackend.works():
-            pytest.skip("no Warp")
-        shapes, ends, t, stiffness = self.given(bars)
-        n = len(Mesh.of(bars.faces, ends[0].shape[1]).edges)
-        stiffness[0] = torch.linspace(1, 2, n, dtype=torch.float64)[None]
-        mesh = Mesh.of(bars.faces, ends[0].shape[1])
-        rests = Rests(ends, None, t, stiffness, None)
-        one, other = (kind(mesh, None)(shapes, rests) for kind in (WarpDistortion, Distortion))
-        torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
-
     def test_a_degenerate_face_does_not_dominate(self, bars: Shapes) -> None:
         """A vertex laid onto its neighbour in both key-frames: Eq. 5 divides by the length of that edge."""
-        shapes, ends, t, stiffness = self.given(bars)
-        mesh = Mesh.of(bars.faces, ends[0].shape[1])
+        shapes, ends, weights, stiffness = self.given(bars)
+        mesh = Mesh.of(bars.faces, ends.shape[2])
         distortion = Distortion(mesh, None)
-        before = distortion(shapes, Rests(ends, None, t, stiffness, None))
+        before = distortion(shapes, RestShapes(ends, weights, stiffness))
         i, j = mesh.edges[50].tolist()
-        collapsed = [x.clone() for x in ends]
-        for x in collapsed:
-            x[:, i] = x[:, j] + 1e-3
-        after = distortion(shapes, Rests(tuple(collapsed), None, t, stiffness, None))
+        collapsed = ends.clone()
+        collapsed[:, :, i] = collapsed[:, :, j] + 1e-3
+        after = distortion(shapes, RestShapes(collapsed, weights, stiffness))
         assert (after < 4 * before).all(), "the faces around it were pulled out of shape, too"
         shell = tm.ShellEnergy(bars.faces)
-        assert shell(shapes[0], collapsed[0]) > 100 * shell(shapes[0], ends[0])
+        assert shell(shapes[0], collapsed[:, 0]) > 100 * shell(shapes[0], ends[:, 0])
 
     def test_the_best_of_the_starts_is_taken(self) -> None:
         x, starts = torch.zeros(3, 4, 3), [torch.full((3, 4, 3), value) for value in (1.0, 2.0)]

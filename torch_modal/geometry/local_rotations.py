@@ -87,6 +87,8 @@ class LocalRotations(nn.Module):
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
+        #: The first reference, from which rotations are measured. *Shape:* ``(1, V, 3)``.
+        self.register_buffer("reference", references[:1].clone(), persistent=False)
         #: Twice the sums of those of the references. *Shape:* ``(F,)``.
         self.register_buffer("areas", torch.cat([x.doubled_areas for x in every]).sum(0), persistent=False)
         #: By 1, 2, 4, ... generations, as many as any tree needs. *Shape:* ``(J, F)``.
@@ -121,19 +123,16 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        own = Frames(*(x.unflatten(-2, weights.shape) for x in _frames(shapes.flatten(0, 1), self.faces)))
-        start = Frames(*(x[..., 0, :] for x in own))
-        turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
+        start, own = _frames(self.reference, self.faces), _frames(shapes.flatten(0, 1), self.faces)
+        turns = _turn_between(start, own)
         if self.clusters is None:
-            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), own.doubled_areas.detach().flatten(0, 1))
-            turns = signs.view(turns.shape[1:]) * turns
+            signs = self.sign(turns.detach().movedim(0, -1), own.doubled_areas.detach())
+            turns = (signs * turns).unflatten(1, weights.shape)
             turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
-            turn = self.clusters(turns, weights[..., None])
-        return self._edges(
-            _turned(turn, start, *((weights[..., None] * x).sum(-2) for x in own[3:])),
-            self.areas.expand(len(weights), -1),
-        )
+            turn = self.clusters(turns.unflatten(1, weights.shape), weights[..., None])
+        stretches = ((weights[..., None] * x.unflatten(0, weights.shape)).sum(-2) for x in own[3:])
+        return self._edges(_turned(turn, start, *stretches), self.areas.expand(len(weights), -1))
 
     def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.

@@ -45,7 +45,7 @@ class WarpRotations(LocalRotations):
     def sign(self, quaternions: Tensor, areas: Tensor) -> Tensor:
         """The sign of the quaternion of each triangle. *Shape:* ``(B, F)``."""
         module, b = kernels("rotations"), len(areas)
-        if areas.device.type != "cpu" or transformed(areas):  # the walk down the tree is one thread's
+        if areas.device.type != "cpu" or traced(areas) or transformed(areas):  # the walk down the tree is one thread's
             return self._sign_votes(quaternions.movedim(-1, 0), areas)
         n_pieces = self.n_pieces
         quaternions, weights = quaternions.double().contiguous(), areas.double()
