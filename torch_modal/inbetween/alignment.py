@@ -28,15 +28,13 @@ SMALLEST_SIZE = 1e-6
 OTHER_SIZE = 3.0
 
 
-class AlignedKeyframes(NamedTuple):
-    """K key-frames of each sample, centred, scaled and turned on to each other."""
+class Pose(NamedTuple):
+    """Where shapes of the frame are in the caller's coordinates."""
 
-    shapes: Tensor
-    """*Shape:* ``(B, K, V, 3)``."""
     rotation: Tensor
-    """From the frame to the weighted mean of the poses of the key-frames. *Shape:* ``(B, 3, 3)``."""
+    """*Shape:* ``(B, 3, 3)``."""
     centre: Tensor
-    """Weighted mean of the centroids in the caller's coordinates. *Shape:* ``(B, 3)``."""
+    """Of the origin of the frame. *Shape:* ``(B, 3)``."""
 
 
 class KeyframeAlignment(nn.Module):
@@ -78,8 +76,8 @@ class KeyframeAlignment(nn.Module):
         """The first reference in the frame. *Shape:* ``(V, 3)``."""
         return self.references[0]
 
-    def forward(self, keyframes: Tensor, weights: Tensor) -> tuple[AlignedKeyframes, Tensor]:
-        """Key-frames in the frame, and which samples have an in-between.
+    def forward(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose, Tensor]:
+        """Key-frames turned on to each other, the weighted mean of their poses, and which samples have an in-between.
 
         Samples have none with key-frames or weights that are not finite, that are a point, or, of closed surfaces,
         mirror images of each other; key-frames without a weight do not count. The reference stands in for these.
@@ -89,13 +87,13 @@ class KeyframeAlignment(nn.Module):
             weights: *Shape:* ``(B, K)``.
 
         Returns:
-            The second, *shape* ``(B,)``, bool.
+            Shapes, *shape* ``(B, K, V, 3)``; the pose; *shape* ``(B,)``, bool.
         """
         weights, known = torch.where(weights.isfinite(), weights, 1 / weights.shape[1]), weights.isfinite()
         x, usable = self.checked(keyframes)
-        aligned = self._aligned(x, weights)
-        usable = usable & ~self.mirrored(aligned.shapes.detach(), weights)
-        return aligned, ((usable | (weights == 0)) & known).all(1)
+        shapes, pose = self._aligned(x, weights)
+        usable = usable & ~self.mirrored(shapes.detach(), weights)
+        return shapes, pose, ((usable | (weights == 0)) & known).all(1)
 
     def checked(self, keyframes: Tensor) -> tuple[Tensor, Tensor]:
         """Key-frames that are finite and have a size, the reference in the place of others; which those are.
@@ -108,7 +106,7 @@ class KeyframeAlignment(nn.Module):
         self._warn_of_size(sizes)
         return torch.where(usable[..., None, None], keyframes, self.reference / self.scale), usable
 
-    def _aligned(self, keyframes: Tensor, weights: Tensor) -> AlignedKeyframes:
+    def _aligned(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:
         """Key-frames turned on to their weighted mean, and this to the reference.
 
         Generalised Procrustes analysis: the weighted squared distances of all pairs are least. Of two, it is their best
@@ -136,15 +134,15 @@ class KeyframeAlignment(nn.Module):
         signs = agreeing(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
         pose = mean((signs * poses)[..., None], weights[..., None])
         rotation = rotate(pose, torch.eye(3).to(poses)[:, None]).movedim(0, 1)
-        return AlignedKeyframes(centred @ turns.mT, rotation, (weights[..., None] * centres).sum(1))
+        return centred @ turns.mT, Pose(rotation, (weights[..., None] * centres).sum(1))
 
-    def restore(self, x: Tensor, aligned: AlignedKeyframes) -> Tensor:
+    def restore(self, x: Tensor, pose: Pose) -> Tensor:
         """Shapes of the frame in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
-        return (x / self.scale) @ aligned.rotation.mT + aligned.centre[:, None]
+        return (x / self.scale) @ pose.rotation.mT + pose.centre[:, None]
 
-    def bring(self, points: Tensor, aligned: AlignedKeyframes) -> Tensor:
+    def bring(self, points: Tensor, pose: Pose) -> Tensor:
         """The inverse of :meth:`restore`. *Shape:* ``(B, P, 3)``."""
-        return (points - aligned.centre[:, None]) @ aligned.rotation * self.scale
+        return (points - pose.centre[:, None]) @ pose.rotation * self.scale
 
     def mirrored(self, shapes: Tensor, weights: Tensor) -> Tensor:
         """True for mirror images of the heaviest, of closed surfaces. *Shape:* ``(B, K, V, 3), (B, K) -> (B, K)``."""

@@ -86,11 +86,11 @@ class InBetweenSolver(nn.Module):
             samples: The batch.
             report: Receives the solution.
         """
-        aligned, usable = self.alignment(samples.keyframes, samples.weights)
-        shapes, weights = aligned.shapes, samples.weights
+        weights = samples.weights
+        shapes, pose, usable = self.alignment(samples.keyframes, weights)
         anchors = self.fine.energy.anchors
         if anchors is not None:
-            anchors = self.alignment.bring(anchors.to(weights).expand(len(weights), -1, -1), aligned)
+            anchors = self.alignment.bring(anchors.to(weights).expand(len(weights), -1, -1), pose)
         rests = RestShapes(shapes, weights, samples.stiffness, anchors)
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
@@ -103,7 +103,7 @@ class InBetweenSolver(nn.Module):
         if report is not None:
             warn_of_starts(solution)
         valid = (solution.status != Status.INVALID)[:, None, None]
-        return InBetweenResult(torch.where(valid, self.alignment.restore(x, aligned), torch.nan), solution)
+        return InBetweenResult(torch.where(valid, self.alignment.restore(x, pose), torch.nan), solution)
 
     def minimised(
         self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor, report: Report | None

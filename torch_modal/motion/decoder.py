@@ -185,7 +185,7 @@ class ModalDecoder(nn.Module):
 
     def _shapes(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
         which = torch.zeros_like(u, dtype=torch.int64)
-        return self.spline.restore(self.bent(knots, i, trajectory, a, u), self.spline.pose(knots, i, which, u))
+        return self.spline.alignment.restore(self.bent(knots, i, trajectory, a, u), self.spline.pose(knots, i, which, u))
 
     def bent(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
         """Shapes of one interval, in the coordinates of the knots' shapes. *Shape:* ``(B, k), (B,)``."""

@@ -220,7 +220,7 @@ class Path(nn.Module):
         x, solution = no_worse(x, [straight], unminimised(x, usable), self.distortion, rests, SLACK_OF_PATHS)
         if report is not None:
             warn_of_starts(solution)
-        shapes = spline.restore(x, spline.pose(knots, i, which, u))
+        shapes = spline.alignment.restore(x, spline.pose(knots, i, which, u))
         return InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution)
 
     def _located(self, keyframes: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, torch.Size]:

@@ -12,7 +12,7 @@ from torch_modal.geometry.local_rotations import LocalRotations, Trajectory, wei
 from torch_modal.geometry.rigid import best_rotation, centroid
 from torch_modal.geometry.rotations import exp, log
 from torch_modal.geometry.vectors import pick
-from torch_modal.inbetween.alignment import KeyframeAlignment
+from torch_modal.inbetween.alignment import KeyframeAlignment, Pose
 from torch_modal.motion.cubics import Cubics, Scheme, cubics, offset
 
 # Strains are relative to the mean size of a triangle, of which the smallest is this part of the mean.
@@ -165,8 +165,8 @@ class Spline(nn.Module):
         found = self.poisson(edges, straight.movedim(-1, 0)).movedim(0, -1)
         return torch.where(found.isfinite().flatten(1).all(1)[:, None, None], found, straight)
 
-    def pose(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations and centroids at times of one interval. *Shape:* ``(B, 3, 3)``, ``(B, 3)``."""
+    def pose(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Pose:
+        """The poses at times of one interval. Arguments as for :meth:`forward`."""
         wide = u[:, None]
         start = knots.rotations[i][which]
         step, first, last = ((part[i][which][:, None] @ start).squeeze(1) for part in knots.turns)
@@ -174,17 +174,7 @@ class Spline(nn.Module):
         last = end.squeeze(1) - step
         rotation = start @ exp(wide * step) @ exp(offset(first, last, wide))
         move, first, last = (part[i][which] for part in knots.moves)
-        return rotation, knots.centres[i][which] + wide * move + offset(first, last, wide)
-
-    def restore(self, x: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
-        """Shapes in the caller's coordinates. *Shape:* ``(B, V, 3)``."""
-        rotation, centre = pose
-        return (x / self.alignment.scale) @ rotation.mT + centre[:, None]
-
-    def bring(self, points: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
-        """The inverse of :meth:`restore`. *Shape:* ``(B, P, 3)``."""
-        rotation, centre = pose
-        return (points - centre[:, None]) @ rotation * self.alignment.scale
+        return Pose(rotation, knots.centres[i][which] + wide * move + offset(first, last, wide))
 
 
 def _rotations(
