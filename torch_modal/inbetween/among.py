@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.backends.torch.rests import Rests
-from torch_modal.energy.shell import DIAGONAL
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.rigid import RigidMotion, best_rotation, centroid
 from torch_modal.geometry.rotation_means import agreeing, mean
 from torch_modal.geometry.rotations import quaternion, rotate
@@ -91,7 +91,7 @@ class Among(Between):
         """The key-frames in the frame, and which samples have an in-between. *Shape:* ``(B,)``."""
         weights = samples.weights
         flat, finite = self.frame.finite(samples.keyframes.flatten(0, 1))
-        sized = (flat.amax(1) - flat.amin(1)).norm(dim=1) * self.frame.scale > SMALLEST_SIZE * DIAGONAL
+        sized = (flat.amax(1) - flat.amin(1)).norm(dim=1) * self.frame.scale > SMALLEST_SIZE * CANONICAL_SIZE
         # The reference stands in for what cannot be used: without a weight, it must do no harm.
         flat = torch.where(sized[:, None, None], flat, self.frame.reference / self.frame.scale)
         group = _aligned(self.frame, flat.unflatten(0, weights.shape), weights)
@@ -190,7 +190,7 @@ def _largest_difference(off: Tensor, masses: Tensor, weights: Tensor) -> Tensor:
         values, vectors = torch.linalg.eigh(root @ (weights[..., None] * root))
         largest, second = values[:, -1], values[:, -2:-1].sum(-1)
         # Key-frames that are the same, to rounding, have none.
-        exists = largest > (1e3 * torch.finfo(values.dtype).eps * DIAGONAL) ** 2
+        exists = largest > (1e3 * torch.finfo(values.dtype).eps * CANONICAL_SIZE) ** 2
         apart = (exists & (largest - second > GAP * largest))[:, None, None]
         largest = torch.where(exists, largest, 1)
         found = (root @ vectors[..., -1:]).squeeze(-1) / largest.sqrt()[:, None]

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import applied, lasting
 from torch_modal.backends.torch.alignment import Alignment
-from torch_modal.energy.shell import DIAGONAL
-from torch_modal.geometry.canonical import size
+from torch_modal.geometry.canonical import canonical_scale
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.inbetween.columns import Columns, Directions
@@ -118,8 +117,7 @@ class Frame(Alignment):
         collapses: Callable[[NDArray[np.float64]], Collapsing] | None = None,
         modes: Sequence[Tensor] = (),
     ) -> None:
-        sizes = [size(x.numpy(), faces.numpy()) for x in shapes]
-        scale = torch.tensor(DIAGONAL * len(sizes) / sum(sizes), dtype=shapes.dtype)
+        scale = torch.tensor(canonical_scale(shapes.numpy(), faces.numpy()), dtype=shapes.dtype)
         weights = mean_areas(shapes, faces) if weights is None else weights
         turns = [best_fit(x, shapes[0], weights) for x in shapes[1:]]
         centre = turns[0].target

@@ -8,8 +8,8 @@ from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.fine_energy import FineEnergy
-from torch_modal.energy.shell import DIAGONAL
 from torch_modal.errors import MeshWarning
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.winding import looks_mirrored
 from torch_modal.inbetween.frame import Frame
 from torch_modal.inbetween.samples import Samples
@@ -42,7 +42,7 @@ class Placing:
         """
         pair, usable, sizes = self.backend.place(self.frame, samples.x_a, samples.x_b)
         self.warn_of_size(sizes)
-        usable = usable & (sizes > SMALLEST_SIZE * DIAGONAL)
+        usable = usable & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)
         if self.closed:
             usable = usable & ~self.mirrored(pair.first, pair.second)
         if samples.spacing is None:

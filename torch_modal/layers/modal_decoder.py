@@ -25,7 +25,7 @@ from torch_modal.autograd import (
 )
 from torch_modal.backends.torch.alignment import Alignment, Pair, vertex_tangent_offset
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.energy.shell import DIAGONAL
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.hermite import Spacing, TangentOffset, around, beyond, located
 from torch_modal.geometry.local_rotations import Trajectory
@@ -105,8 +105,8 @@ class ModalDecoder(nn.Module):
         self.register_buffer("faces", faces, persistent=False)
         self._start(keyframes, times, reference)
         rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
-        displaced = (modes * (UNIT * DIAGONAL / rms)[:, None, None]).movedim(-1, 0).contiguous()
-        placed = reference * (DIAGONAL / self.size)
+        displaced = (modes * (UNIT * CANONICAL_SIZE / rms)[:, None, None]).movedim(-1, 0).contiguous()
+        placed = reference * (CANONICAL_SIZE / self.size)
         own = frames(sides(placed.T[:, None].contiguous(), faces))
         #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
         self.register_buffer("columns", _bounded(convected(bend(sides(displaced, faces), own), own), own))
@@ -129,10 +129,10 @@ class ModalDecoder(nn.Module):
         used = reference[self.faces.unique()]
         #: Diagonal of the reference's bounding box.
         self.register_buffer("size", torch.linalg.norm(used.amax(0) - used.amin(0)), persistent=False)
-        placed = reference * (DIAGONAL / self.size)
+        placed = reference * (CANONICAL_SIZE / self.size)
         weights = mean_areas(keyframes.double().cpu(), self.faces.cpu()).to(keyframes)
         centre = (weights[:, None] * placed).sum(0) / weights.sum()
-        self.alignment = Alignment(placed - centre, DIAGONAL / self.size, weights)
+        self.alignment = Alignment(placed - centre, CANONICAL_SIZE / self.size, weights)
         self._forget()
 
     def _current(self) -> None:

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from torch_modal.autograd import lasting
 from torch_modal.energy.energy import Rest
-from torch_modal.energy.shell import DIAGONAL, ShellEnergy
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 from torch_modal.keyframes.arrays import as_faces
@@ -126,7 +127,7 @@ class ShellLoss(ShellEnergy):
         """
         used = x_rest.detach()[..., : self.energy.n_vertices, :]
         extent = (used.amax(-2) - used.amin(-2)).norm(dim=-1)[..., None, None]
-        return DIAGONAL * inverse(extent, extent <= 0)
+        return CANONICAL_SIZE * inverse(extent, extent <= 0)
 
     def _check(self, *shapes: Tensor) -> None:
         n = self.energy.n_vertices

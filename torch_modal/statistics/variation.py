@@ -8,10 +8,11 @@ from torch_modal import trees
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.fine_steps import FurtherEnergy
 from torch_modal.energy.bend import Bend
-from torch_modal.energy.shell import ALPHA, BETA, DIAGONAL, GAMMA
+from torch_modal.energy.shell import ALPHA, BETA, GAMMA
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.triangle_frames import frames, sides
 from torch_modal.geometry.vectors import pick
 from torch_modal.statistics.coordinates import BendingCoordinates
@@ -58,7 +59,7 @@ class Variation:
         patches = Patches(mean, self.coordinates.reconstruction)
         #: Fields whose sums local weights are; the first is one everywhere. *Shape:* ``(n, V)``.
         self.fields = patches.fields(LENGTH)
-        self.scale = DIAGONAL / self.size
+        self.scale = CANONICAL_SIZE / self.size
         self.mixtures = LocalMixtures(patches, self.shapes)
         mesh = Mesh(self.coordinates.mesh)
         self.fine = choose("auto").fine_energy(mesh, [Stretch(ALPHA), Bend(BETA), Volume(GAMMA)])
