@@ -14,8 +14,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.energy.term import PeriodicTerm, Term
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import about, arc, conjugate, power, product
+from torch_modal.geometry.rotations import about, arc, conjugate, mean, power, product
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross
 from torch_modal.inbetween.among import WeightedSamples

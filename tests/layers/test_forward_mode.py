@@ -12,8 +12,7 @@ from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jacfwd, jvp
 
 import torch_modal as tm
-from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import about
+from torch_modal.geometry.rotations import about, mean
 from torch_modal.inbetween.among import _aligned
 from torch_modal.layers.modal_decoder import ModalDecoder
 

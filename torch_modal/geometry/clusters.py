@@ -9,8 +9,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import conjugate, power, product, turn_of
+from torch_modal.geometry.rotations import conjugate, mean, power, product, turn_of
 from torch_modal.geometry.vectors import pick
 
 # Rotation of the triangles of a cluster relative to its root, in radians. Above half a turn, the direction is unknown.

@@ -9,8 +9,7 @@ from torch import Tensor
 from torch_modal.backends.torch.rests import Rests
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.rigid import RigidMotion, best_rotation, centroid
-from torch_modal.geometry.rotation_means import agreeing, mean
-from torch_modal.geometry.rotations import quaternion, rotate
+from torch_modal.geometry.rotations import agreeing, mean, quaternion, rotate
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.comparison import SLACK
 from torch_modal.inbetween.frame import Frame

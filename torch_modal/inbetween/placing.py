@@ -10,7 +10,7 @@ from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.fine_energy import FineEnergy
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.winding import looks_mirrored
+from torch_modal.geometry.rigid import looks_mirrored
 from torch_modal.inbetween.frame import Frame
 from torch_modal.inbetween.samples import Samples
 

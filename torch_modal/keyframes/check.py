@@ -14,7 +14,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry import inspect
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.winding import looks_mirrored
+from torch_modal.geometry.rigid import looks_mirrored
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 __all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_area", "require_solid"]
