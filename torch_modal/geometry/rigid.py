@@ -76,9 +76,8 @@ def best_rotation(covariance: Tensor) -> Tensor:
     eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     for _ in range(2):
         p = rotation.mT @ covariance
-        torque = torch.stack(
-            [p[..., 2, 1] - p[..., 1, 2], p[..., 0, 2] - p[..., 2, 0], p[..., 1, 0] - p[..., 0, 1]], -1
-        )
+        skew = p.mT - p
+        torque = torch.stack([skew[..., 1, 2], skew[..., 2, 0], skew[..., 0, 1]], -1)
         trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         # Collinear, collapsed or inverted shapes leave a rotation undetermined: a floor above rounding fixes it.
         floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, 64 * torch.finfo(p.dtype).eps * trace.abs(), 1)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torch_modal.geometry.vectors import cross
 
-# Squared half angle below which series are evaluated: their terms are exact to rounding there, and beyond it closed forms
-# lose at most six digits when differentiated twice.
+# Squared half angle below which series are evaluated: they are exact to rounding there, and beyond it closed forms lose
+# at most six digits when differentiated twice.
 SMALL = 1e-3
 _COS = [(-1) ** k / factorial(2 * k) for k in range(4)]
 _SINC = [(-1) ** k / factorial(2 * k + 1) for k in range(4)]
@@ -25,12 +25,12 @@ HALF_TURN_SIDE = (1.0, 1 / pi, 1 / pi**2)
 # Roundings of the real part of a quaternion within which a rotation counts as half a turn.
 HALF_TURN = 64
 
-# Newton steps from the mean of quaternions, before the one that has derivatives. The mean of rotations within 90 degrees
-# of a point is then exact to rounding, and its derivatives to six digits or more.
+# Newton steps from the mean of quaternions, before the one with derivatives. The mean of rotations within 90 degrees of a
+# point is then exact to rounding, and its derivatives to six digits or more.
 MEAN_STEPS = 1
 
-# Smallest eigenvalue of the Hessian for a Newton step; below it, where rotations spread by about a turn, the mean is not
-# unique, and the step is the mean of logarithms.
+# Smallest eigenvalue of the Hessian for a Newton step; below it, where rotations spread by about a turn and the mean is
+# not unique, the step is the mean of logarithms.
 SMALLEST_CURVATURE = 0.1
 
 
@@ -123,9 +123,9 @@ def about(half: Tensor) -> Tensor:
 
 
 def mean(rotations: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean of K rotations, where the weighted sum of their relative logarithms vanishes (of two: the geodesic).
+    """Weighted mean of K rotations, where the weighted sum of their relative logarithms vanishes.
 
-    It has first derivatives only.
+    Of two rotations it is the geodesic. It has first derivatives only.
 
     Args:
         rotations: Quaternions with the signs of :func:`agreeing`. *Shape:* ``(4, ..., K, F)``.
@@ -146,8 +146,8 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
 def agreeing(products: Tensor, weights: Tensor) -> Tensor:
     r"""Signs with which K quaternions, or fields of them, are near their chordal mean (Markley et al. 2007).
 
-    The mean is the dominant eigenvector of :math:`\sum_k w_k q_k q_k^T`: it is continuous in the weights and independent
-    of the order. The signs change only where a rotation is half a turn away from it.
+    The mean is the dominant eigenvector of :math:`\sum_k w_k q_k q_k^T`: it is continuous in the weights and does not
+    depend on the order. The signs change only where a rotation is half a turn away from it.
 
     Args:
         products: Inner products of all pairs. *Shape:* ``(..., K, K)``.
