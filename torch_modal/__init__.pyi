@@ -30,7 +30,7 @@ from .energy.term import PeriodicTerm as PeriodicTerm
 from .energy.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
-from .geometry.normals import vertex_normals as vertex_normals
+from .geometry.vectors import vertex_normals as vertex_normals
 from .inbetween.samples import ConvergenceError as ConvergenceError
 from .inbetween.samples import InBetweenResult as InBetweenResult
 from .inbetween.settings import PRESETS as PRESETS

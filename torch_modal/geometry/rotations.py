@@ -25,8 +25,8 @@ HALF_TURN_SIDE = (1.0, 1 / pi, 1 / pi**2)
 # Roundings of the real part of a quaternion within which a rotation counts as half a turn.
 HALF_TURN = 64
 
-# Newton steps from the mean of quaternions, before the one with derivatives. The mean of rotations within 90 degrees of a
-# point is then exact to rounding, and its derivatives to six digits or more.
+# Newton steps from the mean of quaternions, before the one with derivatives. The mean of rotations within 90 degrees of
+# a point is then exact to rounding, and its derivatives to six digits or more.
 MEAN_STEPS = 1
 
 # Smallest eigenvalue of the Hessian for a Newton step; below it, where rotations spread by about a turn and the mean is

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.seams import merge_seams
+from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 

@@ -12,7 +12,7 @@ from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import ordered_faces, placed
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 _DIAGONAL_RANGE = (1e-90, 1e90)
 MOST_SAMPLES = 60_000

@@ -11,7 +11,7 @@ from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 LEAN = 0.01
 """Weight of normals relative to positions, in diagonals; distinguishes sheets closer than twice this distance."""
