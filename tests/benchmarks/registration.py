@@ -29,8 +29,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.samples import sample_files
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import read_mesh
-from torch_modal.registration.consistency import farthest_points
-from torch_modal.registration.spectrum import SpectralShape
+from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.surface import MeshSurface, referenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -106,7 +105,7 @@ def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> tuple[Fl
     """Five points spread over the template, and where they belong: what a person would pick."""
     surface = MeshSurface(rest, faces)
     shape = SpectralShape(surface)
-    chosen = surface.nearest_alike(shape.positions, shape.coarse.vertex_normals)[farthest_points(shape, 5)[0]]
+    chosen = surface.nearest_alike(shape.placed.vertices, shape.coarse.vertex_normals)[shape.farthest_points(5)[0]]
     return rest[chosen], truth[chosen]
 
 
