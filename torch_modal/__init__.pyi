@@ -42,8 +42,8 @@ from .io.formats import animation_format as animation_format
 from .io.formats import mesh_format as mesh_format
 from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
+from .keyframes.arrays import weld_seams as weld_seams
 from .keyframes.check import check_keyframes as check_keyframes
-from .keyframes.seams import weld_seams as weld_seams
 from .layers.blend import Blend as Blend
 from .layers.in_between import InBetween as InBetween
 from .layers.mid_shape import MidShape as MidShape

@@ -33,8 +33,8 @@ from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
 from torch_modal.inbetween.blend import Blends, RotationBlend
 from torch_modal.inbetween.frame import mean_areas
+from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import checked_arrays
-from torch_modal.keyframes.times import checked_times
 
 UNIT = 0.01
 """An amplitude of 1 moves the vertices of the key-frame by this part of its diagonal, in the root mean square."""

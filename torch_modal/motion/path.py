@@ -20,7 +20,7 @@ from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.hermite import Tangents, around, located, wrapped
 from torch_modal.inbetween.samples import InBetweenResult, Samples
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.keyframes.times import checked_times
+from torch_modal.keyframes.arrays import checked_times
 from torch_modal.layers.in_between import InBetween, joined, unflattened, with_exact_ends
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.solver import Solution
