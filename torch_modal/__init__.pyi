@@ -69,7 +69,7 @@ from .solve.adjoint import ConvergenceWarning as ConvergenceWarning
 from .solve.gauss_newton import GaussNewtonStep as GaussNewtonStep
 from .solve.solver import Solution as Solution
 from .solve.solver import Status as Status
-from .statistics.components import Components as Components
+from .statistics.coordinates import Components as Components
 from .statistics.fit import Fitted as Fitted
 from .view.animation import save_animation as save_animation
 from .view.document import Page as Page
