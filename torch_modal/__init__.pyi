@@ -30,7 +30,7 @@ from .energy.term import PeriodicTerm as PeriodicTerm
 from .energy.term import Term as Term
 from .errors import MeshError as MeshError
 from .errors import MeshWarning as MeshWarning
-from .geometry.normals import vertex_normals as vertex_normals
+from .geometry.vectors import vertex_normals as vertex_normals
 from .inbetween.results import ConvergenceError as ConvergenceError
 from .inbetween.results import InBetweenResult as InBetweenResult
 from .inbetween.settings import PRESETS as PRESETS
@@ -42,8 +42,8 @@ from .io.formats import animation_format as animation_format
 from .io.formats import mesh_format as mesh_format
 from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
+from .keyframes.arrays import weld_seams as weld_seams
 from .keyframes.check import check_keyframes as check_keyframes
-from .keyframes.seams import weld_seams as weld_seams
 from .layers.blend import Blend as Blend
 from .layers.in_between import InBetween as InBetween
 from .layers.mid_shape import MidShape as MidShape
@@ -65,11 +65,11 @@ from .registration.landmarks import suggest_landmarks as suggest_landmarks
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register
 from .registration.report import Registration as Registration
-from .solve.implicit import ConvergenceWarning as ConvergenceWarning
 from .solve.gauss_newton import GaussNewtonStep as GaussNewtonStep
+from .solve.implicit import ConvergenceWarning as ConvergenceWarning
 from .solve.minimise import Solution as Solution
 from .solve.minimise import Status as Status
-from .statistics.components import Components as Components
+from .statistics.coordinates import Components as Components
 from .statistics.fit import Fitted as Fitted
 from .view.animation import save_animation as save_animation
 from .view.document import Page as Page

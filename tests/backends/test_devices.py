@@ -16,14 +16,14 @@ from conftest import Shapes
 from torch import Tensor, nn
 from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.overrides import TorchFunctionMode
+from torch_modal.backends.torch.alignment import Pair
+from torch_modal.inbetween.samples import Samples
 
 import torch_modal as tm
-from torch_modal.backends.torch.alignment import Pair
 from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
 from torch_modal.contact.search import Contacts
 from torch_modal.energy.energy import Energy
 from torch_modal.geometry.rigid import RigidMotion
-from torch_modal.inbetween.samples import Samples
 from torch_modal.inbetween.settings import PRESETS
 
 DOUBLE = torch.float64

@@ -15,6 +15,7 @@ import torch
 from conftest import Shapes
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
+from torch_modal.geometry.hermite import Spacing
 
 import torch_modal as tm
 from torch_modal import trees
@@ -32,12 +33,11 @@ from torch_modal.backends.warp.shell import WarpShell
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import ModalEnergy, Placement
-from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
-from torch_modal.geometry.hermite import Spacing
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.inbetween.settings import PRESETS
 
@@ -54,7 +54,7 @@ class Case:
         mesh = self.mesh = Mesh.of(faces, shapes.keyframes.shape[1])
         self.energy = Energy(mesh, [Stretch(), Bend(), Volume()])
         self.fused = WarpSteps(self.energy, mesh)
-        x = shapes.keyframes * (DIAGONAL / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
+        x = shapes.keyframes * (CANONICAL_SIZE / (shapes.keyframes[0].amax(0) - shapes.keyframes[0].amin(0)).norm())
         n_edges, n_hinges = len(mesh.edges), len(mesh.hinges)
         stiffness = [
             500 + 100 * torch.rand(2, n_edges, generator=generator, dtype=DOUBLE),
@@ -111,7 +111,7 @@ def assert_alike(found: tuple[Tensor, ...], truth: tuple[Tensor, ...], to: float
 def test_local_steps(case: Case) -> None:
     found, truth = case.by_warp(*case.given), case.by_torch(*case.given)
     assert float((truth - case.given[0]).abs().max()) > 1e-2
-    torch.testing.assert_close(found, truth, rtol=0, atol=1e-8 * DIAGONAL)
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-8 * CANONICAL_SIZE)
     truth = gradients(case.by_torch, case.given)
     assert_alike(gradients(case.by_warp, case.given), truth, 1e-6)
 
@@ -133,7 +133,7 @@ def test_steps_that_would_go_uphill_are_shortened(small_bars: Shapes) -> None:
     to = reference_of(case.fused, case.rests(*case.given[1:]))
     found, lengths = case.fused.steps(2, 4, *(value.contiguous() for value in (case.given[0], *to)))
     assert float(lengths.min()) < 0.5 < float(lengths.max()), "no step is shortened, or all are"
-    torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * DIAGONAL)
+    torch.testing.assert_close(found, case.by_torch(*case.given), rtol=0, atol=1e-8 * CANONICAL_SIZE)
 
 
 def test_gradient_where_the_steps_start(small_bars: Shapes) -> None:
@@ -155,7 +155,7 @@ def test_vmap(small_bars: Shapes) -> None:
     moved = torch.stack([case.given[0], 1.01 * case.given[0]])
     found = vmap(lambda x: case.by_warp(x, *case.given[1:]))(moved)
     truth = torch.stack([case.by_warp(x, *case.given[1:]) for x in moved])
-    torch.testing.assert_close(found, truth, rtol=0, atol=1e-12 * DIAGONAL)
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-12 * CANONICAL_SIZE)
 
 
 def along_circle(gradient: Placement, at: Placement) -> Placement:

@@ -14,11 +14,11 @@ from torch import Tensor
 from torch_modal.energy.assembly import PairBlocks
 from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.energy import Energy, Linearised, Reference, Rest
-from torch_modal.energy.shell import DIAGONAL
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.geometry import connectivity
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.sparse import factorize
 from torch_modal.geometry.vectors import cross, pick
@@ -99,7 +99,7 @@ def full_space(
     own = (first.amax(0) - first.amin(0)).norm()
     if not bool(torch.isfinite(own + second.sum())) or own == 0:
         raise ValueError("x_a and x_b must be finite and x_a must have a size; check them for NaN and infinity")
-    scale = DIAGONAL / (own if size is None else size)
+    scale = CANONICAL_SIZE / (own if size is None else size)
     faces = torch.as_tensor(faces).cpu().long()
     weights = torch.from_numpy(connectivity.vertex_areas(first.numpy(), faces.numpy()))
     first, second = first * scale, second * scale

@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.optimize import minimize
 from torch import Tensor
 
-from torch_modal.energy.shell import DIAGONAL
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import best_fit
 
@@ -64,7 +64,7 @@ def geodesic(x_a: Tensor, x_b: Tensor, faces: Tensor, n_steps: int = 8, levels: 
     """
     if n_steps < 2 or n_steps & (n_steps - 1):
         raise ValueError(f"n_steps must be a power of two, 2 or more; got {n_steps}")
-    scale = DIAGONAL / (x_a.amax(0) - x_a.amin(0)).norm()
+    scale = CANONICAL_SIZE / (x_a.amax(0) - x_a.amin(0)).norm()
     first, second = x_a.double() * scale, x_b.double() * scale
     back = best_fit(second, first, torch.from_numpy(vertex_areas(first.numpy(), faces.numpy())))
     pairs = []

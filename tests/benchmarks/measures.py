@@ -13,7 +13,7 @@ from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to
 
 import torch_modal as tm
 from torch_modal.energy.bend import wrap_angle
-from torch_modal.energy.shell import DIAGONAL
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import best_fit
 
@@ -81,7 +81,7 @@ class Yardstick:
         self.case = case
         self.edges = torch.tensor(Connectivity(case.faces.numpy()).edges)
         used = case.x_a[case.faces.unique()]
-        self.scale = DIAGONAL / torch.linalg.norm(used.amax(0) - used.amin(0))
+        self.scale = CANONICAL_SIZE / torch.linalg.norm(used.amax(0) - used.amin(0))
         self.shell = tm.ShellEnergy(case.faces)
         self.truth = case.truths.get(HALF)
 

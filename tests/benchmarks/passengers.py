@@ -5,17 +5,13 @@
 Two key-frames of the sample creature are refined by Loop's subdivision (four times the faces each level: 310,000
 vertices with three) and get a relief. One in-between, half-way, is made by the whole mesh and by a proxy of 20,000
 vertices that carries the relief: seconds of one core after set-up, distance in percent of the diagonal, and mean error
-of edges against the mean of both ends. Memory is that of a process which does nothing but 17 frames by proxy.
+of edges against the mean of both ends.
 """
 
 import argparse
-import resource
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -86,16 +82,6 @@ def fine_meshes(levels: int, n_proxy: int, picture: Path | None) -> None:
         tm.render_sequence(rows, faces, picture, view=load_sample("creature").view, overwrite=True)
 
 
-def memory(file: Path, n_proxy: int) -> None:
-    """Of 17 frames by proxy, in a process of its own."""
-    with np.load(file) as given:
-        keyframes, faces = (torch.from_numpy(given[name]) for name in ("keyframes", "faces"))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    frames = tm.subdivide(keyframes, faces, 4, proxy=n_proxy, progress=False)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    print(f"peak memory of {len(frames)} frames: {peak:.2f} GB; {before:.2f} GB before, of torch and key-frames")
-
-
 def many_points(n: int) -> None:
     """One shape and its gradient."""
     sample = load_sample("creature")
@@ -125,18 +111,10 @@ def main() -> None:
     parser.add_argument("--proxy", type=int, default=20_000, help="vertices of the carrier")
     parser.add_argument("--points", type=int, default=1_000_000, help="that follow the creature")
     parser.add_argument("--picture", type=Path, help="the in-betweens side by side")
-    parser.add_argument("--memory", type=Path, help="only the memory of 17 frames by proxy of stored key-frames")
     given = parser.parse_args()
     limit_threads()
-    if given.memory:
-        memory(given.memory, given.proxy)
-        return
     many_points(given.points)
     fine_meshes(given.levels, given.proxy, given.picture)
-    with TemporaryDirectory() as folder:
-        file = Path(folder, "relief.npz")
-        np.savez(file, **dict(zip(("keyframes", "faces"), (x.numpy() for x in relief(given.levels)), strict=True)))
-        subprocess.run([sys.executable, __file__, "--memory", str(file), "--proxy", str(given.proxy)], check=True)
 
 
 if __name__ == "__main__":

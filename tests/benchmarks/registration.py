@@ -1,6 +1,6 @@
 """How well meshes are registered whose truth is known: the table of docs/registration.md.
 
-    python tests/benchmarks/registration.py [--parts poses pairs marked across middle time] [--rows FILE] [--n-pairs 50]
+    python tests/benchmarks/registration.py [--parts poses pairs across middle time] [--n-pairs 50]
     python tests/benchmarks/registration.py --picture docs/images/registration.png
 
 The template is a pose decimated to 60 % of its vertices and shuffled; the target is another pose, turned, scaled and
@@ -29,8 +29,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.data.samples import sample_files
 from torch_modal.geometry.decimation import decimate
 from torch_modal.io.read import read_mesh
-from torch_modal.registration.consistency import farthest_points
-from torch_modal.registration.spectrum import SpectralShape
+from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.surface import MeshSurface, referenced
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -106,7 +105,7 @@ def five_marks(rest: FloatArray, faces: IntArray, truth: FloatArray) -> tuple[Fl
     """Five points spread over the template, and where they belong: what a person would pick."""
     surface = MeshSurface(rest, faces)
     shape = SpectralShape(surface)
-    chosen = surface.nearest_alike(shape.positions, shape.coarse.vertex_normals)[farthest_points(shape, 5)[0]]
+    chosen = surface.nearest_alike(shape.placed.vertices, shape.coarse.vertex_normals)[shape.farthest_points(5)[0]]
     return rest[chosen], truth[chosen]
 
 
@@ -173,51 +172,13 @@ def pose_cases() -> Iterator[tuple[str, int, int, str, int, bool]]:
             yield name, i, j, "none", 10 * i + j, False
 
 
-def random_cases(n: int, marked: bool) -> Iterator[tuple[str, int, int, str, int, bool]]:
+def random_cases(n: int) -> Iterator[tuple[str, int, int, str, int, bool]]:
     """Random pairs of poses, with each flaw in turn."""
     random = np.random.default_rng(7)
     for k in range(n):
         name = list(BODIES)[random.integers(len(BODIES))]
         i, j = random.permutation(len(BODIES[name]))[:2]
-        yield name, int(i), int(j), DAMAGES[k % len(DAMAGES)], 1000 + k, marked
-
-
-def across() -> dict[str, Any]:
-    """Two animals of other proportions and tessellation, eight landmarks."""
-    (first, first_faces, first_cones), (second, second_faces, second_cones) = animal("slender"), animal("stout")
-    marks = [surface.closest(tips(cones)).points for surface, cones in (
-        (MeshSurface(first, first_faces), first_cones), (MeshSurface(second, second_faces), second_cones))]  # fmt: skip
-    started = time.process_time()
-    found = tm.register(
-        first,
-        first_faces,
-        second,
-        second_faces,
-        landmarks=tuple(marks),
-        same_subject=False,
-        cache=False,
-        progress=False,
-    )
-    seconds = time.process_time() - started
-    here = MeshSurface(first, first_faces)
-    others = [
-        surface.closest(held_out(cones))
-        for surface, cones in ((here, first_cones), (MeshSurface(second, second_faces), second_cones))
-    ]
-    size = np.linalg.norm(np.ptp(second, axis=0))
-    off = 100 / size * np.linalg.norm(here.rows(others[0]) @ found.positions.numpy() - others[1].points, axis=1)
-    return {
-        "case": "slender animal on stout animal",
-        "vertices": len(first),
-        "to": found.to_target,
-        "from": found.from_target,
-        "flipped": found.flipped_area,
-        "folds": found.folds,
-        "held out": off.tolist(),
-        "landmarks": found.landmark_errors.tolist(),
-        "confidence": found.confidence,
-        "seconds": seconds,
-    }
+        yield name, int(i), int(j), DAMAGES[k % len(DAMAGES)], 1000 + k, False
 
 
 def own_hand() -> tuple[FloatArray, IntArray, FloatArray]:
@@ -246,28 +207,42 @@ def web(surface: MeshSurface, tips: tuple[int, int]) -> int:
     return way[int(away.argmax())]
 
 
+def across() -> dict[str, Any]:
+    """An animal on one of other proportions and tessellation, by eight landmarks; other places are held out."""
+    (first, first_faces, cones), (second, second_faces, second_cones) = animal("slender"), animal("stout")
+    here, there = MeshSurface(first, first_faces), MeshSurface(second, second_faces)
+    marks = here.closest(tips(cones)).points, there.closest(tips(second_cones)).points
+    others, places = here.closest(held_out(cones)), there.closest(held_out(second_cones)).points
+    return laid("slender animal on stout animal", here, there, marks, lambda x: here.rows(others) @ x - places)
+
+
 def across_hands() -> dict[str, Any]:
     """A hand on a hand of another maker, eight landmarks; the webs between the four fingers are held out."""
     first, first_faces, places = own_hand()
     second, second_faces = (part[0] if part.ndim == 3 else part for part in poses("mh-hand"))
     here, there = MeshSurface(first, first_faces), MeshSurface(second, second_faces)
     marks = np.stack([cKDTree(first).query(places)[1], HAND_LANDMARKS], axis=1)
-    started = time.process_time()
-    found = tm.register(
-        first, first_faces, second, second_faces, landmarks=marks, same_subject=False, cache=False, progress=False
-    )
-    seconds = time.process_time() - started
     pairs = [(web(here, (a[0], b[0])), web(there, (a[1], b[1]))) for a, b in itertools.pairwise(marks[1:5])]
-    size = there.diagonal
-    off = [100 / size * float(np.linalg.norm(found.positions[i].numpy() - second[j])) for i, j in pairs]
+    own, others = (list(column) for column in zip(*pairs, strict=True))
+    return laid("sample hand on mh-hand", here, there, marks, lambda x: x[own] - second[others])
+
+
+def laid(
+    case: str, here: MeshSurface, there: MeshSurface, marks: Any, off: Callable[[FloatArray], FloatArray]
+) -> dict[str, Any]:
+    """A registration across subjects, with the distances of what is held out."""
+    started = time.process_time()
+    meshes = here.vertices, here.faces, there.vertices, there.faces
+    found = tm.register(*meshes, landmarks=marks, same_subject=False, cache=False, progress=False)
+    seconds = time.process_time() - started
     return {
-        "case": "sample hand on mh-hand",
-        "vertices": len(first),
+        "case": case,
+        "vertices": len(here.vertices),
         "to": found.to_target,
         "from": found.from_target,
         "flipped": found.flipped_area,
         "folds": found.folds,
-        "held out": off,
+        "held out": (100 / there.diagonal * np.linalg.norm(off(found.positions.numpy()), axis=1)).tolist(),
         "landmarks": found.landmark_errors.tolist(),
         "confidence": found.confidence,
         "seconds": seconds,
@@ -307,8 +282,8 @@ def timed(n_rounds: int, kept: float = KEPT) -> dict[str, Any]:
 
 def tasks(part: str, n_pairs: int) -> list[Callable[[], dict[str, Any]]]:
     """What a part of the table is made of."""
-    if part in ("poses", "pairs", "marked"):
-        cases = pose_cases() if part == "poses" else random_cases(n_pairs, part == "marked")
+    if part in ("poses", "pairs"):
+        cases = pose_cases() if part == "poses" else random_cases(n_pairs)
         return [lambda case=case: one(*case) for case in cases]  # type: ignore[misc]
     if part == "across":
         return [across, across_hands]
@@ -348,33 +323,27 @@ def picture(out: Path) -> None:
 
 
 def main() -> None:
-    """Run parts and print their rows; rows are kept, and the table at the end is made of all that are kept."""
+    """Run parts and print their rows, and a summary of all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="*", default=["poses", "pairs", "marked", "across", "middle", "time"])
+    parser.add_argument("--parts", nargs="*", default=["poses", "pairs", "across", "middle", "time"])
     parser.add_argument("--n-pairs", type=int, default=50)
-    parser.add_argument("--rows", type=Path, help="a file of rows from earlier runs, which is added to")
     parser.add_argument("--picture", type=Path, help="only draw three examples there")
     args = parser.parse_args()
     if args.picture:
         picture(args.picture)
         return
-    rows = [json.loads(line) for line in args.rows.read_text().splitlines()] if args.rows and args.rows.exists() else []
-    done = [row["part"] for row in rows]
+    rows = []
     for part in args.parts:
-        for task in tasks(part, args.n_pairs)[done.count(part) :]:
-            row = {"part": part, **task()}
-            rows.append(row)
-            print(json.dumps(row, default=float), flush=True)
-            if args.rows:
-                with args.rows.open("a") as file:
-                    file.write(json.dumps(row, default=float) + "\n")
+        for task in tasks(part, args.n_pairs):
+            rows.append({"part": part, **task()})
+            print(json.dumps(rows[-1], default=float), flush=True)
     print("\n".join(table(rows)))
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """The lines of the summary."""
     lines = []
-    for part in ("poses", "pairs", "marked"):
+    for part in ("poses", "pairs"):
         own = [row for row in rows if row["part"] == part]
         if not own:
             continue
@@ -393,9 +362,6 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
                 f"{np.mean(tails):.2f} %, worst {max(tails):.2f} %; {sum(m > 1.3 for m in means)} of {len(whole)} "
                 "above 1.3 %"
             )
-    for row in rows:
-        if row["part"] in ("across", "middle", "time"):
-            lines.append(f"{row['part']}: {json.dumps(row, default=float)}")
     return lines
 
 

@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from precompute import MORE, ROOT, sample
 from scipy.spatial.transform import Rotation
 from threads import limit_threads
+from torch_modal.solve.solver import Status
 from tqdm import tqdm
 from wild import FELL_BACK, WORSE, straight
 
 import torch_modal as tm
-from torch_modal.energy.shell import DIAGONAL
 from torch_modal.errors import MeshError
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.precompute.coarsening import coarsen
 from torch_modal.precompute.filling import MESHERS
-from torch_modal.solve.solver import Status
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -79,7 +79,7 @@ def in_between(
     with torch.no_grad():
         result = layer.solve(x_a, x_b, time)
     status = Status(int(result.solution.status))
-    shell, scale = tm.ShellEnergy(layer.faces), DIAGONAL / torch.linalg.norm(x_a.amax(0) - x_a.amin(0))
+    shell, scale = tm.ShellEnergy(layer.faces), CANONICAL_SIZE / torch.linalg.norm(x_a.amax(0) - x_a.amin(0))
 
     def energy(x: torch.Tensor) -> float:
         given = ((end * scale, pull) for end, pull in ((x_a, 1 - time), (x_b, time)))

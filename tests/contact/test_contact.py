@@ -9,10 +9,12 @@ import torch
 from conftest import Shapes
 from scipy.optimize import minimize
 from torch import Tensor
+from torch_modal.backends.torch.alignment import Pair
+from torch_modal.inbetween.between import Between
+from torch_modal.inbetween.samples import Samples
 
 import torch_modal as tm
 from torch_modal import trees
-from torch_modal.backends.torch.alignment import Pair
 from torch_modal.cli import main as cli
 from torch_modal.contact import rounds as contact_rounds
 from torch_modal.contact import together
@@ -29,8 +31,6 @@ from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
-from torch_modal.inbetween.between import Between
-from torch_modal.inbetween.samples import Samples
 from torch_modal.motion import path as path_module
 
 pytest.importorskip("ipctk")

@@ -8,6 +8,7 @@ import pytest
 import torch
 from conftest import Shapes, modal
 from torch import Tensor, nn
+from torch_modal.inbetween.levels import coarse_values
 
 import torch_modal as tm
 from torch_modal.backends.torch.fine_steps import relax
@@ -17,7 +18,6 @@ from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 from torch_modal.energy.volume import Volume
-from torch_modal.inbetween.levels import coarse_values
 
 DOUBLE = torch.float64
 

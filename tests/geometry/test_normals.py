@@ -6,7 +6,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 F64 = torch.float64
 CORNER = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -3], [5, 5, 5]], dtype=F64)

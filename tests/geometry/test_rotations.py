@@ -6,13 +6,13 @@ import pytest
 import torch
 from conftest import Shapes, modal, problem_of
 from torch import Tensor
+from torch_modal.geometry.hermite import Spacing
 
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.hermite import Spacing
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.rotations import exp
 from torch_modal.inbetween.blend import Blends, RotationBlend

@@ -5,12 +5,11 @@ import pytest
 import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
-
 from torch_modal.backends.torch.alignment import Pair
-from torch_modal.energy.shell import DIAGONAL
-from torch_modal.geometry.canonical import size
 from torch_modal.inbetween.columns import Directions
 from torch_modal.inbetween.frame import Frame
+
+from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.precompute.coarsening import coarsen
 
 
@@ -29,7 +28,9 @@ def moved(bars: Shapes, generator: torch.Generator) -> Tensor:
 def test_size_is_100_and_centred(frame: Frame, bars: Shapes) -> None:
     reference = frame.reference
     sizes = [size(x.numpy(), bars.faces.numpy()) for x in bars.keyframes[:2]]
-    assert size(reference.numpy(), bars.faces.numpy()) == pytest.approx(2 * DIAGONAL * sizes[0] / sum(sizes), rel=1e-13)
+    assert size(reference.numpy(), bars.faces.numpy()) == pytest.approx(
+        2 * CANONICAL_SIZE * sizes[0] / sum(sizes), rel=1e-13
+    )
     assert (frame.weights[:, None] * reference).sum(0).abs().max() < 1e-11
     assert float(frame.weights.sum()) == pytest.approx(1)
     assert float(frame.coarse.weights.sum()) == pytest.approx(1)
@@ -67,7 +68,7 @@ def test_place_and_restore(frame: Frame, moved: Tensor) -> None:
     # The second is turned on to the first as well as it goes: no small rotation brings it closer.
     arms = pair.first - (frame.weights[:, None] * pair.first).sum(-2, keepdim=True)
     torque = (frame.weights[:, None] * torch.linalg.cross(arms, pair.second - pair.first)).sum(-2)
-    assert torque.abs().max() < 1e-10 * DIAGONAL**2
+    assert torque.abs().max() < 1e-10 * CANONICAL_SIZE**2
 
 
 def test_orthonormal_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:

@@ -5,8 +5,11 @@ import torch
 from conftest import Shapes, modal
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev
-
 from torch_modal.backends.torch.alignment import Pair
+from torch_modal.inbetween.frame import Frame
+from torch_modal.inbetween.levels import Levels
+from torch_modal.solve.solver import minimise
+
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.energies import FineEnergy
 from torch_modal.energy.bend import SquaredBend
@@ -16,13 +19,10 @@ from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.inbetween.frame import Frame
-from torch_modal.inbetween.levels import Levels
 from torch_modal.inbetween.paired import PairedPlacement, PairedProblem, PairedSpace
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.solve.gauss_newton import GaussNewtonStep
-from torch_modal.solve.solver import minimise
 
 MU = 0.3
 

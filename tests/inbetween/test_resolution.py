@@ -6,11 +6,11 @@ import torch
 import trimesh
 from bodies import body
 from conftest import Shapes
+from torch_modal.inbetween.resolution import ENOUGH_FACES, spread, stretching
 
 import torch_modal as tm
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-from torch_modal.inbetween.resolution import ENOUGH_FACES, spread, stretching
 from torch_modal.precompute.coarsening import FACES_OF_PIECE, coarsen
 
 

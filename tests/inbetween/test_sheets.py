@@ -10,14 +10,14 @@ import pytest
 import torch
 from sheets import cylinder, folded, rectangle, rolled
 from torch import Tensor
+from torch_modal.inbetween.resolution import resolving
+from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.energy.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.inbetween.resolution import resolving
 from torch_modal.precompute.coarsening import Collapses, coarsen
-from torch_modal.solve.solver import Status
 
 BACKENDS = ["torch", "warp"]
 Direction = Callable[[np.ndarray], np.ndarray]

@@ -13,7 +13,7 @@ from bodies import twisted_plate
 
 from torch_modal.geometry import inspect
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.winding import looks_mirrored
+from torch_modal.geometry.rigid import looks_mirrored
 from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes, require_solid
 from torch_modal.registration.load import load_keyframes
 

@@ -10,8 +10,7 @@ from textured import bend, split_at_seams, textured_glb, textured_obj, triangles
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.seams import merge_seams
+from torch_modal.geometry.connectivity import Connectivity, merge_seams
 
 FAST = ["--modes", "6", "--levels", "2", "--mesher", "lattice", "--preset", "fast", "--quiet"]
 

@@ -9,19 +9,18 @@ import pytest
 import torch
 from conftest import Shapes, modal, random_rotation
 from torch import Tensor
+from torch_modal.inbetween.among import WeightedSamples
+from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.energy.term import PeriodicTerm, Term
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import about, arc, conjugate, power, product
+from torch_modal.geometry.rotations import about, arc, conjugate, mean, power, product
 from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross
-from torch_modal.inbetween.among import WeightedSamples
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
-from torch_modal.solve.solver import Status
 
 DOUBLE = torch.float64
 PRESETS = ("accurate", "fast")

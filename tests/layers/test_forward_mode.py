@@ -10,12 +10,11 @@ from conftest import Shapes
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jacfwd, jvp
-
-import torch_modal as tm
-from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import about
 from torch_modal.inbetween.among import _aligned
 from torch_modal.layers.modal_decoder import ModalDecoder
+
+import torch_modal as tm
+from torch_modal.geometry.rotations import about, mean
 
 DOUBLE = torch.float64
 

@@ -18,6 +18,8 @@ from conftest import Shapes, bent_bar, modal, placement_of, random_rotation
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
+from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning, Samples
+from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal import trees
@@ -25,13 +27,11 @@ from torch_modal.data.samples import load_sample
 from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning, Samples
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.gauss_newton import GaussNewtonStep
-from torch_modal.solve.solver import Status
 
 DOUBLE = torch.float64
 

@@ -10,11 +10,11 @@ import torch
 from conftest import Shapes, modal, placement_of, random_rotation
 from torch import Tensor
 from torch.func import functional_call
+from torch_modal.inbetween.samples import ConvergenceWarning
 
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import best_fit, blend
-from torch_modal.inbetween.samples import ConvergenceWarning
 from torch_modal.inbetween.settings import Objective
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis

@@ -9,9 +9,8 @@ from conftest import Shapes
 from scipy.spatial.transform import Rotation
 
 from torch_modal.cli import main as cli
-from torch_modal.geometry.harmonics import harmonics, rotated
 from torch_modal.io.frames import save_frames
-from torch_modal.io.points import PointFile
+from torch_modal.io.points import PointFile, harmonics, rotated_harmonics
 
 NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
 NAMES += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -45,7 +44,7 @@ def test_harmonics_turn_with_the_function(degree: int) -> None:
         basis = np.concatenate([harmonics(at, d) for d in range(1, degree + 1)], -1)
         return np.asarray(np.einsum("p...j,pcj->pc...", np.broadcast_to(basis, (40, 25, n)), values))
 
-    found = seen(rotated(coefficients, turns), directions)
+    found = seen(rotated_harmonics(coefficients, turns), directions)
     np.testing.assert_allclose(found, seen(coefficients, directions @ turns), atol=1e-12)
 
 

@@ -8,6 +8,8 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
+from torch_modal.solve.adjoint import ConvergenceWarning
+from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.backends.torch.distortion import Distortion, _weights
@@ -16,8 +18,6 @@ from torch_modal.backends.warp.backend import WarpBackend
 from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.comparison import no_worse
 from torch_modal.inbetween.settings import PRESETS
-from torch_modal.solve.adjoint import ConvergenceWarning
-from torch_modal.solve.solver import Status
 
 BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not WarpBackend.works(), reason="no Warp")), "torch"]
 

@@ -12,8 +12,7 @@ from torch_modal.geometry.local_rotations import _turn_between
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import BentTriangles, bending_between, bent_sides, frames, sides
-from torch_modal.statistics.components import Components
-from torch_modal.statistics.coordinates import BendingCoordinates
+from torch_modal.statistics.coordinates import BendingCoordinates, Components
 from torch_modal.statistics.variation import Variation
 
 

@@ -10,10 +10,8 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.statistics.fit import Fit, fit, followed
-from torch_modal.statistics.observations import Observations, Pulls
-from torch_modal.statistics.patches import MOST_BELOW_ZERO, LocalMixtures, Patches, bounded
-from torch_modal.statistics.variation import Variation
+from torch_modal.statistics.fit import Fit, Observations, Pulls, factors_of_points, fit
+from torch_modal.statistics.variation import MOST_BELOW_ZERO, LocalMixtures, Patches, Variation, bounded
 
 DOUBLE = torch.float64
 
@@ -105,7 +103,7 @@ def test_gradients_are_those_of_weights_and_pose(
     # The elastic steps are carried along by the pose; without them the gradient is exact.
     to = Observations(leaf, picked, torch.ones(len(points), dtype=DOUBLE))
     given = Fit(variation, to._replace(points=points), about)
-    x = given.shape(followed(given, given.solved(False)[0], to))
+    x = given.shape(factors_of_points(given.solved(False)[0], leaf, given, to))
     (best_fit(x[picked], leaf, to.weights).apply(x) * taken).sum().backward()
     assert leaf.grad is not None
     assert float((leaf.grad * move).sum()) == pytest.approx(expected, rel=1e-5)

@@ -16,7 +16,7 @@ from torch_modal.data.random_in_between import RandomInBetween
 from torch_modal.data.sequential import AugmentationSequential
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets, open_set
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 Labels = Mapping[str, Tensor]
 Sample = dict[str, Any]

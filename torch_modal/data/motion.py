@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.keyframes.times import checked_times
+from torch_modal.keyframes.arrays import checked_times
 
 
 class Span(NamedTuple):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_shapes
 from torch_modal.data.space import ShapeSpace
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 DATA_KEYS = ("shapes", "normals", "vertex_labels", "shape_labels")
 

@@ -34,9 +34,8 @@ from torch_modal.motion.path import Path as MotionPath
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.implicit import ConvergenceWarning
 from torch_modal.solve.minimise import Status
-from torch_modal.statistics.components import Components
-from torch_modal.statistics.fit import Fitted, fit
-from torch_modal.statistics.observations import Observations, checked_observations, checked_weights
+from torch_modal.statistics.coordinates import Components
+from torch_modal.statistics.fit import Fitted, Observations, checked_observations, checked_weights, fit
 from torch_modal.statistics.variation import Variation
 from torch_modal.version import __version__
 

@@ -14,14 +14,10 @@ from torch_modal.energy.volume import Volume
 from torch_modal.keyframes.arrays import as_faces
 
 ALPHA, BETA, GAMMA = 500.0, 10.0, 1000.0
-"""The paper's stiffnesses, for shapes of a size of 100."""
+"""The paper's stiffnesses. Eq. 5 is not scale-invariant: they are meant for shapes of `CANONICAL_SIZE`."""
 
 N_SHELL_TERMS = 3
 """How many terms Eq. 5 has; they come first."""
-
-DIAGONAL = 100.0
-"""Eq. 5 is not scale-invariant: its stiffnesses are meant for shapes of this size, which is that of
-:func:`torch_modal.geometry.canonical.size`, for rods and spheres the bounding-box diagonal."""
 
 
 class Measures(NamedTuple):

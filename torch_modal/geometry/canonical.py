@@ -9,8 +9,8 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 
-SIZE = 100.0
-"""Size of canonical shapes (:func:`placed`)."""
+CANONICAL_SIZE = 100.0
+"""Size (:func:`size`) at which energies are evaluated, modes computed and meshes decimated."""
 ROUNDING = 2.0**-20
 """Quantum of their coordinates, far above the rounding of rotations and sums, which it removes."""
 ALIKE = 1e-6
@@ -47,6 +47,11 @@ def size(points: FloatArray, faces: IntArray) -> float:
     return _moments(points, faces)[2]
 
 
+def canonical_scale(shapes: FloatArray, faces: IntArray) -> float:
+    """Factor that brings the mean size of shapes to :data:`CANONICAL_SIZE`. *Shape:* ``(K, V, 3), (F, 3)``."""
+    return CANONICAL_SIZE / float(np.mean([size(x, faces) for x in shapes]))
+
+
 def placed(points: FloatArray, faces: IntArray) -> Placed:
     """A shape in its principal axes.
 
@@ -65,7 +70,7 @@ def placed(points: FloatArray, faces: IntArray) -> Placed:
     # The axis of least skewness completes a right-handed frame: mirrored shapes stay different.
     last = int(np.abs(skewness).argmin())
     axes[last] = np.cross(axes[last - 2], axes[last - 1])
-    scale = SIZE / length
+    scale = CANONICAL_SIZE / length
     turned = ((points - centre) * scale) @ axes.T
     return Placed(np.round(turned / ROUNDING) * ROUNDING, axes, centre, scale)
 

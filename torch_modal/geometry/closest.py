@@ -1,20 +1,57 @@
-"""Exact closest points on a surface. NumPy and SciPy only."""
+"""Exact closest points on a surface, by a tree of bounding boxes. NumPy and SciPy only."""
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.box_tree import leaves
 
-# Triangles with less than this part of the area that their sides allow are lines.
+# Triangles with less than this part of the area that their sides allow count as segments.
 FLAT = 1e-12
 
-# Pairs of a point and a box that are tested at a time.
+# Pairs of a point and a box that are tested together.
 CHUNK = 2**18
 
 
+def leaves(faces: IntArray, shapes: FloatArray) -> IntArray:
+    """Faces as leaves of a binary tree, split on each level along the longest axis of their centres.
+
+    Node 1 is the root, node ``i`` has the children ``2 i`` and ``2 i + 1``, and the last ``F`` nodes are the leaves.
+
+    Args:
+        faces: *Shape:* ``(F, 3)``.
+        shapes: Shapes in which the faces of a node should be close. *Shape:* ``(K, V, 3)``.
+
+    Returns:
+        Face of each leaf. *Shape:* ``(F,)``.
+    """
+    points = np.concatenate(shapes[:, faces].mean(2), 1)
+    n = len(points)
+    first_nodes = [1 << k for k in range((n - 1).bit_length())]  # of each inner level
+    sizes = np.ones(2 * n, np.int64)
+    for start in reversed(first_nodes):
+        own = np.arange(start, min(2 * start, n))
+        sizes[own] = sizes[2 * own] + sizes[2 * own + 1]
+    order, nodes = np.arange(n), np.ones(n, np.int64)
+    for start in first_nodes:
+        # Finished leaves come last.
+        own = np.arange(start, min(2 * start, n))
+        size = sizes[own]
+        firsts, m = np.cumsum(size) - size, int(size.sum())
+        inner = points[order[:m]]
+        low = np.minimum.reduceat(inner, firsts)
+        extent = np.maximum.reduceat(inner, firsts) - low
+        axis, node = extent.argmax(1), np.repeat(np.arange(len(own)), size)
+        longest = np.maximum(extent[np.arange(len(own)), axis], 1e-300)
+        share = (inner[np.arange(m), axis[node]] - low[node, axis[node]]) / longest[node]
+        order[:m] = order[:m][np.argsort(2 * node + share)]
+        nodes[:m] = np.repeat(np.arange(2 * own[0], 2 * own[-1] + 2), sizes[2 * own[0] : 2 * own[-1] + 2])
+    found = np.empty(n, np.int64)
+    found[nodes - n] = order
+    return found
+
+
 class ClosestFaces:
-    """Exact queries for the closest triangle of a surface, by a tree of bounding boxes.
+    """Exact queries for the closest triangle of a surface.
 
     Args:
         vertices: *Shape:* ``(V, 3)``.
@@ -37,7 +74,7 @@ class ClosestFaces:
             first = (first + 1) // 2
 
     def __call__(self, points: FloatArray) -> IntArray:
-        """The triangle that is closest to each point. *Shape:* ``(n, 3) -> (n,)``."""
+        """Closest triangle to each point. *Shape:* ``(n, 3) -> (n,)``."""
         face = np.asarray(self.centroids.query(points)[1], dtype=np.int64)
         nearest = closest_on_triangles(points, self.corners[face])[1]
         n = len(self.corners)
@@ -45,7 +82,7 @@ class ClosestFaces:
         while left:  # depth first, so that few pairs are kept
             row, node = left.pop()
             gap = np.maximum(np.maximum(self._low[node] - points[row], points[row] - self._high[node]), 0)
-            near = _dot(gap, gap) < nearest[row] ** 2
+            near = dot(gap, gap) < nearest[row] ** 2
             row, node = row[near], node[near]
             at, found = row[node >= n], self._leaves[node[node >= n] - n]
             distance = closest_on_triangles(points[at], self.corners[found])[1]
@@ -70,28 +107,29 @@ def closest_on_triangles(points: FloatArray, corners: FloatArray) -> tuple[Float
     """
     a = corners[..., 0, :]
     first, second, to_point = corners[..., 1, :] - a, corners[..., 2, :] - a, points - a
-    along, across = _dot(first, to_point), _dot(second, to_point)
-    ff, ss, fs = _dot(first, first), _dot(second, second), _dot(first, second)
+    along, across = dot(first, to_point), dot(second, to_point)
+    ff, ss, fs = dot(first, first), dot(second, second), dot(first, second)
     determinant = ff * ss - fs**2
     tiny = np.finfo(np.float64).tiny
     per_area = 1 / np.maximum(determinant, tiny)
     v, w = (ss * along - fs * across) * per_area, (ff * across - fs * along) * per_area
     inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (determinant > FLAT * ff * ss)
-    # Else it is on a side: the nearest of three.
+    # Otherwise it is on a side: the nearest of three.
     zero, third = np.zeros_like(v), second - first
     on_first, on_second, on_third = (
         np.clip(part / np.maximum(whole, tiny), 0, 1)
-        for part, whole in ((along, ff), (across, ss), (_dot(third, to_point - first), _dot(third, third)))
+        for part, whole in ((along, ff), (across, ss), (dot(third, to_point - first), dot(third, third)))
     )
     pairs = (on_first, zero), (zero, on_second), (1 - on_third, on_third)
     sides = np.stack([np.stack(pair, -1) for pair in pairs], -2)  # (..., 3, 2)
     gaps = to_point[..., None, :] - sides @ np.stack([first, second], -2)
-    nearest = _dot(gaps, gaps).argmin(-1)[..., None, None]
+    nearest = dot(gaps, gaps).argmin(-1)[..., None, None]
     at = np.where(inside[..., None], np.stack([v, w], -1), np.take_along_axis(sides, nearest, -2)[..., 0, :])
     gap = to_point - at[..., :1] * first - at[..., 1:] * second
-    return np.maximum(np.concatenate([1 - at.sum(-1, keepdims=True), at], -1), 0), np.sqrt(_dot(gap, gap))
+    return np.maximum(np.concatenate([1 - at.sum(-1, keepdims=True), at], -1), 0), np.sqrt(dot(gap, gap))
 
 
-def _dot(x: FloatArray, y: FloatArray) -> FloatArray:
-    product: FloatArray = np.einsum("...i,...i->...", x, y)
-    return product
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Inner products, faster than sums along an axis of length three. *Shape:* ``(..., 3)``."""
+    found: FloatArray = np.einsum("...i,...i->...", a, b)
+    return found

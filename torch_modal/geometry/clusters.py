@@ -7,8 +7,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor, nn
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.rotation_means import mean
-from torch_modal.geometry.rotations import conjugate, product, turn_of
+from torch_modal.geometry.rotations import conjugate, mean, product, turn_of
 from torch_modal.geometry.vectors import pick
 
 # Rotation of the triangles of a cluster relative to its root, in radians. Above half a turn, the direction is unknown.

@@ -7,8 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
+
+SEAM_WIDTH = 1e-7
+"""Part of the bounding-box diagonal within which vertices coincide: the rounding of float32 and of seven digits."""
 
 
 class Connectivity:
@@ -165,6 +169,30 @@ def connected_pieces(pairs: IntArray, n: int) -> IntArray:
     """
     graph = sparse.coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def merge_seams(shapes: FloatArray, faces: IntArray) -> IntArray:
+    """Merge vertices along seams, where files for rendering repeat them for texture coordinates or normals.
+
+    Two vertices are merged if both lie on a boundary and coincide in every shape. Surfaces that merely touch stay
+    separate: closed ones have no boundary, and open ones part in some shape.
+
+    Args:
+        shapes: *Shape:* ``(K, V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
+
+    Returns:
+        Index of the merged vertex of each vertex, numbered by first vertices. *Shape:* ``(V,)``.
+    """
+    n = shapes.shape[1]
+    boundary = np.unique(Connectivity(faces).boundary_edges)
+    if not len(boundary):
+        return np.arange(n)
+    used = np.unique(faces)
+    tolerance = SEAM_WIDTH * float(np.linalg.norm(np.ptp(shapes[:, used], axis=1), axis=1).min())
+    pairs = boundary[cKDTree(shapes[0, boundary]).query_pairs(tolerance, output_type="ndarray")]
+    distance = np.linalg.norm(shapes[:, pairs[:, 0]] - shapes[:, pairs[:, 1]], axis=2).max(axis=0, initial=0.0)
+    return connected_pieces(pairs[distance <= tolerance], n)
 
 
 def spanning_forest(n: int, pairs: IntArray, costs: FloatArray) -> tuple[IntArray, IntArray]:

@@ -11,18 +11,14 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from torch_modal import extras
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.triangle_pairs import cross, dot, triangles_cross
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 PACKAGES = ("ipctk", "igl")
 """Of the extra."""

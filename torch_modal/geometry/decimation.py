@@ -10,7 +10,7 @@ import fast_simplification
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.canonical import SIZE, ordered_faces, placed, vertex_order
+from torch_modal.geometry.canonical import CANONICAL_SIZE, ordered_faces, placed, vertex_order
 
 # The library keeps its mesh in static memory.
 _NOT_THREAD_SAFE = threading.Lock()
@@ -19,7 +19,7 @@ _AGGRESSIVENESS = 7.0
 # Where this many times the wanted faces are left, the vertices are shifted a little, and the collapses start anew: in
 # exactly flat parts that lie obliquely, the optimal positions are those of rounding errors, and nothing collapses.
 _STUCK = 1.5
-_SHIFT = 1e-5 * SIZE
+_SHIFT = 1e-5 * CANONICAL_SIZE
 
 
 class Decimation(NamedTuple):

@@ -8,8 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
-from torch_modal.geometry.rotation_means import agreeing, mean
-from torch_modal.geometry.rotations import quaternion, rotate, turn_of, turned
+from torch_modal.geometry.rotations import agreeing, mean, quaternion, rotate, turn_of, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
     Sides,

@@ -1,4 +1,4 @@
-"""Rigid motions between shapes: best fit, and the geodesic along which they are interpolated."""
+"""Rigid motions between shapes: best fit, interpolation, and detection of mirrored shapes."""
 
 from typing import NamedTuple
 
@@ -7,6 +7,10 @@ from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.geometry.rotations import exp, log
+
+# Required gain of a reflection, in mean cosine between normals: mirrored poses of one body have at least 0.44, poses of
+# thin plates at most 0.2.
+MIRRORED = 0.3
 
 
 class RigidMotion(NamedTuple):
@@ -24,11 +28,11 @@ class RigidMotion(NamedTuple):
         return (x - self.source[..., None, :]) @ self.rotation.mT + self.target[..., None, :]
 
     def inverse(self) -> "RigidMotion":
-        """The inverse motion."""
+        """Inverse motion."""
         return RigidMotion(self.rotation.mT, self.target, self.source)
 
     def fraction(self, t: Tensor) -> "RigidMotion":
-        """The motion at the time ``t`` of the geodesic from rest (0) to this motion (1).
+        """Motion at the time ``t`` of the geodesic from rest (0) to this motion (1).
 
         The rotation has constant angular velocity, the centroid moves on a straight line. A half turn has two shortest
         geodesics: :func:`~torch_modal.geometry.rotations.log` chooses one.
@@ -49,12 +53,15 @@ def centroid(x: Tensor, weights: Tensor) -> Tensor:
 def best_rotation(covariance: Tensor) -> Tensor:
     """The rotation ``R`` that maximises ``tr(R^T A)``, differentiable to second order.
 
+    For ``A = sum_v w_v y_v x_v^T`` it aligns ``x`` with ``y``; of a matrix of positive determinant it is the nearest
+    rotation (polar decomposition).
+
     The value comes from the singular value decomposition. Its derivative divides by differences of singular values and
     fails on symmetric shapes, where the rotation itself is smooth. Derivatives come instead from two Newton steps at
     the solution, each of which makes them exact to a higher order.
 
     Args:
-        covariance: ``A = sum_v w_v y_v x_v^T``. *Shape:* ``(..., 3, 3)``.
+        covariance: *Shape:* ``(..., 3, 3)``.
 
     Returns:
         *Shape:* ``(..., 3, 3)``, determinant one; NaN where the covariance is not finite.
@@ -66,26 +73,18 @@ def best_rotation(covariance: Tensor) -> Tensor:
     rotation = torch.where(finite, (u * sign[..., None, :]) @ vh, torch.nan)
     if not torch.is_grad_enabled() and (traced(covariance) or not transformed(covariance)):
         return rotation
+    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     for _ in range(2):
         p = rotation.mT @ covariance
+        skew = p.mT - p
+        torque = torch.stack([skew[..., 1, 2], skew[..., 2, 0], skew[..., 0, 1]], -1)
+        trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        # Collinear, collapsed or inverted shapes leave a rotation undetermined: a floor above rounding fixes it.
+        floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, 64 * torch.finfo(p.dtype).eps * trace.abs(), 1)
+        hessian = (trace + floor.detach()) * eye - 0.5 * (p + p.mT)
         # Never singular: `solve_ex` avoids a synchronisation of the GPU.
-        turn = torch.linalg.solve_ex(_stiffness(p), _torque(p)).result
-        rotation = rotation @ exp(turn)
+        rotation = rotation @ exp(torch.linalg.solve_ex(hessian, torque).result)
     return rotation
-
-
-def _torque(p: Tensor) -> Tensor:
-    """Inner products with infinitesimal rotations. *Shape:* ``(..., 3, 3) -> (..., 3)``."""
-    return torch.stack([p[..., 2, 1] - p[..., 1, 2], p[..., 0, 2] - p[..., 2, 0], p[..., 1, 0] - p[..., 0, 1]], -1)
-
-
-def _stiffness(p: Tensor) -> Tensor:
-    """Hessian with respect to infinitesimal rotations. *Shape:* ``(..., 3, 3)``."""
-    eye = torch.eye(3, dtype=p.dtype, device=p.device)
-    trace = p.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    # Collinear, collapsed or inverted shapes leave a rotation undetermined: a floor above rounding fixes it.
-    floor = torch.where(trace.abs() > torch.finfo(p.dtype).tiny, 64 * torch.finfo(p.dtype).eps * trace.abs(), 1)
-    return trace * eye - 0.5 * (p + p.mT) + floor.detach() * eye
 
 
 def best_fit(x: Tensor, y: Tensor, weights: Tensor) -> RigidMotion:
@@ -113,3 +112,34 @@ def blend(x: Tensor, y: Tensor, t: Tensor, weights: Tensor) -> Tensor:
     """
     back = best_fit(y, x, weights)
     return back.inverse().fraction(t).apply(torch.lerp(x, back.apply(y), t[..., None, None]))
+
+
+@torch.no_grad()
+def looks_mirrored(first: Tensor, second: Tensor, faces: Tensor) -> Tensor:
+    """Test whether normals agree clearly better after a reflection than after a rotation.
+
+    For bodies with signed volumes of different sign: the volume of a thin plate also changes its sign if its sheets
+    intersect slightly.
+
+    Args:
+        first: *Shape:* ``(B, V, 3)``.
+        second: *Shape:* ``(B, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+
+    Returns:
+        *Shape:* ``(B,)``, bool.
+    """
+    centres, normals = [], []
+    for x in (first, second):
+        a, b, c = (x[:, corner] for corner in faces.unbind(1))
+        centres.append((a + b + c) / 3)
+        normals.append(torch.linalg.cross(b - a, c - a))
+    areas = [torch.linalg.vector_norm(x, dim=-1) for x in normals]
+    weights = (areas[0] * areas[1]).sqrt()
+    total = weights.sum(1)
+    centred = [c - (weights[..., None] * c).sum(1, keepdim=True) / total[:, None, None] for c in centres]
+    unit = [x / torch.where(area > 0, area, 1)[..., None] for x, area in zip(normals, areas, strict=True)]
+    covariance, alike = ((weights[..., None] * a).mT @ b for a, b in (centred, unit))
+    # A reflection M flips normals, and -M is the best rotation of the negative covariance.
+    gain = ((best_rotation(-covariance) - best_rotation(covariance)) * alike).sum((1, 2))
+    return gain > MIRRORED * total

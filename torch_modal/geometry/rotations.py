@@ -1,7 +1,8 @@
-r"""Finite rotations: exponential, logarithm, quaternions, and vectors turned by them.
+r"""Finite rotations: exponential, logarithm, quaternions, weighted means.
 
-Closed forms with all derivatives everywhere but at a whole turn: near none, where they divide zero by zero, series take
-over. Quaternions have their real part first; components come first, as in :mod:`~torch_modal.geometry.vectors`.
+Closed forms with all derivatives everywhere but at a whole turn; near zero, where they divide zero by zero, series
+replace them. Quaternions have their real part first; their sign distinguishes the two ways round. Components come
+first, as in :mod:`~torch_modal.geometry.vectors`.
 """
 
 from math import factorial, pi
@@ -11,22 +12,30 @@ from torch import Tensor
 
 from torch_modal.geometry.vectors import cross
 
-# Squared half angle below which series are taken: so many terms are exact to rounding there, and beyond it closed forms
-# lose six digits at most when they are differentiated twice.
+# Squared half angle below which series are evaluated: they are exact to rounding there, and beyond it closed forms lose
+# at most six digits when differentiated twice.
 SMALL = 1e-3
 _COS = [(-1) ** k / factorial(2 * k) for k in range(4)]
 _SINC = [(-1) ** k / factorial(2 * k + 1) for k in range(4)]
 _ARC = [(-1) ** k / (2 * k + 1) for k in range(5)]
 
-# At half a turn, the axis is taken that lies on this side. Hardly any axis that has a name lies between both sides.
+# At half a turn the axis on this side is chosen. Hardly any axis that has a name lies between both sides.
 HALF_TURN_SIDE = (1.0, 1 / pi, 1 / pi**2)
 
-# A rotation is taken for half a turn within so many units of rounding of the real part of its quaternion.
+# Roundings of the real part of a quaternion within which a rotation counts as half a turn.
 HALF_TURN = 64
+
+# Newton steps from the mean of quaternions, before the one with derivatives. The mean of rotations within 90 degrees of
+# a point is then exact to rounding, and its derivatives to six digits or more.
+MEAN_STEPS = 1
+
+# Smallest eigenvalue of the Hessian for a Newton step; below it, where rotations spread by about a turn and the mean is
+# not unique, the step is the mean of logarithms.
+SMALLEST_CURVATURE = 0.1
 
 
 def exp(turn: Tensor) -> Tensor:
-    """The rotation about an axis by its length in radians (Rodrigues). *Shape:* ``(..., 3) -> (..., 3, 3)``."""
+    """Rotation matrix of axis times angle in radians (Rodrigues). *Shape:* ``(..., 3) -> (..., 3, 3)``."""
     w = turn.movedim(-1, 0)
     cosine, sinc = _cos_and_sinc(0.25 * (w * w).sum(0))
     x, y, z = sinc * cosine * w
@@ -36,9 +45,9 @@ def exp(turn: Tensor) -> Tensor:
 
 
 def log(rotation: Tensor) -> Tensor:
-    """Axis times angle of a rotation, of the shortest way: at most half a turn. *Shape:* ``(..., 3, 3) -> (..., 3)``.
+    """Axis times angle of a rotation, at most half a turn. *Shape:* ``(..., 3, 3) -> (..., 3)``.
 
-    At half a turn both senses are equally short: the axis on the side of :data:`HALF_TURN_SIDE` is taken.
+    At half a turn both directions are equally short: the axis on the side of :data:`HALF_TURN_SIDE` is chosen.
     """
     q = quaternion(rotation.movedim((-2, -1), (0, 1)))
     side = sum(factor * part for factor, part in zip(HALF_TURN_SIDE, q[1:], strict=True))
@@ -48,7 +57,7 @@ def log(rotation: Tensor) -> Tensor:
 
 
 def quaternion(rotation: Tensor) -> Tensor:
-    """The quaternion of a rotation, one of two that differ in their sign. *Shape:* ``(3, 3, ...) -> (4, ...)``."""
+    """Quaternion of a rotation, of either sign. *Shape:* ``(3, 3, ...) -> (4, ...)``."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     # Four times the quaternion's products with itself. The row of its largest entry is far from zero.
     w, x, y, z = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
@@ -62,46 +71,42 @@ def quaternion(rotation: Tensor) -> Tensor:
 
 
 def power(q: Tensor, t: Tensor) -> Tensor:
-    """Rotations about the same axes by the part ``t`` of the angle, which is below a whole turn.
+    """Rotations about unchanged axes by the fraction ``t`` of the angle, which is below a whole turn.
 
-    The sign of a quaternion tells the way round: with a real part below zero it is the long one.
     *Shape:* ``(4, ...), (...) -> (4, ...)``.
     """
     return about(t * arc(q))
 
 
 def product(p: Tensor, q: Tensor) -> Tensor:
-    """The quaternion of the rotation ``q`` followed by ``p``. *Shape:* ``(4, ...), (4, ...) -> (4, ...)``."""
+    """Quaternion of the rotation ``q`` followed by ``p``. *Shape:* ``(4, ...), (4, ...) -> (4, ...)``."""
     real = p[0] * q[0] - (p[1:] * q[1:]).sum(0)
     return torch.cat([real[None], p[0] * q[1:] + q[0] * p[1:] + cross(p[1:], q[1:])])
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """The quaternion of the inverse rotation. *Shape:* ``(4, ...)``."""
+    """Quaternion of the inverse rotation. *Shape:* ``(4, ...)``."""
     return torch.cat([q[:1], -q[1:]])
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Vectors turned by quaternions. *Shape:* ``(4, ...), (3, ...) -> (3, ...)``."""
+    """Vectors rotated by quaternions. *Shape:* ``(4, ...), (3, ...) -> (3, ...)``."""
     twice = 2 * cross(q[1:], v)
     return v + q[0] * twice + cross(q[1:], twice)
 
 
 def turned(turn: Tensor, v: Tensor) -> Tensor:
-    """Vectors turned about axes by their lengths. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
+    """Vectors rotated by rotation vectors. *Shape:* ``(3, ...), (3, ...) -> (3, ...)``."""
     return rotate(about(0.5 * turn), v)
 
 
 def turn_of(q: Tensor) -> Tensor:
-    """Axis times angle of a quaternion, the way round that its sign tells: below a whole turn.
-
-    *Shape:* ``(4, ...) -> (3, ...)``.
-    """
+    """Axis times angle of a quaternion, below a whole turn. *Shape:* ``(4, ...) -> (3, ...)``."""
     return 2 * arc(q)
 
 
 def arc(q: Tensor) -> Tensor:
-    """Axis times half the angle: the logarithm of a quaternion of any size. *Shape:* ``(4, ...) -> (3, ...)``."""
+    """Axis times half the angle: the logarithm of a quaternion of any norm. *Shape:* ``(4, ...) -> (3, ...)``."""
     real, imaginary = q[0], q[1:]
     squared = (imaginary * imaginary).sum(0)
     small = (squared < SMALL * real * real) & (real > 0)
@@ -112,13 +117,79 @@ def arc(q: Tensor) -> Tensor:
 
 
 def about(half: Tensor) -> Tensor:
-    """The quaternion of axis times half the angle: the inverse of :func:`arc`. *Shape:* ``(3, ...) -> (4, ...)``."""
+    """Quaternion of axis times half the angle, the inverse of :func:`arc`. *Shape:* ``(3, ...) -> (4, ...)``."""
     cosine, sinc = _cos_and_sinc((half * half).sum(0))
     return torch.cat([cosine[None], sinc * half])
 
 
+def mean(rotations: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean of K rotations, where the weighted sum of their relative logarithms vanishes.
+
+    Of two rotations it is the point on the geodesic between them. Of more it has first derivatives only.
+
+    Args:
+        rotations: Quaternions with the signs of :func:`agreeing`. *Shape:* ``(4, ..., K, F)``.
+        weights: Weights with sum one. *Shape:* ``(..., K, 1)``.
+
+    Returns:
+        *Shape:* ``(4, ..., F)``.
+    """
+    if rotations.shape[-2] == 2:
+        first, second = rotations.unbind(-2)
+        return product(first, power(product(conjugate(first), second), weights[..., 1, :]))
+    with torch.no_grad():
+        found = (weights * rotations).sum(-2)
+        found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)
+        for _ in range(MEAN_STEPS):
+            found = _mean_step(found, rotations, weights)
+    return _mean_step(found.detach(), rotations, weights)  # forward mode goes through no_grad
+
+
+@torch.no_grad()
+def agreeing(products: Tensor, weights: Tensor) -> Tensor:
+    r"""Signs with which K quaternions, or fields of them, are near their chordal mean (Markley et al. 2007).
+
+    The mean is the dominant eigenvector of :math:`\sum_k w_k q_k q_k^T`: it is continuous in the weights and does not
+    depend on the order. The signs change only where a rotation is half a turn away from it.
+
+    Args:
+        products: Inner products of all pairs. *Shape:* ``(..., K, K)``.
+        weights: *Shape:* ``(..., K)``.
+
+    Returns:
+        *Shape:* ``(..., K)``.
+    """
+    roots = weights.clamp_min(0).sqrt()
+    dominant = torch.linalg.eigh(roots[..., None] * products * roots[..., None, :]).eigenvectors[..., -1]
+    return torch.where((products @ (roots * dominant)[..., None]).squeeze(-1) < 0, -1.0, 1.0).to(products)
+
+
+def _mean_step(found: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
+    """Newton step for half the weighted sum of squared angles; at the mean, its derivatives are those of the mean."""
+    relative = product(conjugate(found)[..., None, :], rotations)
+    arcs = arc(relative)
+    downhill = (weights * arcs).sum(-2)
+    with torch.no_grad():
+        # The Hessian of one rotation is 1 along its axis and a cot(a) of half its angle across it.
+        squared = (arcs * arcs).sum(0)
+        small = squared < SMALL
+        safe = torch.where(small, 1, squared)
+        sine = relative[1:].square().sum(0).sqrt().clamp_min(torch.finfo(arcs.dtype).tiny)
+        # a cot(a) = 1 - a²/3 - a⁴/45 - 2 a⁶/945 - ...
+        series = 1 / 3 + squared / 45 + 2 * squared * squared / 945
+        less = torch.where(small, series, (1 - safe.sqrt() * relative[0] / sine) / safe)
+        across = (weights * (1 - less * squared)).sum(-2)  # a lower bound of the eigenvalues
+        along = ((weights * less * arcs)[:, None] * arcs).sum(-2)
+        eye = torch.eye(3).to(across).reshape(3, 3, *[1] * across.dim())
+        hessian = torch.where(across < SMALLEST_CURVATURE, eye, along + eye * across)
+    a, b, c = hessian.detach()
+    cofactors = cross(b, c), cross(c, a), cross(a, b)
+    step = sum(x * part for x, part in zip(downhill, cofactors, strict=True)) / (a * cofactors[0]).sum(0)
+    return product(found, about(step))
+
+
 def _cos_and_sinc(squared: Tensor) -> tuple[Tensor, Tensor]:
-    """``cos(a)`` and ``sin(a) / a``, of the square of the angle."""
+    """``cos(a)`` and ``sin(a) / a`` from the squared angle."""
     small = squared < SMALL
     near, angle = torch.where(small, squared, 0), torch.where(small, 1, squared).sqrt()
     cosine, sinc = angle.cos(), angle.sin() / angle
@@ -126,7 +197,7 @@ def _cos_and_sinc(squared: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _series(factors: list[float], x: Tensor) -> Tensor:
-    """A polynomial, from its constant on."""
+    """Polynomial, coefficients in ascending order."""
     out = factors[-2] + factors[-1] * x
     for factor in factors[-3::-1]:
         out = factor + x * out

@@ -4,6 +4,7 @@ import numpy as np
 
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray
+from torch_modal.geometry.closest import dot
 
 MARGIN = 1e-12
 """Relative to the cubed largest length in a determinant; above its rounding error."""
@@ -14,12 +15,6 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     found = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         found[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
-    return found
-
-
-def dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Inner products, faster than sums along an axis of length three. *Shape:* ``(..., 3)``."""
-    found: FloatArray = np.einsum("...i,...i->...", a, b)
     return found
 
 

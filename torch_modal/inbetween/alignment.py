@@ -7,15 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import traced, transformed
-from torch_modal.energy.shell import DIAGONAL
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.canonical import size
+from torch_modal.geometry.canonical import CANONICAL_SIZE, canonical_scale
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
-from torch_modal.geometry.rigid import best_rotation, centroid
-from torch_modal.geometry.rotation_means import agreeing, mean
-from torch_modal.geometry.rotations import quaternion, rotate
+from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
+from torch_modal.geometry.rotations import agreeing, mean, quaternion, rotate
 from torch_modal.geometry.vectors import cross, pick
-from torch_modal.geometry.winding import looks_mirrored
 
 # Rounds in which more than two key-frames are turned on to their mean, and the last of them, which have derivatives: of
 # the poses of a gallop, each leaves a tenth.
@@ -54,8 +51,7 @@ class KeyframeAlignment(nn.Module):
     def __init__(self, references: Tensor, mesh: Connectivity) -> None:
         super().__init__()
         faces = torch.tensor(mesh.faces)
-        sizes = [size(x.numpy(), mesh.faces) for x in references]
-        scale = torch.tensor(DIAGONAL * len(sizes) / sum(sizes), dtype=references.dtype)
+        scale = torch.tensor(canonical_scale(references.numpy(), mesh.faces), dtype=references.dtype)
         weights = mean_areas(references, faces)
         centred = references - centroid(references, weights)[:, None]
         self.register_buffer("scale", scale, persistent=False)
@@ -102,7 +98,7 @@ class KeyframeAlignment(nn.Module):
         """
         rows = keyframes.detach().movedim(-1, 0).contiguous()
         sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=0) * self.scale
-        usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * DIAGONAL)  # what is not finite has no extent
+        usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)  # what is not finite has no extent
         self._warn_of_size(sizes)
         return torch.where(usable[..., None, None], keyframes, self.reference / self.scale), usable
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.normals import vertex_normals
-from torch_modal.geometry.seams import merge_seams
+from torch_modal.geometry.connectivity import merge_seams
+from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, Material, Part
 from torch_modal.io.formats import Animation, animation_format, mesh_format
 from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json

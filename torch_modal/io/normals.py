@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 
 class CarriedNormals:

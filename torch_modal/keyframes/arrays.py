@@ -1,15 +1,18 @@
-"""Conversion of tensors, NumPy arrays and sequences to tensors."""
+"""Positions, faces and times from tensors, NumPy arrays and sequences; vertices welded along seams."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torch_modal.arrays import IntArray
 from torch_modal.errors import MeshError
+from torch_modal.geometry.connectivity import merge_seams
 
 
-def as_positions(keyframes: Any) -> torch.Tensor:
+def as_positions(keyframes: Any) -> Tensor:
     """Convert positions to a float tensor, sharing memory where possible."""
     if isinstance(keyframes, (list, tuple)):
         if not keyframes:
@@ -48,9 +51,9 @@ def as_faces(faces: Any) -> IntArray:
     return array.astype(np.int64)
 
 
-def _as_tensor(name: str, value: Any) -> torch.Tensor:
+def _as_tensor(name: str, value: Any) -> Tensor:
     """Convert a tensor, an array or nested lists to a dense tensor."""
-    if isinstance(value, torch.Tensor):
+    if isinstance(value, Tensor):
         if value.layout != torch.strided or value.device.type == "meta" or value.is_quantized:
             raise MeshError(
                 f"{name} is a {value.layout} tensor on {value.device}; a dense tensor with values is needed"
@@ -69,3 +72,84 @@ def _as_tensor(name: str, value: Any) -> torch.Tensor:
             f"{name} is a {type(value).__name__} that is no array of numbers ({str(error)[:150]}); "
             f"pass a tensor or a NumPy array"
         ) from error
+
+
+def checked_times(times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> Tensor:
+    """Checked times of key-frames; if cyclic, with the end of the cycle. *Shape:* ``(K,)`` or ``(K + 1,)``.
+
+    Raises:
+        ValueError: The number of times is wrong, or they do not ascend.
+    """
+    n = n_keyframes + cyclic
+    if times is None:
+        return torch.arange(n, dtype=torch.float64)
+    found = torch.as_tensor(times, dtype=torch.float64).detach().cpu()
+    if found.shape != (n,):
+        also = ", and one when the first comes again" if cyclic else ""
+        raise ValueError(
+            f"times has the shape {tuple(found.shape)}; it needs one time for each key-frame{also}: ({n},)"
+        )
+    if not bool(found.isfinite().all()) or bool((found.diff() <= 0).any()):
+        raise ValueError(f"times must ascend from key-frame to key-frame; got {found.tolist()}")
+    return found
+
+
+class WeldedKeyframes(NamedTuple):
+    """Key-frames without duplicate vertices along seams."""
+
+    keyframes: Tensor
+    """*Shape:* ``(K, W, 3)``."""
+    faces: Tensor
+    """Indices of the W vertices, int64. *Shape:* ``(F, 3)``."""
+    vertex_of: Tensor
+    """Welded vertex of each of the V vertices. *Shape:* ``(V,)``."""
+
+    @property
+    def n_merged(self) -> int:
+        """Number of removed vertices."""
+        return len(self.vertex_of) - self.keyframes.shape[1]
+
+    def scatter(self, shapes: Tensor) -> Tensor:
+        """Positions of all V vertices; duplicates coincide exactly.
+
+        *Shape:* ``(..., W, 3) -> (..., V, 3)``.
+        """
+        return shapes.index_select(-2, self.vertex_of.to(shapes.device))
+
+
+def weld_seams(keyframes: Any, faces: Any) -> WeldedKeyframes:
+    """Join the vertices that exporters split along seams of texture coordinates and normals.
+
+    Otherwise the surface would tear there. Boundary vertices that coincide in all key-frames become one, with the
+    position of the first. Faces that become degenerate are removed.
+
+    Args:
+        keyframes: Vertex positions, as for :func:`torch_modal.check_keyframes`. *Shape:* ``(K, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+
+    Returns:
+        The welded key-frames; unchanged if nothing was split.
+
+    Raises:
+        MeshError: The arguments are not numeric arrays.
+    """
+    positions = as_positions(keyframes)
+    indices = as_faces(faces)
+    n = positions.shape[1] if positions.dim() == 3 else 0
+    fits = positions.dim() == 3 and indices.ndim == 2 and indices.shape[1:] == (3,) and len(indices)
+    # `check_keyframes` reports errors of the mesh.
+    if fits and indices.min() >= 0 and indices.max() < n and bool(torch.isfinite(positions).all()):
+        vertex_of = merge_seams(positions.detach().cpu().double().numpy(), indices)
+    else:
+        vertex_of = np.arange(n)
+    welded = vertex_of.max(initial=-1) + 1
+    if welded == n:
+        return WeldedKeyframes(positions, torch.from_numpy(indices), torch.arange(n))
+    first = torch.from_numpy(np.unique(vertex_of, return_index=True)[1]).to(positions.device)
+    joined = vertex_of[indices]
+    whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)
+    return WeldedKeyframes(
+        positions.index_select(1, first),
+        torch.from_numpy(joined[whole]).to(positions.device),
+        torch.from_numpy(vertex_of).to(positions.device),
+    )

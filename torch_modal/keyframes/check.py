@@ -14,7 +14,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry import inspect
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.winding import looks_mirrored
+from torch_modal.geometry.rigid import looks_mirrored
 from torch_modal.keyframes.arrays import as_faces, as_positions
 
 __all__ = ["Keyframes", "MeshError", "MeshWarning", "check_keyframes", "require_area", "require_solid"]
@@ -45,7 +45,7 @@ def check_keyframes(keyframes: Any, faces: Any, *, min_keyframes: int = 1, warn:
             ``(V, 3)``. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices, of any integer type. *Shape:* ``(F, 3)``.
         min_keyframes: Required number of key-frames.
-        warn: Whether to warn; errors are raised in any case.
+        warn: Emit warnings; errors are raised in any case.
 
     Returns:
         The unchanged positions, with their dtype, device and graph; the repaired faces, int64, on the same device.
@@ -172,7 +172,7 @@ def _check_values(shapes: FloatArray, faces: IntArray) -> None:
 
 
 def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> tuple[Connectivity, bool]:
-    """Drop degenerate and repeated faces, orient the others; return whether the mesh is orientable."""
+    """Drop degenerate and repeated faces, orient the others; return the mesh and its orientability."""
     kept = np.arange(len(faces))
     for flaw, what in (
         (inspect.degenerate_faces, "use a vertex twice"),

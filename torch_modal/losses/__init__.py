@@ -1,4 +1,4 @@
-"""What other people's models minimise: elastic energies of predicted shapes, and of what a latent space decodes to."""
+"""Losses for other models: elastic energies of predicted shapes and of decoded latents."""
 
 from torch_modal.losses.latent import LatentElasticity as LatentElasticity
 from torch_modal.losses.latent import PathEnergy as PathEnergy

@@ -1,4 +1,4 @@
-"""Elasticity of what a decoder makes of small steps, and of paths, in its latent space."""
+"""Elastic energy of a decoder's shapes along small steps and along paths in its latent space."""
 
 from collections.abc import Callable
 from typing import Any, Literal
@@ -16,7 +16,7 @@ FLOOR = 1e-6
 
 
 class LatentElasticity(nn.Module):
-    r"""How much shell energy a small step of the latent costs: small where latents move shapes as bodies move.
+    r"""Shell energy of a small step of the latent: small where latents move shapes as bodies move.
 
     With the Jacobian ``J`` of the decoder and the Hessian ``H`` of :class:`ShellLoss` about the decoded shape, a step
     ``u`` costs :math:`u^T G u` with :math:`G = \tfrac12 J^T H J`. Its eigenvalues are zero where the latent only turns
@@ -27,8 +27,8 @@ class LatentElasticity(nn.Module):
     Args:
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         spectrum: ``"roots"``, or ``"mean"``, which one random direction estimates without bias.
-        directions: How many orthonormal directions of the latent are drawn at each call; all by default. Each costs
-            about two passes of the decoder.
+        directions: Number of random orthonormal directions of the latent at each call; all by default. Each costs about
+            two passes of the decoder.
         step: Size of the steps in the latent by which the Jacobian is taken in central differences. None: by forward
             mode, exact, for decoders whose operations have it.
         stiffness: ``alpha``, ``beta`` and ``gamma`` of :class:`ShellLoss`.
@@ -75,7 +75,7 @@ class LatentElasticity(nn.Module):
             NotImplementedError: An operation of the decoder has no forward mode, and ``step`` is None.
         """
         flat = z.reshape(-1, z.shape[-1])
-        x, along = self._moved(decoder, flat, self._drawn(flat, generator))
+        x, along = self._tangents(decoder, flat, generator)
         gram = self._gram(x.detach(), along)
         if self.spectrum == "mean":
             return gram.diagonal(dim1=-2, dim2=-1).mean(-1).reshape(z.shape[:-1])
@@ -83,17 +83,14 @@ class LatentElasticity(nn.Module):
         floor = FLOOR * values.mean(-1, keepdim=True) + torch.finfo(values.dtype).tiny
         return (values + floor).sqrt().mean(-1).reshape(z.shape[:-1])
 
-    def _drawn(self, z: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Orthonormal directions. *Shape:* ``(k, n)``."""
-        n = z.shape[-1]
-        if self.directions is None or self.directions >= n:
-            return torch.eye(n).to(z)
-        device = z.device if generator is None else generator.device
-        drawn = torch.randn(n, self.directions, generator=generator, device=device, dtype=torch.float64)
-        return torch.linalg.qr(drawn)[0].mT.to(z)
-
-    def _moved(self, decoder: Decoder, z: Tensor, directions: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def _tangents(self, decoder: Decoder, z: Tensor, generator: torch.Generator | None) -> tuple[Tensor, list[Tensor]]:
         """Decoded shapes, and their derivatives along directions of the latent. *Shape of each:* ``(B, V, 3)``."""
+        n = z.shape[-1]
+        directions = torch.eye(n).to(z)
+        if self.directions is not None and self.directions < n:
+            device = z.device if generator is None else generator.device
+            drawn = torch.randn(n, self.directions, generator=generator, device=device, dtype=torch.float64)
+            directions = torch.linalg.qr(drawn)[0].mT.to(z)
         steps = [row.expand_as(z) for row in directions]
         if self.step is not None:
             both = [(decoder(z + self.step * row), decoder(z - self.step * row)) for row in steps]
@@ -101,7 +98,7 @@ class LatentElasticity(nn.Module):
         try:
             found: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
         except (NotImplementedError, RuntimeError) as error:
-            decoder(z)  # what is wrong without derivatives too has an error of its own
+            decoder(z)  # a decoder that fails without derivatives too has an error of its own
             raise NotImplementedError(
                 f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
             ) from error

@@ -7,13 +7,14 @@ from torch import Tensor
 
 from torch_modal.autograd import lasting
 from torch_modal.energy.energy import Rest
-from torch_modal.energy.shell import DIAGONAL, ShellEnergy
+from torch_modal.energy.shell import ShellEnergy
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 from torch_modal.keyframes.arrays import as_faces
 
 BEND, VOLUME = 1e-6, 1e-4
-"""Beside a stretching stiffness of one, about what the paper's stiffnesses are at a size of 100 and 5,000 vertices."""
+"""Stiffnesses beside a stretching stiffness of one: about the paper's at a size of 100 and 5,000 vertices."""
 
 # Smallest rest volume, as a part of (surface area)^(3/2), by which changes are divided; a sphere has 0.094.
 SMALLEST_VOLUME = 0.01
@@ -31,7 +32,7 @@ class ShellTerms(NamedTuple):
 
 
 class ShellLoss(ShellEnergy):
-    r"""Eq. 5 as a loss: how much a predicted shape stretches, bends and inflates a rest shape.
+    r"""Eq. 5 as a loss: stretch, bend and inflation of a predicted shape relative to a rest shape.
 
     .. math::
         \alpha \sum_e \frac{A_e}{A} \frac{(l_e - \bar l_e)^2}{\bar l_e^2}
@@ -66,7 +67,7 @@ class ShellLoss(ShellEnergy):
     ) -> None:
         super().__init__(faces, alpha, beta, gamma)
         mesh = Connectivity(as_faces(faces))
-        #: Whether there is a volume.
+        #: Open surfaces have no volume.
         self.closed = len(mesh.boundary_edges) == 0
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
 
@@ -120,13 +121,10 @@ class ShellLoss(ShellEnergy):
         return super().forward(scale * x, scale * x_rest)
 
     def scale(self, x_rest: Tensor) -> Tensor:
-        """To a common size: it changes nothing but rounding, as squares of areas underflow in float32.
-
-        *Shape:* ``(..., V, 3) -> (..., 1, 1)``.
-        """
+        """Scale to a common size, as squares of areas underflow in float32. *Shape:* ``(..., V, 3) -> (..., 1, 1)``."""
         used = x_rest.detach()[..., : self.energy.n_vertices, :]
         extent = (used.amax(-2) - used.amin(-2)).norm(dim=-1)[..., None, None]
-        return DIAGONAL * inverse(extent, extent <= 0)
+        return CANONICAL_SIZE * inverse(extent, extent <= 0)
 
     def _check(self, *shapes: Tensor) -> None:
         n = self.energy.n_vertices

@@ -17,8 +17,8 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
+from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import checked_arrays
-from torch_modal.keyframes.times import checked_times
 from torch_modal.motion.cubics import located
 from torch_modal.motion.spline import Knots, Spline
 
@@ -185,7 +185,9 @@ class ModalDecoder(nn.Module):
 
     def _shapes(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
         which = torch.zeros_like(u, dtype=torch.int64)
-        return self.spline.alignment.restore(self.bent(knots, i, trajectory, a, u), self.spline.pose(knots, i, which, u))
+        return self.spline.alignment.restore(
+            self.bent(knots, i, trajectory, a, u), self.spline.pose(knots, i, which, u)
+        )
 
     def bent(self, knots: Knots, i: int, trajectory: Trajectory, a: Tensor, u: Tensor) -> Tensor:
         """Shapes of one interval, in the coordinates of the knots' shapes. *Shape:* ``(B, k), (B,)``."""

@@ -16,9 +16,8 @@ from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
 from torch_modal.inbetween.results import InBetweenResult, unminimised, warn_of_starts, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.keyframes.arrays import as_faces
+from torch_modal.keyframes.arrays import as_faces, checked_times
 from torch_modal.keyframes.check import checked_surface
-from torch_modal.keyframes.times import checked_times
 from torch_modal.layers.base import Bases, BasisBuffers, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween

@@ -15,8 +15,8 @@ from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.results import warn_of_starts
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
+from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.keyframes.times import checked_times
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size

@@ -15,15 +15,12 @@ from torch_modal.geometry.vectors import cross, inverse, norm, pick
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.passengers.binding import binding
 
-# Newton's steps for the rotation nearest to a mean of rotations; each doubles the digits, from the first or second on.
-POLAR_STEPS = 6
-
 
 class Passengers(nn.Module):
     r"""Points that follow a carrier: markers, scans, splats, fine meshes, accessories.
 
-    Each point is bound once, to the vertices of the nearest triangles, and moves with them and with how the surface
-    around them turns:
+    Each point is bound once, to the vertices of the nearest triangles, and moves with them and with the rotation of the
+    surface around them:
 
     .. math::
         p'(x) = \sum_v w_v \left(x_v + R_v(x)\, (p - \bar x_v)\right)
@@ -52,6 +49,12 @@ class Passengers(nn.Module):
     points: Tensor
     inverses: Tensor
     areas: Tensor
+    starts: Tensor
+    columns: Tensor
+    values: Tensor
+    transposed_starts: Tensor
+    transposed_columns: Tensor
+    transposed_values: Tensor
 
     @lasting
     def __init__(self, reference: Tensor, faces: Tensor, points: Tensor, anchors: Tensor | None = None) -> None:
@@ -74,36 +77,40 @@ class Passengers(nn.Module):
         if not bool(cross(first, second).any()):
             raise ValueError("no face of the reference has an area: there is no surface to follow")
         known = None if anchors is None else anchors.detach().cpu().numpy()
-        self.register_buffer("faces", corners, persistent=False)
-        self._bind(own, bound, binding(bound.numpy(), own.numpy(), corners.numpy(), known))
+        self._bind(own, bound, corners, binding(bound.numpy(), own.numpy(), corners.numpy(), known))
         self.to(reference)
 
-    def _bind(self, reference: Tensor, points: Tensor, weights: sparse.csr_matrix) -> None:
-        #: Of the carrier's vertices, for each point. *Shape:* ``(P, V)``.
-        self.weights = weights
-        self._matrices: dict[Any, tuple[Tensor, Tensor]] = {}
+    def _bind(self, reference: Tensor, points: Tensor, faces: Tensor, weights: sparse.csr_matrix) -> None:
+        self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("reference", reference, persistent=False)
         self.register_buffer("points", points, persistent=False)
-        first, second, normal = _sides(reference.mT, self.faces)
+        first, second, normal = _sides(reference.mT, faces)
         area = 0.5 * norm(cross(first, second))
         flat = area <= 1e-12 * area.mean()
         frame = torch.stack([first, second, normal], 1).movedim(-1, 0)  # (F, 3, 3), sides as columns
         frame = torch.where(flat[:, None, None], torch.eye(3).to(frame), frame)
         self.register_buffer("inverses", torch.linalg.inv(frame), persistent=False)
         self.register_buffer("areas", torch.where(flat, 0, area), persistent=False)
+        # Weights by rows, and their transpose: torch would make it anew at each backward pass.
+        for prefix, matrix in (("", weights), ("transposed_", weights.T.tocsr())):
+            parts = {"starts": matrix.indptr, "columns": matrix.indices, "values": matrix.data}
+            for name, part in parts.items():
+                self.register_buffer(prefix + name, torch.from_numpy(part), persistent=False)
+
+    @property
+    def weights(self) -> sparse.csr_matrix:
+        """Weights of the carrier's vertices for each point. *Shape:* ``(P, V)``."""
+        parts = (part.cpu().numpy() for part in (self.values, self.columns, self.starts))
+        return sparse.csr_matrix(tuple(parts), shape=(len(self), len(self.reference)))
 
     @lasting
     def rebound(self, reference: Tensor, points: Tensor) -> "Passengers":
-        """The same weights for another pose of carrier and points. *Shape:* ``(V, 3), (P, 3)``."""
+        """Passengers with these weights for another pose of carrier and points. *Shape:* ``(V, 3), (P, 3)``."""
         found = Passengers.__new__(Passengers)
         nn.Module.__init__(found)
-        found.register_buffer("faces", self.faces.cpu(), persistent=False)
-        found._bind(reference.detach().double().cpu(), points.detach().double().cpu(), self.weights)
+        reference, points = (x.detach().double().cpu() for x in (reference, points))
+        found._bind(reference, points, self.faces.cpu(), self.weights.astype(np.float64))
         return found.to(self.points)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the products' matrices, which cannot be copied."""
-        return {**self.__dict__, "_matrices": {}}
 
     def __len__(self) -> int:
         return len(self.points)
@@ -127,14 +134,14 @@ class Passengers(nn.Module):
 
     @full_precision
     def rotations(self, shapes: Tensor) -> Tensor:
-        """How the surroundings of each point turn. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``."""
+        """Rotation of the surface around each point. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``."""
         flat = self._flat(shapes)
         found = self._mixed(best_rotation(self._deformation(flat)).flatten(2)).unflatten(-1, (3, 3))
-        return _nearest_rotation(found).view(*shapes.shape[:-2], len(self), 3, 3)
+        return best_rotation(found).view(*shapes.shape[:-2], len(self), 3, 3)
 
     @full_precision
     def gradients(self, shapes: Tensor) -> Tensor:
-        """How they turn and stretch: the deformation gradient, whose thickness is kept. *Shape:* ``(..., P, 3, 3)``.
+        """Deformation gradient around each point, of constant thickness. *Shape:* ``(..., V, 3) -> (..., P, 3, 3)``.
 
         A covariance ``C`` at a point becomes ``G C G^T``.
         """
@@ -169,25 +176,19 @@ class Passengers(nn.Module):
     def _mixed(self, values: Tensor) -> Tensor:
         """Weighted sums over the vertices that points follow. *Shape:* ``(B, V, n) -> (B, P, n)``."""
         if traced(values) or transformed(values):  # sparse products know neither
-            entries = self.weights.tocoo()
-            row, column = (torch.from_numpy(part).long().to(values.device) for part in (entries.row, entries.col))
-            each = values[:, column] * torch.from_numpy(entries.data).to(values)[:, None]
+            counts = self.starts.diff().long()
+            row = torch.arange(len(self), device=values.device).repeat_interleave(counts, output_size=len(self.values))
+            each = values[:, self.columns.long()] * self.values[:, None]
             return values.new_zeros(values.shape[0], len(self), values.shape[2]).index_add(1, row, each)
-        columns = values.movedim(0, 1).flatten(1)
-        found: Tensor = _Product.apply(columns, *self._matrix(values))
+        columns, (p, v) = values.movedim(0, 1).flatten(1), (len(self), len(self.reference))
+        matrix = _csr(self.starts, self.columns, self.values, (p, v))
+        transposed = _csr(self.transposed_starts, self.transposed_columns, self.transposed_values, (v, p))
+        found: Tensor = _Product.apply(columns, matrix, transposed)
         return found.unflatten(1, (len(values), values.shape[2])).movedim(1, 0)
-
-    @lasting
-    def _matrix(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """The weights and their transpose, of a dtype and on a device."""
-        key = like.dtype, like.device
-        if key not in self._matrices:
-            self._matrices = {key: (_csr(self.weights, like), _csr(self.weights.T.tocsr(), like))}
-        return self._matrices[key]
 
 
 class _Product(torch.autograd.Function):
-    """A sparse matrix times a dense one; torch would transpose it anew at each backward pass."""
+    """Product of a sparse matrix, given with its transpose, and a dense one."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
@@ -201,12 +202,10 @@ class _Product(torch.autograd.Function):
         return found, None, None
 
 
-def _csr(matrix: sparse.csr_matrix, like: Tensor) -> Tensor:
-    starts, columns = (torch.from_numpy(np.asarray(part)) for part in (matrix.indptr, matrix.indices))
-    values = torch.from_numpy(matrix.data).to(like.dtype)
+def _csr(starts: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparse CSR")  # "beta", since 2021
-        return torch.sparse_csr_tensor(starts, columns, values, matrix.shape, check_invariants=False).to(like.device)
+        return torch.sparse_csr_tensor(starts, columns, values, shape, check_invariants=False)
 
 
 def _sides(rows: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -216,13 +215,3 @@ def _sides(rows: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     normal = cross(first, second)
     length = norm(normal)
     return first, second, normal * inverse(length, (normal * normal).sum(0) <= 0)
-
-
-def _nearest_rotation(x: Tensor) -> Tensor:
-    """Of means of rotations that are less than half a turn apart, by Newton's iteration. *Shape:* ``(..., 3, 3)``."""
-    for _ in range(POLAR_STEPS):
-        a, b, c = x.unbind(-2)
-        cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
-        determinant = (a * cofactors[..., 0, :]).sum(-1)[..., None, None]
-        x = 0.5 * (x + cofactors * inverse(determinant, determinant.abs() <= torch.finfo(x.dtype).tiny))
-    return x

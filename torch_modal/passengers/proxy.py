@@ -10,8 +10,8 @@ from torch_modal.autograd import lasting
 from torch_modal.passengers.passengers import Passengers
 from torch_modal.precompute.coarsening import coarsen
 
-# Vertices of the carrier of meshes of more than so many; below, the whole mesh takes seconds.
-SIZE, ABOVE, SMALLEST = 20_000, 100_000, 100
+# Number of vertices of the carrier, of the meshes above which it is the default, and of the smallest one.
+PROXY_SIZE, ABOVE, SMALLEST = 20_000, 100_000, 100
 
 
 def proxy_size(wanted: int | None, n_vertices: int) -> int:
@@ -25,7 +25,7 @@ def proxy_size(wanted: int | None, n_vertices: int) -> int:
         ValueError: ``wanted`` is out of range.
     """
     if wanted is None:
-        return SIZE if n_vertices > ABOVE else 0
+        return PROXY_SIZE if n_vertices > ABOVE else 0
     if not isinstance(wanted, int) or wanted < 0 or 0 < wanted < SMALLEST:
         raise ValueError(f"proxy is 0, or a number of vertices from {SMALLEST} on; got {wanted!r}")
     return wanted if wanted < n_vertices else 0

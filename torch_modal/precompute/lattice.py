@@ -13,11 +13,12 @@ from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import bisected
 from torch_modal.precompute.parallel import closest_in
 from torch_modal.precompute.proximity import clearances
-from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface, SurfaceSamples, sampled
+from torch_modal.precompute.surface import CanonicalSurface, SurfaceSamples, sampled
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
     TetrahedralizationError,
@@ -179,7 +180,7 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
     Raises:
         TetrahedralizationError: The lattice would be too fine.
     """
-    largest = edge_length_fac * DIAGONAL
+    largest = edge_length_fac * CANONICAL_SIZE
     root = ROOT * largest
     low, counts = _box(surface, root)
     if is_too_fine(surface, edge_length_fac):
@@ -221,7 +222,7 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
 
 def is_too_fine(surface: CanonicalSurface, edge_length_fac: float) -> bool:
     """Whether a lattice would have too many root cubes."""
-    return bool(_box(surface, ROOT * edge_length_fac * DIAGONAL)[1].prod() > MOST_CUBES)
+    return bool(_box(surface, ROOT * edge_length_fac * CANONICAL_SIZE)[1].prod() > MOST_CUBES)
 
 
 def _box(surface: CanonicalSurface, cell: float) -> tuple[FloatArray, IntArray]:

@@ -6,9 +6,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.precompute.parallel import closest_in
-from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface, SurfaceSamples, sampled
+from torch_modal.precompute.surface import CanonicalSurface, SurfaceSamples, sampled
 
 NEAR = 0.03
 """Largest gap that counts as proximity, in bounding-box diagonals."""
@@ -39,7 +40,7 @@ def self_proximity(surface: CanonicalSurface) -> float:
     tree = cKDTree(points)
     opposed = np.zeros(len(points), dtype=bool)
     for part in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
-        nearest = closest_in(tree, points + part * NEAR * DIAGONAL * normals)[1]
+        nearest = closest_in(tree, points + part * NEAR * CANONICAL_SIZE * normals)[1]
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
@@ -55,18 +56,18 @@ def separation(rest: CanonicalSurface, posed: CanonicalSurface) -> float:
         rest: The surface in the first pose.
         posed: The surface in the other pose.
     """
-    cells = np.floor(rest.points / (CELL * DIAGONAL)).astype(np.int64)
+    cells = np.floor(rest.points / (CELL * CANONICAL_SIZE)).astype(np.int64)
     cells -= cells.min(axis=0)
     _, chosen, cell = np.unique(np.ravel_multi_index(tuple(cells.T), cells.max(axis=0) + 1), True, True)
     areas = np.bincount(cell.reshape(-1), vertex_areas(rest.points, rest.faces))
     # The diagonal, the unit of length here, depends on the pose; the area hardly does.
     before, after = rest.points[chosen], posed.points[chosen] * np.sqrt(rest.area / posed.area)
-    one, other = cKDTree(before).query_pairs(TOUCHING * DIAGONAL, output_type="ndarray").T
+    one, other = cKDTree(before).query_pairs(TOUCHING * CANONICAL_SIZE, output_type="ndarray").T
     growth = np.linalg.norm(after[one] - after[other], axis=1) - np.linalg.norm(before[one] - before[other], axis=1)
     largest = np.zeros(len(chosen))
     for point in (one, other):
         np.maximum.at(largest, point, growth)
-    return float(np.sqrt(np.average((largest / 2) ** 2, weights=areas))) / DIAGONAL
+    return float(np.sqrt(np.average((largest / 2) ** 2, weights=areas))) / CANONICAL_SIZE
 
 
 class Clearance(NamedTuple):
@@ -88,7 +89,7 @@ def clearances(surface: CanonicalSurface) -> Clearance:
     seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))
     found = []
     for side in (-1.0, 1.0):
-        radii = _opposed_radius(samples, side, seen, MOST * DIAGONAL / 2)
+        radii = _opposed_radius(samples, side, seen, MOST * CANONICAL_SIZE / 2)
         smallest = np.full(len(surface.faces), np.inf)
         np.minimum.at(smallest, samples.faces[seen], 2 * radii)
         found.append(smallest)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.energy.rest_hessian import rest_hessian
 from torch_modal.energy.shell import BETA
-from torch_modal.geometry.canonical import SIZE
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
 from torch_modal.io.cache import Arrays
 from torch_modal.precompute.coarsening import Collapses, coarsen
@@ -120,12 +120,12 @@ class Sheet:
     def mass(self) -> sp.csr_matrix:
         """Lumped mass of a density of 1. *Shape:* ``(N, N)``."""
         areas = vertex_areas(self.points, self.mesh.faces)
-        return sp.diags(THICKNESS * SIZE * np.maximum(areas, LEAST_MASS * areas.mean()), format="csr")
+        return sp.diags(THICKNESS * CANONICAL_SIZE * np.maximum(areas, LEAST_MASS * areas.mean()), format="csr")
 
     @property
     def scale(self) -> Scale:
         """Orders of eigenvalues, by the lowest one of a flat sheet."""
-        lowest = 100 * 2 * BETA / (SIZE**4 * THICKNESS * SIZE)
+        lowest = 100 * 2 * BETA / (CANONICAL_SIZE**4 * THICKNESS * CANONICAL_SIZE)
         return Scale(shift=50 * lowest, zero=5e-6 * lowest, enough=MOST_ROUNDING)
 
     def carried(self, motions: FloatArray) -> FloatArray:

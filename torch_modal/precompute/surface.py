@@ -9,13 +9,11 @@ from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.geometry.canonical import SIZE, ordered_faces, placed
+from torch_modal.geometry.canonical import ordered_faces, placed
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
-DIAGONAL = SIZE
-"""Size of canonical surfaces (:func:`~torch_modal.geometry.canonical.size`)."""
 _DIAGONAL_RANGE = (1e-90, 1e90)
 MOST_SAMPLES = 60_000
 LEAF = 32

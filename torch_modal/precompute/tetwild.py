@@ -17,11 +17,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.io.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.parallel import StoppedError
-from torch_modal.precompute.surface import DIAGONAL, CanonicalSurface, outward
+from torch_modal.precompute.surface import CanonicalSurface, outward
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
@@ -143,7 +144,7 @@ def tetrahedralize(
     used, compact = np.unique(faces, return_inverse=True)
     surface = vertices[used]
     center = (surface.min(axis=0) + surface.max(axis=0)) / 2
-    scale = DIAGONAL / np.linalg.norm(surface.max(axis=0) - surface.min(axis=0))
+    scale = CANONICAL_SIZE / np.linalg.norm(surface.max(axis=0) - surface.min(axis=0))
     surface = (surface - center) * scale
 
     compact = outward(surface, compact.reshape(-1, 3))
@@ -236,7 +237,7 @@ def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: Tetrahed
     if not np.isfinite(tetrahedra.vertices).all():
         raise TetrahedralizationError(f"the result has coordinates that are not finite. {advice}", np.inf)
     # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
-    reach = DIAGONAL * (0.05 + 2 * (settings.edge_length_fac or EDGE_RANGE[1]))
+    reach = CANONICAL_SIZE * (0.05 + 2 * (settings.edge_length_fac or EDGE_RANGE[1]))
     distance = cKDTree(tetrahedra.vertices).query(surface)[0]
     n_far = int((distance > reach).sum())
     if n_far:

@@ -4,60 +4,133 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy import sparse
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.registration.elastic import ElasticSurface, PointTargets
-from torch_modal.registration.spectrum import SpectralShape
-from torch_modal.registration.surface import Closest, MeshSurface
+from torch_modal.geometry.closest import dot
+from torch_modal.geometry.connectivity import half_cotangents
+from torch_modal.geometry.rigid import best_rotation
+from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
+from torch_modal.registration.maps import SpectralShape
+from torch_modal.registration.surface import MeshSurface
 
-WORKING_DIAGONAL = 100.0
-"""Diagonal of the target; the reaches below are percentages of it."""
+# Bounds of cotangent weights: those of obtuse triangles are negative, those of slivers huge.
+_WEIGHTS = (0.05, 10.0)
+# Smoothing of rotations over neighbours resists bending (Levi and Gotsman 2015).
+_SMOOTHING, _SMOOTHING_ROUNDS = 0.5, 2
+# Smoothing rounds and bounds of local scales.
+_SCALE_ROUNDS, _SCALES = 30, (0.3, 3.0)
 
 
 class Stage(NamedTuple):
-    """Steps with constant parameters."""
+    """Steps with constant parameters. Lengths are percentages of the target's diagonal."""
 
     weight: float
     """Weight of closest points relative to the stiffness."""
     reach: float
-    """Largest distance of closest points, in percent of the diagonal."""
+    """Largest distance of closest points."""
     steps: int
 
 
 COARSE_STAGES = (Stage(0.05, 6, 4), Stage(0.2, 5, 6), Stage(0.5, 4, 6), Stage(2.0, 3, 4))
 FINE_STAGES = (Stage(0.3, 4, 3), Stage(1.0, 3, 3), Stage(3.0, 3, 3))
+_RELEASED, _CAUGHT = Stage(0.3, 5, 4), Stage(0.5, 5, 3)  # without flipped faces, then with them
 
-_ALIKE = 0.4  # smallest cosine between the normals of closest points
-_LANDMARK_WEIGHT = 5.0
 MAP_WEIGHTS = (0.02, 0.1)
 _MAP_ROUNDS = 40
 _MAP_SHARE = 0.05  # weight of the map relative to closest points
-_RELEASED, _CAUGHT = Stage(0.3, 5, 4), Stage(0.5, 5, 3)  # without flipped faces, then with them
-_REST = 1e-5  # fixes pieces without a counterpart
-_ON_EDGE = 1e-6
+_LANDMARK_WEIGHT = 5.0
+_FIXING_WEIGHT = 1e-5  # fixes pieces without a counterpart
+_ALIKE = 0.4  # smallest cosine between the normals of closest points
+_NEAR_MAP = 0.12  # largest geodesic distance of closest points from the image of the map, for a surface of unit area
+
+
+class PointTargets(NamedTuple):
+    """Target positions of points of the surface, with weights: ``sum_m weight_m |points_m x - targets_m|^2``."""
+
+    points: sparse.csr_matrix
+    """*Shape:* ``(m, V)``."""
+    targets: FloatArray
+    """*Shape:* ``(m, 3)``."""
+    weights: FloatArray
+    """*Shape:* ``(m,)``."""
+
+
+class ElasticSurface:
+    r"""Minimises :math:`\sum_{ij} w_{ij} |x_i - x_j - \bar R_{ij} (r_i - r_j)|^2` plus pulls, by local-global steps.
+
+    As-rigid-as-possible surface modeling (Sorkine and Alexa 2007) with smoothed rotations.
+
+    Args:
+        rest: The rest shape.
+        stretchable: Allow smooth local scaling.
+    """
+
+    def __init__(self, rest: MeshSurface, *, stretchable: bool = False) -> None:
+        self.stretchable, n, edges = stretchable, len(rest.vertices), rest.edges
+        opposite = half_cotangents(rest.vertices, rest.connectivity)
+        weights: FloatArray = np.clip(np.bincount(rest.connectivity.sides, opposite, minlength=len(edges)), *_WEIGHTS)
+        self.laplacian = graph_laplacian(edges, weights, n)
+        self._i, self._j = np.concatenate([edges, edges[:, ::-1]]).T
+        self._weights = np.tile(weights, 2)
+        self._sides = rest.vertices[self._i] - rest.vertices[self._j]
+        around = np.bincount(self._i, self._weights, minlength=n)
+        self.stiffness = float(around.mean())
+        """Mean weight around a vertex, the unit of the weights of pulls."""
+        adjacency = sparse.csr_matrix((self._weights, (self._i, self._j)), shape=(n, n))
+        self._mean = sparse.diags(1 / np.maximum(around, 1e-12)) @ adjacency
+        m = len(self._i)
+        self._gather = sparse.csr_matrix((np.ones(m), (self._i, np.arange(m))), shape=(n, m))
+
+    @torch.no_grad()
+    def local_frames(self, x: FloatArray) -> FloatArray:
+        """Local rotation, with scale if stretchable, from rest to ``x``. *Shape:* ``(V, 3, 3)``."""
+        sides = x[self._i] - x[self._j]
+        products = self._weights[:, None, None] * sides[:, :, None] * self._sides[:, None, :]
+        covariance = self._gather @ products.reshape(-1, 9)
+        for _ in range(_SMOOTHING_ROUNDS):
+            covariance = (1 - _SMOOTHING) * covariance + _SMOOTHING * (self._mean @ covariance)
+        rotations = best_rotation(torch.from_numpy(covariance).unflatten(1, (3, 3))).numpy()
+        if not self.stretchable:
+            return rotations
+        # Smoothed ratios of edge lengths to rest lengths.
+        squares = self._gather @ np.stack([self._weights * dot(s, s) for s in (sides, self._sides)], axis=1)
+        for _ in range(_SCALE_ROUNDS):
+            squares = 0.5 * squares + 0.5 * (self._mean @ squares)
+        scales = np.clip(np.sqrt(squares[:, 0] / np.maximum(squares[:, 1], 1e-30)), *_SCALES)
+        return rotations * scales[:, None, None]
+
+    def follow(self, x: FloatArray, pulls: Sequence[PointTargets], rounds: int = 2) -> FloatArray:
+        """Alternate local steps (rotations) and global steps (positions). *Shape:* ``(V, 3)``."""
+        matrix, pulled = self.laplacian, np.zeros_like(x)
+        for pull in pulls:
+            weighted = pull.points.T @ sparse.diags(pull.weights)
+            matrix = matrix + weighted @ pull.points
+            pulled += weighted @ pull.targets
+        solver = SparseSolver(matrix)
+        for _ in range(rounds):
+            frames = self.local_frames(x)
+            wanted = 0.5 * np.einsum("eij,ej->ei", frames[self._i] + frames[self._j], self._sides)
+            x = solver.solve(self._gather @ (self._weights[:, None] * wanted) + pulled)
+        return x
 
 
 class Gate:
-    """Accepts closest points near the image of a map, by geodesic distance: touching fingers do not mix.
+    """Accepts closest points near the image of a map along the surface: touching fingers do not mix.
 
     Args:
         target: The target's coarse shape.
-        radius: Largest geodesic distance, for a surface of unit area.
     """
 
-    def __init__(self, target: SpectralShape, radius: float = 0.12) -> None:
-        self._near = target.neighbourhoods(radius)
-        self._tree = cKDTree(target.positions)
+    def __init__(self, target: SpectralShape) -> None:
+        self._near = target.neighbourhoods(_NEAR_MAP)
+        self._tree = cKDTree(target.placed.vertices)
 
-    def coarse(self, points: FloatArray) -> IntArray:
-        """Nearest coarse vertices of points on the target. *Shape:* ``(n, 3) -> (n,)``."""
-        return self._tree.query(points)[1].astype(np.int64)
-
-    def open(self, images: IntArray, coarse: IntArray) -> BoolArray:
-        """Whether pairs of coarse vertices are within the radius. *Shape:* ``(n,), (n,) -> (n,)``."""
-        return self._near[images, coarse]
+    def accepts(self, images: IntArray, points: FloatArray) -> BoolArray:
+        """Points of the target near coarse vertices, as a mask. *Shape:* ``(n,), (n, 3) -> (n,)``."""
+        return self._near[images, self._tree.query(points)[1]]
 
 
 class TemplateFit:
@@ -70,7 +143,7 @@ class TemplateFit:
         gate: Accepts or rejects closest points.
         images: Coarse vertex of the target for each template vertex. *Shape:* ``(V,)``.
         landmarks: Points of the template and their target positions.
-        stretchable: Whether parts may grow and shrink.
+        stretchable: Allow parts to grow and shrink.
         tick: Called after each step.
     """
 
@@ -81,32 +154,34 @@ class TemplateFit:
         back: MeshSurface,
         gate: Gate,
         images: IntArray,
-        landmarks: tuple[sparse.csr_matrix, FloatArray] | None = None,
+        landmarks: tuple[sparse.csr_matrix, FloatArray] | None,
         *,
-        stretchable: bool = False,
-        tick: Callable[[], None] = lambda: None,
+        stretchable: bool,
+        tick: Callable[[], None],
     ) -> None:
         self.template, self.target, self.back, self.tick = template, target, back, tick
         self.elastic = ElasticSurface(template, stretchable=stretchable)
         self._gate, self._images = gate, images
+        self._everywhere = sparse.identity(len(images), format="csr")
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
-        self._back_coarse = gate.coarse(back.vertices)
-        self._fixed: list[PointTargets] = []
+        self._landmarks: list[PointTargets] = []
         self._map: list[PointTargets] = []
         if landmarks is not None:
-            self._fixed = [self._pull(*landmarks, np.full(len(landmarks[1]), _LANDMARK_WEIGHT))]
+            self._landmarks = [self._pull(*landmarks, np.full(len(landmarks[1]), _LANDMARK_WEIGHT))]
 
     def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray) -> PointTargets:
         return PointTargets(points, places, self.elastic.stiffness * weights)
 
+    def _pull_all(self, places: FloatArray, weight: float) -> PointTargets:
+        return self._pull(self._everywhere, places, np.full(len(places), weight))
+
     def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
         """Fit to the positions of a map, which keep a small weight in later steps. *Shape:* ``(V, 3), (V, 3)``."""
-        everywhere, ones = sparse.identity(len(x), format="csr"), np.ones(len(x))
         for weight in MAP_WEIGHTS:
-            x = self.elastic.follow(x, [self._pull(everywhere, places, weight * ones), *self._fixed], _MAP_ROUNDS)
+            x = self.elastic.follow(x, [self._pull_all(places, weight), *self._landmarks], _MAP_ROUNDS)
             self.tick()
-        self._map = [self._pull(everywhere, places, _MAP_SHARE * ones)]
+        self._map = [self._pull_all(places, _MAP_SHARE)]
         return x
 
     def run(self, x: FloatArray, stages: Sequence[Stage], releases: int) -> FloatArray:
@@ -115,69 +190,54 @@ class TemplateFit:
             x = self._steps(x, stage)
         self._map = []
         for _ in range(releases):
-            flipped = self._flipped(x)
-            if flipped.any():
-                x = self._steps(self._steps(x, _RELEASED, flipped), _CAUGHT)
+            # Vertices of flipped faces and their neighbours.
+            shape = self.template.moved(x)
+            flipped = np.zeros(len(x), dtype=bool)
+            flipped[shape.faces[self.target.looks_away(x[shape.faces].mean(1), shape.face_normals)]] = True
+            i, j = shape.edges.T
+            released = flipped.copy()
+            released[i[flipped[j]]] = released[j[flipped[i]]] = True
+            if released.any():
+                x = self._steps(self._steps(x, _RELEASED, released), _CAUGHT)
         return x
 
     def _steps(self, x: FloatArray, stage: Stage, released: BoolArray | None = None) -> FloatArray:
-        everywhere = sparse.identity(len(x), format="csr")
         for _ in range(stage.steps):
             shape = self.template.moved(x)
-            pulls = [self._forth(shape, stage, released), self._and_back(shape, stage, released), *self._fixed]
+            pulls = [self._to_target(shape, stage, released), self._from_target(shape, stage, released)]
             pulls += [pull._replace(weights=pull.weights * stage.weight) for pull in self._map]
-            pulls.append(self._pull(everywhere, x, np.full(len(x), _REST)))
-            x = self.elastic.follow(x, pulls)
+            x = self.elastic.follow(x, [*pulls, *self._landmarks, self._pull_all(x, _FIXING_WEIGHT)])
             self.tick()
         return x
 
-    def _forth(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
+    def _to_target(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
         """Pull template vertices to closest points on the target."""
         closest = self.target.closest(shape.vertices)
-        places, normals = closest.points.copy(), self.target.face_normals[closest.faces]
-        used = np.einsum("vi,vi->v", shape.vertex_normals, normals) > _ALIKE
-        used &= self._gate.open(self._images, self._gate.coarse(places))
+        places, normals = closest.points.copy(), shape.vertex_normals
+        used = dot(normals, self.target.face_normals[closest.faces]) > _ALIKE
+        used &= self._gate.accepts(self._images, places)
         # If another sheet is closer, take the nearest vertex with a similar normal.
         hidden = np.flatnonzero(~used)
-        beside = self.target.nearest_alike(shape.vertices[hidden], shape.vertex_normals[hidden])
+        beside = self.target.nearest_alike(shape.vertices[hidden], normals[hidden])
         places[hidden] = self.target.vertices[beside]
-        used[hidden] = np.einsum("vi,vi->v", shape.vertex_normals[hidden], self.target.vertex_normals[beside]) > _ALIKE
-        used[hidden] &= self._gate.open(self._images[hidden], self._gate.coarse(places[hidden]))
+        used[hidden] = dot(normals[hidden], self.target.vertex_normals[beside]) > _ALIKE
+        used[hidden] &= self._gate.accepts(self._images[hidden], places[hidden])
         used &= np.linalg.norm(places - shape.vertices, axis=1) < stage.reach
-        used &= shape.on_boundary | ~on_open_edge(self.target, closest)
+        used &= shape.on_boundary | ~self.target.on_open_edge(closest)
         if released is not None:
             used &= ~released
         kept = np.flatnonzero(used)
-        points = sparse.identity(len(used), format="csr")[kept]
-        return self._pull(points, places[kept], stage.weight * self._share[kept])
+        return self._pull(self._everywhere[kept], places[kept], stage.weight * self._share[kept])
 
-    def _and_back(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
+    def _from_target(self, shape: MeshSurface, stage: Stage, released: BoolArray | None) -> PointTargets:
         """Pull the closest points on the template to the target's vertices."""
         closest = shape.closest(self.back.vertices)
         corners = shape.faces[closest.faces]
-        used = np.einsum("vi,vi->v", self.back.vertex_normals, shape.face_normals[closest.faces]) > _ALIKE
+        used = dot(self.back.vertex_normals, shape.face_normals[closest.faces]) > _ALIKE
         used &= closest.distances < stage.reach
-        used &= self.back.on_boundary | ~on_open_edge(shape, closest)
-        used &= self._gate.open(self._images[corners[:, 0]], self._back_coarse)
+        used &= self.back.on_boundary | ~shape.on_open_edge(closest)
+        used &= self._gate.accepts(self._images[corners[:, 0]], self.back.vertices)
         if released is not None:
             used &= ~released[corners].any(1)
         kept = np.flatnonzero(used)
-        points = shape.rows(closest)[kept]
-        return self._pull(points, self.back.vertices[kept], stage.weight * self._back_share[kept])
-
-    def _flipped(self, x: FloatArray) -> BoolArray:
-        """Vertices of flipped faces and their neighbours."""
-        shape = self.template.moved(x)
-        bad = np.zeros(len(x), dtype=bool)
-        bad[shape.faces[self.target.looks_away(x[shape.faces].mean(1), shape.face_normals)]] = True
-        spread = bad.copy()
-        i, j = shape.edges.T
-        spread[i[bad[j]]] = spread[j[bad[i]]] = True
-        return spread
-
-
-def on_open_edge(surface: MeshSurface, closest: Closest) -> BoolArray:
-    """Whether closest points are on the boundary, where the true counterpart may be missing. *Shape:* ``(n,)``."""
-    if not surface.open_sides.any():
-        return np.zeros(len(closest.faces), dtype=bool)
-    return np.logical_or.reduce((surface.barycentric(closest) < _ON_EDGE) & surface.open_sides[closest.faces], axis=1)
+        return self._pull(shape.rows(closest)[kept], self.back.vertices[kept], stage.weight * self._back_share[kept])

@@ -12,8 +12,7 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.registration.consistency import farthest_points
-from torch_modal.registration.spectrum import SpectralShape
+from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.surface import referenced
 
 N_SUGGESTED = 14
@@ -177,12 +176,9 @@ def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArr
     points = checked.keyframes[0].detach().cpu().double().numpy()
     surface, used = referenced(points, checked.faces.cpu().numpy())
     shape = SpectralShape(surface)
-    _, to_samples = farthest_points(shape, 4 * n)
-    eccentricity = to_samples.mean(1)
-    near = shape.neighbourhoods(_TIP_RADIUS)
-    highest = np.where(near, eccentricity, -np.inf).max(1)
+    eccentricity = shape.farthest_points(4 * n)[1].mean(1)
+    highest = np.where(shape.neighbourhoods(_TIP_RADIUS), eccentricity, -np.inf).max(1)
     tips = np.flatnonzero(eccentricity >= highest)
     tips = tips[np.argsort(-eccentricity[tips])][:n]
-    chosen, _ = farthest_points(shape, n, start=tips)
-    fine = surface.nearest_alike(shape.positions[chosen], shape.coarse.vertex_normals[chosen])
-    return used[fine]
+    chosen = shape.farthest_points(n, start=tips)[0]
+    return used[surface.nearest_alike(shape.placed.vertices[chosen], shape.coarse.vertex_normals[chosen])]

@@ -39,12 +39,12 @@ def load_keyframes(
 
     Args:
         paths: One file per key-frame, in the order of the sequence.
-        register: Whether to register meshes of another connectivity, see :func:`torch_modal.register`.
+        register: Register meshes of another connectivity, see :func:`torch_modal.register`.
         landmarks: For the registration: a landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``, a column for
             each of the K meshes.
-        same_subject: Whether all are poses of one body; if not, five landmarks or more are needed.
+        same_subject: True for poses of one body; different bodies need five landmarks or more.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
-        cache: Whether registrations are kept on disk and found there.
+        cache: Keep registrations on disk, and find them there.
         progress: Of the registration, see :data:`torch_modal.progress.Progress`.
         report: Called with a line about each registration.
 

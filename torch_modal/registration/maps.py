@@ -1,7 +1,8 @@
-"""Maps between two coarse shapes, from their spectra or from landmarks.
+"""Maps between coarse copies of two shapes, from their spectra or from landmarks.
 
 A map gives each vertex of the first shape a vertex of the second, ``(n_first,)``. It follows from rows of
-eigenfunctions: those of near-isometric shapes agree up to the functional map (Ovsjanikov et al. 2012).
+eigenfunctions: those of near-isometric shapes agree up to the functional map (Ovsjanikov et al. 2012). Lengths are in
+square roots of the area.
 """
 
 import itertools
@@ -9,35 +10,241 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.sparse.linalg import eigsh
 
-from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.registration.spectrum import SpectralShape
+from torch_modal import extras
+from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.geometry import inspect
+from torch_modal.geometry.closest import dot
+from torch_modal.geometry.decimation import decimate
+from torch_modal.registration.surface import DUST, MeshSurface, largest_pieces, main_part, referenced
 
+N_COARSE = 2000
+"""Approximate number of vertices of the coarse copies."""
+N_FUNCTIONS = 60
+"""Number of eigenfunctions, including the constant one."""
 COARSE_FUNCTIONS = 20
 FINE_FUNCTIONS = 50
+N_SIGNS, MORE_SIGNS = 4, 6
+"""Number of eigenfunctions with both signs in the initial maps, and in those of a second attempt."""
 N_OTHER_STARTS = 6
 """Number of initial maps besides the sign patterns."""
 N_REFINED = 4
 """Number of fully refined maps."""
+N_SAMPLES = 40
+"""Number of samples between which distances are compared."""
 _STEP = 3
 
-# Weight of the round-trip error, for a surface of unit area, relative to the oriented area.
+# Weight of the round-trip error relative to the oriented area.
 _ROUND_TRIP = 3.0
 # Relative and absolute stretch above which a triangle counts as torn.
 _TORN = (2.5, 0.03)
 # Smallest fraction of the area that is the denominator of the score, if many triangles collapse.
 _LEAST_COUNTED = 0.3
+# Largest error of a consistent distance, and minimum number of consistent samples for a repair.
+_CONSISTENT, _FEWEST = 0.12, 8
+
+
+class SpectralShape:
+    """The main part of a surface, decimated and scaled to unit area, with eigenfunctions of its Laplacian.
+
+    A surface with at most a fifth more vertices than :data:`N_COARSE` is not decimated.
+
+    Args:
+        surface: The fine surface.
+    """
+
+    def __init__(self, surface: MeshSurface) -> None:
+        clean = largest_pieces(surface, DUST)
+        if len(clean.vertices) > 1.2 * N_COARSE:
+            n_faces = int(N_COARSE / len(clean.vertices) * len(clean.faces))
+            vertices, faces, _ = decimate(clean.vertices, clean.faces, n_faces)
+            faces = faces[~inspect.degenerate_faces(faces)]
+            clean, _ = referenced(vertices, faces[~inspect.repeated_faces(faces)])
+        #: Coarse copy in the units of the fine surface.
+        self.placed = main_part(clean)
+        self.scale = np.sqrt(self.placed.area)
+        #: Coarse copy of unit area.
+        self.coarse = self.placed.moved(self.placed.vertices / self.scale)
+        mesh, n = (self.coarse.vertices, self.coarse.faces), len(self)
+        laplacian, mass = extras.require("robust_laplacian", "register", "registration").mesh_laplacian(*mesh)
+        # A small shift: the constant function makes the matrix singular.
+        start = np.ones(n) + np.arange(n) / n
+        #: *Shape:* ``(k,)``, and ``(n, k)``, orthonormal in the mass.
+        self.eigenvalues, self.functions = eigsh(
+            laplacian.tocsc(), min(N_FUNCTIONS, n - 2), mass.tocsc(), sigma=-0.01, v0=start
+        )
+        #: Lumped mass of the Laplacian. *Shape:* ``(n,)``.
+        self.mass = mass.diagonal()
+        self._heat = extras.require("potpourri3d", "register", "registration").MeshHeatMethodDistanceSolver(*mesh)
+
+    def __len__(self) -> int:
+        """Number of coarse vertices."""
+        return len(self.coarse.vertices)
+
+    def wave_kernel_signatures(self, n_energies: int = 40) -> FloatArray:
+        """Wave kernel signatures (Aubry et al. 2011) in unit columns. *Shape:* ``(n, n_energies)``."""
+        logs = np.log(np.maximum(self.eigenvalues[1:], 1e-9))
+        energies = np.linspace(logs[0], logs[-1] / 1.02, n_energies)
+        width = max(7 * (logs[-1] - logs[0]) / n_energies, 1e-9)
+        weights = np.exp(-((energies[:, None] - logs) ** 2) / (2 * width**2))
+        signatures = self.functions[:, 1:] ** 2 @ (weights / weights.sum(1, keepdims=True)).T
+        return signatures / np.linalg.norm(signatures, axis=0)
+
+    def geodesics_from(self, sources: IntArray) -> FloatArray:
+        """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
+        return np.stack([self._heat.compute_distance(int(source)) for source in sources], axis=1)
+
+    def neighbourhoods(self, radius: float) -> BoolArray:
+        """Pairs of vertices within a distance along edges, as a mask. *Shape:* ``(n, n)``."""
+        i, j = self.coarse.edges.T
+        lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
+        graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
+        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=radius) <= radius
+        return near
+
+    def farthest_points(self, n: int, start: IntArray | None = None) -> tuple[IntArray, FloatArray]:
+        """Farthest-point samples and the distances to them. *Shape:* ``(m,), (n, m)``.
+
+        Args:
+            n: Number of samples; fewer on a shape with fewer vertices.
+            start: The first samples; by default the vertex farthest from the first vertex.
+        """
+        if start is None:
+            start = self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax(0)
+        chosen, distances = list(start), self.geodesics_from(start)
+        while len(chosen) < min(n, len(self)):
+            chosen.append(int(distances.min(1).argmax()))
+            distances = np.hstack([distances, self.geodesics_from(np.array(chosen[-1:]))])
+        return np.array(chosen), distances
 
 
 class Map(NamedTuple):
-    """A map and its score."""
+    """A map and its scores."""
 
     vertices: IntArray
     """*Shape:* ``(n_first,)``."""
     score: float
-    """See `rate`; correct maps of one subject have 0.7 or more."""
-    mirrored_score: float = -np.inf
-    """Score for the mirrored target, from `spectral_maps`."""
+    """Oriented area of the worse direction minus three times the mean round-trip error; correct maps of one subject
+    have 0.7 or more, mirrored ones a negative one."""
+    mirrored_score: float
+    """Score for the mirror image of the second shape."""
+
+
+class CoarsePair:
+    """Maps from one coarse shape to another.
+
+    Args:
+        first: *n_first vertices.*
+        second: *n_second vertices.*
+    """
+
+    def __init__(self, first: SpectralShape, second: SpectralShape) -> None:
+        self.first, self.second = first, second
+        self.samples, self.distances = first.farthest_points(N_SAMPLES)
+
+    # ------------------------------------------------------------------------------------------------ scores and errors
+    def rated(self, vertices: IntArray, k: int = FINE_FUNCTIONS) -> Map:
+        """Scores of a map with ``k`` eigenfunctions. *Shape:* ``(n_first,)``."""
+        first, second = self.first, self.second
+        k = min(k, first.functions.shape[1], second.functions.shape[1])
+        back = nearest_rows(second.functions[:, :k] @ self._functional(vertices, k).T, first.functions[:, :k])
+        areas = _oriented_area(first, second, vertices), _oriented_area(second, first, back)
+        round_trip = np.linalg.norm(first.coarse.vertices[back[vertices]] - first.coarse.vertices, axis=1).mean()
+        return Map(
+            vertices, float(min(areas) - _ROUND_TRIP * round_trip), float(-max(areas) - _ROUND_TRIP * round_trip)
+        )
+
+    def errors(self, vertices: IntArray) -> FloatArray:
+        """Errors of the distances from vertices to samples. *Shape:* ``(n_first,) -> (n_first, m)``."""
+        images = self.second.geodesics_from(vertices[self.samples])[vertices]
+        found: FloatArray = np.abs(self.distances - images)
+        return found
+
+    def distortion(self, vertices: IntArray) -> float:
+        """Mean over the vertices of the largest distance error to a sample. *Shape:* ``(n_first,)``."""
+        return float(self.errors(vertices).max(1).mean())
+
+    # ------------------------------------------------------------------------------------------------------------- maps
+    def _functional(self, vertices: IntArray, k: int) -> FloatArray:
+        """Pull-back of functions from the second shape to the first. *Shape:* ``(k, k)``."""
+        weighted = self.first.mass[:, None] * self.second.functions[vertices, :k]
+        found: FloatArray = self.first.functions[:, :k].T @ weighted
+        return found
+
+    def refined(self, vertices: IntArray, start: int, stop: int = FINE_FUNCTIONS) -> Map:
+        """Refine a map with an increasing number of eigenfunctions (ZoomOut, Melzi et al. 2019).
+
+        Args:
+            vertices: The map. *Shape:* ``(n_first,)``.
+            start: Initial number of eigenfunctions.
+            stop: Final number of eigenfunctions.
+        """
+        most = min(stop, self.first.functions.shape[1], self.second.functions.shape[1])
+        for k in [*range(min(start, most), most, _STEP), most]:
+            rows = self.second.functions[:, :k] @ self._functional(vertices, k).T
+            vertices = nearest_rows(self.first.functions[:, :k], rows)
+        return self.rated(vertices, stop)
+
+    def from_landmarks(self, pairs: IntArray) -> Map:
+        """Refined map from geodesic distances to landmarks. *Shape:* ``(n, 2)``, coarse vertices of both."""
+        signatures = []
+        for shape, sources in zip((self.first, self.second), pairs.T, strict=True):
+            distances = shape.geodesics_from(sources)
+            signatures.append(distances / distances.max(0))  # proportions differ
+        return self.refined(nearest_rows(*signatures), 8)
+
+    def from_spectra(self, n_signs: int, tick: Callable[[], None] = lambda: None) -> list[Map]:
+        """The best maps from spectra, best first; the last is the best map to the mirrored target.
+
+        The initial maps are all sign patterns of the lowest eigenfunctions, wave kernel signatures and rigid alignments
+        of principal axes. All are refined with few eigenfunctions, the best with all.
+
+        Args:
+            n_signs: Number of eigenfunctions with both signs: ``2**n_signs`` initial maps.
+            tick: Called after each initial map.
+        """
+        coarse = []
+        for vertices, k in self._starts(n_signs):
+            coarse.append(self.refined(vertices, k, COARSE_FUNCTIONS))
+            tick()
+        coarse.sort(key=lambda found: -found.score)
+        best = [*coarse[:N_REFINED], max(coarse, key=lambda found: found.mirrored_score)]
+        *fine, mirrored = [self.refined(found.vertices, COARSE_FUNCTIONS) for found in best]
+        return [*sorted(fine, key=lambda found: -found.score), mirrored]
+
+    def _starts(self, n_signs: int) -> Iterator[tuple[IntArray, int]]:
+        """Initial maps, and the number of eigenfunctions for their refinement."""
+        first, second, k = self.first, self.second, n_signs + 1
+        for signs in itertools.product([1.0, -1.0], repeat=n_signs):
+            yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
+        yield nearest_rows(first.wave_kernel_signatures(), second.wave_kernel_signatures()), 6
+        axes, (centred, target) = [], [shape.coarse.vertices - shape.coarse.centroid for shape in (first, second)]
+        for shape, points in ((first, centred), (second, target)):
+            frame = np.linalg.eigh(points.T @ (shape.coarse.vertex_areas[:, None] * points))[1]
+            axes.append(frame * [1, 1, np.sign(np.linalg.det(frame))])
+        flips = ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
+        goal = np.hstack([target, 0.1 * second.coarse.vertex_normals])
+        for turn in (np.eye(3), *(axes[0] * signs @ axes[1].T for signs in flips)):
+            yield nearest_rows(np.hstack([centred @ turn, 0.1 * first.coarse.vertex_normals @ turn]), goal), 12
+
+    def repaired(self, found: Map) -> Map | None:
+        """A map from the mutually consistent samples of one that may be wrong in parts; None if they are few."""
+        images = found.vertices[self.samples]
+        to_images = self.second.geodesics_from(images)
+        error = np.abs(self.distances[self.samples] - to_images[images])
+        error = np.maximum(error, error.T)
+        kept = np.arange(len(self.samples))
+        while len(kept) >= _FEWEST:
+            against = (error[np.ix_(kept, kept)] > _CONSISTENT).sum(1)
+            if not against.any():
+                break
+            kept = np.delete(kept, against.argmax())
+        if len(kept) < _FEWEST or len(kept) == len(self.samples):
+            return None
+        return self.refined(nearest_rows(self.distances[:, kept], to_images[:, kept]), 26)
 
 
 def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
@@ -49,134 +256,15 @@ def nearest_rows(queries: FloatArray, rows: FloatArray) -> IntArray:
     )
 
 
-def zoom_out(first: SpectralShape, second: SpectralShape, vertices: IntArray, start: int, stop: int) -> IntArray:
-    """Refine a map with an increasing number of eigenfunctions (ZoomOut, Melzi et al. 2019).
-
-    Args:
-        first: *n_first vertices.*
-        second: *n_second vertices.*
-        vertices: The map. *Shape:* ``(n_first,)``.
-        start: Initial number of eigenfunctions.
-        stop: Final number of eigenfunctions.
-    """
-    stop = min(stop, first.functions.shape[1], second.functions.shape[1])
-    for k in [*range(min(start, stop), stop, _STEP), stop]:
-        functional = functional_map(first, second, vertices, k)
-        vertices = nearest_rows(first.functions[:, :k], second.functions[:, :k] @ functional.T)
-    return vertices
-
-
-def functional_map(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int) -> FloatArray:
-    """Matrix of the pull-back of functions from the second shape to the first. *Shape:* ``(k, k)``."""
-    return first.functions[:, :k].T @ (first.mass[:, None] * second.functions[vertices, :k])
-
-
-def rate(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int) -> float:
-    """Score: oriented area of the worse direction minus three times the mean round-trip error.
-
-    Mirrored maps have negative oriented area.
-    """
-    return rates(first, second, vertices, k)[0]
-
-
-def rates(first: SpectralShape, second: SpectralShape, vertices: IntArray, k: int) -> tuple[float, float]:
-    """Scores for the second shape and its mirror image."""
-    k = min(k, first.functions.shape[1], second.functions.shape[1])
-    functional = functional_map(first, second, vertices, k)
-    back = nearest_rows(second.functions[:, :k] @ functional.T, first.functions[:, :k])
-    kept = _oriented_area(first, second, vertices), _oriented_area(second, first, back)
-    away = np.linalg.norm(first.coarse.vertices[back[vertices]] - first.coarse.vertices, axis=1).mean()
-    return float(min(kept) - _ROUND_TRIP * away), float(-max(kept) - _ROUND_TRIP * away)
-
-
 def _oriented_area(first: SpectralShape, second: SpectralShape, vertices: IntArray) -> float:
     """Fraction of the first shape's area with an untorn, outward image minus that with an inward image."""
     faces = first.coarse.faces
-    image = second.coarse.vertices[vertices][faces]
+    image, own = second.coarse.vertices[vertices][faces], first.coarse.vertices[faces]
     area_vectors = np.cross(image[:, 1] - image[:, 0], image[:, 2] - image[:, 0])
-    normals = second.coarse.vertex_normals[vertices][faces].mean(1)
-    own = first.coarse.vertices[faces]
+    sign = np.sign(dot(area_vectors, second.coarse.vertex_normals[vertices][faces].mean(1)))
     before, after = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1) for x in (own, image))
     whole = after < _TORN[0] * before + _TORN[1]
-    sign = np.sign(np.einsum("fi,fi->f", area_vectors, normals))
     # Faces that collapse, because the other mesh is coarser, do not count.
     counted = first.coarse.face_areas[sign != 0].sum()
     total = max(counted, _LEAST_COUNTED * first.coarse.area)
     return float((first.coarse.face_areas * whole * sign).sum() / total)
-
-
-def landmark_map(first: SpectralShape, second: SpectralShape, pairs: IntArray) -> Map:
-    """Refined map from geodesic distances to landmarks.
-
-    Args:
-        first: The first shape.
-        second: The second.
-        pairs: Coarse vertices of both. *Shape:* ``(n, 2)``.
-    """
-    signatures = []
-    for shape, sources in ((first, pairs[:, 0]), (second, pairs[:, 1])):
-        distances = shape.geodesics_from(sources)
-        signatures.append(distances / distances.max(0))  # proportions differ
-    vertices = nearest_rows(*signatures)
-    vertices = zoom_out(first, second, vertices, 8, FINE_FUNCTIONS)
-    return Map(vertices, rate(first, second, vertices, FINE_FUNCTIONS))
-
-
-def spectral_maps(
-    first: SpectralShape,
-    second: SpectralShape,
-    n_signs: int = 4,
-    tick: Callable[[], None] = lambda: None,
-) -> list[Map]:
-    """The best maps from spectra, best first; the last is the best map to the mirrored target.
-
-    The initial maps are all sign patterns of the lowest eigenfunctions, wave kernel signatures and rigid alignments of
-    principal axes. All are refined with few eigenfunctions, the best with all.
-
-    Args:
-        first: The first shape.
-        second: The second.
-        n_signs: Number of eigenfunctions with both signs: ``2**n_signs`` initial maps.
-        tick: Called after each initial map.
-    """
-    coarse = []
-    for vertices, k in _starts(first, second, n_signs):
-        vertices = zoom_out(first, second, vertices, k, COARSE_FUNCTIONS)
-        coarse.append(Map(vertices, *rates(first, second, vertices, COARSE_FUNCTIONS)))
-        tick()
-    coarse.sort(key=lambda found: -found.score)
-    fine = []
-    for found in [*coarse[:N_REFINED], max(coarse, key=lambda found: found.mirrored_score)]:
-        vertices = zoom_out(first, second, found.vertices, COARSE_FUNCTIONS, FINE_FUNCTIONS)
-        fine.append(Map(vertices, *rates(first, second, vertices, FINE_FUNCTIONS)))
-    return [*sorted(fine[:-1], key=lambda found: -found.score), fine[-1]]
-
-
-def _starts(first: SpectralShape, second: SpectralShape, n_signs: int) -> Iterator[tuple[IntArray, int]]:
-    """Initial maps, and the number of eigenfunctions for their refinement."""
-    k = n_signs + 1
-    for signs in itertools.product([1.0, -1.0], repeat=n_signs):
-        yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
-    yield nearest_rows(first.wave_kernel_signatures(), second.wave_kernel_signatures()), 6
-    for points, normals in _placements(first, second):
-        here, there = points, second.coarse.vertices - _centroid(second)
-        yield nearest_rows(np.hstack([here, 0.1 * normals]), np.hstack([there, 0.1 * second.coarse.vertex_normals])), 12
-
-
-def _placements(first: SpectralShape, second: SpectralShape) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Centred positions and normals of the first shape, unrotated and aligned by principal axes."""
-    points, normals = first.coarse.vertices - _centroid(first), first.coarse.vertex_normals
-    yield points, normals
-    axes = []
-    for shape in (first, second):
-        centred = shape.coarse.vertices - _centroid(shape)
-        frame = np.linalg.eigh(centred.T @ (shape.coarse.vertex_areas[:, None] * centred))[1]
-        axes.append(frame * [1, 1, np.sign(np.linalg.det(frame))])
-    for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]):
-        rotation = axes[0] * signs @ axes[1].T
-        yield points @ rotation, normals @ rotation
-
-
-def _centroid(shape: SpectralShape) -> FloatArray:
-    weights = shape.coarse.vertex_areas
-    return weights @ shape.coarse.vertices / weights.sum()

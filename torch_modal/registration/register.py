@@ -1,7 +1,6 @@
 """Registration of one mesh to another."""
 
 import os
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,37 +12,34 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.io.cache import Cache
+from torch_modal.keyframes.arrays import weld_seams
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.keyframes.seams import weld_seams
 from torch_modal.progress import Progress, ProgressReport
-from torch_modal.registration.consistency import Consistency
-from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, WORKING_DIAGONAL, Gate, TemplateFit
+from torch_modal.registration.fit import COARSE_STAGES, FINE_STAGES, MAP_WEIGHTS, Gate, TemplateFit
 from torch_modal.registration.landmarks import landmark_points
 from torch_modal.registration.maps import (
     FINE_FUNCTIONS,
+    MORE_SIGNS,
     N_OTHER_STARTS,
+    N_SIGNS,
+    CoarsePair,
     Map,
-    landmark_map,
-    rate,
-    spectral_maps,
-    zoom_out,
+    SpectralShape,
 )
 from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp, support
-from torch_modal.registration.spectrum import SpectralShape, main_part
-from torch_modal.registration.surface import MeshSurface, outward, referenced
+from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
 VERSION = 5
 """Part of the cache key: raise it when the algorithm changes."""
 MIN_LANDMARKS = 5
 """Minimum number of landmarks between different subjects, whose spectra do not determine the map."""
 _SURE_SCORE = 0.62  # score of a spectral map below which more initial maps are tried
-_SIGNS, _MORE_SIGNS = 4, 6
 _SCORE_SHARE = 0.5  # weight of a map's score relative to the stretch of its fit
 _NEAR_LANDMARK = 0.1  # largest landmark error of a spectral map, for a surface of unit area
 _RIVALS = 3  # maximum number of maps that are fitted
 _RIVAL_SCORE = 0.15  # largest difference to the best map, in score minus distortion
 _SAME = 0.1  # 98th percentile of the distance of maps that count as equal, for a surface of unit area
-_REFINEMENTS = (True, True, False, False)  # whether each map is first refined by spectra
+_SPECTRAL_REFINEMENTS = (True, True, False, False)  # of the map of each repeated fit
 _CONVERGED = 0.3  # mean displacement of the vertices at convergence, in percent of the diagonal
 _WORSE = 0.05  # accepted increase of a candidate's cost
 _MOST = 0.8  # part of a vertex's distances that are right where the vertex is, though parts are missing
@@ -89,9 +85,9 @@ def register(
         target_faces: Vertex indices. *Shape:* ``(F_target, 3)``.
         landmarks: Pairs of vertices, template first, *shape* ``(n, 2)``; or two arrays of points ``(n, 3)``, in the
             coordinates of the template and of the target.
-        same_subject: Whether both are nearly isometric poses of one body. Different bodies need five landmarks.
+        same_subject: True for nearly isometric poses of one body. Different bodies need five landmarks.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
-        cache: Whether results are kept on disk and found there.
+        cache: Keep results on disk, and find them there.
         progress: See :data:`torch_modal.progress.Progress`; the total grows during the work.
 
     Returns:
@@ -138,7 +134,7 @@ def register(
 
 
 class _RegistrationProblem:
-    """Both meshes in working units: the target centred with a diagonal of 100, the template with equal area."""
+    """Both meshes in percent of the target's diagonal, the target centred, the template with equal area."""
 
     def __init__(
         self,
@@ -153,7 +149,7 @@ class _RegistrationProblem:
         goal, self.target_vertices = referenced(target[0], outward(*target))
         # Sizes are those of the main body, without stray pieces.
         body = main_part(goal)
-        self.unit, self.origin = body.diagonal / WORKING_DIAGONAL, body.vertices.mean(0)
+        self.unit, self.origin = body.diagonal / 100, body.vertices.mean(0)
         self.target = goal.moved((goal.vertices - self.origin) / self.unit)
         own, self.used = referenced(rest, outward(*template))
         self.size = np.sqrt(body.area / main_part(own).area) / self.unit
@@ -161,9 +157,18 @@ class _RegistrationProblem:
         self.template = own.moved(own.vertices * self.size)
         self.first, self.second = SpectralShape(self.template), SpectralShape(self.target)
         self.gate = Gate(self.second)
-        self.consistency = Consistency(self.first, self.second)
+        self.pair = CoarsePair(self.first, self.second)
         self.marks = points[:, 0] * self.size
         self.mark_places = (points[:, 1] - self.origin) / self.unit
+        #: Landmarks as coarse vertices. *Shape:* ``(n, 2)``.
+        self.mark_vertices = np.zeros((0, 2), dtype=np.int64)
+        if len(points):
+            both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
+            found = [
+                shape.placed.nearest_alike(at, surface.face_normals[surface.closest(at).faces])
+                for shape, surface, at in both
+            ]
+            self.mark_vertices = np.stack(found, axis=1)
         #: Score minus distortion of the best map onto the mirrored target.
         self.mirrored = -np.inf
 
@@ -174,44 +179,32 @@ class _RegistrationProblem:
         x, everything = self._fine(best)
         return self._report(x, everything, best)
 
-    # ------------------------------------------------------------------------------------------------------- maps
+    # ------------------------------------------------------------------------------------------------------------- maps
     def _maps(self) -> list[Map]:
         if len(self.marks):
-            maps = [landmark_map(self.first, self.second, self._pairs)]
-            return maps + [one for one in self._spectral() if self._agrees(one)] if self.same_subject else maps
-        maps = self._spectral()
-        if maps[0].score < _SURE_SCORE:
-            maps += self._spectral(_MORE_SIGNS)
-        return maps
+            maps = [self.pair.from_landmarks(self.mark_vertices)]
+            return maps + [one for one in self._spectral(N_SIGNS) if self._agrees(one)] if self.same_subject else maps
+        maps = self._spectral(N_SIGNS)
+        return maps if maps[0].score >= _SURE_SCORE else maps + self._spectral(MORE_SIGNS)
 
-    def _spectral(self, n_signs: int = _SIGNS) -> list[Map]:
+    def _spectral(self, n_signs: int) -> list[Map]:
         self.progress.expect(2**n_signs + N_OTHER_STARTS)
-        *maps, other = spectral_maps(self.first, self.second, n_signs, tick=self.progress.update)
-        self.mirrored = max(self.mirrored, other.mirrored_score - self.consistency.distortion(other.vertices))
+        *maps, other = self.pair.from_spectra(n_signs, tick=self.progress.update)
+        self.mirrored = max(self.mirrored, other.mirrored_score - self.pair.distortion(other.vertices))
         return maps
-
-    @cached_property
-    def _pairs(self) -> IntArray:
-        """Landmarks as coarse vertices. *Shape:* ``(n, 2)``."""
-        if not len(self.marks):
-            return np.zeros((0, 2), dtype=np.int64)
-        both = ((self.first, self.template, self.marks), (self.second, self.target, self.mark_places))
-        return np.stack(
-            [shape.nearest(at, surface.face_normals[surface.closest(at).faces]) for shape, surface, at in both], axis=1
-        )
 
     def _agrees(self, found: Map) -> bool:
-        """Whether a map agrees with all landmarks."""
-        places = self.second.coarse.vertices
-        errors = np.linalg.norm(places[found.vertices[self._pairs[:, 0]]] - places[self._pairs[:, 1]], axis=1)
+        """Test whether a map agrees with all landmarks."""
+        places, (here, target) = self.second.coarse.vertices, self.mark_vertices.T
+        errors = np.linalg.norm(places[found.vertices[here]] - places[target], axis=1)
         return bool((errors < _NEAR_LANDMARK).all())
 
     def _rivals(self, maps: list[Map]) -> list[tuple[Map, float]]:
         """Different maps that will be fitted, found and repaired ones, with their distortions."""
-        repaired = [self.consistency.repaired(found) for found in maps] if self.same_subject else []
+        repaired = [self.pair.repaired(found) for found in maps] if self.same_subject else []
         everything = [*maps, *(found for found in repaired if found is not None and self._agrees(found))]
-        rated = [(found, self.consistency.distortion(found.vertices)) for found in everything]
-        rated.sort(key=lambda pair: pair[1] - pair[0].score)
+        rated = [(found, self.pair.distortion(found.vertices)) for found in everything]
+        rated.sort(key=lambda one: one[1] - one[0].score)
         places = self.second.coarse.vertices
         kept = rated[:1]
         for found, distortion in rated[1:]:
@@ -222,15 +215,18 @@ class _RegistrationProblem:
                 kept.append((found, distortion))
         return kept
 
-    # ------------------------------------------------------------------------------------------------------- fits
+    # ------------------------------------------------------------------------------------------------------------- fits
     def _coarse(self, found: Map, distortion: float, scale: float = 1.0, x: FloatArray | None = None) -> _Candidate:
-        template = self.first.placed.moved(scale * self.first.positions)
+        template = self.first.placed.moved(scale * self.first.placed.vertices)
         back = self.second.placed
         fit = self._fit(template, back, found.vertices, scale)
         self.progress.expect(len(MAP_WEIGHTS) + sum(stage.steps for stage in COARSE_STAGES))
-        places = self.second.positions[found.vertices]
+        places = self.second.placed.vertices[found.vertices]
         if x is None:
-            x = fit.follow_map(_placed(template.vertices, places, template.vertex_areas), places)
+            rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
+            with torch.no_grad():
+                placed = best_fit(rest, goal, areas).apply(rest).numpy()
+            x = fit.follow_map(placed, places)
         x = fit.run(x, COARSE_STAGES, releases=2)
         return _Candidate(found, distortion, scale, x, fit, measure(template, x, back))
 
@@ -258,13 +254,11 @@ class _RegistrationProblem:
         if not self.same_subject:
             return candidate
         most = candidate.cost + _WORSE
-        for spectral in _REFINEMENTS:
+        for spectral in _SPECTRAL_REFINEMENTS:
             shape = self.first.placed.moved(candidate.x)
-            vertices = self.second.nearest(shape.vertices, shape.vertex_normals)
-            if spectral:
-                vertices = zoom_out(self.first, self.second, vertices, FINE_FUNCTIONS, FINE_FUNCTIONS)
-            found = Map(vertices, rate(self.first, self.second, vertices, FINE_FUNCTIONS))
-            again = self._coarse(found, self.consistency.distortion(vertices))
+            vertices = self.second.placed.nearest_alike(shape.vertices, shape.vertex_normals)
+            found = self.pair.refined(vertices, FINE_FUNCTIONS) if spectral else self.pair.rated(vertices)
+            again = self._coarse(found, self.pair.distortion(found.vertices))
             if again.cost > most:
                 break
             if np.linalg.norm(again.x - candidate.x, axis=1).mean() < _CONVERGED:
@@ -289,7 +283,7 @@ class _RegistrationProblem:
         template = self.template.moved(self.template.vertices * candidate.scale)
         frames = candidate.fit.elastic.local_frames(x)
         start = _carried(template.vertices, coarse, x, frames)
-        images = self.second.nearest(start, template.moved(start).vertex_normals)
+        images = self.second.placed.nearest_alike(start, template.moved(start).vertex_normals)
         fit = self._fit(template, self.target, images, candidate.scale)
         self.progress.expect(sum(stage.steps for stage in FINE_STAGES))
         found = fit.run(start, FINE_STAGES, releases=1)
@@ -297,24 +291,24 @@ class _RegistrationProblem:
         everything[self.used] = found
         return found, everything
 
-    # ----------------------------------------------------------------------------------------------------- report
+    # ----------------------------------------------------------------------------------------------------------- report
     def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate) -> Registration:
         quality = measure(self.template, x, self.target)
         coarse = best.fit.template.moved(best.x)
-        images = self.second.nearest(coarse.vertices, coarse.vertex_normals)
-        score = rate(self.first, self.second, images, FINE_FUNCTIONS)
+        images = self.second.placed.nearest_alike(coarse.vertices, coarse.vertex_normals)
+        score = self.pair.rated(images).score
         # Where sheets touch, the image of a sample may lie on the wrong one; the map has no such errors.
-        distortion = min(best.distortion, self.consistency.distortion(images))
+        distortion = min(best.distortion, self.pair.distortion(images))
         errors = np.zeros(0)
         if len(self.marks):
             rows = self.template.rows(self.template.closest(self.marks))
-            errors = np.linalg.norm(rows @ x - self.mark_places, axis=1) * (100 / WORKING_DIAGONAL)
+            errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
         lead = float(self.mirrored - (score - distortion))
         supported = support(self.template, x, self.target)
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
-            misplaced = np.quantile(self.consistency.errors(images), _MOST, axis=1)
-            near = self.first.nearest(self.template.vertices, self.template.vertex_normals)
+            misplaced = np.quantile(self.pair.errors(images), _MOST, axis=1)
+            near = self.first.placed.nearest_alike(self.template.vertices, self.template.vertex_normals)
             supported = np.minimum(supported, ramp(misplaced, *_MISPLACED)[near])
         lost = float(self.template.vertex_areas[supported < TRUSTED].sum() / self.template.area)
         quality = quality._replace(unsupported_area=max(quality.unsupported_area, lost))
@@ -335,17 +329,10 @@ class _RegistrationProblem:
             mirrored_lead=lead,
             landmark_errors=torch.from_numpy(errors),
             target_faces=torch.from_numpy(closest.faces),
-            barycentric=torch.from_numpy(self.target.barycentric(closest)),
+            barycentric=torch.from_numpy(closest.barycentric),
             target_corners=torch.from_numpy(corners),
             warnings=said,
         )
-
-
-def _placed(x: FloatArray, places: FloatArray, weights: FloatArray) -> FloatArray:
-    """Best rigid alignment to target positions. *Shape:* ``(n, 3), (n, 3), (n,)``."""
-    here, there, shares = (torch.from_numpy(array) for array in (x, places, weights))
-    with torch.no_grad():
-        return best_fit(here, there, shares).apply(here).numpy()
 
 
 def _carried(points: FloatArray, coarse: MeshSurface, x: FloatArray, frames: FloatArray) -> FloatArray:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.errors import MeshError
+from torch_modal.geometry.closest import dot
 from torch_modal.io.write import to_numpy
-from torch_modal.registration.fit import on_open_edge
 from torch_modal.registration.surface import MeshSurface, referenced
 
 TRUSTED = 0.5
@@ -65,9 +65,7 @@ def measure(template: MeshSurface, x: FloatArray, target: MeshSurface) -> Qualit
     logs = np.log(now[usable] / rest[usable])
     against = target.looks_away(x[shape.faces].mean(1), shape.face_normals)
     pairs = shape.connectivity.face_neighbours
-    cosines = [
-        np.einsum("ni,ni->n", n[pairs[:, 0]], n[pairs[:, 1]]) for n in (template.face_normals, shape.face_normals)
-    ]
+    cosines = [dot(n[pairs[:, 0]], n[pairs[:, 1]]) for n in (template.face_normals, shape.face_normals)]
     return Quality(
         Distances.between(shape, target, target.diagonal),
         Distances.between(target, shape, target.diagonal),
@@ -90,9 +88,9 @@ def _without_strays(target: MeshSurface, shape: MeshSurface) -> MeshSurface:
 
 
 def _unsupported(template: MeshSurface, shape: MeshSurface, target: MeshSurface) -> BoolArray:
-    """Whether faces are far from the target, at one of its holes, or collapsed. *Shape:* ``(F,)``."""
+    """Faces that are far from the target, at one of its holes, or collapsed, as a mask. *Shape:* ``(F,)``."""
     closest = target.closest(shape.vertices[shape.faces].mean(1))
-    open_there = on_open_edge(target, closest) & ~shape.on_boundary[shape.faces].any(1)
+    open_there = target.on_open_edge(closest) & ~shape.on_boundary[shape.faces].any(1)
     change = shape.face_areas / np.maximum(template.face_areas, 1e-30)
     usual = np.median(change[template.face_areas > 0])
     found: BoolArray = (closest.distances > _FAR * target.diagonal) | open_there | (change < _SHRUNK * usual)
@@ -153,7 +151,7 @@ class Registration(NamedTuple):
 
     @property
     def doubtful(self) -> bool:
-        """Whether the confidence is below 0.5."""
+        """True for a confidence below 0.5."""
         return self.confidence < TRUSTED
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -235,7 +233,7 @@ def judge(
         ", or more of them" if landmarks else ""
     )
     distance = max(quality.to_target.mean, quality.from_target.mean)
-    signs = [
+    criteria = [
         (ramp(distance, 1.0, 0.3), f"the mean distance of the surfaces is {distance:.2f} % of the diagonal"),
         (ramp(quality.flipped_area, 0.10, 0.01), f"{100 * quality.flipped_area:.1f} % of the area are flipped"),
         (
@@ -244,17 +242,15 @@ def judge(
         ),
     ]
     if same_subject:
-        said_of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
-        signs.append((ramp(map_score - distortion, 0.32, 0.70), said_of_map))
-        signs.append((ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"))
-        signs.append((ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"))
+        of_map = f"the map scores {map_score:.2f} with distances {distortion:.2f} off, right ones 0.7 and 0.1"
+        criteria += [
+            (ramp(map_score - distortion, 0.32, 0.70), of_map),
+            (ramp(mirrored_lead, 0.15, 0.05), "the target looks like a mirror image of the template"),
+            (ramp(quality.stretch, 0.35, 0.2), f"edges change by {100 * quality.stretch:.0f} % in the mean"),
+        ]
     if len(landmark_errors):
         worst = int(landmark_errors.argmax())
-        signs.append(
-            (
-                ramp(landmark_errors[worst], 8.0, 2.0),
-                f"landmark {worst} is {landmark_errors[worst]:.1f} % off its place",
-            )
-        )
-    said = tuple(f"{what}; {advice}" for value, what in signs if value < TRUSTED)
-    return float(min(value for value, _ in signs)), said
+        error = landmark_errors[worst]
+        criteria.append((ramp(error, 8.0, 2.0), f"landmark {worst} is {error:.1f} % off its place"))
+    said = tuple(f"{what}; {advice}" for value, what in criteria if value < TRUSTED)
+    return float(min(value for value, _ in criteria)), said

@@ -1,4 +1,4 @@
-"""Closest-point queries on a surface."""
+"""Surfaces with closest-point queries, and their connected pieces."""
 
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -9,12 +9,17 @@ from scipy.spatial import cKDTree
 
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.geometry.closest import closest_on_triangles, dot
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 LEAN = 0.01
 """Weight of normals relative to positions, in diagonals; distinguishes sheets closer than twice this distance."""
+DUST = 0.01
+"""Part of the area below which a connected piece is ignored."""
+CUT = 0.04
+"""Widest cut through a surface that is closed, in diagonals."""
 
 
 class Closest(NamedTuple):
@@ -26,6 +31,8 @@ class Closest(NamedTuple):
     """Face of each point. *Shape:* ``(n,)``."""
     points: FloatArray
     """*Shape:* ``(n, 3)``."""
+    barycentric: FloatArray
+    """Non-negative coordinates in the faces. *Shape:* ``(n, 3)``."""
 
 
 class MeshSurface:
@@ -39,23 +46,26 @@ class MeshSurface:
     def __init__(self, vertices: FloatArray, faces: IntArray | Connectivity) -> None:
         self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         self.connectivity = faces if isinstance(faces, Connectivity) else Connectivity(faces, len(self.vertices))
-        self.faces = self.connectivity.faces
+        self.faces, self.edges = self.connectivity.faces, self.connectivity.edges
+
+    def moved(self, vertices: FloatArray) -> "MeshSurface":
+        """Surface of the same connectivity with other positions."""
+        return MeshSurface(vertices, self.connectivity)
 
     @cached_property
-    def area_vectors(self) -> FloatArray:
-        """Face normals scaled by area. *Shape:* ``(F, 3)``."""
+    def _area_vectors(self) -> FloatArray:
         a, b, c = (self.vertices[corner] for corner in self.faces.T)
         return 0.5 * np.cross(b - a, c - a)
 
     @cached_property
     def face_areas(self) -> FloatArray:
         """*Shape:* ``(F,)``."""
-        return np.linalg.norm(self.area_vectors, axis=1)
+        return np.linalg.norm(self._area_vectors, axis=1)
 
     @cached_property
     def face_normals(self) -> FloatArray:
         """Unit vectors; zero where a face has no area. *Shape:* ``(F, 3)``."""
-        return unit(self.area_vectors)
+        return self._area_vectors / np.where(self.face_areas > 0, self.face_areas, 1)[:, None]
 
     @cached_property
     def vertex_normals(self) -> FloatArray:
@@ -68,104 +78,80 @@ class MeshSurface:
         return vertex_areas(self.vertices, self.faces)
 
     @property
-    def edges(self) -> IntArray:
-        """*Shape:* ``(E, 2)``."""
-        return self.connectivity.edges
+    def area(self) -> float:
+        """Total area."""
+        return float(self.face_areas.sum())
 
-    @cached_property
-    def open_sides(self) -> BoolArray:
-        """Whether the edge opposite to each corner is a boundary edge. *Shape:* ``(F, 3)``."""
-        is_open = (self.connectivity.counts == 1)[self.connectivity.sides].reshape(3, -1).T
-        return np.roll(is_open, -1, axis=1)  # the edge opposite to a corner starts at the next one
-
-    @cached_property
-    def on_boundary(self) -> BoolArray:
-        """Whether vertices are on the boundary. *Shape:* ``(V,)``."""
-        found = np.zeros(len(self.vertices), dtype=bool)
-        found[self.connectivity.boundary_edges] = True
-        return found
+    @property
+    def centroid(self) -> FloatArray:
+        """Area-weighted mean of the vertices. *Shape:* ``(3,)``."""
+        return np.average(self.vertices, 0, self.vertex_areas)
 
     @property
     def diagonal(self) -> float:
         """Diagonal of the bounding box."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
-    @property
-    def area(self) -> float:
-        """Total area."""
-        return float(self.face_areas.sum())
+    @cached_property
+    def on_boundary(self) -> BoolArray:
+        """Vertices on the boundary, as a mask. *Shape:* ``(V,)``."""
+        found = np.zeros(len(self.vertices), dtype=bool)
+        found[self.connectivity.boundary_edges] = True
+        return found
 
+    # --------------------------------------------------------------------------------------------------- closest points
     @cached_property
     def _tree(self) -> Any:
+        # Seven times as fast as ClosestFaces, whose tree needs no extra.
         tree = extras.require("igl", "register", "registration").AABB()
         tree.init(self.vertices, self.faces)
         return tree
 
     def closest(self, points: FloatArray) -> Closest:
-        """The closest point on the surface to each query. *Shape:* ``(n, 3)``."""
-        squared, faces, found = self._tree.squared_distance(
-            self.vertices, self.faces, np.ascontiguousarray(points, dtype=np.float64)
-        )
-        distances = np.sqrt(np.maximum(np.asarray(squared).reshape(-1), 0))
-        return Closest(distances, np.asarray(faces).reshape(-1).astype(np.int64), np.asarray(found).reshape(-1, 3))
-
-    @cached_property
-    def _sides_tree(self) -> cKDTree:
-        return cKDTree(np.hstack([self.vertices, LEAN * self.diagonal * self.vertex_normals]))
-
-    def nearest_alike(self, points: FloatArray, normals: FloatArray) -> IntArray:
-        """The nearest vertex in position and normal, which distinguishes touching sheets.
-
-        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
-        """
-        return self._sides_tree.query(np.hstack([points, LEAN * self.diagonal * normals]))[1].astype(np.int64)
-
-    def looks_away(self, points: FloatArray, normals: FloatArray) -> BoolArray:
-        """Whether normals oppose those of the closest point and of the nearest sheet with a similar normal.
-
-        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
-        """
-        away = np.einsum("ni,ni->n", normals, self.face_normals[self.closest(points).faces]) < 0
-        some = np.flatnonzero(away)
-        there = self.vertex_normals[self.nearest_alike(points[some], normals[some])]
-        away[some] = np.einsum("ni,ni->n", normals[some], there) < 0
-        return away
-
-    def barycentric(self, closest: Closest) -> FloatArray:
-        """Non-negative barycentric coordinates of closest points. *Shape:* ``(n, 3)``."""
-        a, b, c = (self.vertices[self.faces[closest.faces, corner]] for corner in range(3))
-        normal = np.cross(b - a, c - a)
-        squared = np.einsum("ni,ni->n", normal, normal)
-        p = closest.points
-        weights = np.stack(
-            [
-                np.einsum("ni,ni->n", np.cross(c - b, p - b), normal),
-                np.einsum("ni,ni->n", np.cross(a - c, p - c), normal),
-            ]
-        )
-        weights = weights / np.where(squared > 0, squared, 1)
-        weights = np.concatenate([weights, 1 - weights.sum(0, keepdims=True)]).T
-        weights[squared <= 0] = 1 / 3
-        weights = np.clip(weights, 0, 1)
-        return weights / weights.sum(1, keepdims=True)
+        """Closest point on the surface to each query. *Shape:* ``(n, 3)``."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        _, faces, found = self._tree.squared_distance(self.vertices, self.faces, points)
+        faces = np.asarray(faces).reshape(-1).astype(np.int64)
+        barycentric, distances = closest_on_triangles(points, self.vertices[self.faces[faces]])
+        return Closest(distances, faces, np.asarray(found).reshape(-1, 3), barycentric)
 
     def rows(self, closest: Closest) -> sparse.csr_matrix:
         """Interpolation matrix from vertices to closest points. *Shape:* ``(n, V)``."""
         n = len(closest.faces)
         where = (np.repeat(np.arange(n), 3), self.faces[closest.faces].reshape(-1))
-        return sparse.csr_matrix((self.barycentric(closest).reshape(-1), where), shape=(n, len(self.vertices)))
+        return sparse.csr_matrix((closest.barycentric.reshape(-1), where), shape=(n, len(self.vertices)))
 
-    def moved(self, vertices: FloatArray) -> "MeshSurface":
-        """The same connectivity with other positions."""
-        return MeshSurface(vertices, self.connectivity)
+    def on_open_edge(self, closest: Closest) -> BoolArray:
+        """Closest points on the boundary, as a mask: their true counterpart may be missing. *Shape:* ``(n,)``."""
+        is_open = (self.connectivity.counts == 1)[self.connectivity.sides].reshape(3, -1).T[closest.faces]
+        # The edge opposite to a corner starts at the next one.
+        found: BoolArray = ((closest.barycentric < 1e-6) & np.roll(is_open, -1, axis=1)).any(1)
+        return found
+
+    @cached_property
+    def _tree_with_normals(self) -> cKDTree:
+        return cKDTree(np.hstack([self.vertices, LEAN * self.diagonal * self.vertex_normals]))
+
+    def nearest_alike(self, points: FloatArray, normals: FloatArray) -> IntArray:
+        """Nearest vertex in position and normal, which distinguishes touching sheets.
+
+        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
+        """
+        rows = np.hstack([points, LEAN * self.diagonal * normals])
+        return self._tree_with_normals.query(rows)[1].astype(np.int64)
+
+    def looks_away(self, points: FloatArray, normals: FloatArray) -> BoolArray:
+        """Normals opposed to those of the closest point and of the nearest sheet with a similar normal, as a mask.
+
+        *Shape:* ``(n, 3), (n, 3) -> (n,)``.
+        """
+        away = dot(normals, self.face_normals[self.closest(points).faces]) < 0
+        some = np.flatnonzero(away)
+        away[some] = dot(normals[some], self.vertex_normals[self.nearest_alike(points[some], normals[some])]) < 0
+        return away
 
 
-def unit(vectors: FloatArray) -> FloatArray:
-    """Unit vectors; zero for zero. *Shape:* ``(n, 3)``."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1)
-
-
+# --------------------------------------------------------------------------------------------------------------- pieces
 def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     """Faces with outward winding if the surface is closed, otherwise unchanged. *Shape:* ``(F, 3)``."""
     closed = not len(Connectivity(faces).boundary_edges)
@@ -174,23 +160,25 @@ def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
 
 
 def referenced(vertices: FloatArray, faces: IntArray) -> tuple[MeshSurface, IntArray]:
-    """Remove unreferenced vertices; returns the indices of the others, too. *Shape of the second:* ``(V',)``."""
+    """Surface without unreferenced vertices, and the indices of the others. *Shape of the second:* ``(V',)``."""
     used, renumbered = np.unique(faces, return_inverse=True)
     return MeshSurface(vertices[used], renumbered.reshape(-1, 3)), used
 
 
-def without_dust(surface: MeshSurface, share: float = 0.01) -> MeshSurface:
-    """The connected pieces with a minimum share of the area; at least the largest."""
+def largest_pieces(surface: MeshSurface, share: float = 1.0) -> MeshSurface:
+    """The largest connected piece, with those of at least a share of the whole area."""
     pieces = surface.connectivity.vertex_pieces
     if pieces.max() == 0:
         return surface
     of_faces = pieces[surface.faces[:, 0]]
     areas = np.bincount(of_faces, surface.face_areas, minlength=pieces.max() + 1)
-    return referenced(surface.vertices, surface.faces[areas[of_faces] >= min(share * surface.area, areas.max())])[0]
+    kept = areas >= share * surface.area
+    kept[areas.argmax()] = True
+    return referenced(surface.vertices, surface.faces[kept[of_faces]])[0]
 
 
-def sewn(surface: MeshSurface, reach: float) -> MeshSurface:
-    """Join the boundaries of adjacent pieces by strips of triangles, to close cuts.
+def sewn(surface: MeshSurface, reach: float = CUT) -> MeshSurface:
+    """Surface with strips of triangles between the boundaries of adjacent pieces, which close cuts.
 
     Args:
         surface: A surface of several pieces.
@@ -215,11 +203,6 @@ def sewn(surface: MeshSurface, reach: float) -> MeshSurface:
     return MeshSurface(surface.vertices, np.concatenate([surface.faces, *strips]))
 
 
-def largest_piece(surface: MeshSurface) -> MeshSurface:
-    """The connected piece with the largest area."""
-    pieces = surface.connectivity.vertex_pieces
-    if pieces.max() == 0:
-        return surface
-    of_faces = pieces[surface.faces[:, 0]]
-    kept = of_faces == np.bincount(of_faces, surface.face_areas).argmax()
-    return referenced(surface.vertices, surface.faces[kept])[0]
+def main_part(surface: MeshSurface) -> MeshSurface:
+    """The largest piece, with those separated from it by a cut."""
+    return largest_pieces(sewn(largest_pieces(surface, DUST)))

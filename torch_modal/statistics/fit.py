@@ -1,42 +1,87 @@
 """The shape of a set's variation that meets a few observed points."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_modal.autograd import recorded
-from torch_modal.backends.torch.fine_steps import conjugate_gradients
+from torch_modal.backends.torch.fine_steps import FurtherDerivatives, conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.triangle_frames import Sides, edge_means
-from torch_modal.statistics.observations import Observations, Pulls
-from torch_modal.statistics.patches import bounded
-from torch_modal.statistics.variation import Variation
+from torch_modal.solve.fitting import levenberg_marquardt
+from torch_modal.statistics.variation import Variation, bounded
 
-# Standard deviation of observed points, in sizes of the shape, beside local weights of a standard deviation of one.
-NOISE = 0.01
+# Standard deviation of observed points, in sizes of the shape, beside local weights of a standard deviation of one; and
+# larger ones that come first, relative to it: far from the points there are other minima, which a more certain prior
+# does not have.
+NOISE, COARSE_NOISE = 0.01, (10.0, 3.0)
 
-# Gauss-Newton steps for the weights, the part of the cost that ends them, and Newton steps that follow, with products.
-MOST_STEPS, TOLERANCE, LAST_STEPS, PRODUCTS = 30, 1e-6, 2, 20
+# Gauss-Newton steps for the weights, with coarse noise or changing weights and at last, and the part of the cost that
+# ends them; rounds of weights of the observations; Newton steps that follow, and products in each.
+FEW_STEPS, MOST_STEPS, TOLERANCE, ROBUST_ROUNDS, LAST_STEPS, PRODUCTS = 5, 30, 1e-6, 8, 2, 20
 
-# Of a step: how often it is shortened at most. Larger noises that come first, with a few steps of each.
-TRIALS, COARSE_NOISE, FEW_STEPS, ROBUST_ROUNDS = 8, (10.0, 3.0), 5, 8
-
-# Of all pulls together, and of one at most, at a size of 100.
+# Stiffness of all pulls together, and of one at most, at a size of 100.
 STIFFNESS, LARGEST_STIFFNESS = 2000.0, 100.0
 
-# Newton steps and products of the first round, and of each of the next, with weights found anew.
+# Newton steps and products of the first elastic round, and of each of the next, with weights computed anew.
 FIRST_ROUND, NEXT_ROUND, N_ROUNDS = (6, 40), (4, 40), 3
 
-# By so many sizes, on average, points may be missed more than by a given shape.
+# Mean distance, in sizes, by which the result may be farther from the points than a given shape.
 SLACK = 1e-3
 
-# Points extend over more or less than the same vertices of the key-frames by this factor only in other units.
+# Points that extend over more or less than the same vertices of the key-frames by this factor are in other units.
 UNITS = 8.0
 
-# Rows of the Jacobian that are made at a time.
+# Rows of the Jacobian that are computed together.
 CHUNK = 32
+
+
+class Observations(NamedTuple):
+    """Points with the vertices that should be there."""
+
+    points: Tensor
+    """*Shape:* ``(n, 3)``."""
+    vertices: Tensor
+    """*Shape:* ``(n,)``."""
+    weights: Tensor
+    """Weight of each observation. *Shape:* ``(n,)``."""
+
+    def pose(self, x: Tensor) -> RigidMotion:
+        """Rigid motion of a shape on to the points. *Shape:* ``(V, 3)``."""
+        return best_fit(x[self.vertices], self.points, self.weights)
+
+    def missed(self, x: Tensor) -> Tensor:
+        """Distances of the points from their vertices. *Shape:* ``(V, 3) -> (n,)``."""
+        return (x[self.vertices] - self.points).norm(dim=-1)
+
+
+class Pulls:
+    """``stiffness sum_i weights_i |x_i - p_i|^2`` of one shape, as an energy beside that of the terms.
+
+    Args:
+        to: The observations.
+        stiffness: Per squared length.
+    """
+
+    def __init__(self, to: Observations, stiffness: float) -> None:
+        self.to, self.factors = to, stiffness * to.weights
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(1, V, 3) -> (1,)``."""
+        return (self.factors * (x[0, self.to.vertices] - self.to.points).square().sum(-1)).sum()[None]
+
+    def at(self, x: Tensor) -> FurtherDerivatives:
+        """*Shape:* ``(1, V, 3)``."""
+
+        def spread(at_vertices: Tensor) -> Tensor:  # from the observed vertices to all, doubled
+            values = 2 * self.factors[:, None] * at_vertices
+            return x.new_zeros(x.shape[1], values.shape[1]).index_add(0, self.to.vertices, values)[None]
+
+        diagonal = spread(x.new_tensor([1, 0, 0, 1, 0, 1]).expand(len(self.factors), 6))
+        gradient = spread(x[0, self.to.vertices] - self.to.points)
+        return FurtherDerivatives(self.value(x), gradient, diagonal, lambda f: spread(f[0, self.to.vertices]))
 
 
 class Fitted(NamedTuple):
@@ -45,15 +90,15 @@ class Fitted(NamedTuple):
     shape: Tensor
     """In the pose of the observations. *Shape:* ``(V, 3)``."""
     weights: Tensor
-    """Of the given shapes at each vertex; they add up to one. *Shape:* ``(K, V)``."""
+    """Weights of the given shapes at each vertex, with sum one. *Shape:* ``(K, V)``."""
     misses: Tensor
     """Distance of each observed point from its place. *Shape:* ``(n,)``."""
     trust: Tensor
-    """How much each observation counts in the end: less than one for outliers. *Shape:* ``(n,)``."""
+    """Final weight of each observation: less than one for outliers. *Shape:* ``(n,)``."""
 
 
 class Fit:
-    r"""Local weights and the rigid motion of least cost, then elastic steps of all vertices.
+    r"""Local weights and the rigid motion of least cost.
 
     The cost of factors ``z`` of the weights' fields is that of their logarithmic posterior density,
     :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`.
@@ -61,124 +106,133 @@ class Fit:
     Args:
         variation: The given shapes and how they vary.
         to: The observations.
-        about: The weights that are most likely. *Shape:* ``(K,)``.
+        about: The most likely weights. *Shape:* ``(K,)``.
     """
 
     def __init__(self, variation: Variation, to: Observations, about: Tensor) -> None:
         self.variation, self.to, self.about = variation, to, about
         self.noise = NOISE * variation.size
-        self.influence = _influence(variation, to)
+        self.influence = self._influence()
 
     def shape(self, factors: Tensor) -> Tensor:
-        """*Shape:* ``(K, n) -> (V, 3)``."""
-        return self.variation.assembled(self.variation.local(factors, self.about))
+        """*Shape:* ``(K n,) -> (V, 3)``."""
+        return self.variation.assembled(self.weights(factors))
 
-    def cost(self, factors: Tensor, to: Observations, noise: float | None = None) -> Tensor:
-        """*Shape:* ``(K, n) -> ()``."""
-        noise = self.noise if noise is None else noise
-        seen = to.seen(self.shape(factors))
-        off = _pose(seen, to).apply(seen) - to.points
-        return (to.weights * off.square().sum(-1)).sum() / noise**2 + factors.square().sum()
+    def weights(self, factors: Tensor) -> Tensor:
+        """Local weights. *Shape:* ``(K n,) -> (K, V)``."""
+        return self.variation.local(factors.view(len(self.about), -1), self.about)
+
+    def cost(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
+        """*Shape:* ``(K n,) -> ()``."""
+        x = self.shape(factors)
+        missed = to.missed(to.pose(x).apply(x)).square()
+        return (to.weights * missed).sum() / noise**2 + factors.square().sum()
 
     @torch.no_grad()
     def solved(self, robust: bool) -> tuple[Tensor, Tensor]:
-        """Factors of least cost, and the weights of the observations. *Shape:* ``(K, n), (n,)``."""
-        to, factors = self.to, self.about.new_zeros(len(self.about), len(self.variation.fields))
+        """Factors of least cost, and the weights of the observations. *Shape:* ``(K n,), (n,)``."""
+        to, factors = self.to, self.about.new_zeros(len(self.about) * len(self.variation.fields))
+
+        def descended(noise: float, n_steps: int) -> Tensor:
+            cost, linearise = partial(self.cost, to=to, noise=noise), partial(self.linearised, to=to, noise=noise)
+            return levenberg_marquardt(factors, cost, linearise, n_steps, TOLERANCE)
+
         for noise in COARSE_NOISE:
-            # Far from the points there are other minima, which a more certain prior does not have.
-            factors = self.descended(factors, to, noise * self.noise, FEW_STEPS)
+            factors = descended(noise * self.noise, FEW_STEPS)
         for _ in range(ROBUST_ROUNDS if robust else 0):
-            seen = to.seen(self.shape(factors))
-            to = _trusted(self.variation, self.to, (_pose(seen, to).apply(seen) - to.points).norm(dim=-1))
-            factors = self.descended(factors, to, self.noise, FEW_STEPS)
-        factors = self.descended(factors, to, self.noise, MOST_STEPS)
+            # Observations that are missed by more than most have less weight (Geman and McClure).
+            x = self.shape(factors)
+            missed = to.missed(to.pose(x).apply(x))
+            usual = (3 * missed.median()).clamp_min(self.noise)
+            to = to._replace(weights=self.to.weights / (1 + (missed / usual) ** 2) ** 2)
+            factors = descended(self.noise, FEW_STEPS)
+        factors = descended(self.noise, MOST_STEPS)
         for _ in range(LAST_STEPS):
-            slope = torch.func.grad(self.cost)(factors, to).flatten()
-            tried = factors - self.newton(factors, to, 0.5 * slope).view_as(factors)
-            if not self.cost(tried, to) <= self.cost(factors, to):  # where the Hessian is indefinite
+            slope = torch.func.grad(self.cost)(factors, to, self.noise)
+            tried = factors - self.newton(factors, to, 0.5 * slope)
+            if not self.cost(tried, to, self.noise) <= self.cost(factors, to, self.noise):  # an indefinite Hessian
                 break
             factors = tried
         return factors, to.weights
 
-    def descended(self, factors: Tensor, to: Observations, noise: float, n_steps: int) -> Tensor:
-        """Steps of Levenberg and Marquardt's method."""
-        cost, damping = self.cost(factors, to, noise), 0.0
-        for _ in range(n_steps):
-            matrix, downhill = self._system(factors, to, noise)
-            for _ in range(TRIALS):
-                eye = torch.eye(len(matrix)).to(matrix)
-                tried = factors + torch.linalg.solve_ex(matrix + damping * eye, downhill).result.view_as(factors)
-                value = self.cost(tried, to, noise)
-                if value < cost:
-                    break
-                damping = max(10 * damping, 1.0)
-            else:
-                break
-            damping = damping / 10 if damping > 1 else 0.0
-            ended = cost - value < TOLERANCE * cost
-            factors, cost = tried, value
-            if ended:
-                break
-        return factors
-
-    def normal(self, factors: Tensor, to: Observations) -> tuple[Tensor, Tensor]:
-        """The Jacobian of the places, and they. *Shape:* ``(3n, K n_fields), (n, 3)``."""
-        own, y = self.variation, self.variation.bending(self.variation.local(factors, self.about))
-        slopes = _slopes(own, y)
-        fields = own.coordinates.spread(own.fields)
-        deviations = own.deviations  # centred over the shapes, as the weights are
-        rows = []
-        moves = own.coordinates.size * torch.eye(3, 6).to(y)[..., None]
-        beyond = own.coordinates.carries(self.to.vertices).to(y)
-        for first, second, carried in zip(*(part.split(CHUNK) for part in (*self.influence, beyond)), strict=True):
-            at_faces = first[:, None, None] * slopes[0] + second[:, None, None] * slopes[1]
-            at = torch.cat([at_faces, carried[:, None, None] * moves], -1)  # (n, 3, 6, E)
-            parts = [(at * deviation).sum(2) @ fields.mT for deviation in deviations]
-            rows.append(torch.stack(parts, 2).flatten(2))
-        return torch.cat(rows).flatten(0, 1), to.seen(self.shape(factors))
-
-    def _system(self, factors: Tensor, to: Observations, noise: float) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton's matrix with the rigid motion eliminated, and half the gradient."""
-        jacobian, seen = self.normal(factors, to)
-        pose = _pose(seen, to)
-        off = pose.inverse().apply(to.points) - seen
+    def linearised(self, factors: Tensor, to: Observations, noise: float) -> tuple[Tensor, Tensor]:
+        """Gauss-Newton matrix without the rigid motion, and half the negative gradient. *Shape:* ``(K n,)``."""
+        seen = self.shape(factors)[to.vertices]
+        off = best_fit(seen, to.points, to.weights).inverse().apply(to.points) - seen
         arms = seen - (to.weights @ seen) / to.weights.sum()
-        eye = torch.eye(3).to(seen)
-        turns = torch.linalg.cross(eye.expand(len(arms), 3, 3), arms[:, None].expand(-1, 3, -1)).mT
-        rigid = torch.cat([turns, eye.expand(len(arms), 3, 3)], -1).flatten(0, 1)
+        eye = torch.eye(3).to(seen).expand(len(arms), 3, 3)
+        turns = torch.linalg.cross(eye, arms[:, None].expand(-1, 3, -1)).mT
+        rigid = torch.cat([turns, eye], -1).flatten(0, 1)
         root = (to.weights.sqrt() / noise).repeat_interleave(3)[:, None]
         q = torch.linalg.qr(root * rigid)[0]
-        rows = root * jacobian
+        rows = root * self.jacobian(factors)
         rows = rows - q @ (q.mT @ rows)
         matrix = rows.mT @ rows
         matrix.diagonal().add_(1)
-        return matrix, rows.mT @ (root[:, 0] * off.flatten()) - factors.flatten()
+        return matrix, rows.mT @ (root[:, 0] * off.flatten()) - factors
 
-    def curvature(self, factors: Tensor, to: Observations) -> Callable[[Tensor], Tensor]:
-        """Products with half the Hessian of the cost. *Shape:* ``(K n,) -> (K n,)``."""
+    def jacobian(self, factors: Tensor) -> Tensor:
+        """Derivatives of the observed vertices, without loose pieces' rotations. *Shape:* ``(K n,) -> (3m, K n)``."""
+        own = self.variation
+        bending = own.bending(self.weights(factors))
+        # Each side depends on its triangle alone. By columns, forward mode would take five times as long.
         with torch.enable_grad():
-            own = factors.detach().requires_grad_()
-            slope = torch.autograd.grad(0.5 * self.cost(own, to), own, create_graph=True)[0].flatten()
-        return lambda x: torch.autograd.grad(slope, own, x, retain_graph=True)[0].flatten()
+            leaf = bending.detach().requires_grad_()
+            ends = torch.cat(own.coordinates.sides(leaf[None]))[:, 0]
+            slopes = torch.stack([torch.autograd.grad(row.sum(), leaf, retain_graph=True)[0] for row in ends])
+        one, other = slopes[..., : len(own.faces)].split(3)  # (3, 6, F) each
+        fields = own.coordinates.spread(own.fields)
+        moves = own.coordinates.size * torch.eye(3, 6).to(bending)[..., None]
+        carries = own.coordinates.carries(self.to.vertices).to(bending)
+        rows = []
+        for first, second, carried in zip(*(part.split(CHUNK) for part in (*self.influence, carries)), strict=True):
+            at_faces = first[:, None, None] * one + second[:, None, None] * other
+            at = torch.cat([at_faces, carried[:, None, None] * moves], -1)  # (n, 3, 6, E)
+            parts = [(at * deviation).sum(2) @ fields.mT for deviation in own.deviations]
+            rows.append(torch.stack(parts, 2).flatten(2))
+        return torch.cat(rows).flatten(0, 1)
 
     def newton(self, factors: Tensor, to: Observations, right: Tensor) -> Tensor:
-        """The inverse of half the Hessian, times a vector, by conjugate gradients. *Shape:* ``(K n,)``."""
-        matrix = self._system(factors, to, self.noise)[0]
+        """Inverse of half the Hessian, times a vector, by conjugate gradients. *Shape:* ``(K n,)``."""
+        matrix = self.linearised(factors, to, self.noise)[0]
         matrix.diagonal().add_(len(matrix) * torch.finfo(matrix.dtype).eps * matrix.diagonal().max())  # its rounding
         factor = torch.linalg.cholesky_ex(matrix).L
+        with torch.enable_grad():
+            own = factors.detach().requires_grad_()
+            slope = torch.autograd.grad(0.5 * self.cost(own, to, self.noise), own, create_graph=True)[0]
 
         def precondition(x: Tensor) -> Tensor:
             return torch.cholesky_solve(x[:, None], factor)[:, 0]
 
-        return conjugate_gradients(self.curvature(factors, to), precondition, torch.dot, right, PRODUCTS)
+        def curvature(x: Tensor) -> Tensor:
+            return torch.autograd.grad(slope, own, x, retain_graph=True)[0]
+
+        return conjugate_gradients(curvature, precondition, torch.dot, right, PRODUCTS)
+
+    def _influence(self) -> tuple[Tensor, Tensor]:
+        """Part of both sides of each triangle in each observed place. *Shape:* ``(n, F)`` each."""
+        own, to = self.variation, self.to
+        n, v = len(to.points), len(own.coordinates.mean)
+        parts = to.weights.new_zeros(n, v).scatter(1, to.vertices[:, None], 1)
+        reconstruction = own.coordinates.reconstruction
+        for piece, anchors in reconstruction.loose:
+            # A loose piece goes where the vertices go that it follows.
+            parts[:, anchors] += parts[:, piece].sum(1, keepdim=True) / len(anchors)
+        sides = [parts.new_zeros(1, n, len(own.faces)).requires_grad_() for _ in range(2)]
+        with torch.enable_grad():
+            weights, signs = reconstruction.weights, reconstruction.signs
+            edges = edge_means(Sides(*sides), weights, reconstruction.sides, signs, len(reconstruction.edges))
+            found = reconstruction.poisson(edges, parts.new_zeros(1, n, v))
+            first, second = torch.autograd.grad((found[0] * parts).sum(), sides)
+        return first[0], second[0]
 
 
-class _Followed(torch.autograd.Function):
+class _FactorsOfPoints(torch.autograd.Function):
     """Factors of least cost, with their derivatives in the observed points by the implicit function theorem."""
 
     @staticmethod
     def forward(ctx: Any, factors: Tensor, points: Tensor, given: Fit, to: Observations) -> Tensor:
-        ctx.given, ctx.to = given, to
+        ctx.given, ctx.to = given, to._replace(points=points.detach())
         ctx.save_for_backward(factors, points)
         return factors.clone()
 
@@ -190,28 +244,32 @@ class _Followed(torch.autograd.Function):
                 "the graph; take the gradient without create_graph"
             )
         factors, points = ctx.saved_tensors
-        turned = ctx.given.newton(factors, ctx.to, grad.flatten()).view_as(factors)
+        turned = ctx.given.newton(factors, ctx.to, grad)
         with torch.enable_grad():
             own, to_points = factors.detach().requires_grad_(), points.detach().requires_grad_()
-            cost = 0.5 * ctx.given.cost(own, ctx.to._replace(points=to_points))
+            cost = 0.5 * ctx.given.cost(own, ctx.to._replace(points=to_points), ctx.given.noise)
             slope = torch.autograd.grad(cost, own, create_graph=True)[0]
             return None, -torch.autograd.grad(slope, to_points, turned)[0], None, None
 
 
-def followed(given: Fit, factors: Tensor, to: Observations) -> Tensor:
-    """Factors of least cost, with their derivatives in the observed points. *Shape:* ``(K, n)``."""
-    known: Tensor = _Followed.apply(factors, to.points, given, to._replace(points=to.points.detach()))
-    return known
+def factors_of_points(factors: Tensor, points: Tensor, given: Fit, to: Observations) -> Tensor:
+    """Factors of least cost as a function of the observed points. *Shape:* ``(K n,), (m, 3) -> (K n,)``."""
+    found: Tensor = _FactorsOfPoints.apply(factors, points, given, to)
+    return found
 
 
 def fit(variation: Variation, to: Observations, about: Tensor, robust: bool = False) -> Fitted:
     """The shape that meets observations, differentiable in their points.
 
+    The weights of least cost are followed by elastic steps of all vertices, in rounds with weights computed anew. The
+    steps are constants of the graph: gradients are those of the weights and of the rigid motion. Where a given shape is
+    nearer to the points, it is the result.
+
     Args:
         variation: The given shapes and how they vary.
         to: The observations.
-        about: The weights that are most likely. *Shape:* ``(K,)``.
-        robust: Whether outliers are to be ignored.
+        about: The most likely weights. *Shape:* ``(K,)``.
+        robust: Ignore outliers.
 
     Raises:
         ValueError: The points are in other units than the shapes.
@@ -221,8 +279,29 @@ def fit(variation: Variation, to: Observations, about: Tensor, robust: bool = Fa
     factors, trust = given.solved(robust)
     to = to._replace(weights=trust)
     if torch.is_grad_enabled() and to.points.requires_grad:
-        factors = followed(given, factors, to)
-    return _finished(variation, to, variation.local(factors, about))
+        factors = factors_of_points(factors, to.points, given, to)
+    weights = given.weights(factors)
+    assembled = variation.assembled(weights)
+    pose = to.pose(assembled)
+    with torch.no_grad():
+        stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points))
+        pulls = Pulls(to._replace(points=variation.scale * pose.inverse().apply(to.points)), stiffness)
+        own = bounded(weights)
+        x = variation.relaxed(assembled, own, *FIRST_ROUND, pulls)
+        for _ in range(N_ROUNDS):
+            own = variation.mixtures.weights(x)
+            x = variation.relaxed(x, own, *NEXT_ROUND, pulls)
+        step = x - assembled
+        moved = [to.pose(shape).apply(shape) for shape in variation.shapes]
+        *errors, error = [float((to.weights * to.missed(y).square()).sum()) for y in (*moved, pose.apply(x))]
+        k = min(range(len(errors)), key=lambda k: errors[k])
+        is_given = error > errors[k] + float(to.weights.sum()) * (SLACK * variation.size) ** 2
+    if is_given:
+        shape = to.pose(moved[k]).apply(moved[k])
+        own = torch.eye(len(moved)).to(x)[k, :, None].expand_as(own)
+    else:
+        shape = pose.apply(assembled + step)
+    return Fitted(shape, own, to.missed(shape), to.weights)
 
 
 def _check_units(variation: Variation, to: Observations) -> None:
@@ -241,77 +320,45 @@ def _check_units(variation: Variation, to: Observations) -> None:
         )
 
 
-def _finished(variation: Variation, to: Observations, weights: Tensor) -> Fitted:
-    """Elastic steps of all vertices, in rounds with weights found anew; the best given shape, where that is nearer.
+def checked_observations(points: Tensor, vertices: Tensor, n_vertices: int) -> Tensor:
+    """The vertices on the CPU.
 
-    The steps are constants of the graph: gradients are those of the weights and of the rigid motion.
+    Raises:
+        ValueError: Points or vertices that do not fit.
     """
-    assembled = variation.assembled(weights)
-    pose = _pose(to.seen(assembled), to)
-    with torch.no_grad():
-        stiffness = min(LARGEST_STIFFNESS, STIFFNESS / len(to.points))
-        pulls = Pulls(to._replace(points=variation.scale * pose.inverse().apply(to.points)), stiffness)
-        own = bounded(weights)
-        x = variation.relaxed(assembled, own, *FIRST_ROUND, pulls)
-        for _ in range(N_ROUNDS):
-            own = variation.mixtures.weights(x)
-            x = variation.relaxed(x, own, *NEXT_ROUND, pulls)
-        step = x - assembled
-        moved = [_pose(to.seen(shape), to).apply(shape) for shape in variation.shapes]
-        *errors, error = [float((to.weights * _missed(y, to).square()).sum()) for y in (*moved, pose.apply(x))]
-        k = min(range(len(errors)), key=lambda k: errors[k])
-        better = error <= errors[k] + float(to.weights.sum()) * (SLACK * variation.size) ** 2
-    if better:
-        shape = pose.apply(assembled + step)
-    else:
-        shape, own = (
-            _pose(to.seen(moved[k]), to).apply(moved[k]),
-            torch.eye(len(moved)).to(x)[k, :, None].expand_as(own),
+    if points.dim() < 2 or points.shape[-1] != 3 or points.shape[-2] < 3 or not points.is_floating_point():
+        raise ValueError(
+            f"points are floating-point of the shape (..., n, 3), with n of 3 or more; got {tuple(points.shape)} of "
+            f"{points.dtype}"
         )
-    return Fitted(shape, own, _missed(shape, to), to.weights)
+    if not bool(points.detach().isfinite().all()):
+        raise ValueError("points hold numbers that are not finite; leave out those that were not observed")
+    numbers = torch.as_tensor(vertices).cpu()
+    if numbers.shape != points.shape[-2:-1] or numbers.is_floating_point() or numbers.dtype == torch.bool:
+        raise ValueError(
+            f"vertices hold one vertex index for each of {points.shape[-2]} points; got {tuple(numbers.shape)} of "
+            f"{numbers.dtype}"
+        )
+    if len(numbers.unique()) < 3:
+        raise ValueError(f"a pose follows from three vertices or more; got {len(numbers.unique())}")
+    if not bool(((numbers >= 0) & (numbers < n_vertices)).all()):
+        raise ValueError(f"vertices lie in 0 to {n_vertices - 1}; got {int(numbers.min())} to {int(numbers.max())}")
+    return numbers.long()
 
 
-def _missed(x: Tensor, to: Observations) -> Tensor:
-    return (to.seen(x) - to.points).norm(dim=-1)
+def checked_weights(near: int | Tensor | None, n: int) -> Tensor:
+    """Weights of n shapes that add up to one. *Shape:* ``(n,)``, float64.
 
-
-def _trusted(variation: Variation, to: Observations, missed: Tensor) -> Observations:
-    """The observations with less weight for those that are missed by more than most (Geman and McClure)."""
-    usual = (3 * missed.median()).clamp_min(NOISE * variation.size)
-    return to._replace(weights=to.weights / (1 + (missed / usual) ** 2) ** 2)
-
-
-def _pose(seen: Tensor, to: Observations) -> RigidMotion:
-    """The rigid motion on to the observations. *Shape:* ``(n, 3)``."""
-    return best_fit(seen, to.points, to.weights)
-
-
-def _influence(own: Variation, to: Observations) -> tuple[Tensor, Tensor]:
-    """What each observed place receives from the sides of each triangle, but for loose pieces' rotations.
-
-    *Shape:* ``(n, F)`` each.
+    Raises:
+        ValueError: They do not, or there is no such shape.
     """
-    n, v = len(to.points), len(own.coordinates.mean)
-    parts = to.weights.new_zeros(n, v).scatter(1, to.vertices[:, None], 1)
-    reconstruction = own.coordinates.reconstruction
-    for piece, anchors in reconstruction.loose:
-        # A loose piece goes where the vertices go that it follows.
-        parts[:, anchors] += parts[:, piece].sum(1, keepdim=True) / len(anchors)
-    sides = [parts.new_zeros(1, n, len(own.faces)).requires_grad_() for _ in range(2)]
-    with torch.enable_grad():
-        weights, signs = reconstruction.weights, reconstruction.signs
-        edges = edge_means(Sides(*sides), weights, reconstruction.sides, signs, len(reconstruction.edges))
-        found = reconstruction.poisson(edges, parts.new_zeros(1, n, v))
-        first, second = torch.autograd.grad((found[0] * parts).sum(), sides)
-    return first[0], second[0]
-
-
-def _slopes(own: Variation, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of the sides in the coordinates of their triangle. *Shape:* ``(3, 6, F)`` each."""
-    # Each side is that of its triangle alone. By columns, forward mode would take five times as long.
-    with torch.enable_grad():
-        leaf = y.detach().requires_grad_()
-        ends = torch.cat(own.coordinates.sides(leaf[None]))[:, 0]
-        rows = [torch.autograd.grad(row.sum(), leaf, retain_graph=True)[0] for row in ends]
-    found = torch.stack(rows)[..., : len(own.faces)]
-    return found[:3], found[3:]
+    if near is None:
+        return torch.full((n,), 1 / n, dtype=torch.float64)
+    if isinstance(near, int):
+        if not -n <= near < n:
+            raise ValueError(f"near is one of {n} key-frames; got {near}")
+        return torch.eye(n, dtype=torch.float64)[near]
+    weights = torch.as_tensor(near).detach().to("cpu", torch.float64)
+    if weights.shape != (n,) or not bool(((weights >= 0).all()) & ((weights.sum() - 1).abs() < 1e-5)):
+        raise ValueError(f"near holds {n} weights, none below zero, that add up to one; got {near}")
+    return weights

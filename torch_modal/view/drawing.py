@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.normals import vertex_normals
+from torch_modal.geometry.vectors import vertex_normals
 
 logger = logging.getLogger("torch_modal")
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.energy.energy import Energy, Linearised, Reference
-from torch_modal.energy.shell import DIAGONAL
+from torch_modal.geometry.canonical import CANONICAL_SIZE
 
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
 RIDGE = 1e-6
@@ -16,7 +16,7 @@ RIDGE = 1e-6
 _UNPACKED = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 
 # Where steps are small, the curvature along them is rounding of energies.
-SLIGHT = 1e-5 * DIAGONAL
+SLIGHT = 1e-5 * CANONICAL_SIZE
 
 # Roundings of an energy, relative to it, that make no step shorter.
 ENERGY_ROUNDING = 64.0

@@ -4,7 +4,7 @@ import torch
 
 from torch_modal.autograd import lasting
 from torch_modal.backends.warp.launch import kernels, launch
-from torch_modal.geometry.box_tree import leaves
+from torch_modal.geometry.closest import leaves
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import FloatArray, IntArray
 
