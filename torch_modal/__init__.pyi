@@ -1,8 +1,7 @@
 """The public names, and the modules that they are loaded from when they are first used."""
 
 from . import losses as losses
-from .codec.compress import Compressed as Compressed
-from .codec.compress import compress as compress
+from .codec.selection import select_keyframes as select_keyframes
 from .codec.sequence import ModalSequence as ModalSequence
 from .codec.sequence import encode as encode
 from .contact.self_contacts import SelfContacts as SelfContacts

@@ -15,7 +15,7 @@ import math
 import resource
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import torch
@@ -25,8 +25,7 @@ from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.codec.modes import reproducible_modes
-from torch_modal.codec.selection import FrameSequence, IntervalErrors, select_keyframes
+from torch_modal.codec.selection import Selection
 from torch_modal.geometry.connectivity import Connectivity
 
 GALLOP, GRIP, LONG = 96, 41, 1000
@@ -111,9 +110,7 @@ def print_floats(sequence: Sequence) -> None:
     frames = sequence.frames
     for keys in sequence.keyframes:
         encoded = tm.encode(frames, sequence.faces, keys, 60, cyclic=sequence.cyclic, progress=False)
-        still = tm.ModalSequence(
-            **{**vars_of(encoded), "amplitudes": 0 * encoded.amplitudes, "motions": 0 * encoded.motions}
-        )
+        still = replace(encoded, amplitudes=0 * encoded.amplitudes, motions=0 * encoded.motions)
         n = components(frames, encoded.n_floats)
         numbers = frames[0].numel()
         own, path = sequence.measured(encoded.decode()), sequence.measured(still.decode())
@@ -126,19 +123,14 @@ def print_floats(sequence: Sequence) -> None:
         )
 
 
-def vars_of(sequence: tm.ModalSequence) -> dict[str, object]:
-    """The fields of a sequence."""
-    return {name: getattr(sequence, name) for name in sequence.__dataclass_fields__}
-
-
 def print_selection(sequence: Sequence) -> None:
     """Rows of chosen against even key-frames, judged alike, by all frames."""
     frames, cyclic = sequence.frames, sequence.cyclic
-    motion = FrameSequence.checked(frames, sequence.faces, None, cyclic)
-    modes = reproducible_modes(frames[0], sequence.faces, 20).modes
+    modes = tm.extract_modes(frames[0], sequence.faces, 20).modes
+    times = torch.arange(len(frames) + cyclic).double()
     for even in sequence.keyframes:
         start = time.process_time()
-        keys = select_keyframes(motion, modes, len(even), 0.0, False)
+        keys = tm.select_keyframes(frames, sequence.faces, len(even), n_modes=20, cyclic=cyclic, progress=False)
         seconds = time.process_time() - start
         errors = []
         for choice in (even, keys):
@@ -146,9 +138,9 @@ def print_selection(sequence: Sequence) -> None:
             errors.append(1e3 * float(found.errors.mean()))
         best = ""
         if len(frames) < 12:
-            intervals = IntervalErrors(motion, modes)
+            selection = Selection(frames, sequence.faces, times, cyclic, modes)
             inner = combinations(range(1, len(frames) - 1), len(even) - 2)
-            best = f"{1e3 * min(intervals.mean([0, *each, len(frames) - 1]) for each in inner):.3g}"
+            best = f"{1e3 * min(selection.mean([0, *each, len(frames) - 1]) for each in inner):.3g}"
         print(
             f"| {sequence.name} | {len(even)} | {errors[0]:.3g} | {errors[1]:.3g} {keys} "
             f"| {errors[1] / errors[0]:.2f} | {best or '-'} | {seconds:.0f} |",

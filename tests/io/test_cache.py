@@ -17,8 +17,8 @@ from torch_modal.io.cache import (
     CacheWarning,
     cache_content,
     clear_cache,
-    content_key,
     default_cache_dir,
+    entry_name,
     parse_size,
     shrink_cache,
     size_limit,
@@ -71,19 +71,19 @@ def test_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_key_depends_on_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     keys = [
-        content_key("thing", {"points": POINTS}, {"k": 3}),
-        content_key("other", {"points": POINTS}, {"k": 3}),
-        content_key("thing", {"points": POINTS}, {"k": 4}),
-        content_key("thing", {"points": POINTS}, {"k": 3, "form": "x"}),
-        content_key("thing", {"points": POINTS + np.spacing(5.0)}, {"k": 3}),
-        content_key("thing", {"points": POINTS.reshape(3, 2)}, {"k": 3}),
-        content_key("thing", {"points": POINTS.view(np.int64)}, {"k": 3}),
-        content_key("thing", {"faces": POINTS}, {"k": 3}),
+        entry_name("thing", {"points": POINTS}, {"k": 3}),
+        entry_name("other", {"points": POINTS}, {"k": 3}),
+        entry_name("thing", {"points": POINTS}, {"k": 4}),
+        entry_name("thing", {"points": POINTS}, {"k": 3, "form": "x"}),
+        entry_name("thing", {"points": POINTS + np.spacing(5.0)}, {"k": 3}),
+        entry_name("thing", {"points": POINTS.reshape(3, 2)}, {"k": 3}),
+        entry_name("thing", {"points": POINTS.view(np.int64)}, {"k": 3}),
+        entry_name("thing", {"faces": POINTS}, {"k": 3}),
     ]
     monkeypatch.setattr(cache_module, "CACHE_VERSION", cache_module.CACHE_VERSION + 1)
-    keys.append(content_key("thing", {"points": POINTS}, {"k": 3}))
+    keys.append(entry_name("thing", {"points": POINTS}, {"k": 3}))
     assert len(set(keys)) == len(keys)
-    assert content_key("thing", {"points": np.asfortranarray(POINTS)}, {"k": 3}) == keys[-1]
+    assert entry_name("thing", {"points": np.asfortranarray(POINTS)}, {"k": 3}) == keys[-1]
 
 
 def test_stale_version_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +193,7 @@ def keep(cache: Cache, number: int) -> None:
 def kept(cache: Cache, n: int) -> list[int]:
     """Which are there, without using them."""
     assert cache.folder is not None
-    return [i for i in range(n) if cache._path(cache.folder, "thing", {}, {"number": i}).exists()]
+    return [i for i in range(n) if (cache.folder / entry_name("thing", {}, {"number": i})).exists()]
 
 
 def test_the_least_recently_used_make_room(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import torch
 
 import torch_modal as tm
 from torch_modal.energy.stretch import Stretch
-from torch_modal.io.content import ContentError, content_digest
+from torch_modal.io.cache import ContentError, content_digest
 
 ROOT = Path(__file__).parents[2]
 
@@ -80,7 +80,7 @@ def test_what_is_equal_has_the_same() -> None:
 def test_the_same_in_another_process() -> None:
     code = (
         "import torch, torch_modal as tm\n"
-        "from torch_modal.io.content import content_digest\n"
+        "from torch_modal.io.cache import content_digest\n"
         "print(content_digest([{'a', 'bb', 'ccc'}, tm.Objective(alpha=torch.tensor([2.0]))]))\n"
     )
     found = {
