@@ -12,8 +12,15 @@ import numpy as np
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import FEATURES, Asset, Image, Material, Part
-from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json, world_transforms
-from torch_modal.io.morph import Drawn, place_frames
+from torch_modal.io.gltf import (
+    ARRAY_BUFFER,
+    ELEMENT_ARRAY_BUFFER,
+    Document,
+    Drawn,
+    Json,
+    place_frames,
+    world_transforms,
+)
 from torch_modal.io.normals import carry_together
 
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -152,7 +159,7 @@ class GltfAsset(Asset):
             frames: Those with normals, all or the first. *Shape:* ``(N, V, 3)``.
 
         Returns:
-            The document; its primitives, for :func:`torch_modal.io.morph.place_frames`; the nodes that show them.
+            The document; its primitives, for :func:`torch_modal.io.gltf.place_frames`; the nodes that show them.
         """
         old = self.document
         root = {key: copy.deepcopy(value) for key, value in old.root.items() if key not in _REPLACED}

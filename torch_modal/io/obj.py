@@ -4,6 +4,7 @@ import re
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -228,3 +229,9 @@ class ObjAsset(Asset):
                 )
             )
         return found
+
+
+def obj_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
+    """Text, float64."""
+    points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
+    return (points + "".join(f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist())).encode("ascii")

@@ -1,21 +1,21 @@
-"""PLY: the bytes of the file, with other numbers in the place of positions and normals.
+"""PLY and OFF: the bytes or lines of the file, with other numbers in the place of positions and normals.
 
-trimesh reads positions and triangles. It writes neither further elements and properties nor comments, so that the file
-is patched here. plyfile could do so, but its license is the GPL.
+trimesh reads positions and triangles. It writes neither further elements and properties of PLY nor comments, and of OFF
+neither polygons nor colours, so that files are patched here. plyfile could do so for PLY, but its license is the GPL.
 """
 
 import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_modal.arrays import FloatArray
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset, Material, Part, linear
-from torch_modal.io.bare_mesh import read_triangles
 from torch_modal.io.mtl import as_image
 from torch_modal.io.normals import CarriedNormals
 
@@ -197,3 +197,97 @@ def _text(column: FloatArray, single: bool) -> list[bytes]:
     """The fewest digits that read back as the same number of the file's type."""
     numbers = column.astype(np.float32) if single else column
     return [str(number).encode() for number in (numbers if single else numbers.tolist())]
+
+
+class OffAsset(Asset):
+    """An OFF file, kept as lines: colours, polygons and further numbers of vertices stay."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        text = path.read_bytes().decode("utf-8", errors="surrogateescape")
+        counts = re.sub(r"^\s*\w*OFF", "", re.sub(r"#[^\n]*", "", text[: 1 << 16])).split()[:2]
+        known = len(counts) == 2 and all(word.isdigit() for word in counts)
+        self.positions, self.faces = read_triangles(path, *map(int, counts if known else (0, 0)))
+        self.lines = text.splitlines()
+        content = [n for n, line in enumerate(self.lines) if line.partition("#")[0].strip()]
+        # The header and the counts stand on one line or on two.
+        header = self.lines[content[0]].partition("#")[0].split()
+        first, kind = 1 if len(header) > 1 else 2, header[0]
+        self._rows = content[first : first + len(self.positions)]
+        words = [len(self.lines[n].partition("#")[0].split()) for n in self._rows]
+        if len(words) < len(self.positions) or min(words, default=0) < 3:  # not a vertex a line: only the mesh stays
+            self._rows, words = [], [3]
+        self._colored = "N" not in kind and "4" not in kind and min(words) >= 6
+        faces = content[first + len(self.positions) :]
+        if len(self.faces) > len(faces):
+            self.carries["polygons"] = "polygons"
+        if self._colored:
+            self._carry("colors")
+        elif min(words) > 3:
+            self.carries["properties"] = "further numbers of vertices"
+
+    def with_positions(self, positions: FloatArray) -> bytes:
+        """The file with other positions."""
+        if not self._rows:
+            return off_bytes(positions, self.faces)
+        lines = list(self.lines)
+        for number, (x, y, z) in zip(self._rows, positions.tolist(), strict=True):
+            lines[number] = " ".join([repr(x), repr(y), repr(z), *lines[number].split(None, 3)[3:]])
+        return ("\n".join(lines) + "\n").encode("utf-8", errors="surrogateescape")
+
+    def parts(self) -> list[Part]:
+        """One part."""
+        everything = np.arange(len(self.positions))
+        if not self._colored:
+            return [Part(everything, self.faces, Material())]
+        rows = [[float(word) for word in self.lines[n].partition("#")[0].split()[3:7]] for n in self._rows]
+        colors = np.array([row[: min(map(len, rows))] for row in rows])
+        # Whole numbers go to 255, others to 1.
+        whole = all("." not in self.lines[n].partition("#")[0].split()[3] for n in self._rows)
+        white = Material(self.path.stem, (1.0, 1.0, 1.0, 1.0))
+        return [Part(everything, self.faces, white, colors=linear(colors / (255 if whole else 1)))]
+
+
+def read_triangles(path: Path, n_vertices: int, n_faces: int) -> tuple[FloatArray, IntArray]:
+    """Vertices ``(V, 3)`` as they stand in the file, faces ``(F, 3)``.
+
+    Args:
+        path: The file.
+        n_vertices: From its header.
+        n_faces: From its header, polygons included; 0 if unknown.
+
+    Raises:
+        MeshError: The file was cut off, which trimesh accepts.
+    """
+    import trimesh
+
+    # Without process=False vertices are merged; with fix_texture a PLY is split at texture seams.
+    options = {"fix_texture": False} if path.suffix.lower() == ".ply" else {}
+    mesh = trimesh.load_mesh(path, process=False, maintain_order=True, **options)
+    vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    faces = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
+    if n_faces and (len(vertices) != n_vertices or len(faces) < n_faces):
+        raise MeshError(
+            f"{path}: the header promises {n_vertices} vertices and {n_faces} faces, the file holds {len(vertices)} "
+            f"and {len(faces)}; it was cut off or is damaged"
+        )
+    return vertices, faces
+
+
+def ply_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
+    """Binary, float32."""
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    rows["count"], rows["corners"] = 3, faces
+    return header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes()
+
+
+def off_bytes(vertices: FloatArray, faces: IntArray, asset: Any = None) -> bytes:
+    """Text, float64."""
+    points = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
+    triangles = "".join(f"3 {a} {b} {c}\n" for a, b, c in faces.tolist())
+    return f"OFF\n{len(vertices)} {len(faces)} 0\n{points}{triangles}".encode("ascii")

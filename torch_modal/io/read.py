@@ -13,7 +13,7 @@ from torch_modal.io.asset import Asset
 READERS = {
     ".obj": "torch_modal.io.obj.ObjAsset",
     ".ply": "torch_modal.io.ply.PlyAsset",
-    ".off": "torch_modal.io.off.OffAsset",
+    ".off": "torch_modal.io.ply.OffAsset",
     ".glb": "torch_modal.io.gltf_asset.GltfAsset",
     ".gltf": "torch_modal.io.gltf_asset.GltfAsset",
 }
