@@ -490,7 +490,7 @@ def test_frames_as_glb(tmp_path):
 
 
 def test_pictures_of_other_formats_become_png():
-    from torch_modal.io.mtl import as_image
+    from torch_modal.io.asset import as_image
 
     stream = io.BytesIO()
     Image.new("RGB", (4, 4), RED).save(stream, format="BMP")

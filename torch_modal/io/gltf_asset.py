@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import FEATURES, Asset, Image, Material, Part
+from torch_modal.io.asset import Asset, Image, Material, Part, as_image
 from torch_modal.io.gltf import (
     ARRAY_BUFFER,
     ELEMENT_ARRAY_BUFFER,
@@ -61,11 +61,6 @@ class GltfAsset(Asset):
         """Of the files that it writes."""
         return ".glb"
 
-    @property
-    def keeps(self) -> Collection[str]:
-        """All but skeletons, animations and morph targets."""
-        return set(FEATURES) - {"posing"}
-
     def _collect(self) -> None:
         positions, faces, n = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
         posed = 0
@@ -95,11 +90,14 @@ class GltfAsset(Asset):
         self.positions = np.concatenate(positions)
         self.faces = np.concatenate(faces)
         names = {name for primitive in self._primitives for name in primitive.json["attributes"]}
-        for feature, wanted in (("texcoords", "TEXCOORD_0"), ("normals", "NORMAL"), ("colors", "COLOR_0")):
-            if wanted in names:
-                self._carry(feature)
+        if "TEXCOORD_0" in names:
+            self.carries["texcoords"] = "texture coordinates"
+        if "NORMAL" in names:
+            self.carries["normals"] = "normals"
+        if "COLOR_0" in names:
+            self.carries["colors"] = "vertex colours"
         if self.document.get("materials"):
-            self._carry("materials", len(self.document.get("materials")))
+            self.carries["materials"] = "materials"
         moving = ["skeleton"] if posed else []
         if self.document.get("animations"):
             moving.append("animations")
@@ -235,8 +233,7 @@ class GltfAsset(Asset):
             data = self._image_bytes(number)
             image.pop("uri", None)
             image["bufferView"] = document.add_bytes(data)
-            known = Image.of(data)
-            image.setdefault("mimeType", known.mime if known else "image/png")
+            image.setdefault("mimeType", "image/jpeg" if data.startswith(b"\xff\xd8") else "image/png")
 
     def _image_bytes(self, number: int) -> bytes:
         image = self.document.get("images", number)
@@ -279,7 +276,7 @@ class GltfAsset(Asset):
             texture = self.document.get("textures", surface["baseColorTexture"]["index"])
             if "source" in texture:
                 data = self._image_bytes(texture["source"])
-                image = Image.of(data) or Image(data, "image/png")
+                image = as_image(data) or Image(data, "image/png")
         color = tuple(float(c) for c in surface.get("baseColorFactor", (1, 1, 1, 1)))
         metallic, roughness = surface.get("metallicFactor", 1.0), surface.get("roughnessFactor", 1.0)
         return Material(material.get("name", f"material-{number}"), color, metallic, roughness, image)

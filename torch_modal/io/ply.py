@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Material, Part, linear
-from torch_modal.io.mtl import as_image
+from torch_modal.io.asset import Asset, Material, Part, as_image, linear
 from torch_modal.io.normals import CarriedNormals
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
@@ -84,11 +83,11 @@ class PlyAsset(Asset):
         if len(self.faces) > n_faces:
             self.carries["polygons"] = "polygons"
         if {"nx", "ny", "nz"} <= names:
-            self._carry("normals")
+            self.carries["normals"] = "normals"
         if {"red", "green", "blue"} <= names:
-            self._carry("colors")
+            self.carries["colors"] = "vertex colours"
         if self._uv_names is not None:
-            self._carry("texcoords")
+            self.carries["texcoords"] = "texture coordinates"
         if self._textures:
             self.carries["materials"] = "texture"
         known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", *(self._uv_names or ())}
@@ -222,7 +221,7 @@ class OffAsset(Asset):
         if len(self.faces) > len(faces):
             self.carries["polygons"] = "polygons"
         if self._colored:
-            self._carry("colors")
+            self.carries["colors"] = "vertex colours"
         elif min(words) > 3:
             self.carries["properties"] = "further numbers of vertices"
 

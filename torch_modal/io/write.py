@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Sequence
 from itertools import chain
 from pathlib import Path
@@ -76,7 +77,7 @@ def save_frames(
 
 
 def save_mesh(
-    vertices: Array, faces: Array, out: str | Path, overwrite: bool = False, asset: Asset | None = None
+    vertices: Array, faces: Array, out: str | os.PathLike[str], overwrite: bool = False, asset: Asset | None = None
 ) -> Path:
     """Write one shape; the file's extension says the format. All else is as for `save_frames`.
 
@@ -108,7 +109,7 @@ def _write(
     own = asset is not None and asset.suffix == suffix
     if asset is not None:
         asset.warn_lost(paths[0].name, asset.keeps if own else fmt.holds)
-    beside = asset.companions_for(paths[0].parent, overwrite) if asset is not None and own else []
+    beside = asset.missing_companions(paths[0].parent, overwrite) if asset is not None and own else []
     data = (asset.with_positions(x) if asset is not None and own else fmt.write(x, faces, asset) for x in shapes)
     write_files(chain(beside, zip(paths, data, strict=True)))
 
