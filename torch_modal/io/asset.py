@@ -109,14 +109,12 @@ class Asset(ABC):
     keeps = frozenset(FEATURES) - {"posing"}
     """Features that :meth:`with_positions` keeps."""
 
+    suffix: str
+    """Of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
+
     def __init__(self, path: Path) -> None:
         self.path = path
         self.carries = {}
-
-    @property
-    def suffix(self) -> str:
-        """Of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
-        return self.path.suffix.lower()
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:

@@ -104,7 +104,7 @@ def _document(
         if part.colors is not None:
             primitive["attributes"]["COLOR_0"] = document.add(part.colors.astype(np.float32), "VEC4", ARRAY_BUFFER)
         primitives.append(primitive)
-        drawn.append(Drawn(primitive, part.vertices, None, own_normals))
+        drawn.append(Drawn(primitive, part.vertices, np.eye(4), own_normals))
     document.append("meshes", {"name": name, "primitives": primitives})
     document.append("nodes", {"name": name, "mesh": 0})
     document.append("scenes", {"name": "scene", "nodes": [0]})

@@ -35,15 +35,17 @@ class Document:
 
     Args:
         root: The JSON.
-        binary: Content of its first buffer, unless that is a separate file.
-        folder: Where its files are.
+        folder: Folder that its URIs are relative to.
+        binary: The binary part of a GLB file.
     """
 
-    def __init__(self, root: Json | None = None, binary: bytes = b"", folder: Path = Path()) -> None:
+    def __init__(self, root: Json | None = None, folder: Path = Path(), binary: bytes = b"") -> None:
         self.root: Json = {"asset": {"version": "2.0", "generator": "torch_modal"}} if root is None else root
-        self.binary = bytearray(binary)
         self.folder = folder
-        self._buffers: dict[int, bytes] = {}
+        #: Documents that are written have one.
+        self.buffers = [
+            bytearray(self.resource(buffer["uri"]) if "uri" in buffer else binary) for buffer in self.get("buffers")
+        ] or [bytearray()]
 
     @classmethod
     def read(cls, path: Path) -> Document:
@@ -71,20 +73,13 @@ class Document:
         root = json.loads(text.decode("utf-8"))
         if not isinstance(root, dict) or not str(root.get("asset", {}).get("version", "")).startswith("2"):
             raise ValueError("not glTF 2")
-        return cls(root, binary, path.parent)
+        return cls(root, path.parent, binary)
 
     # --------------------------------------------------------------------------------------------------------- reading
     def get(self, kind: str, index: int | None = None) -> Any:
         """A list of the document, empty where there is none; or one of its members."""
         items = self.root.get(kind, [])
         return items if index is None else items[_index(index)]
-
-    def buffer(self, index: int) -> bytes:
-        """All bytes of a buffer."""
-        if index not in self._buffers:
-            uri = self.get("buffers", index).get("uri")
-            self._buffers[index] = bytes(self.binary) if uri is None else self.resource(uri)
-        return self._buffers[index]
 
     def resource(self, uri: str) -> bytes:
         """The data in a URI, or of the file that it names."""
@@ -96,10 +91,15 @@ class Document:
         """The bytes of a buffer view."""
         view = self.get("bufferViews", index)
         start = view.get("byteOffset", 0)
-        data = self.buffer(_index(view["buffer"]))[start : start + view["byteLength"]]
+        data = self.buffers[_index(view["buffer"])][start : start + view["byteLength"]]
         if start < 0 or len(data) < view["byteLength"]:
             raise ValueError("a buffer is too short")
-        return data
+        return bytes(data)
+
+    def image(self, index: int) -> bytes:
+        """The bytes of an image."""
+        image = self.get("images", index)
+        return self.view(image["bufferView"]) if "bufferView" in image else self.resource(image["uri"])
 
     def accessor(self, index: int) -> NDArray[Any]:
         """The numbers of an accessor, in its component type. *Shape:* ``(count, width)``.
@@ -151,11 +151,12 @@ class Document:
 
     def add_bytes(self, data: bytes, target: int | None = None) -> int:
         """Add bytes as a buffer view; its number."""
-        self.binary += bytes(-len(self.binary) % 4)  # views start at multiples of four bytes
-        view: Json = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
+        (binary,) = self.buffers
+        binary += bytes(-len(binary) % 4)  # views start at multiples of four bytes
+        view: Json = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
         if target is not None:
             view["target"] = target
-        self.binary += data
+        binary += data
         return self.append("bufferViews", view)
 
     def add(
@@ -195,10 +196,11 @@ class Document:
 
     def to_glb(self) -> bytes:
         """The document as a GLB file."""
-        self.root["buffers"] = [{"byteLength": len(self.binary)}]
+        (data,) = self.buffers
+        self.root["buffers"] = [{"byteLength": len(data)}]
         text = json.dumps(self.root, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode("utf-8")
         text += b" " * (-len(text) % 4)
-        binary = bytes(self.binary) + bytes(-len(self.binary) % 4)
+        binary = bytes(data) + bytes(-len(data) % 4)
         head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
         return b"".join(
             [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
@@ -249,7 +251,7 @@ class Drawn(NamedTuple):
     json: Json
     points: Any
     """Its vertices among all; indices or a slice. *Shape:* ``(P,)``."""
-    inverse: FloatArray | None = None
+    inverse: FloatArray
     """From the scene to the node. *Shape:* ``(4, 4)``."""
     normals: FloatArray | None = None
     """Of each frame, or of frame 0 alone if they do not move. *Shape:* ``(N, P, 3)`` or ``(1, P, 3)``."""
@@ -260,43 +262,33 @@ def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray)
 
     Args:
         document: The document.
-        drawn: Its primitives.
+        drawn: Its primitives; those that share points and normals share accessors.
         frames: Positions of all vertices, in the scene. *Shape:* ``(N, V, 3)``.
     """
-    made: dict[tuple[int, int], tuple[Json, list[Json]]] = {}
+    made: dict[tuple[int, int], list[Json]] = {}
     for primitive in drawn:
         key = (id(primitive.points), id(primitive.normals))
         if key not in made:
-            made[key] = _attributes(document, primitive, frames)
-        attributes, targets = made[key]
-        primitive.json["attributes"] = {**attributes, **primitive.json.get("attributes", {})}
+            shapes = frames[:, primitive.points] @ primitive.inverse[:3, :3].T + primitive.inverse[:3, 3]
+            made[key] = [{"POSITION": document.add(x, "VEC3", ARRAY_BUFFER, bounds=True)} for x in _differences(shapes)]
+            if primitive.normals is not None:
+                for attributes, x in zip(made[key], _differences(_unit(primitive.normals)), strict=False):
+                    attributes["NORMAL"] = document.add(x, "VEC3", ARRAY_BUFFER)
+        first, *targets = made[key]
+        primitive.json["attributes"] = {**first, **primitive.json.get("attributes", {})}
         if targets:
             primitive.json["targets"] = targets
 
 
-def _attributes(document: Document, primitive: Drawn, frames: FloatArray) -> tuple[Json, list[Json]]:
-    local = frames[:, primitive.points]
-    if primitive.inverse is not None:
-        local = local @ primitive.inverse[:3, :3].T + primitive.inverse[:3, 3]
-    base = local[0].astype(np.float32)
-    attributes = {"POSITION": document.add(base, "VEC3", ARRAY_BUFFER, bounds=True)}
-    normals = [] if primitive.normals is None else [_unit(own) for own in primitive.normals]
-    if normals:
-        normals[0] = normals[0].astype(np.float32)
-        attributes["NORMAL"] = document.add(normals[0], "VEC3", ARRAY_BUFFER)
-    targets = []
-    for number, shape in enumerate(local[1:], start=1):
-        # Against the rounded base, so that its rounding is not carried into every frame.
-        target = {"POSITION": document.add((shape - base).astype(np.float32), "VEC3", ARRAY_BUFFER, bounds=True)}
-        if number < len(normals):
-            target["NORMAL"] = document.add((normals[number] - normals[0]).astype(np.float32), "VEC3", ARRAY_BUFFER)
-        targets.append(target)
-    return attributes, targets
+def _differences(frames: FloatArray) -> NDArray[np.float32]:
+    """Frame 0 in single precision, and the others less that, so that its rounding is in none of them."""
+    first = frames[0].astype(np.float32)
+    return np.concatenate([first[None], (frames[1:] - first).astype(np.float32)])
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
     """Of unit length, as glTF demands; ``(0, 0, 1)`` where there is none. Unit vectors stay bit for bit."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     usable = length > 1e-12
     scaled = np.where(np.abs(length - 1) < 1e-6, vectors, vectors / np.where(usable, length, 1.0))
     return np.where(usable, scaled, np.array([0.0, 0.0, 1.0]))

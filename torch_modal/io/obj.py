@@ -24,6 +24,8 @@ class ObjAsset(Asset):
     name the new ones.
     """
 
+    suffix = ".obj"
+
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         text = path.read_bytes().decode("utf-8", errors="surrogateescape")

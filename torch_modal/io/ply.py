@@ -42,6 +42,8 @@ class _Element(NamedTuple):
 class PlyAsset(Asset):
     """A PLY file, kept as bytes. Written again it differs in positions and normals alone, in the file's types."""
 
+    suffix = ".ply"
+
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.data = path.read_bytes()
@@ -200,6 +202,8 @@ def _text(column: FloatArray, single: bool) -> list[bytes]:
 
 class OffAsset(Asset):
     """An OFF file, kept as lines: colours, polygons and further numbers of vertices stay."""
+
+    suffix = ".off"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
