@@ -22,6 +22,7 @@ _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4
 _TYPES |= {"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _TYPES |= {"float32": "f4", "float64": "f8"}
 _UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+_NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 
 
 class _Property(NamedTuple):
@@ -35,76 +36,58 @@ class _Element(NamedTuple):
     length: int
     properties: dict[str, _Property]
 
-    def row(self, order: str) -> np.dtype:
-        return np.dtype([(name, order + prop.type) for name, prop in self.properties.items()])
 
+class PlyFile:
+    """A PLY file in memory: its header, and the numbers of its vertices.
 
-class PlyAsset(Asset):
-    """A PLY file, kept as bytes. Written again it differs in positions and normals alone, in the file's types."""
+    Args:
+        path: The file.
 
-    suffix = ".ply"
+    Raises:
+        ValueError: It has no header, or no vertices.
+    """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path)
         self.data = path.read_bytes()
-        self._read_header()
-        faces = [element for element in self._elements if element.name == "face"]
-        n_faces = sum(element.length for element in faces)
-        self.positions, self.faces = read_triangles(path, self._vertex.length, n_faces)
-        self._describe(n_faces, {name for element in faces for name in element.properties})
-
-    def _read_header(self) -> None:
         match = re.search(rb"end_header[^\n]*\n|end_header\r", self.data)
         if match is None:
             raise ValueError("no end_header")
         self._start = match.end()
-        self._format, self._order, self._textures = "ascii", "", []
-        self._elements: list[_Element] = []
+        self._order, self.textures = "", []
+        self.elements: list[_Element] = []
         for line in re.split(r"\r\n|\n|\r", self.data[: self._start].decode("utf-8", errors="replace")):
             words = line.split()
             if line.lower().startswith("comment texturefile"):
-                self._textures.append(line.split(None, 2)[2].strip())
+                self.textures.append(line.split(None, 2)[2].strip())
             elif words[:1] == ["format"]:
-                self._format = words[1]
-                self._order = ">" if words[1] == "binary_big_endian" else "<"
+                self._order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
             elif words[:1] == ["element"]:
-                self._elements.append(_Element(words[1], int(words[2]), {}))
+                self.elements.append(_Element(words[1], int(words[2]), {}))
             elif words[:2] == ["property", "list"]:
-                self._elements[-1].properties[words[4]] = _Property(_TYPES[words[3]], _TYPES[words[2]])
+                self.elements[-1].properties[words[4]] = _Property(_TYPES[words[3]], _TYPES[words[2]])
             elif words[:1] == ["property"]:
-                self._elements[-1].properties[words[2]] = _Property(_TYPES[words[1]])
-        vertices = [element for element in self._elements if element.name == "vertex"]
+                self.elements[-1].properties[words[2]] = _Property(_TYPES[words[1]])
+        vertices = [element for element in self.elements if element.name == "vertex"]
         if not vertices:
             raise ValueError("no vertices")
-        self._vertex = vertices[0]
-        names = self._vertex.properties.keys()
-        self._uv_names = next((pair for pair in _UV_NAMES if names >= set(pair)), None)
+        self.vertex = vertices[0]
 
-    def _describe(self, n_faces: int, face_properties: set[str]) -> None:
-        names = self._vertex.properties.keys()
-        if len(self.faces) > n_faces:
-            self.carries["polygons"] = "polygons"
-        if {"nx", "ny", "nz"} <= names:
-            self.carries["normals"] = "normals"
-        if {"red", "green", "blue"} <= names:
-            self.carries["colors"] = "vertex colours"
-        if self._uv_names is not None:
-            self.carries["texcoords"] = "texture coordinates"
-        if self._textures:
-            self.carries["materials"] = "texture"
-        known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", *(self._uv_names or ())}
-        further = sorted((names - known) | (face_properties - {"vertex_indices", "vertex_index"}))
-        if further or len(self._elements) > 2:
-            others = [e.name for e in self._elements if e.name not in ("vertex", "face")]
-            self.carries["properties"] = "properties " + ", ".join(further + others)
-
-    # ------------------------------------------------------------------------------------------------ the vertex rows
     @cached_property
-    def _place(self) -> tuple[int, int]:
-        """Start of the rows of the vertices, as a byte or in text as a line, and their size in bytes."""
-        before = self._elements[: self._elements.index(self._vertex)]
-        if self._format == "ascii":
-            return sum(element.length for element in before), 0
+    def _content(self) -> tuple[bytes, NDArray[Any], bytes]:
+        """The vertices with all their properties, and the bytes before and after them.
+
+        *Shape:* ``(V,)``, structured; of text ``(V, n)`` words.
+        """
+        if any(prop.count_type for prop in self.vertex.properties.values()):
+            raise ValueError("vertices with properties that are lists")
+        before = self.elements[: self.elements.index(self.vertex)]
+        if not self._order:
+            lines = self.data[self._start :].splitlines(keepends=True)
+            first = sum(element.length for element in before)
+            last = first + self.vertex.length
+            words = np.array([line.split() for line in lines[first:last]], dtype=object)
+            head = self.data[: self._start] + b"".join(lines[:first])
+            return head, words.reshape(-1, len(self.vertex.properties)), b"".join(lines[last:])
         place = self._start
         for element in before:
             for _ in range(element.length):
@@ -115,89 +98,97 @@ class PlyAsset(Asset):
                         repeat = int(np.frombuffer(self.data, count, 1, place)[0])
                         place += count.itemsize
                     place += repeat * np.dtype(prop.type).itemsize
-        return place, self._vertex.length * self._vertex.row(self._order).itemsize
+        row = np.dtype([(name, self._order + prop.type) for name, prop in self.vertex.properties.items()])
+        rows = np.frombuffer(self.data, row, self.vertex.length, place)
+        return self.data[:place], rows, self.data[place + rows.nbytes :]
 
-    @cached_property
-    def _lines(self) -> list[bytes]:
-        return self.data[self._start :].splitlines()
+    def columns(self, *names: str) -> FloatArray:
+        """Properties of the vertices. *Shape:* ``(V, n)``."""
+        _, rows, _ = self._content
+        at = list(self.vertex.properties)
+        found = [rows[name] if self._order else rows[:, at.index(name)] for name in names]
+        return np.stack([column.astype(np.float64) for column in found], axis=1)
 
-    @cached_property
-    def _rows(self) -> NDArray[np.void]:
-        """The vertices with all their properties. *Shape:* ``(V,)``."""
-        if any(prop.count_type for prop in self._vertex.properties.values()):
-            raise ValueError("vertices with properties that are lists")
-        place, size = self._place
-        row = self._vertex.row(self._order)
-        if self._format != "ascii":
-            return np.frombuffer(self.data[place : place + size], row).copy()
-        lines = self._lines[place : place + self._vertex.length]
-        words = [tuple(map(float, line.split())) for line in lines]
-        return np.array(words, dtype=[(name, "f8") for name in row.names or ()])
+    def with_columns(self, new: Mapping[str, FloatArray]) -> bytes:
+        """The file with other values of some properties of the vertices. *Shape of each:* ``(V,)``."""
+        before, rows, after = self._content
+        rows = rows.copy()
+        if self._order:
+            for name, column in new.items():
+                rows[name] = column
+            return before + rows.tobytes() + after
+        properties = self.vertex.properties
+        for name, column in new.items():
+            # The fewest digits that read back as the same number of the file's type.
+            numbers = column.astype(np.float32) if properties[name].type == "f4" else column.tolist()
+            rows[:, list(properties).index(name)] = [str(number).encode() for number in numbers]
+        return before + b"".join(b" ".join(row) + b"\n" for row in rows.tolist()) + after
 
-    def _columns(self, *names: str) -> FloatArray:
-        return np.stack([self._rows[name].astype(np.float64) for name in names], axis=1)
+
+class PlyAsset(Asset):
+    """A PLY file, kept as bytes. Written again it differs in positions and normals alone, in the file's types."""
+
+    suffix = ".ply"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._file = PlyFile(path)
+        faces = [element for element in self._file.elements if element.name == "face"]
+        n_faces = sum(element.length for element in faces)
+        self.positions, self.faces = read_triangles(path, self._file.vertex.length, n_faces)
+        names = self._file.vertex.properties.keys()
+        self._uv_names = next((pair for pair in _UV_NAMES if names >= set(pair)), None)
+        if len(self.faces) > n_faces:
+            self.carries["polygons"] = "polygons"
+        if names >= {*_NORMALS}:
+            self.carries["normals"] = "normals"
+        if names >= {*_COLORS}:
+            self.carries["colors"] = "vertex colours"
+        if self._uv_names is not None:
+            self.carries["texcoords"] = "texture coordinates"
+        if self._file.textures:
+            self.carries["materials"] = "texture"
+        of_vertices = names - {"x", "y", "z", *_NORMALS, *_COLORS, "alpha", *(self._uv_names or ())}
+        of_faces = {name for element in faces for name in element.properties} - {"vertex_indices", "vertex_index"}
+        others = [element.name for element in self._file.elements if element.name not in ("vertex", "face")]
+        if further := [*sorted(of_vertices | of_faces), *others]:
+            self.carries["properties"] = "properties " + ", ".join(further)
 
     @cached_property
     def _carried(self) -> CarriedNormals:
-        return CarriedNormals(self._columns("nx", "ny", "nz"), self.positions, self.faces)
+        return CarriedNormals(self._file.columns(*_NORMALS), self.positions, self.faces)
 
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
         new = dict(zip("xyz", positions.T, strict=True))
         if "normals" in self.carries:
-            new |= dict(zip(("nx", "ny", "nz"), self._carried.at(positions).T, strict=True))
-        return self.with_columns(new)
-
-    def with_columns(self, new: Mapping[str, FloatArray]) -> bytes:
-        """The file with other values of some properties of the vertices. *Shape of each:* ``(V,)``."""
-        place, size = self._place
-        if self._format != "ascii":
-            rows = self._rows.copy()
-            for name, column in new.items():
-                rows[name] = column
-            return self.data[:place] + rows.tobytes() + self.data[place + size :]
-        lines = list(self._lines)
-        properties = self._vertex.properties
-        at = {name: number for number, name in enumerate(properties)}
-        columns = {at[name]: _text(column, properties[name].type == "f4") for name, column in new.items()}
-        for number in range(self._vertex.length):
-            words = lines[place + number].split()
-            for place_in_row, text in columns.items():
-                words[place_in_row] = text[number]
-            lines[place + number] = b" ".join(words)
-        return self.data[: self._start] + b"\n".join(lines) + b"\n"
+            new |= dict(zip(_NORMALS, self._carried.at(positions).T, strict=True))
+        return self._file.with_columns(new)
 
     @cached_property
     def companions(self) -> dict[str, bytes]:
         """Textures that the header names."""
-        paths = {name: self.path.parent / name for name in self._textures if not Path(name).is_absolute()}
+        paths = {name: self.path.parent / name for name in self._file.textures if not Path(name).is_absolute()}
         return {name: path.read_bytes() for name, path in paths.items() if path.is_file() and ".." not in path.parts}
 
     def parts(self) -> list[Part]:
         """One part."""
         material = Material()
-        if "colors" in self.carries or self._textures:
+        if "colors" in self.carries or self._file.textures:
             image = as_image(next(iter(self.companions.values()))) if self.companions else None
             material = Material(self.path.stem, (1.0, 1.0, 1.0, 1.0), texture=image)
-        colors = None
+        colors = texcoords = normals = None
         if "colors" in self.carries:
-            channels = ["red", "green", "blue"]
-            channels += ["alpha"] if "alpha" in self._vertex.properties else []
-            kind = np.dtype(self._vertex.properties["red"].type)
+            properties = self._file.vertex.properties
+            kind = np.dtype(properties["red"].type)
             scale = float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
-            colors = linear(self._columns(*channels) / scale)
-        texcoords = None
+            colors = linear(self._file.columns(*_COLORS, *(["alpha"] if "alpha" in properties else [])) / scale)
         if self._uv_names is not None:
-            texcoords = self._columns(*self._uv_names) * [1, -1] + [0, 1]
-        normals = self._columns("nx", "ny", "nz") if "normals" in self.carries else None
+            texcoords = self._file.columns(*self._uv_names) * [1, -1] + [0, 1]
+        if "normals" in self.carries:
+            normals = self._file.columns(*_NORMALS)
         everything = np.arange(len(self.positions))
         return [Part(everything, self.faces, material, texcoords, colors, normals)]
-
-
-def _text(column: FloatArray, single: bool) -> list[bytes]:
-    """The fewest digits that read back as the same number of the file's type."""
-    numbers = column.astype(np.float32) if single else column
-    return [str(number).encode() for number in (numbers if single else numbers.tolist())]
 
 
 class OffAsset(Asset):
