@@ -1,6 +1,6 @@
 """A motion as key-frames and amplitudes, against a plain PCA of its frames.
 
-    python tests/benchmarks/codec.py [floats selection decode] [--motions creature hand-path grip]
+    python tests/benchmarks/codec.py [floats decode] [--motions creature hand-path grip]
     python tests/benchmarks/codec.py long
 
 Distances are means over the vertices and frames, over the diagonal; edge errors are means of ``|l - l_true| / l_true``.
@@ -16,7 +16,6 @@ import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import torch
 from cases import DATA
@@ -25,7 +24,6 @@ from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.codec.selection import Selection
 from torch_modal.geometry.connectivity import Connectivity
 
 GALLOP, GRIP, LONG = 96, 41, 1000
@@ -123,31 +121,6 @@ def print_floats(sequence: Sequence) -> None:
         )
 
 
-def print_selection(sequence: Sequence) -> None:
-    """Rows of chosen against even key-frames, judged alike, by all frames."""
-    frames, cyclic = sequence.frames, sequence.cyclic
-    modes = tm.extract_modes(frames[0], sequence.faces, 20).modes
-    times = torch.arange(len(frames) + cyclic).double()
-    for even in sequence.keyframes:
-        start = time.process_time()
-        keys = tm.select_keyframes(frames, sequence.faces, len(even), n_modes=20, cyclic=cyclic, progress=False)
-        seconds = time.process_time() - start
-        errors = []
-        for choice in (even, keys):
-            found = tm.encode(frames, sequence.faces, choice, 20, cyclic=cyclic, progress=False)
-            errors.append(1e3 * float(found.errors.mean()))
-        best = ""
-        if len(frames) < 12:
-            selection = Selection(frames, sequence.faces, times, cyclic, modes)
-            inner = combinations(range(1, len(frames) - 1), len(even) - 2)
-            best = f"{1e3 * min(selection.mean([0, *each, len(frames) - 1]) for each in inner):.3g}"
-        print(
-            f"| {sequence.name} | {len(even)} | {errors[0]:.3g} | {errors[1]:.3g} {keys} "
-            f"| {errors[1] / errors[0]:.2f} | {best or '-'} | {seconds:.0f} |",
-            flush=True,
-        )
-
-
 def print_decode(sequence: Sequence) -> None:
     """A row of speed: 100 frames of about 8,000 vertices."""
     frames, faces = sequence.frames[:2], sequence.faces
@@ -206,10 +179,6 @@ TABLES = {
         "| motion | key-frames | floats / 3V | path: distance, edges | + 60 amplitudes "
         "| PCA, components: distance, edges = ours over it | PCA of more floats |",
         print_floats,
-    ),
-    "selection": (
-        "| motion | key-frames | evenly spaced | chosen | ratio | exhaustive | seconds |",
-        print_selection,
     ),
     "decode": ("| decoding on one core | speed |", print_decode),
 }

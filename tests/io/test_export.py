@@ -71,16 +71,6 @@ def test_frames_read_back(tmp_path, fmt, tolerance):
         np.testing.assert_array_equal(mesh.faces, FACES)
 
 
-def test_ply_of_thousands_is_what_pyvista_reads(data_dir, tmp_path):
-    import pyvista
-
-    mesh = trimesh.load_mesh(data_dir / "mh-hand-path" / "00.obj", process=False, maintain_order=True)
-    (path,) = save_frames(mesh.vertices[None], mesh.faces, tmp_path)
-    read = pyvista.read(path)
-    np.testing.assert_array_equal(read.points, mesh.vertices.astype(np.float32))
-    np.testing.assert_array_equal(read.faces.reshape(-1, 4)[:, 1:], mesh.faces)
-
-
 def test_numbers_grow_with_the_sequence(tmp_path):
     paths = save_frames(np.repeat(tetrahedra(1), 1001, axis=0), FACES, tmp_path)
     assert (paths[0].name, paths[-1].name) == ("frame-0000.ply", "frame-1000.ply")
@@ -95,12 +85,9 @@ def test_torch_and_numpy_give_the_same_files(tmp_path):
     b = save_frames(tensor, torch.tensor(FACES), tmp_path / "b", fmt="obj")
     b += [save_animation(tensor, torch.tensor(FACES), tmp_path / "b" / "x.glb")]
     assert [path.read_bytes() for path in a] == [path.read_bytes() for path in b]
-
-
-def test_bfloat16_is_taken(tmp_path):
-    frames = torch.tensor(tetrahedra()).bfloat16()
-    (path, *_) = save_frames(frames, FACES, tmp_path)
-    np.testing.assert_array_equal(trimesh.load_mesh(path, process=False).vertices, frames[0].float().numpy())
+    half = tensor.bfloat16()  # which NumPy does not have
+    (path, *_) = save_frames(half, FACES, tmp_path / "half")
+    np.testing.assert_array_equal(trimesh.load_mesh(path, process=False).vertices, half.detach()[0].float().numpy())
 
 
 def test_existing_files_stay_unless_asked(tmp_path):
@@ -278,14 +265,6 @@ def test_glb_container(tmp_path):
     assert 0 <= binary_length - document["buffers"][0]["byteLength"] < 4
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
     assert len(document["meshes"][0]["primitives"][0]["targets"]) == 4
-
-
-def test_trimesh_reads_frame_zero(tmp_path):
-    frames = tetrahedra()
-    scene = trimesh.load(save_animation(frames, FACES, tmp_path / "a.glb"), process=False)
-    (mesh,) = scene.geometry.values()
-    np.testing.assert_array_equal(mesh.vertices, frames[0].astype(np.float32))
-    np.testing.assert_array_equal(mesh.faces, FACES)
 
 
 def test_cyclic_returns_to_frame_zero(tmp_path):

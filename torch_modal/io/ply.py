@@ -205,20 +205,24 @@ class OffAsset(Asset):
         self.lines = text.splitlines()
         content = [n for n, line in enumerate(self.lines) if line.partition("#")[0].strip()]
         # The header and the counts stand on one line or on two.
-        header = self.lines[content[0]].partition("#")[0].split()
-        first, kind = 1 if len(header) > 1 else 2, header[0]
-        self._rows = content[first : first + len(self.positions)]
-        words = [len(self.lines[n].partition("#")[0].split()) for n in self._rows]
-        if len(words) < len(self.positions) or min(words, default=0) < 3:  # not a vertex a line: only the mesh stays
-            self._rows, words = [], [3]
-        self._colored = "N" not in kind and "4" not in kind and min(words) >= 6
-        faces = content[first + len(self.positions) :]
-        if len(self.faces) > len(faces):
-            self.carries["polygons"] = "polygons"
-        if self._colored:
+        kind, *rest = self.lines[content[0]].partition("#")[0].split()
+        first = 1 if rest else 2
+        last = first + len(self.positions)
+        self._rows = content[first:last]
+        words = [self.lines[n].partition("#")[0].split() for n in self._rows]
+        width = min(map(len, words), default=0)
+        if len(words) < len(self.positions) or width < 3:  # not a vertex a line: only the mesh stays
+            self._rows, width = [], 3
+        self._colors: FloatArray | None = None
+        if width >= 6 and "N" not in kind and "4" not in kind:
+            numbers = np.array([row[3 : min(width, 7)] for row in words], dtype=np.float64)
+            whole = all("." not in row[3] for row in words)  # whole numbers go to 255, others to 1
+            self._colors = linear(numbers / (255 if whole else 1))
             self.carries["colors"] = "vertex colours"
-        elif min(words) > 3:
+        elif width > 3:
             self.carries["properties"] = "further numbers of vertices"
+        if len(self.faces) > len(content[last:]):
+            self.carries["polygons"] = "polygons"
 
     def with_positions(self, positions: FloatArray) -> bytes:
         """The file with other positions."""
@@ -231,15 +235,8 @@ class OffAsset(Asset):
 
     def parts(self) -> list[Part]:
         """One part."""
-        everything = np.arange(len(self.positions))
-        if not self._colored:
-            return [Part(everything, self.faces, Material())]
-        rows = [[float(word) for word in self.lines[n].partition("#")[0].split()[3:7]] for n in self._rows]
-        colors = np.array([row[: min(map(len, rows))] for row in rows])
-        # Whole numbers go to 255, others to 1.
-        whole = all("." not in self.lines[n].partition("#")[0].split()[3] for n in self._rows)
-        white = Material(self.path.stem, (1.0, 1.0, 1.0, 1.0))
-        return [Part(everything, self.faces, white, colors=linear(colors / (255 if whole else 1)))]
+        material = Material() if self._colors is None else Material(self.path.stem, (1.0, 1.0, 1.0, 1.0))
+        return [Part(np.arange(len(self.positions)), self.faces, material, colors=self._colors)]
 
 
 def read_triangles(path: Path, n_vertices: int, n_faces: int) -> tuple[FloatArray, IntArray]:
