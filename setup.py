@@ -32,7 +32,6 @@ EXTRAS = {
     "register": ["robust_laplacian>=1.0", "potpourri3d>=1.2", "libigl>=2.6"],
     # Parts that pass through each other; earlier versions of ipctk have another interface, and were not tried.
     "contact": ["ipctk>=1.6", "libigl>=2.6"],
-    "compress": ["constriction>=0.4"],  # small files of motions: the range coder
     "dask": ["distributed>=2024.5"],
 }
 HAS_WARP = (
@@ -112,8 +111,6 @@ setup(
                 "ruff>=0.6",
                 "mypy>=1.11",
                 "pygltflib>=1.16",
-                "DracoPy>=1.7",
-                "zstandard>=0.22",
                 "selenium>=4.20",
                 "h5py>=3.11",
             ],

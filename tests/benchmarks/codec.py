@@ -1,6 +1,6 @@
 """A motion as key-frames and amplitudes, against a plain PCA of its frames.
 
-    python tests/benchmarks/codec.py [floats selection decode] [--motions creature hand-path grip]
+    python tests/benchmarks/codec.py [floats decode] [--motions creature hand-path grip]
     python tests/benchmarks/codec.py long
 
 Distances are means over the vertices and frames, over the diagonal; edge errors are means of ``|l - l_true| / l_true``.
@@ -15,8 +15,7 @@ import math
 import resource
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, replace
 
 import torch
 from cases import DATA
@@ -25,8 +24,6 @@ from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.codec.modes import reproducible_modes
-from torch_modal.codec.selection import FrameSequence, IntervalErrors, select_keyframes
 from torch_modal.geometry.connectivity import Connectivity
 
 GALLOP, GRIP, LONG = 96, 41, 1000
@@ -111,9 +108,7 @@ def print_floats(sequence: Sequence) -> None:
     frames = sequence.frames
     for keys in sequence.keyframes:
         encoded = tm.encode(frames, sequence.faces, keys, 60, cyclic=sequence.cyclic, progress=False)
-        still = tm.ModalSequence(
-            **{**vars_of(encoded), "amplitudes": 0 * encoded.amplitudes, "motions": 0 * encoded.motions}
-        )
+        still = replace(encoded, amplitudes=0 * encoded.amplitudes, motions=0 * encoded.motions)
         n = components(frames, encoded.n_floats)
         numbers = frames[0].numel()
         own, path = sequence.measured(encoded.decode()), sequence.measured(still.decode())
@@ -122,36 +117,6 @@ def print_floats(sequence: Sequence) -> None:
         print(
             f"| {sequence.name} | {len(keys)} | {encoded.n_floats / numbers:.2f} | {path[0]:.3g}, {path[1]:.2g} "
             f"| {own[0]:.3g}, {own[1]:.2g} | {cells[0]} | {cells[1]} |",
-            flush=True,
-        )
-
-
-def vars_of(sequence: tm.ModalSequence) -> dict[str, object]:
-    """The fields of a sequence."""
-    return {name: getattr(sequence, name) for name in sequence.__dataclass_fields__}
-
-
-def print_selection(sequence: Sequence) -> None:
-    """Rows of chosen against even key-frames, judged alike, by all frames."""
-    frames, cyclic = sequence.frames, sequence.cyclic
-    motion = FrameSequence.checked(frames, sequence.faces, None, cyclic)
-    modes = reproducible_modes(frames[0], sequence.faces, 20).modes
-    for even in sequence.keyframes:
-        start = time.process_time()
-        keys = select_keyframes(motion, modes, len(even), 0.0, False)
-        seconds = time.process_time() - start
-        errors = []
-        for choice in (even, keys):
-            found = tm.encode(frames, sequence.faces, choice, 20, cyclic=cyclic, progress=False)
-            errors.append(1e3 * float(found.errors.mean()))
-        best = ""
-        if len(frames) < 12:
-            intervals = IntervalErrors(motion, modes)
-            inner = combinations(range(1, len(frames) - 1), len(even) - 2)
-            best = f"{1e3 * min(intervals.mean([0, *each, len(frames) - 1]) for each in inner):.3g}"
-        print(
-            f"| {sequence.name} | {len(even)} | {errors[0]:.3g} | {errors[1]:.3g} {keys} "
-            f"| {errors[1] / errors[0]:.2f} | {best or '-'} | {seconds:.0f} |",
             flush=True,
         )
 
@@ -214,10 +179,6 @@ TABLES = {
         "| motion | key-frames | floats / 3V | path: distance, edges | + 60 amplitudes "
         "| PCA, components: distance, edges = ours over it | PCA of more floats |",
         print_floats,
-    ),
-    "selection": (
-        "| motion | key-frames | evenly spaced | chosen | ratio | exhaustive | seconds |",
-        print_selection,
     ),
     "decode": ("| decoding on one core | speed |", print_decode),
 }

@@ -1,5 +1,6 @@
 """Motions as key-frames and amplitudes: the decoder, the fit, key-frames, files."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,6 @@ from conftest import Shapes, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.codec.modes import _clusters, reproducible_modes
-from torch_modal.codec.selection import FrameSequence, IntervalErrors, select_keyframes
 from torch_modal.layers import modal_decoder
 
 
@@ -258,62 +257,51 @@ def test_chosen_key_frames_are_no_worse_than_even_ones(bars: Shapes) -> None:
     )
     t = 2 * (1 - (1 - torch.linspace(0, 1, 16).double()) ** 4)
     frames = decoder(torch.zeros(16, 8).double(), t)
-    motion = FrameSequence.checked(frames, bars.faces, None, False)
-    modes = reproducible_modes(frames[0], bars.faces, 4).modes
-    keys = select_keyframes(motion, modes, 4, 0.0, False)
-    intervals = IntervalErrors(motion, modes)
-    assert intervals.mean(keys) < 0.6 * intervals.mean([0, 5, 10, 15])
-
-
-# ---------------------------------------------------------------------------------------------------------------- modes
-def test_clusters_are_not_cut() -> None:
-    values = torch.tensor([1.0, 2.0, 2.0001, 3.0, 4.0, 4.0, 5.0])
-    assert _clusters(values, 2).tolist() == [1, 2]
-    assert _clusters(values, 4).tolist() == [1, 2, 1]
-    assert _clusters(values, 5).tolist() == [1, 2, 1, 2]
-
-
-def test_signs_and_mixtures_are_fixed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another machine finds other signs, and modes of one eigenvalue in another mixture."""
-    from dataclasses import replace
-
-    from torch_modal.codec import modes
-
-    basis = tm.extract_modes(bars.keyframes[0], bars.faces, 10, mesher="lattice")
-    values = basis.eigenvalues.clone()
-    values[3] = values[2] * (1 + 1e-7)
-    c, s = 0.6, 0.8
-    other = basis.modes.clone()
-    other[2], other[3] = c * basis.modes[2] + s * basis.modes[3], s * basis.modes[2] - c * basis.modes[3]
-    other[5] = -other[5]
-    monkeypatch.setattr(modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values))
-    here = reproducible_modes(bars.keyframes[0], bars.faces, 6)
-    monkeypatch.setattr(modes, "extract_modes", lambda *_, **__: replace(basis, eigenvalues=values, modes=other))
-    there = reproducible_modes(bars.keyframes[0], bars.faces, 6, here.clusters, here.seed)
-    assert here.clusters.tolist() == [1, 1, 2, 1, 1]
-    assert torch.allclose(here.modes, there.modes, rtol=0, atol=1e-12 * float(here.modes.abs().max()))
+    keys = tm.select_keyframes(frames, bars.faces, 4, n_modes=4, progress=False)
+    even, chosen = (
+        tm.encode(frames, bars.faces, each, 4, progress=False).errors.mean() for each in ([0, 5, 10, 15], keys)
+    )
+    assert float(chosen) < 0.6 * float(even)
+    again = tm.encode(frames, bars.faces, 4, 4, progress=False)
+    assert torch.equal(again.keyframes, frames[keys])
 
 
 # ---------------------------------------------------------------------------------------------------------------- files
 def test_saved_and_loaded(encoded: tm.ModalSequence, tmp_path: Path) -> None:
-    encoded.save(tmp_path / "a.tms")
-    found = tm.ModalSequence.load(tmp_path / "a.tms")
-    assert torch.equal(found.decode(), encoded.decode())
-    encoded.save(tmp_path / "b.tms")
-    assert (tmp_path / "a.tms").read_bytes() == (tmp_path / "b.tms").read_bytes()
+    encoded.save(tmp_path / "a.safetensors")
+    found = tm.ModalSequence.load(tmp_path / "a.safetensors")
+    assert torch.equal(found.decode(), encoded.decode()) and found.n_floats == encoded.n_floats
+    found.save(tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
-def test_files_of_version_2_are_read(small_bars: Shapes) -> None:
-    """One motion, as a compact file and without loss, both written by an earlier program."""
-    folder = Path(__file__).parents[1] / "fixtures"
-    exact = tm.ModalSequence.load(folder / "bar-exact-2.tms")
-    ends = small_bars.keyframes[:2]
-    frames = torch.lerp(ends[0], ends[1], torch.linspace(0, 1, 7).double()[:, None, None])
-    size = (frames[0].amax(0) - frames[0].amin(0)).norm()
-    assert exact.times.tolist() == [0, 1, 2, 3, 5, 6, 8] and torch.equal(exact.faces, small_bars.faces)
-    assert float((exact.decode() - frames).norm(dim=-1).mean(1).max() / size) <= 0.005
-    pytest.importorskip("constriction")
-    compact = tm.ModalSequence.load(folder / "bar-compact-2.tms")
-    for name in ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions"):
-        assert torch.equal(getattr(compact, name), getattr(exact, name)), name
-    assert compact.modes.seed == exact.modes.seed and torch.equal(compact.modes.clusters, exact.modes.clusters)
+@pytest.mark.parametrize(
+    ("name", "part", "said"),
+    [
+        ("amplitudes", torch.zeros(9, 11).double(), "12 modes needs the shapes"),
+        ("times", torch.arange(9).flip(0).double(), "ascend"),
+        ("times", torch.arange(9).double() + 1, "within those of the key-frames"),
+        ("motions", torch.full((9, 6), torch.nan).double(), "not finite"),
+        ("faces", torch.full((1, 3), 1000), "do not exist"),
+        ("keyframe_times", torch.zeros(3).double(), "ascend"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(
+    encoded: tm.ModalSequence, tmp_path: Path, name: str, part: Tensor, said: str
+) -> None:
+    broken = copy.copy(encoded)
+    object.__setattr__(broken, name, part)
+    broken.save(tmp_path / "a.safetensors")
+    with pytest.raises(ValueError, match=f"a.safetensors: .*{said}"):
+        tm.ModalSequence.load(tmp_path / "a.safetensors")
+
+
+def test_other_files_are_refused(bars: Shapes, tmp_path: Path) -> None:
+    bars.bases[0].save(tmp_path / "basis.safetensors")
+    with pytest.raises(ValueError, match=r"holds no torch_modal\.sequence: its format is 'torch_modal\.basis'"):
+        tm.ModalSequence.load(tmp_path / "basis.safetensors")
+    (tmp_path / "text").write_text("no motion")
+    with pytest.raises(ValueError, match="no safetensors file"):
+        tm.ModalSequence.load(tmp_path / "text")
+    with pytest.raises(FileNotFoundError):
+        tm.ModalSequence.load(tmp_path / "none")

@@ -9,13 +9,14 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
-from safetensors import safe_open
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader, default_collate
 
 import torch_modal as tm
+from torch_modal.data.table import FORMAT, VERSION, write_table
 from torch_modal.energy.bend import Bend
 from torch_modal.io.cache import CacheWarning
+from torch_modal.io.tensors import TensorFile
 
 N_SETS, PER_SET = 3, 8
 
@@ -252,12 +253,10 @@ def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
         return tm.ShapeSpace(bases, faces, folder=tmp_path, **options).table(0, 1)
 
     right = table()
-    with safe_open(path, framework="pt") as file:
-        key = file.metadata()
+    key = TensorFile(path, FORMAT, VERSION).metadata
 
     def plant() -> None:
-        path.unlink()
-        save_file({"shapes": torch.zeros_like(right)}, path, key)
+        write_table(path, torch.zeros_like(right), key)
 
     plant()
     assert float(table().abs().max()) == 0

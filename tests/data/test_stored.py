@@ -164,7 +164,7 @@ def test_a_failure_leaves_nothing_behind(small_bars: Shapes, folder: Path, monke
     monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(OSError, match="No space"):
         write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
-    assert calls == [KEYFRAMES_FILE, BASES_FILE]
+    assert len(calls) == 2
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in folder.parent.iterdir()] == ["bars"]
 

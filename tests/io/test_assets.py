@@ -384,6 +384,25 @@ def test_glb_accessors_of_all_kinds(tmp_path):
     assert len(new.geometry) == 2
 
 
+def test_glb_keeps_what_this_package_does_not_know(tmp_path):
+    root, binary = accessor_document()
+    own = {
+        "samplers": [{"name": "soft", "magFilter": 9729}],
+        "materials": [{"name": "flat", "extensions": {"KHR_materials_unlit": {}}, "extras": {"tags": []}}],
+        "cameras": [{"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.1}}],
+        "extensions": {"KHR_lights_punctual": {"lights": [{"type": "point"}]}},
+        "extensionsUsed": ["KHR_materials_unlit", "KHR_lights_punctual"],
+    }
+    root["nodes"][0] |= {"extensions": {"KHR_lights_punctual": {"light": 0}}, "extras": {"rig": None}}
+    (tmp_path / "mesh.bin").write_bytes(binary)
+    (tmp_path / "a.gltf").write_text(json.dumps(root | own))
+    asset = tm.open_asset(tmp_path / "a.gltf")
+    data = asset.write(tmp_path / "b.glb", asset.positions).read_bytes()
+    written = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert {name: written[name] for name in own} == own
+    assert all(written["nodes"][0][name] == root["nodes"][0][name] for name in ("extensions", "extras", "translation"))
+
+
 def test_glb_vertex_attributes_of_three_bytes_are_padded(tmp_path):
     """Colours as three bytes: each vertex starts at a multiple of four."""
     root, binary = accessor_document()
@@ -471,7 +490,7 @@ def test_frames_as_glb(tmp_path):
 
 
 def test_pictures_of_other_formats_become_png():
-    from torch_modal.io.mtl import as_image
+    from torch_modal.io.asset import as_image
 
     stream = io.BytesIO()
     Image.new("RGB", (4, 4), RED).save(stream, format="BMP")

@@ -17,7 +17,7 @@ from torch_modal.data.batch.precompute import Shard
 from torch_modal.data.stored import open_set
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.io.frames import save_frames
+from torch_modal.io.write import save_frames
 from torch_modal.precompute.shell import THICKNESS
 
 pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.keyframes.check.MeshWarning")
@@ -70,8 +70,8 @@ def test_gradients_and_dtypes(bases: list[tm.ModalBasis], dtype: torch.dtype) ->
 def test_encoded_and_decoded(tmp_path: Path) -> None:
     frames = torch.stack([roll(t) for t in np.linspace(0, 1, 9)])
     encoded = tm.encode(frames, FACES, [0, 8], n_modes=20)
-    encoded.save(tmp_path / "roll.tms")
-    decoded = tm.ModalSequence.load(tmp_path / "roll.tms").decode()
+    encoded.save(tmp_path / "roll.safetensors")
+    decoded = tm.ModalSequence.load(tmp_path / "roll.safetensors").decode()
     assert (decoded - frames).norm(dim=-1).mean() < 0.01 * LENGTH
     basis = tm.extract_modes(frames[0], FACES, 20, cache=False)
     decoder = tm.ModalDecoder(frames[[0, 8]], FACES, [0.0, 1.0], frames[0], basis.modes)

@@ -12,7 +12,7 @@ from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.errors import MeshWarning, MissingPackageError
-from torch_modal.io.timing import make_timing, resample
+from torch_modal.io.formats import make_timing, resample
 from torch_modal.view import animation, video
 
 X, FACES = triangles_of_tube()

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch_modal.cli import carry, check, commands, compress, precompute, register, view
+from torch_modal.cli import carry, check, commands, precompute, register, view
 from torch_modal.cli.arguments import (
     CACHE_DIR,
     Formatter,
@@ -256,16 +256,6 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("precompute", precompute.run, precompute.SUMMARY, precompute.DESCRIPTION, precompute.EXAMPLES)
     precompute.add_arguments(sub)
-
-    sub = command(
-        "compress", compress.compress, compress.COMPRESS, compress.COMPRESS_DESCRIPTION, compress.COMPRESS_EXAMPLES
-    )
-    compress.add_compress(sub)
-    add_common(sub)
-
-    sub = command("expand", compress.expand, compress.EXPAND, compress.EXPAND_DESCRIPTION, compress.EXPAND_EXAMPLES)
-    compress.add_expand(sub)
-    add_common(sub)
 
     sub = command("view", view.run, view.SUMMARY, view.DESCRIPTION, view.EXAMPLES)
     view.add_arguments(sub)

@@ -1,26 +1,28 @@
 """Amplitudes that bring a decoder's shapes closest to given frames: a small least-squares problem for each frame."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rigid import best_fit
+from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.rotations import log
-from torch_modal.motion.decoder import Interval, ModalDecoder, moved
+from torch_modal.motion.decoder import ModalDecoder
 
 MAX_STEPS = 6
 MIN_GAIN = 0.01
 """A frame is done when a step lowers the squared residual by less than this part."""
+SHORTER = 0.4
+"""Part of a step that is tried where the whole step does not lower the residual."""
 RIDGE = 1e-4
 """Over the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero."""
 DIFFERENCE = 1e-3
 """Of amplitudes, in the finite differences of the Jacobian."""
-MAX_ROTATION = 0.35
-"""Radians that triangles on the path may rotate before the Jacobian is recomputed."""
+MAX_TURN = 0.3
+"""Change of edges, over their lengths, from which on the Jacobian is recomputed; about a rotation in radians."""
 QUANTILE = 0.95
-"""Of the triangles' rotations, which is compared with that limit."""
+"""Of the edges' changes, which is compared with that limit."""
 
 
 class FittedFrames(NamedTuple):
@@ -35,114 +37,88 @@ class FittedFrames(NamedTuple):
 
 
 def fit(
-    decoder: ModalDecoder,
-    frames: Tensor,
-    times: Tensor,
-    keys: Sequence[int],
-    on_frame: Callable[[], None] = lambda: None,
-    only: Sequence[int] | None = None,
+    decoder: ModalDecoder, frames: Tensor, times: Tensor, on_frame: Callable[[], object] = lambda: None
 ) -> FittedFrames:
-    """Fit amplitudes and rigid motions of frames; they are zero at the key-frames.
+    """Fit amplitudes and rigid motions of frames.
+
+    Each frame starts from the amplitudes of the one before, as long as both are in the same interval of key-frames.
 
     Args:
         decoder: With key-frames near those frames.
         frames: *Shape:* ``(T, V, 3)``.
         times: Of the frames. *Shape:* ``(T,)``.
-        keys: Which of them are key-frames.
         on_frame: Called after each frame.
-        only: Frames to fit. Default: all. The others' numbers are zero.
     """
     n, k = len(frames), decoder.n_modes
     found = FittedFrames(torch.zeros(n, k).double(), torch.zeros(n, 6).double(), torch.zeros(n).double())
-    wanted = list(range(n) if only is None else only)
-    segment, u = torch.zeros(n).long(), torch.zeros(n).double()
-    segment[wanted], u[wanted] = decoder.located(times[wanted])
-    keyframe_of = {f: i for i, f in enumerate(keys)}
+    intervals = decoder.located(times)[0]
     with torch.no_grad():
-        for i in range(decoder.n_intervals):
-            own = [f for f in wanted if int(segment[f]) == i]
-            inner = [f for f in own if f not in keyframe_of]
-            if inner:
-                _fit_interval(decoder, i, frames, u, inner, found, on_frame)
-            for f in set(own) & keyframe_of.keys():
-                found.errors[f] = _error(decoder.keyframes[keyframe_of[f]], frames[f], decoder)
+        for interval in intervals.unique():
+            a, linear = torch.zeros(k).double(), None
+            for f in torch.nonzero(intervals == interval)[:, 0].tolist():
+                if linear is None or not linear.holds(decoder(a, times[f])):
+                    linear = _Linearisation(decoder, a, times[f])
+                a = _fit_frame(decoder, frames[f], times[f], a, linear)
+                x = decoder(a, times[f])
+                motion = _best_fit(x, frames[f])
+                found.amplitudes[f] = a
+                found.motions[f] = torch.cat([log(motion.rotation), (motion.target - motion.source) / decoder.size])
+                found.errors[f] = (motion.apply(x) - frames[f]).norm(dim=-1).mean() / decoder.size
                 on_frame()
     return found
 
 
-def _fit_interval(
-    decoder: ModalDecoder,
-    i: int,
-    frames: Tensor,
-    u: Tensor,
-    rows: list[int],
-    found: FittedFrames,
-    on_frame: Callable[[], None],
-) -> None:
-    interval = decoder.interval(i)
-    rotation = torch.quantile(interval.trajectory.step[:3].norm(dim=0).flatten()[::7], QUANTILE)
-    n_parts = int(float(rotation) / MAX_ROTATION) + 1
-    part_of = (u[rows] * n_parts).long().clamp(0, n_parts - 1)
-    a = torch.zeros(decoder.n_modes).double()
-    for part in part_of.unique():
-        own = torch.tensor(rows)[part_of == part]
-        jacobian = _Jacobian(decoder, i, interval, a, u[own].mean())
-        for f in own.tolist():
-            a = _fit_frame(decoder, i, interval, frames[f].double(), u[f], a, jacobian)
-            x = decoder.alignment.restore(decoder.bent(i, interval, a[None], u[f : f + 1]), interval.pair, u[f : f + 1])
-            motion = best_fit(x, frames[f : f + 1].double(), torch.ones(x.shape[1]).double())
-            found.amplitudes[f] = a
-            found.motions[f, :3] = log(motion.rotation)[0]
-            found.motions[f, 3:] = (motion.target - motion.source)[0] / decoder.size
-            found.errors[f] = _error(moved(x, found.motions[f : f + 1], decoder.size)[0], frames[f], decoder)
-            on_frame()
+class _Linearisation:
+    """Derivatives of the vertices by the amplitudes at one shape, without rigid motions, and their normal equations.
 
+    All other shapes are aligned to that one, so that its derivatives serve them however the body turns.
+    """
 
-class _Jacobian:
-    """Derivatives of the vertices by the amplitudes, without rigid motions, and their normal equations."""
-
-    def __init__(self, decoder: ModalDecoder, i: int, interval: Interval, a: Tensor, u: Tensor) -> None:
+    def __init__(self, decoder: ModalDecoder, a: Tensor, t: Tensor) -> None:
         k = decoder.n_modes
-        x = decoder.bent(i, interval, a[None], u[None])[0]
-        step = DIFFERENCE * torch.eye(k).double()
-        chunk = max(1, 400_000 // decoder.keyframes.shape[1])
-        parts = []
-        for rows in torch.arange(k).split(chunk):
-            parts.append((decoder.bent(i, interval, a + step[rows], u.expand(len(rows))) - x) / DIFFERENCE)
-        axes = torch.eye(3).double()[:, None].expand(3, *x.shape)
-        rigid = torch.cat([axes, torch.linalg.cross(axes, (x - x.mean(0)).expand(3, *x.shape))])
+        self._ends = decoder.faces[:, :2].T
+        self.x = decoder(a, t)
+        shapes = decoder(a + DIFFERENCE * torch.eye(k).double(), t)
+        flat = ((shapes - self.x) / DIFFERENCE).flatten(1)
+        axes = torch.eye(3).double()[:, None].expand(3, *self.x.shape)
+        rigid = torch.cat([axes, torch.linalg.cross(axes, (self.x - self.x.mean(0)).expand_as(axes))])
         rigid = torch.linalg.qr(rigid.flatten(1).mT).Q
-        flat = torch.cat(parts).flatten(1)
         #: *Shape:* ``(k, 3V)``.
         self.rows = flat - (flat @ rigid) @ rigid.mT
         normal = self.rows @ self.rows.mT
         self.ridge = RIDGE * normal.diagonal().mean().clamp_min(torch.finfo(torch.float64).tiny)
         self.factor = torch.linalg.cholesky(normal + self.ridge * torch.eye(k).double())
 
+    def holds(self, x: Tensor) -> bool:
+        """Whether a shape is so near that the derivatives serve it. *Shape:* ``(V, 3)``."""
+        i, j = self._ends
+        own, other = (shape[j] - shape[i] for shape in (self.x, _best_fit(x, self.x).apply(x)))
+        length = own.norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)
+        change = (other - own).norm(dim=1) / length
+        return float(change.kthvalue(max(1, int(QUANTILE * len(change)))).values) < MAX_TURN
+
     def step(self, residual: Tensor, a: Tensor) -> Tensor:
+        """Gauss-Newton step of the amplitudes. *Shape:* ``(V, 3), (k,) -> (k,)``."""
         right = self.rows @ residual.flatten() - self.ridge * a
         return torch.cholesky_solve(right[:, None], self.factor)[:, 0]
 
 
-def _fit_frame(
-    decoder: ModalDecoder, i: int, interval: Interval, frame: Tensor, u: Tensor, start: Tensor, jacobian: _Jacobian
-) -> Tensor:
-    """Amplitudes of one frame, from those of the frame before or from zero, whichever is nearer."""
-    target = decoder.alignment.bring(frame[None], interval.pair, u[None])
-    uniform = torch.ones(target.shape[1]).double()
+def _fit_frame(decoder: ModalDecoder, frame: Tensor, t: Tensor, start: Tensor, linear: _Linearisation) -> Tensor:
+    """Amplitudes of one frame, from given ones or from zero, whichever is nearer."""
 
     def tried(a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        x = decoder.bent(i, interval, a[None], u[None])
-        residual = best_fit(target, x, uniform).apply(target) - x
+        x = decoder(a, t)
+        x = _best_fit(x, linear.x).apply(x)
+        residual = _best_fit(frame, x).apply(frame) - x
         return a, residual, residual.square().sum()
 
     best = min((tried(a) for a in (start, torch.zeros_like(start))), key=lambda one: float(one[2]))
     for _ in range(MAX_STEPS):
         a, residual, squared = best
-        step = jacobian.step(residual, a)
+        step = linear.step(residual, a)
         new = tried(a + step)
         if new[2] > squared:
-            new = tried(a + 0.4 * step)
+            new = tried(a + SHORTER * step)
         if new[2] > squared:
             break
         best = new
@@ -151,5 +127,5 @@ def _fit_frame(
     return best[0]
 
 
-def _error(x: Tensor, frame: Tensor, decoder: ModalDecoder) -> Tensor:
-    return (x - frame).norm(dim=-1).mean() / decoder.size
+def _best_fit(x: Tensor, y: Tensor) -> RigidMotion:
+    return best_fit(x, y, torch.ones(len(x)).double())

@@ -2,199 +2,172 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_modal.codec.fit import fit
-from torch_modal.codec.modes import reproducible_modes
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.motion.decoder import ModalDecoder
+from torch_modal.precompute.modes import extract_modes
 from torch_modal.progress import Progress, ProgressReport
 
+ERROR = 0.002
+"""Default for the largest mean distance of a frame's vertices, over the diagonal."""
 N_SAMPLES = 5
 """Frames of an interval that are fitted to estimate its error."""
 
 
-class FrameSequence(NamedTuple):
-    """The frames of a motion, after the checks of the border."""
-
-    frames: Tensor
-    """float64. *Shape:* ``(T, V, 3)``."""
-    faces: Tensor
-    """*Shape:* ``(F, 3)``."""
-    times: Tensor
-    """Of the frames; of a cycle, also when the first comes again. *Shape:* ``(T,)`` or ``(T + 1,)``."""
-    cyclic: bool
-    """Whether the last frame leads on to the first."""
-
-    @classmethod
-    def checked(cls, frames: Any, faces: Any, times: Any, cyclic: bool) -> "FrameSequence":
-        """What a caller passes.
-
-        Raises:
-            MeshError: Frames that cannot be used.
-            ValueError: Times that do not ascend or do not fit the frames.
-        """
-        shapes, triangles = check_keyframes(frames, faces, min_keyframes=2, warn=False)
-        x = shapes.detach().cpu().double()
-        return cls(x, triangles.cpu(), checked_times(times, len(x), cyclic), cyclic)
-
-    def ends(self, keys: Sequence[int]) -> list[int]:
-        """Ends of the intervals: key-frames, and of a cycle the number of frames."""
-        return [*keys, len(self.frames)] if self.cyclic else list(keys)
-
-
-class IntervalErrors:
-    """Errors of intervals between key-frames, each computed once for its key-frames and their neighbours.
-
-    Args:
-        motion: The frames.
-        modes: Of the first frame. *Shape:* ``(k, V, 3)``.
-    """
-
-    def __init__(self, motion: FrameSequence, modes: Tensor) -> None:
-        self.motion = motion
-        frames = motion.frames
-        self._decoder = ModalDecoder(frames[:2], motion.faces, torch.arange(2).double(), frames[0], modes)
-        self._known: dict[tuple[int, ...], dict[int, float]] = {}
-
-    def errors(self, keys: Sequence[int]) -> list[dict[int, float]]:
-        """Errors of a few frames of each interval, by their numbers."""
-        return [self._of_interval(list(keys), i) for i in range(len(self.motion.ends(keys)) - 1)]
-
-    def mean(self, keys: Sequence[int]) -> float:
-        """Estimated mean over all frames."""
-        total = 0.0
-        for found, (start, end) in zip(self.errors(keys), pairwise(self.motion.ends(keys)), strict=True):
-            if found:
-                total += sum(found.values()) / len(found) * (end - start - 1)
-        return total / len(self.motion.frames)
-
-    def _of_interval(self, keys: list[int], i: int) -> dict[int, float]:
-        start, end = self.motion.ends(keys)[i : i + 2]
-        inner = range(start + 1, end)
-        if not inner:
-            return {}
-        around = self._around(keys, i)
-        name = (*around, start)
-        if name not in self._known:
-            places = torch.linspace(0, len(inner) - 1, min(N_SAMPLES, len(inner))).round().long().tolist()
-            self._known[name] = self._fitted(around, [inner[p] for p in places])
-        return self._known[name]
-
-    def _around(self, keys: list[int], i: int) -> list[int]:
-        """The four key-frames that the path of an interval depends on; later periods of a cycle count on."""
-        n, period = len(keys), len(self.motion.frames)
-        if self.motion.cyclic:
-            return [keys[j % n] + period * (j // n) for j in range(i - 1, i + 3)]
-        return keys[max(i - 1, 0) : i + 3]
-
-    def _fitted(self, around: list[int], samples: list[int]) -> dict[int, float]:
-        frames, times, period = self.motion.frames, self.motion.times, len(self.motion.frames)
-        duration = times[-1] - times[0] if self.motion.cyclic else times[0] * 0
-        # Of a cycle of two, neighbours are the same shapes at other times.
-        key_times = torch.stack([times[key % period] + duration * (key // period) for key in around])
-        decoder = self._decoder.through(frames[[key % period for key in around]], key_times)
-        found = fit(decoder, frames, times[:period], [], only=samples)
-        return {f: float(found.errors[f]) for f in samples}
-
-
-def choose_keyframes(
-    motion: FrameSequence,
-    keyframes: Sequence[int] | int | None,
-    n_modes: int,
-    error: float,
-    caching: dict[str, Any],
+def select_keyframes(
+    frames: Any,
+    faces: Any,
+    n_keyframes: int | None = None,
+    *,
+    error: float = ERROR,
+    n_modes: int = 60,
+    times: Tensor | Sequence[float] | None = None,
+    cyclic: bool = False,
+    cache_dir: str | None = None,
+    cache: bool = True,
     progress: Progress = None,
 ) -> list[int]:
-    """The key-frames that a caller names, or those that are selected. Arguments as for :func:`torch_modal.encode`."""
-    if not isinstance(keyframes, (int, type(None))):
-        return _checked_keys(keyframes, motion)
-    modes = reproducible_modes(motion.frames[0], motion.faces, n_modes, **caching)
-    return select_keyframes(motion, modes.modes, keyframes, error, progress)
+    """Select the frames of a motion that serve best as its key-frames.
 
-
-def with_worst(keys: Sequence[int], errors: Tensor, error: float) -> list[int]:
-    """Key-frames, and the worst frame of each interval that has one above an error."""
-    ends = [*keys, len(errors)]
-    worst = [a + int(errors[a:b].argmax()) for a, b in pairwise(ends)]
-    return sorted({*keys, *(f for f in worst if float(errors[f]) > error)})
-
-
-def select_keyframes(
-    motion: FrameSequence, modes: Tensor, n_keyframes: int | None, error: float, progress: Progress = None
-) -> list[int]:
-    """Key-frames by insertion at the worst frame, then by exchange with frames nearby.
+    Key-frames are inserted one by one where the errors of the frames between are largest; a given number of them is
+    then moved while the mean error falls. Errors are those of :func:`torch_modal.encode`, estimated from a few frames
+    of each interval.
 
     Args:
-        motion: The frames.
-        modes: Of the first frame. *Shape:* ``(k, V, 3)``.
-        n_keyframes: How many; None: as few as the error needs.
-        error: The largest that a frame should have.
+        frames: A motion of one connectivity, in any units. *Shape:* ``(T, V, 3)``.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_keyframes: How many. Default: as few as the ``error`` needs.
+        error: Largest estimated mean distance of a frame's vertices, over the diagonal.
+        n_modes: Amplitudes of a frame; fewer need more key-frames.
+        times: As for :func:`torch_modal.encode`, like the following.
+        cyclic: Whether the last frame leads on to the first.
+        cache_dir: Folder where modes are cached.
+        cache: Whether they are.
         progress: See :data:`torch_modal.progress.Progress`.
 
+    Returns:
+        Ascending frame numbers, with the first, and, if not cyclic, the last.
+
     Raises:
-        ValueError: More key-frames than frames, or fewer than two.
+        MeshError: Frames that cannot be used.
+        ValueError: Times or numbers that cannot be used.
     """
-    n = len(motion.frames)
-    if n_keyframes is not None and not 2 <= n_keyframes <= n:
-        raise ValueError(f"keyframes is a number from 2 to the {n} frames, or their places; got {n_keyframes}")
-    intervals = IntervalErrors(motion, modes)
-    keys = [0, n // 2] if motion.cyclic else [0, n - 1]
-    with ProgressReport(n_keyframes or n, "key-frames", progress) as bar:
-        while len(keys) < (n_keyframes or n):
-            found, ends = intervals.errors(keys), list(pairwise(motion.ends(keys)))
-            if n_keyframes is None:
-                scores = [max(each.values(), default=0.0) for each in found]
-                if max(scores) <= error:
-                    break
+    x, triangles, when = checked_motion(frames, faces, times, cyclic)
+    modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
+    return Selection(x, triangles, when, cyclic, modes).run(n_keyframes, error, progress)
+
+
+def checked_motion(frames: Any, faces: Any, times: Any, cyclic: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Checked frames (float64), faces and times; of a cycle, also the time when the first frame comes again.
+
+    Raises:
+        MeshError: Frames that cannot be used.
+        ValueError: Times that do not ascend or do not fit the frames.
+    """
+    shapes, triangles = check_keyframes(frames, faces, min_keyframes=2, warn=False)
+    return shapes.detach().cpu().double(), triangles.cpu(), checked_times(times, len(shapes), cyclic)
+
+
+class Selection:
+    """Search for the key-frames of a motion; the error of an interval is computed once.
+
+    Args:
+        frames: float64. *Shape:* ``(T, V, 3)``.
+        faces: *Shape:* ``(F, 3)``.
+        times: Of the frames; of a cycle, also when the first comes again. *Shape:* ``(T,)`` or ``(T + 1,)``.
+        cyclic: Whether the last frame leads on to the first.
+        modes: Of the first frame. *Shape:* ``(k, V, 3)``.
+    """
+
+    def __init__(self, frames: Tensor, faces: Tensor, times: Tensor, cyclic: bool, modes: Tensor) -> None:
+        self.frames, self.times, self.cyclic = frames, times, cyclic
+        self._decoder = ModalDecoder(frames[:2], faces, torch.arange(2).double(), frames[0], modes)
+        self._known: dict[tuple[int, ...], dict[int, float]] = {}
+
+    def run(self, n_keyframes: int | None, error: float, progress: Progress = None) -> list[int]:
+        """The key-frames; see :func:`select_keyframes`.
+
+        Raises:
+            ValueError: More key-frames than frames, or fewer than two.
+        """
+        n = len(self.frames)
+        if n_keyframes is not None and not 2 <= n_keyframes <= n:
+            raise ValueError(f"the number of key-frames is from 2 to the {n} frames; got {n_keyframes}")
+        keys = [0, n // 2] if self.cyclic else [0, n - 1]
+        with ProgressReport(n_keyframes or n, "key-frames", progress) as bar:
+            while len(keys) < (n_keyframes or n):
+                intervals = [(errors, a, b) for errors, (a, b) in zip(self.errors(keys), self._ends(keys), strict=True)]
+                if n_keyframes is None:
+                    scores = [max(errors.values(), default=0.0) for errors, _, _ in intervals]
+                    if max(scores) <= error:
+                        break
+                else:
+                    scores = [sum(errors.values()) * (b - a - 1) for errors, a, b in intervals]
+                errors, a, b = intervals[scores.index(max(scores))]
+                total = sum(errors.values())
+                centre = sum(f * e for f, e in errors.items()) / total if total > 0 else (a + b) / 2
+                keys = sorted([*keys, min(max(round(centre), a + 1), b - 1)])
+                bar.update()
+        return keys if n_keyframes is None else self._moved(keys)
+
+    def errors(self, keys: Sequence[int]) -> list[dict[int, float]]:
+        """Errors of a few frames of each interval between key-frames, by their numbers."""
+        found = []
+        for i, (a, b) in enumerate(self._ends(keys)):
+            n, period = len(keys), len(self.frames)
+            # The path of an interval depends on four key-frames; those of later periods of a cycle count on.
+            if self.cyclic:
+                around = [keys[j % n] + period * (j // n) for j in range(i - 1, i + 3)]
             else:
-                scores = [sum(each.values()) * (b - a - 1) for each, (a, b) in zip(found, ends, strict=True)]
-            worst = scores.index(max(scores))
-            keys = sorted([*keys, _split(found[worst], *ends[worst])])
-            bar.update()
-        return keys if n_keyframes is None else _exchanged(keys, intervals)
+                around = list(keys[max(i - 1, 0) : i + 3])
+            name = (*around, a)
+            if name not in self._known:
+                samples = torch.linspace(a + 1, b - 1, min(N_SAMPLES, b - a - 1)).round().long()
+                self._known[name] = self._fitted(around, samples)
+            found.append(self._known[name])
+        return found
 
+    def mean(self, keys: Sequence[int]) -> float:
+        """Estimated mean error of all frames."""
+        total = 0.0
+        for errors, (a, b) in zip(self.errors(keys), self._ends(keys), strict=True):
+            total += sum(errors.values()) / max(len(errors), 1) * (b - a - 1)
+        return total / len(self.frames)
 
-def _split(errors: dict[int, float], start: int, end: int) -> int:
-    """The frame at the centre of an interval's errors."""
-    if not errors:
-        raise ValueError("there are no frames left between the key-frames")
-    total = sum(errors.values())
-    place = sum(f * e for f, e in errors.items()) / total if total > 0 else (start + end) / 2
-    return min(max(round(place), start + 1), end - 1)
+    def _ends(self, keys: Sequence[int]) -> list[tuple[int, int]]:
+        """First and last frame of each interval; the last interval of a cycle ends at the number of frames."""
+        return list(pairwise([*keys, len(self.frames)] if self.cyclic else keys))
 
+    def _fitted(self, around: list[int], samples: Tensor) -> dict[int, float]:
+        if not len(samples):
+            return {}
+        period = len(self.frames)
+        duration = self.times[-1] - self.times[0]
+        key_times = torch.stack([self.times[key % period] + duration * (key // period) for key in around])
+        decoder = self._decoder.through(self.frames[[key % period for key in around]], key_times)
+        found = fit(decoder, self.frames[samples], self.times[samples])
+        return dict(zip(samples.tolist(), found.errors.tolist(), strict=True))
 
-def _exchanged(keys: list[int], intervals: IntervalErrors) -> list[int]:
-    """Key-frames moved one at a time, by steps that halve, as long as the mean error falls."""
-    n, cyclic = len(intervals.motion.frames), intervals.motion.cyclic
-    step = max(1, n // (4 * len(keys)))
-    best = intervals.mean(keys)
-    while step:
-        improved = False
-        for j in range(1, len(keys) if cyclic else len(keys) - 1):
-            low, high = keys[j - 1] + 1, (keys[j + 1] if j + 1 < len(keys) else n) - 1
-            for place in {min(max(keys[j] + side * step, low), high) for side in (-1, 1)} - {keys[j]}:
-                tried = [*keys[:j], place, *keys[j + 1 :]]
-                mean = intervals.mean(tried)
-                if mean < best * (1 - 1e-3):
-                    best, keys, improved = mean, tried, True
-        if not improved:
-            step //= 2
-    return keys
-
-
-def _checked_keys(keyframes: Any, motion: FrameSequence) -> list[int]:
-    keys, last = [int(i) for i in keyframes], len(motion.frames) - 1
-    required = "the first frame" if motion.cyclic else "the first and the last frame"
-    ends = {0} if motion.cyclic else {0, last}
-    ascending = all(a < b for a, b in pairwise(keys))
-    if len(keys) < 2 or not ascending or not ends <= set(keys) or keys[-1] > last or keys[0] < 0:
-        raise ValueError(
-            f"keyframes are two or more ascending frame numbers from 0 to {last}, with {required} among them; "
-            f"got {keys}"
-        )
-    return keys
+    def _moved(self, keys: list[int]) -> list[int]:
+        """Key-frames moved one at a time, by steps that halve, as long as the mean error falls."""
+        n = len(self.frames)
+        step = max(1, n // (4 * len(keys)))
+        best = self.mean(keys)
+        while step:
+            improved = False
+            for j in range(1, len(keys) if self.cyclic else len(keys) - 1):
+                low, high = keys[j - 1] + 1, (keys[j + 1] if j + 1 < len(keys) else n) - 1
+                for place in {min(max(keys[j] + side * step, low), high) for side in (-1, 1)} - {keys[j]}:
+                    tried = [*keys[:j], place, *keys[j + 1 :]]
+                    mean = self.mean(tried)
+                    if mean < best * (1 - 1e-3):
+                        best, keys, improved = mean, tried, True
+            if not improved:
+                step //= 2
+        return keys

@@ -2,32 +2,35 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path as FilePath
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_modal.codec.file import read, write_exact
 from torch_modal.codec.fit import FittedFrames, fit
-from torch_modal.codec.modes import ReproducibleModes, reproducible_modes
-from torch_modal.codec.selection import FrameSequence, choose_keyframes, with_worst
+from torch_modal.codec.selection import ERROR, Selection, checked_motion
+from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.motion.decoder import ModalDecoder
+from torch_modal.precompute.modes import extract_modes
 from torch_modal.progress import Progress, ProgressReport
 
-ERROR = 0.002
-"""Default for the largest mean distance of a frame's vertices, over the diagonal."""
+FORMAT = "torch_modal.sequence"
+VERSION = "3"
+STORED = ("keyframes", "faces", "keyframe_times", "times", "amplitudes", "motions", "modes", "errors")
+CHUNK = 16
+"""Frames that are decoded at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModalSequence:
     """A motion: key-frames, and amplitudes, a rigid motion and a time for each frame.
 
-    Modes follow from a key-frame, so they are not stored. Amplitudes are those of :class:`torch_modal.ModalDecoder`: 0
-    is the smooth path, 1 moves vertices by 1 % of the diagonal. They mean the same in all frames.
+    Amplitudes are those of :class:`torch_modal.ModalDecoder`: 0 is the smooth path, 1 moves vertices by 1 % of the
+    diagonal. They mean the same in all frames.
 
     Attributes:
         keyframes: *Shape:* ``(K, V, 3)``.
@@ -37,10 +40,12 @@ class ModalSequence:
         amplitudes: Zero at the key-frames. *Shape:* ``(T, k)``.
         motions: Rotations (axis times angle) about the centre, and translations in units of the diagonal. *Shape:*
             ``(T, 6)``.
-        modes: Of the key-frame ``reference``.
-        reference: Index of the key-frame that the modes belong to.
-        errors: Mean distance of the vertices to the frame that was encoded, over the diagonal; NaN where that is not
-            known. *Shape:* ``(T,)``.
+        modes: Of the first key-frame. *Shape:* ``(k, V, 3)``.
+        errors: Mean distance of the vertices to the frame that was encoded, over the diagonal. *Shape:* ``(T,)``.
+        decoder: Maps amplitudes and times to shapes, with gradients.
+
+    Raises:
+        ValueError: The parts do not fit each other.
     """
 
     keyframes: Tensor
@@ -49,9 +54,24 @@ class ModalSequence:
     times: Tensor
     amplitudes: Tensor
     motions: Tensor
-    modes: ReproducibleModes
-    reference: int
+    modes: Tensor
     errors: Tensor
+    decoder: ModalDecoder = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        first = self.keyframes[0] if len(self.keyframes) else self.keyframes
+        decoder = ModalDecoder(self.keyframes, self.faces, self.keyframe_times, first, self.modes)
+        t, k = len(self.times), decoder.n_modes
+        shapes = {name: tuple(getattr(self, name).shape) for name in ("times", "amplitudes", "motions", "errors")}
+        wanted = {"times": (t,), "amplitudes": (t, k), "motions": (t, 6), "errors": (t,)}
+        if not t or shapes != wanted:
+            raise ValueError(f"a motion of {t} frames and {k} modes needs the shapes {wanted}; got {shapes}")
+        if not all(bool(part.isfinite().all()) for part in (self.times, self.amplitudes, self.motions)):
+            raise ValueError("times, amplitudes or motions are not finite")
+        start, *_, end = self.keyframe_times
+        if bool((self.times.diff() <= 0).any()) or self.times[0] < start or self.times[-1] > end:
+            raise ValueError("times must ascend within those of the key-frames")
+        object.__setattr__(self, "decoder", decoder)
 
     @property
     def cyclic(self) -> bool:
@@ -60,30 +80,27 @@ class ModalSequence:
 
     @property
     def n_frames(self) -> int:
-        """T."""
+        """Number of frames, T."""
         return len(self.times)
 
     @property
     def n_modes(self) -> int:
-        """Amplitudes of a frame, k."""
+        """Number of amplitudes of a frame, k."""
         return self.amplitudes.shape[1]
 
     @property
     def n_floats(self) -> int:
-        """Numbers to store: key-frames, and amplitudes, rigid motion and time of each other frame."""
+        """Numbers that the motion consists of: key-frames, and amplitudes, rigid motion and time of each other frame.
+
+        Without modes, which :func:`torch_modal.extract_modes` computes again from the first key-frame.
+        """
         others = self.n_frames - int(self.is_keyframe.sum())
         return self.keyframes.numel() + len(self.keyframe_times) + others * (self.n_modes + 7)
 
     @property
     def is_keyframe(self) -> Tensor:
-        """Which frames are key-frames. *Shape:* ``(T,)``."""
+        """True for the frames that are key-frames. *Shape:* ``(T,)``."""
         return torch.isin(self.times, self.keyframe_times[: len(self.keyframes)])
-
-    @cached_property
-    def decoder(self) -> ModalDecoder:
-        """Maps amplitudes and times to shapes, with gradients; made at the first use."""
-        reference = self.keyframes[self.reference]
-        return ModalDecoder(self.keyframes, self.faces, self.keyframe_times, reference, self.modes.modes)
 
     def decode(self, t: Any = None, progress: Progress = False) -> Tensor:
         """The frames, or the shapes at other times, by linear interpolation of the amplitudes.
@@ -107,11 +124,11 @@ class ModalSequence:
                 a, motions = self.at(times)
             out = torch.empty(len(times), *self.keyframes.shape[1:], dtype=torch.float64)
             with ProgressReport(len(times), "decoded frames", progress) as bar:
-                for rows in torch.arange(len(times)).split(16):
+                for rows in torch.arange(len(times)).split(CHUNK):
                     out[rows] = self.decoder(a[rows], times[rows], motions[rows])
                     bar.update(len(rows))
-            for shape, at in zip(self.keyframes, self.keyframe_times.tolist(), strict=False):
-                out[times == at] = shape.double()
+            for shape, time in zip(self.keyframes, self.keyframe_times.tolist(), strict=False):
+                out[times == time] = shape
         return out
 
     def fit(self, frames: Any, times: Any) -> FittedFrames:
@@ -135,7 +152,7 @@ class ModalSequence:
                 f"frames have the shape (N, {self.keyframes.shape[1]}, 3), and times (N,); got {tuple(x.shape)} and "
                 f"{tuple(t.shape)}"
             )
-        return fit(self.decoder, x, t, [])
+        return fit(self.decoder, x, t)
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Amplitudes and rigid motions at any time. *Shape:* ``(N,) -> (N, k), (N, 6)``."""
@@ -155,28 +172,26 @@ class ModalSequence:
         return mixed[:, : self.n_modes], mixed[:, self.n_modes :]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a ``.tms`` file without loss, to be read by :meth:`load`; a failed write leaves no file.
+        """Write a safetensors file without loss, modes included; a failed write leaves no file.
 
         Raises:
             OSError: The file cannot be written.
         """
-        write_exact(self.__dict__, FilePath(path))
+        write_tensors(Path(path), FORMAT, VERSION, {name: getattr(self, name) for name in STORED})
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], cache_dir: str | None = None, cache: bool = True) -> "ModalSequence":
-        """Read a ``.tms`` file, and compute the modes again from its key-frame.
-
-        Args:
-            path: The file.
-            cache_dir: Where modes are cached, as for :func:`torch_modal.extract_modes`.
-            cache: Whether they are.
+    def load(cls, path: str | os.PathLike[str]) -> "ModalSequence":
+        """Read a file that :meth:`save` wrote.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is damaged, holds something else, or has another version; or this machine finds other modes.
-            MissingPackageError: :func:`torch_modal.compress` wrote it, and the extra ``compress`` is not installed.
+            ValueError: It is damaged, holds something else, or has another version.
         """
-        return cls(**read(FilePath(path).read_bytes(), FilePath(path), cache_dir, cache))
+        tensors = TensorFile(Path(path), FORMAT, VERSION, STORED).tensors()
+        try:
+            return cls(**{name: tensors[name] for name in STORED})
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
 def encode(
@@ -195,19 +210,19 @@ def encode(
     """Encode a motion as key-frames and amplitudes.
 
     Each frame is fitted by least squares of its vertices, after the best rigid motion, from the amplitudes of the frame
-    before. Modes are those of the first key-frame, by the deterministic mesher.
+    before. Modes are those of the first frame.
 
     Args:
         frames: A motion of one connectivity, in any units. *Shape:* ``(T, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
-        keyframes: Which frames are key-frames, with the first, and, if not cyclic, the last; or how many; or, by
-            default, as few as the ``error`` needs.
-        n_modes: Amplitudes of a frame, k. A few more where eigenvalues are nearly the same.
-        error: Largest mean distance of a frame's vertices, over the diagonal, where key-frames are selected.
+        keyframes: Numbers of the frames that are key-frames, with the first, and, if not cyclic, the last; or their
+            number, or None for as few as the ``error`` needs, which :func:`torch_modal.select_keyframes` places.
+        n_modes: Amplitudes of a frame, k.
+        error: Largest mean distance of a frame's vertices, over the diagonal, where ``keyframes`` is None.
         times: Of the frames, ascending; if cyclic, also when the first comes again. Default: 0, 1, 2, and so on.
             *Shape:* ``(T,)``, or ``(T + 1,)`` if cyclic.
         cyclic: Whether the last frame leads on to the first.
-        cache_dir: Where modes are cached, as for :func:`torch_modal.extract_modes`.
+        cache_dir: Folder where modes are cached, as for :func:`torch_modal.extract_modes`.
         cache: Whether they are.
         progress: See :data:`torch_modal.progress.Progress`.
 
@@ -215,35 +230,50 @@ def encode(
         MeshError: Frames that cannot be used.
         ValueError: Key-frames, times or numbers that cannot be used.
     """
-    motion = FrameSequence.checked(frames, faces, times, cyclic)
+    x, triangles, when = checked_motion(frames, faces, times, cyclic)
     if isinstance(n_modes, bool) or not isinstance(n_modes, int) or n_modes < 1:
         raise ValueError(f"n_modes is {n_modes!r}; give a whole number of at least 1")
     if not 0 < error < 1:
         raise ValueError(f"error is a part of the diagonal, such as 0.002; got {error!r}")
-    caching = {"cache_dir": cache_dir, "cache": cache}
-    keys = choose_keyframes(motion, keyframes, n_modes, error, caching, progress)
-    modes = reproducible_modes(motion.frames[0], motion.faces, n_modes, **caching)  # type: ignore[arg-type]
+    given = not isinstance(keyframes, (int, type(None)))
+    keys = _checked_keys(keyframes, len(x), cyclic) if given else []
+    modes = extract_modes(x[0], triangles, n_modes, cache_dir=cache_dir, cache=cache).modes
+    if not given:
+        keys = Selection(x, triangles, when, cyclic, modes).run(keyframes, error, progress)  # type: ignore[arg-type]
     while True:
-        found = fitted(motion, keys, motion.frames[keys], modes, progress)
-        if keyframes is not None or float(found.errors.max()) <= error:
-            return found
-        keys = with_worst(keys, found.errors, error)
+        sequence = _encoded(x, triangles, when, cyclic, keys, modes, progress)
+        if keyframes is not None or float(sequence.errors.max()) <= error:
+            return sequence
+        # Errors were estimated from samples: add the worst frame of each interval that has one above the error.
+        ends = pairwise([*keys, len(x)])
+        worst = [a + int(sequence.errors[a:b].argmax()) for a, b in ends]
+        keys = sorted({*keys, *(f for f in worst if float(sequence.errors[f]) > error)})
 
 
-def fitted(
-    motion: FrameSequence,
-    keys: Sequence[int],
-    keyframes: Tensor,
-    modes: ReproducibleModes,
-    progress: Progress = None,
-    only: Sequence[int] | None = None,
+def _encoded(
+    frames: Tensor, faces: Tensor, times: Tensor, cyclic: bool, keys: list[int], modes: Tensor, progress: Progress
 ) -> ModalSequence:
-    """The sequence of given key-frames, rounded or not, fitted to all frames or ``only`` some."""
-    key_times = motion.times[motion.ends(keys)]
-    decoder = ModalDecoder(keyframes, motion.faces, key_times, keyframes[0], modes.modes)
-    times = motion.times[: len(motion.frames)]
-    with ProgressReport(len(times if only is None else only), "encoded frames", progress) as bar:
-        found = fit(decoder, motion.frames, times, keys, bar.update, only)
-    return ModalSequence(
-        keyframes, motion.faces, key_times, times, found.amplitudes, found.motions, modes, 0, found.errors
-    )
+    """A motion with given key-frames."""
+    n, k = len(frames), len(modes)
+    key_times = times[[*keys, n]] if cyclic else times[keys]
+    amplitudes, motions, errors = torch.zeros(n, k).double(), torch.zeros(n, 6).double(), torch.zeros(n).double()
+    sequence = ModalSequence(frames[keys], faces, key_times, times[:n], amplitudes, motions, modes, errors)
+    others = torch.nonzero(~sequence.is_keyframe)[:, 0]
+    with ProgressReport(len(others), "encoded frames", progress) as bar:
+        amplitudes[others], motions[others], errors[others] = fit(
+            sequence.decoder, frames[others], times[others], bar.update
+        )
+    return sequence
+
+
+def _checked_keys(keyframes: Any, n_frames: int, cyclic: bool) -> list[int]:
+    keys, last = [int(i) for i in keyframes], n_frames - 1
+    required = "the first frame" if cyclic else "the first and the last frame"
+    ends = {0} if cyclic else {0, last}
+    ascending = all(a < b for a, b in pairwise(keys))
+    if len(keys) < 2 or not ascending or not ends <= set(keys) or keys[-1] > last or keys[0] < 0:
+        raise ValueError(
+            f"keyframes are two or more ascending frame numbers from 0 to {last}, with {required} among them; "
+            f"got {keys}"
+        )
+    return keys

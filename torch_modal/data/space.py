@@ -25,8 +25,7 @@ from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.vectors import norm, pick
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.io.cache import CacheWarning
-from torch_modal.io.content import ContentError, code_digest, content_digest
+from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween

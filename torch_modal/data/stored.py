@@ -8,7 +8,6 @@ the times if the key-frames are a motion) and ``bases.safetensors``, where the t
 
 import contextlib
 import errno
-import json
 import os
 import re
 import shutil
@@ -24,15 +23,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.autograd import lasting
 from torch_modal.data.motion import Motion
-from torch_modal.io.tensors import opened, to_bytes
+from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.precompute.basis import FORMAT as BASIS_FORMAT
 from torch_modal.precompute.basis import VERSION as BASIS_VERSION
 from torch_modal.precompute.basis import ModalBasis
 
 FORMAT = "torch_modal.set"
-VERSION = "1"
+VERSION = "2"
 KEYFRAMES_FILE = "keyframes.safetensors"
 BASES_FILE = "bases.safetensors"
 LABELS_FILE = "labels.safetensors"
@@ -62,20 +60,23 @@ class StoredSet:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
-        meta, shapes = _read_header(self.folder / KEYFRAMES_FILE, FORMAT, VERSION, ("keyframes", "faces"))
+        file = self._keyframes_file()
+        meta, shapes = file.metadata, file.shapes
         self._shape = shapes["keyframes"]
         if len(self._shape) != 3 or self._shape[2] != 3 or len(shapes["faces"]) != 2 or shapes["faces"][1] != 3:
             raise ValueError(f"{self.folder / KEYFRAMES_FILE} needs keyframes (K, V, 3) and faces (F, 3); has {shapes}")
-        try:
-            names, times = json.loads(meta.get("names", "[]")), json.loads(meta.get("times", "null"))
-        except ValueError as error:
-            raise ValueError(f"{self.folder / KEYFRAMES_FILE} is damaged: {error}") from error
         #: Names of the source files, one for each key-frame.
-        self.names: tuple[str, ...] = tuple(names)
+        self.names: tuple[str, ...] = tuple(meta["names"])
         #: When the key-frames are, if they are a motion; if cyclic, with the time when the first comes again.
-        self.times: tuple[float, ...] | None = times and tuple(times)
+        self.times: tuple[float, ...] | None = meta["times"] and tuple(meta["times"])
+        self._bases_file()  # checks its header
+
+    def _keyframes_file(self) -> TensorFile:
+        return TensorFile(self.folder / KEYFRAMES_FILE, FORMAT, VERSION, ("keyframes", "faces"))
+
+    def _bases_file(self) -> TensorFile:
         wanted = [f"{i}.{part}" for i in range(len(self)) for part in _PARTS]
-        _read_header(self.folder / BASES_FILE, BASIS_FORMAT, BASIS_VERSION, wanted)
+        return TensorFile(self.folder / BASES_FILE, BASIS_FORMAT, BASIS_VERSION, wanted)
 
     def __len__(self) -> int:
         """Number of key-frames, K."""
@@ -94,18 +95,18 @@ class StoredSet:
     @cached_property
     def keyframes(self) -> Tensor:
         """Vertex positions, float64. *Shape:* ``(K, V, 3)``."""
-        return _map(self.folder / KEYFRAMES_FILE, ["keyframes"])[0]
+        return self._keyframes_file().tensor("keyframes")
 
     @cached_property
     def faces(self) -> Tensor:
         """Vertex indices, int64. *Shape:* ``(F, 3)``."""
-        return _map(self.folder / KEYFRAMES_FILE, ["faces"])[0]
+        return self._keyframes_file().tensor("faces")
 
     @cached_property
     def bases(self) -> list[ModalBasis]:
         """The basis of each key-frame."""
-        tensors = iter(_map(self.folder / BASES_FILE, [f"{i}.{part}" for i in range(len(self)) for part in _PARTS]))
-        return [ModalBasis(**{part: next(tensors) for part in _PARTS}) for _ in range(len(self))]
+        file = self._bases_file()
+        return [ModalBasis(**{part: file.tensor(f"{i}.{part}") for part in _PARTS}) for i in range(len(self))]
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in ("folder", "names", "times", "_shape")}
@@ -163,16 +164,11 @@ def write_set(
     fresh, old = (folder.with_name(f".{folder.name}.{mark}.{end}") for end in ("tmp", "old.tmp"))
     try:
         fresh.mkdir()
-        shapes = {"keyframes": _plain(keyframes, torch.float64), "faces": _plain(faces, torch.int64)}
-        names_json = json.dumps([str(name) for name in names])
-        metadata = {"format": FORMAT, "version": VERSION, "names": names_json}
-        if motion is not None:
-            metadata["times"] = json.dumps(motion.times.tolist())
-        # Not safetensors' own save_file: its files are for the owner's eyes alone, whatever the umask says.
-        (fresh / KEYFRAMES_FILE).write_bytes(to_bytes(shapes, metadata))
-        parts = {f"{i}.{part}": _plain(getattr(basis, part)) for i, basis in enumerate(bases) for part in _PARTS}
-        metadata = {"format": BASIS_FORMAT, "version": BASIS_VERSION}
-        (fresh / BASES_FILE).write_bytes(to_bytes(parts, metadata))
+        metadata = {"names": list(map(str, names)), "times": None if motion is None else motion.times.tolist()}
+        shapes = {"keyframes": keyframes.to(torch.float64), "faces": faces.to(torch.int64)}
+        write_tensors(fresh / KEYFRAMES_FILE, FORMAT, VERSION, shapes, metadata)
+        parts = {f"{i}.{part}": getattr(basis, part) for i, basis in enumerate(bases) for part in _PARTS}
+        write_tensors(fresh / BASES_FILE, BASIS_FORMAT, BASIS_VERSION, parts)
         for name, content in (beside or {}).items():
             (fresh / name).write_bytes(content)
         _put_in_place(fresh, folder, old)
@@ -262,11 +258,6 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
     return sorted(found)
 
 
-def _plain(x: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    # A copy: safetensors refuses tensors that share memory, as those of a basis that serves two key-frames do.
-    return x.detach().to("cpu", dtype, copy=True).contiguous()
-
-
 def _check_parts(keyframes: Tensor, faces: Tensor, bases: Sequence[ModalBasis], names: Sequence[str]) -> None:
     shape = tuple(keyframes.shape)
     if len(shape) != 3 or shape[2] != 3 or not shape[0]:
@@ -279,26 +270,3 @@ def _check_parts(keyframes: Tensor, faces: Tensor, bases: Sequence[ModalBasis], 
             f"{shape[0]} key-frames of {shape[1]} vertices need as many bases and names; got bases of {sizes} vertices "
             f"and {len(names)} names"
         )
-
-
-def _read_header(
-    path: Path, kind: str, version: str, wanted: Sequence[str]
-) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
-    """Metadata and the shapes of the tensors of a file that holds what it should."""
-    with opened(path) as file:
-        meta, there = file.metadata, file.shapes
-        if meta.get("format") != kind:
-            raise ValueError(f"{path} is of the format {meta.get('format')!r}, not {kind!r}")
-        if meta.get("version") != version:
-            raise ValueError(f"{path} has version {meta.get('version')!r}, this is the reader of version {version!r}")
-        missing = [name for name in wanted if name not in there]
-        if missing:
-            raise ValueError(f"{path} lacks the tensors {', '.join(missing[:4])}; compute the set again")
-        return meta, there
-
-
-@lasting
-def _map(path: Path, names: Sequence[str]) -> list[Tensor]:
-    """Tensors of a file, mapped into memory; the mapping outlives the handle."""
-    with opened(path) as file:
-        return [file.tensor(name) for name in names]

@@ -5,11 +5,10 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torch_modal.io.files import write_atomically
-from torch_modal.io.tensors import opened, to_bytes
+from torch_modal.io.tensors import TensorFile, write_tensors
 
 FORMAT = "torch_modal.between"
-VERSION = "1"
+VERSION = "2"
 
 
 def interpolate(table: Tensor, t: Tensor) -> Tensor:
@@ -40,8 +39,9 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
 
 def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
     """A memory-mapped table; None if it is missing, damaged, or of another key."""
-    with contextlib.suppress(OSError, ValueError), opened(path) as file:
-        if file.metadata == _metadata(key):
+    with contextlib.suppress(OSError, ValueError):
+        file = TensorFile(path, FORMAT, VERSION, ["shapes"])
+        if key.items() <= file.metadata.items():
             return file.tensor("shapes")
     return None
 
@@ -49,8 +49,4 @@ def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
 def write_table(path: Path, table: Tensor, key: dict[str, str]) -> None:
     """Store a table, if its folder is writable."""
     with contextlib.suppress(OSError):
-        write_atomically(path, to_bytes({"shapes": table}, _metadata(key)))
-
-
-def _metadata(key: dict[str, str]) -> dict[str, str]:
-    return {"format": FORMAT, "version": VERSION, **key}
+        write_tensors(path, FORMAT, VERSION, {"shapes": table}, key)

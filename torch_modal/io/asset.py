@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from abc import ABC, abstractmethod
@@ -14,20 +15,10 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
-from torch_modal.io.files import write_files
-from torch_modal.io.write import check_frames, refuse_existing, to_numpy
+from torch_modal.io.write import refuse_existing, save_mesh
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
-
-NAMES = {
-    "texcoords": "texture coordinates",
-    "normals": "normals",
-    "colors": "vertex colours",
-    "materials": "materials",
-    "groups": "groups",
-}
-"""Names of features in messages."""
-
+"""Content of mesh files besides positions and triangles."""
 CLAY = (0.66, 0.52, 0.42, 1.0)
 """Linear RGBA of surfaces without a colour."""
 
@@ -39,11 +30,20 @@ class Image(NamedTuple):
     mime: str
     """``image/png`` or ``image/jpeg``."""
 
-    @classmethod
-    def of(cls, data: bytes) -> Image | None:
-        """PNG and JPEG by their first bytes, None for all else."""
-        starts = {b"\x89PNG": "image/png", b"\xff\xd8": "image/jpeg"}
-        return next((cls(data, mime) for start, mime in starts.items() if data.startswith(start)), None)
+
+def as_image(data: bytes) -> Image | None:
+    """PNG and JPEG as they are, other pictures as PNG, or None."""
+    for start, mime in ((b"\x89PNG", "image/png"), (b"\xff\xd8", "image/jpeg")):
+        if data.startswith(start):
+            return Image(data, mime)
+    from PIL import Image as pillow
+
+    stream = io.BytesIO()
+    try:
+        pillow.open(io.BytesIO(data)).save(stream, format="PNG")
+    except OSError:
+        return None
+    return Image(stream.getvalue(), "image/png")
 
 
 def linear(colors: FloatArray) -> FloatArray:
@@ -106,21 +106,15 @@ class Asset(ABC):
     """Polygons are triangulated. *Shape:* ``(F, 3)``."""
     carries: dict[str, str]
     """Further content of the file: some of :data:`FEATURES`, each with a description for messages."""
+    keeps = frozenset(FEATURES) - {"posing"}
+    """Features that :meth:`with_positions` keeps."""
+
+    suffix: str
+    """Of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.carries = {}
-
-    def _carry(self, feature: str, number: int | None = None) -> None:
-        """Record a feature, with its name and number for messages."""
-        name = NAMES[feature]
-        counted = f"{number} {name.removesuffix('s') if number == 1 else name}"
-        self.carries[feature] = name if number is None else counted
-
-    @property
-    def suffix(self) -> str:
-        """Of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
-        return self.path.suffix.lower()
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:
@@ -140,7 +134,7 @@ class Asset(ABC):
 
     @cached_property
     def companions(self) -> dict[str, bytes]:
-        """Files that must lie beside a copy: material libraries, textures."""
+        """Files that must lie beside a copy, by their names there: material libraries, textures."""
         return {}
 
     def write(self, path: str | os.PathLike[str], positions: Any, overwrite: bool = False) -> Path:
@@ -157,17 +151,15 @@ class Asset(ABC):
         Raises:
             ValueError: The positions or the ending do not fit.
             FileExistsError: A file exists and ``overwrite`` is off; then none is written.
-        """
-        path = Path(path)
-        if path.suffix.lower() != self.suffix:
-            raise ValueError(f"{self.path.name} is written as {self.suffix}, got {path.name!r}.")
-        x = to_numpy(positions)
-        self.check(x[None] if x.ndim == 2 else x)
-        refuse_existing(path, overwrite)
-        write_files([*self.companions_for(path.parent, overwrite), (path, self.with_positions(x.astype(np.float64)))])
-        return path
 
-    def companions_for(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
+        Warns:
+            MeshWarning: A skeleton, animations or morph targets are left out.
+        """
+        if Path(path).suffix.lower() != self.suffix:
+            raise ValueError(f"{self.path.name} is written as {self.suffix}, got {Path(path).name!r}.")
+        return save_mesh(positions, self.faces, path, overwrite, self)
+
+    def missing_companions(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
         """The companions that a copy in this folder lacks.
 
         Raises:
@@ -182,20 +174,13 @@ class Asset(ABC):
             missing.append((path, data))
         return missing
 
-    def check(self, frames: Any) -> FloatArray:
-        """Raise unless frames are of this mesh. *Shape:* ``(N, V, 3)``."""
-        shapes, _ = check_frames(frames, self.faces)
+    def check(self, shapes: FloatArray) -> None:
+        """Raise unless shapes are of this mesh. *Shape:* ``(N, V, 3)``."""
         if shapes.shape[1] != len(self.positions):
             raise ValueError(
                 f"{self.path} has {len(self.positions)} vertices, the frames have {shapes.shape[1]}; an asset takes "
                 "frames of its own mesh."
             )
-        return shapes
-
-    @property
-    def keeps(self) -> Collection[str]:
-        """Features that :meth:`with_positions` keeps."""
-        return self.carries
 
     def warn_lost(self, name: str, holds: Collection[str]) -> None:
         """Warn of features that a file loses.

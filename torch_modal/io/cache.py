@@ -1,27 +1,29 @@
-"""Results of long computations on disk, named by the hash of their inputs."""
+"""Results of long computations on disk, named by a digest of all that they depend on."""
 
 import contextlib
 import hashlib
-import json
 import os
 import re
+import struct
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_arrays
-from safetensors.numpy import save as save_arrays
+from torch import Tensor
 
-from torch_modal.io.files import write_atomically
+from torch_modal.io.tensors import TensorFile, write_tensors
+from torch_modal.version import __version__
 
-CACHE_VERSION = 5
+CACHE_VERSION = 6
 """Part of every key: raise it when the algorithm of cached results changes."""
 CACHE_VARIABLE = "TORCH_MODAL_CACHE"
 LIMIT_VARIABLE = "TORCH_MODAL_CACHE_LIMIT"
@@ -30,8 +32,8 @@ KEPT_PART = 0.9
 """Share of the limit that is left after entries were removed, so that not each new entry removes others."""
 ABANDONED = 3600.0
 """Seconds after which a partial file belongs to no running process."""
+FORMAT = "torch_modal.cache"
 SUFFIX = ".safetensors"
-_DIGEST = "digest"
 _OWN_NAME = re.compile(r"[a-z]+-[0-9a-f]{64}\.safetensors|\.[a-z]+-[0-9a-f]{64}\.safetensors\..+\.tmp")
 
 Arrays = dict[str, NDArray[Any]]
@@ -39,6 +41,10 @@ Arrays = dict[str, NDArray[Any]]
 
 class CacheWarning(UserWarning):
     """The cache cannot be written: results are right, but will be computed again."""
+
+
+class ContentError(ValueError):
+    """An object has contents that are not plain data, so that it has no digest."""
 
 
 def default_cache_dir() -> Path:
@@ -82,7 +88,7 @@ def parse_size(text: str) -> int:
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder of safetensors files, one per result, each with a digest that every read verifies.
+    """A folder of files, one per result, each with digests that every read verifies.
 
     Damaged, truncated or foreign entries are computed again and replaced. Several processes may share the
     folder: entries are moved into place whole. When they take more than the limit, the least recently used are
@@ -128,17 +134,21 @@ class Cache:
         Warns:
             CacheWarning: The folder cannot be written.
         """
-        kept = self.find(kind, inputs, parameters)
-        return self.keep(kind, inputs, parameters, compute()) if kept is None else kept
+        found = self.find(kind, inputs, parameters)
+        return self.keep(kind, inputs, parameters, compute()) if found is None else found
 
     def find(self, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Arrays | None:
         """The cached result, if there is one; arguments as for :meth:`get`."""
         if self.folder is None:
             return None
-        path = self._path(self.folder, kind, inputs, parameters)
-        if (found := _read(path)) is not None:
-            with contextlib.suppress(OSError):  # removed meanwhile, or not writable
-                os.utime(path)  # the time of the last use
+        path = self.folder / entry_name(kind, inputs, parameters)
+        try:
+            file = TensorFile(path, FORMAT, str(CACHE_VERSION))
+            found = {name: tensor.numpy() for name, tensor in file.tensors().items()}
+        except (OSError, ValueError):  # missing or damaged
+            return None
+        with contextlib.suppress(OSError):  # removed meanwhile, or not writable
+            os.utime(path)  # the time of the last use
         return found
 
     def keep(
@@ -158,11 +168,11 @@ class Cache:
         """
         if self.folder is None:
             return dict(result)
-        arrays = {name: np.ascontiguousarray(array) for name, array in result.items()}
+        tensors = {name: torch.from_numpy(np.array(array)) for name, array in result.items()}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            path = self._path(self.folder, kind, inputs, parameters)
-            write_atomically(path, save_arrays({**arrays, _DIGEST: _digest(arrays)}))
+            path = self.folder / entry_name(kind, inputs, parameters)
+            write_tensors(path, FORMAT, str(CACHE_VERSION), tensors)
             _make_room(self.folder, self.limit, path)
         except OSError as error:
             warnings.warn(
@@ -171,18 +181,28 @@ class Cache:
                 CacheWarning,
                 stacklevel=3,
             )
-        return arrays
-
-    @staticmethod
-    def _path(folder: Path, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Path:
-        return folder / f"{kind}-{content_key(kind, inputs, parameters)}{SUFFIX}"
+        return dict(result)
 
 
+def entry_name(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:
+    """Name of the file of a result, from all that it depends on and the version of the cache."""
+    key = content_digest([CACHE_VERSION, kind, sorted(inputs.items()), sorted(parameters.items())])
+    return f"{kind}-{key}{SUFFIX}"
+
+
+# -------------------------------------------------------------------------------------------------- size of a folder
 class CacheContent(NamedTuple):
     """Size of a cache folder."""
 
     n_entries: int
     n_bytes: int
+
+
+class _Entry(NamedTuple):
+    used: int
+    """Time of the last use, in nanoseconds."""
+    size: int
+    path: Path
 
 
 def cache_content(cache_dir: str | os.PathLike[str] | None = None) -> CacheContent:
@@ -228,13 +248,6 @@ def shrink_cache(limit: int, cache_dir: str | os.PathLike[str] | None = None) ->
     return _remove(_oldest(_entries(cache_dir), limit))
 
 
-class _Entry(NamedTuple):
-    used: int
-    """Time of the last use, in nanoseconds."""
-    size: int
-    path: Path
-
-
 def _entries(cache_dir: str | os.PathLike[str] | None) -> list[_Entry]:
     """Entries and partial ones, known by their names; a user's own files may lie beside them. The oldest come first."""
     folder = default_cache_dir() if cache_dir is None else Path(cache_dir).expanduser()
@@ -259,7 +272,7 @@ def _make_room(folder: Path, limit: int, newest: Path) -> None:
 
 
 def _oldest(entries: list[_Entry], limit: int) -> list[_Entry]:
-    """Which entries to remove so that the rest takes no more than a limit: those not used for the longest."""
+    """Entries to remove so that the rest takes no more than a limit: those not used for the longest."""
     now, total, chosen = time.time(), sum(entry.size for entry in entries), []
     for entry in entries:
         if entry.path.suffix != SUFFIX and now - entry.used / 1e9 < ABANDONED:
@@ -272,7 +285,6 @@ def _oldest(entries: list[_Entry], limit: int) -> list[_Entry]:
 
 
 def _remove(entries: list[_Entry]) -> CacheContent:
-    """Remove entries; returns how many there were."""
     sizes = []
     for entry in entries:
         with contextlib.suppress(FileNotFoundError):
@@ -281,30 +293,70 @@ def _remove(entries: list[_Entry]) -> CacheContent:
     return CacheContent(len(sizes), sum(sizes))
 
 
-def content_key(kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> str:
-    """SHA-256 of the kind, the arrays (bytes, shapes, dtypes), the parameters and the cache version."""
-    head = json.dumps([CACHE_VERSION, kind, dict(parameters)], sort_keys=True)
-    return hashlib.sha256(head.encode() + _digest(inputs).tobytes()).hexdigest()
+# ----------------------------------------------------------------------------------------------------------- digests
+def content_digest(value: Any) -> str:
+    """SHA-256 of all contents of a value, the same in every process.
 
+    Numbers count with their types and shapes, objects of this package with their classes and all their attributes.
 
-def _digest(arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """SHA-256 of named arrays. *Shape:* ``(32,)``."""
-    total = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        if array.dtype.hasobject or array.dtype.names:
-            raise ValueError(f"{name} is an array of {array.dtype}; a key is made of numbers")
-        total.update(json.dumps([name, array.dtype.str, list(array.shape)]).encode())
-        total.update(array.tobytes())
-    return np.frombuffer(total.digest(), dtype=np.uint8).copy()
-
-
-def _read(path: Path) -> Arrays | None:
-    """The entry's arrays if the file is there, can be parsed, and has the digest it was written with."""
+    Raises:
+        ContentError: Some of it is neither plain data nor an object of this package: results would depend on code that
+            has no digest.
+    """
     try:
-        arrays = load_arrays(path.read_bytes())
-    except (OSError, SafetensorError, KeyError, ValueError):
-        # Any damaged file is computed again.
-        return None
-    written = arrays.pop(_DIGEST, None)
-    return arrays if written is not None and np.array_equal(written, _digest(arrays)) else None
+        return _digest(value).hex()
+    except RecursionError:
+        raise ContentError(f"a {type(value).__name__} is nested too deeply") from None
+
+
+@cache
+def code_digest() -> str:
+    """SHA-256 of the package's own code, which changes before its version does."""
+    root = Path(__file__).parents[1]
+    files = sorted(root.rglob("*.py"))
+    parts = [part for file in files for part in (file.relative_to(root).as_posix().encode(), file.read_bytes())]
+    return _joined(__version__, parts).hex()
+
+
+def _digest(value: Any) -> bytes:
+    kind = type(value)
+    if value is None or kind in (bool, int, float, str):
+        return _joined(kind.__name__, [repr(value).encode("utf-8", "surrogatepass")])
+    if kind in (list, tuple):
+        return _joined(kind.__name__, map(_digest, value))
+    if kind in (dict, OrderedDict):
+        return _joined(kind.__name__, (_digest(part) for pair in value.items() for part in pair))
+    if kind in (set, frozenset):
+        return _joined(kind.__name__, sorted(map(_digest, value)))
+    if kind in (Tensor, torch.nn.Parameter):
+        return _joined("tensor", [str(value.dtype).encode(), str(tuple(value.shape)).encode(), _bytes_of(value)])
+    if isinstance(value, (np.ndarray, np.generic)) and not value.dtype.hasobject:
+        return _joined("array", [str(value.dtype.descr).encode(), str(value.shape).encode(), value.tobytes()])
+    if _is_of_package(kind):
+        content = tuple(value) if isinstance(value, tuple) else dict(vars(value))
+        return _joined(f"{kind.__module__}.{kind.__qualname__}", [_digest(content)])
+    raise ContentError(f"a {kind.__qualname__} is neither plain data nor of a class of torch_modal")
+
+
+def _bytes_of(x: Tensor) -> bytes:
+    plain = x.detach()
+    if plain.layout is not torch.strided or plain.is_meta or torch.func.debug_unwrap(plain, recurse=False) is not plain:
+        raise ContentError(f"a tensor of {x.layout} on {x.device}, or inside a transform of torch.func, has no numbers")
+    numbers = plain.cpu().resolve_conj().resolve_neg().contiguous().flatten().view(torch.uint8)
+    return numbers.numpy().tobytes()
+
+
+def _is_of_package(kind: type) -> bool:
+    """Whether a class is the one of its name in this package."""
+    found: Any = sys.modules.get(kind.__module__) if kind.__module__.startswith("torch_modal.") else None
+    for name in kind.__qualname__.split("."):
+        found = getattr(found, name, None)
+    return found is kind
+
+
+def _joined(kind: str, parts: Iterable[bytes]) -> bytes:
+    total = hashlib.sha256(kind.encode())
+    for part in parts:
+        total.update(struct.pack("<q", len(part)))
+        total.update(part)
+    return total.digest()

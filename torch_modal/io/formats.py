@@ -1,47 +1,222 @@
-"""Output formats by suffix. A format is a function that registers itself.
-
-Modules of built-in formats are imported when their format is first used, so that listing formats costs nothing.
-"""
+"""Output formats by suffix, and what an animation passes to them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from importlib import import_module
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-if TYPE_CHECKING:  # at run time NumPy stays out: the command line lists formats in its help
-    from torch_modal.arrays import FloatArray, IntArray
+import numpy as np
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.progress import Progress
+
+if TYPE_CHECKING:
     from torch_modal.io.asset import Asset
-    from torch_modal.io.timing import Timing
-    from torch_modal.progress import Progress
 
 Writer = TypeVar("Writer", bound=Callable[..., Any])
 
+SECONDS_OF_A_PAIR = 2.0
+SECONDS_OF_A_CYCLE = 1.0
+SECONDS_OF_AN_INTERVAL = 1.0
+FPS = 24.0
 
-class OutputFormat(NamedTuple):
-    """A registered function, with the arguments of its registration."""
 
-    write: Callable[..., Any]
+@dataclass(frozen=True)
+class OutputFormat:
+    """A function that writes, and what is known of it before it is imported.
+
+    Attributes:
+        function: The function; of built-in formats its place, ``module:name``.
+        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from an asset.
+        modules: Modules that must be installed.
+        extra: The extra of torch_modal that installs them.
+    """
+
+    function: Callable[..., Any] | str
     holds: Collection[str] = ()
     modules: Collection[str] = ()
     extra: str = ""
 
+    def write(self, *arguments: Any) -> Any:
+        """Call the function."""
+        function = resolve_name(self.function) if isinstance(self.function, str) else self.function
+        return function(*arguments)
 
-MESH_FORMATS: dict[str, OutputFormat | str] = {
-    **dict.fromkeys((".ply", ".obj", ".off"), "torch_modal.io.bare_mesh"),
-    ".glb": "torch_modal.io.glb",
+
+GLB_HOLDS = ("texcoords", "normals", "colors", "materials")
+"""From a file of another format; of materials, colour, roughness and the texture of the colour."""
+MESH_FORMATS = {
+    ".ply": OutputFormat("torch_modal.io.ply:ply_bytes"),
+    ".obj": OutputFormat("torch_modal.io.obj:obj_bytes"),
+    ".off": OutputFormat("torch_modal.io.ply:off_bytes"),
+    ".glb": OutputFormat("torch_modal.io.glb:glb_bytes", GLB_HOLDS),
 }
-ANIMATION_FORMATS: dict[str, OutputFormat | str] = {
-    ".glb": "torch_modal.io.glb",
-    **dict.fromkeys((".mp4", ".gif"), "torch_modal.view.video"),
-    **dict.fromkeys((".usd", ".usda", ".usdc"), "torch_modal.io.usd"),
-    **dict.fromkeys((".mdd", ".pc2", ".npz"), "torch_modal.io.point_cache"),
+ANIMATION_FORMATS = {
+    ".glb": OutputFormat("torch_modal.io.glb:write_glb", GLB_HOLDS),
+    ".mp4": OutputFormat("torch_modal.view.video:write_mp4", (), ("imageio", "imageio_ffmpeg"), "video"),
+    ".gif": OutputFormat("torch_modal.view.video:write_gif"),
+    **dict.fromkeys(
+        (".usd", ".usda", ".usdc"),
+        OutputFormat("torch_modal.io.animations:write_usd", ("polygons", "texcoords", "colors"), ("pxr",), "usd"),
+    ),
+    ".mdd": OutputFormat("torch_modal.io.animations:write_mdd"),
+    ".pc2": OutputFormat("torch_modal.io.animations:write_pc2"),
+    ".npz": OutputFormat("torch_modal.io.animations:write_npz"),
 }
-"""Each format, or the module that registers it."""
-
-
 PICTURES = (".png", ".pdf")
 PAGES = (".html", ".htm")
+
+
+def mesh_format(*suffixes: str, holds: Collection[str] = ()) -> Callable[[Writer], Writer]:
+    """Register a function that writes one shape, for :func:`torch_modal.save_frames`.
+
+    The function takes vertices ``(V, 3)``, faces ``(F, 3)`` and the :class:`torch_modal.Asset` that they come from, or
+    None, and returns the bytes of the file.
+
+    Args:
+        suffixes: In small letters with their dots, such as ``".xyz"``.
+        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from the asset; a warning names the others.
+    """
+
+    def register(write: Writer) -> Writer:
+        MESH_FORMATS.update(dict.fromkeys(suffixes, OutputFormat(write, holds)))
+        return write
+
+    return register
+
+
+def animation_format(*suffixes: str, modules: Collection[str] = (), extra: str = "") -> Callable[[Writer], Writer]:
+    """Register a function that writes a sequence, for :func:`torch_modal.save_animation`.
+
+    The function takes an :class:`torch_modal.Animation` and the path of a new file, which is renamed when the
+    function returns.
+
+    Args:
+        suffixes: In small letters with their dots, such as ``".csv"``.
+        modules: Modules that must be installed.
+        extra: The extra of torch_modal that installs them.
+    """
+
+    def register(write: Writer) -> Writer:
+        ANIMATION_FORMATS.update(dict.fromkeys(suffixes, OutputFormat(write, (), modules, extra)))
+        return write
+
+    return register
+
+
+class Timing(NamedTuple):
+    """Times and repetitions of a sequence that plays."""
+
+    duration: float
+    """Of the whole sequence once, in seconds; for a cycle, with the step back to its start."""
+    fps: float
+    """Pictures a second, for formats that have a fixed rate."""
+    cyclic: bool
+    ping_pong: bool
+    """There and back again."""
+    ease: bool
+    """Slow at both ends, by half a period of a cosine."""
+    parts: FloatArray
+    """Time of each frame over the duration, from 0 on. *Shape:* ``(N,)``."""
+
+    def knots(self, frames: IntArray | None = None) -> tuple[FloatArray, IntArray]:
+        """Times at which frames are fully shown, for formats that interpolate linearly between them.
+
+        Args:
+            frames: Frame numbers that are kept, from the first to the last, ascending. Default: all. *Shape:* ``(n,)``.
+
+        Returns:
+            Times in seconds, and indices into ``frames``. *Shape of both:* ``(T,)``.
+        """
+        parts = self.parts if frames is None else self.parts[frames]
+        places = np.arange(len(parts))
+        if len(parts) == 1:
+            return np.zeros(1), places
+        if self.ease:
+            parts = np.arccos(np.clip(1 - 2 * parts, -1, 1)) / np.pi
+        times = self.duration * parts
+        if self.cyclic:
+            return np.append(times, self.duration), np.append(places, 0)
+        if self.ping_pong:
+            return np.concatenate([times, 2 * self.duration - times[-2::-1]]), np.concatenate([places, places[-2::-1]])
+        return times, places
+
+    def samples(self) -> FloatArray:
+        """Fractional frame numbers at the fixed rate, without the repeated ends of loops.
+
+        *Shape:* ``(T,)``, from 0 to ``N - 1`` (to ``N``, if cyclic, which is frame 0 again).
+        """
+        if len(self.parts) == 1:
+            return np.zeros(1)
+        steps = max(1, round(self.duration * self.fps))
+        part = np.arange(steps if self.cyclic else steps + 1) / steps
+        if self.ease:
+            part = (1 - np.cos(np.pi * part)) / 2
+        if self.ping_pong:
+            part = np.concatenate([part, part[-2:0:-1]])
+        known = np.append(self.parts, 1.0) if self.cyclic else self.parts
+        return np.interp(part, known, np.arange(len(known)))
+
+
+def make_timing(
+    n_frames: int,
+    n_keyframes: int = 2,
+    *,
+    duration: float | None = None,
+    fps: float | None = None,
+    cyclic: bool = False,
+    ping_pong: bool = False,
+    ease: bool = False,
+    times: Sequence[float] | FloatArray | None = None,
+) -> Timing:
+    """Check and complete the settings of an animation.
+
+    Args:
+        n_frames: Of the sequence.
+        n_keyframes: Of the sequence.
+        duration: In seconds. Default: of ``fps`` frames a second where that is given; otherwise 1 s for a cycle, 2 s
+            for two key-frames, and 1 s for each interval of more.
+        fps: Frames a second. With a duration, only formats of a fixed rate (videos, point caches) depend on it.
+        cyclic: The last frame leads on to the first.
+        ping_pong: There and back again.
+        ease: Slow at both ends.
+        times: Of the frames, in any unit; of a cycle, also when it begins again. Default: evenly spaced.
+
+    Raises:
+        ValueError: A number is not positive, a cycle is to turn back or to slow down, or times do not fit.
+    """
+    for name, value in (("duration", duration), ("fps", fps)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be a positive number, got {value}.")
+    if cyclic and (ping_pong or ease):
+        name = "ping_pong" if ping_pong else "ease"
+        raise ValueError(f"{name} is for sequences that begin and end; a cyclic one does neither.")
+    steps = max(n_frames if cyclic else n_frames - 1, 1)
+    if duration is None:
+        if fps is not None:
+            duration = steps / fps
+        elif cyclic:
+            duration = SECONDS_OF_A_CYCLE
+        else:
+            duration = max(SECONDS_OF_A_PAIR, SECONDS_OF_AN_INTERVAL * (n_keyframes - 1))
+    parts = np.arange(n_frames) / steps
+    if times is not None:
+        given, wanted = np.asarray(times, np.float64), n_frames + cyclic
+        if given.shape != (wanted,) or not np.isfinite(given).all() or (np.diff(given) <= 0).any():
+            also = ", and the one when it begins again" if cyclic else ""
+            raise ValueError(f"times must be {wanted} ascending numbers, one for each frame{also}; got {given.shape}.")
+        parts = parts if wanted == 1 else ((given - given[0]) / (given[-1] - given[0]))[:n_frames]
+    return Timing(float(duration), float(FPS if fps is None else fps), cyclic, ping_pong, ease, parts)
+
+
+def resample(frames: FloatArray, places: FloatArray) -> FloatArray:
+    """Linear interpolation at fractional frame numbers. *Shape:* ``(N, V, 3), (T,) -> (T, V, 3)``."""
+    left = np.floor(places).astype(np.int64)
+    part = (places - left)[:, None, None]
+    following = frames[(left + 1) % len(frames)]
+    return np.where(part > 0, (1 - part) * frames[left % len(frames)] + part * following, frames[left % len(frames)])
 
 
 class Animation(NamedTuple):
@@ -63,53 +238,3 @@ class Animation(NamedTuple):
     """Most morph targets of a GLB."""
     progress: Progress
     """See :data:`torch_modal.progress.Progress`."""
-
-
-def mesh_format(*suffixes: str, holds: Collection[str] = ()) -> Callable[[Writer], Writer]:
-    """Register a function that writes one shape, for :func:`torch_modal.save_frames`.
-
-    The function takes vertices ``(V, 3)``, faces ``(F, 3)`` and the :class:`torch_modal.Asset` that they come from, or
-    None, and returns the bytes of the file.
-
-    Args:
-        suffixes: In small letters with their dots, such as ``".xyz"``.
-        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from the asset; a warning names the others.
-    """
-    return _registration(MESH_FORMATS, suffixes, holds=holds)
-
-
-def animation_format(*suffixes: str, modules: Collection[str] = (), extra: str = "") -> Callable[[Writer], Writer]:
-    """Register a function that writes a sequence, for :func:`torch_modal.save_animation`.
-
-    The function takes an :class:`torch_modal.Animation` and the path of a new file, which is renamed when the
-    function returns.
-
-    Args:
-        suffixes: In small letters with their dots, such as ``".csv"``.
-        modules: What must be installed.
-        extra: The extra of torch_modal that installs it.
-    """
-    return _registration(ANIMATION_FORMATS, suffixes, modules=modules, extra=extra)
-
-
-def _registration(
-    table: dict[str, OutputFormat | str], suffixes: tuple[str, ...], **options: Any
-) -> Callable[[Writer], Writer]:
-    def register(write: Writer) -> Writer:
-        built_in = write.__module__.startswith("torch_modal.")
-        for suffix in suffixes:
-            if not built_in or not isinstance(table.get(suffix), OutputFormat):  # a user's format stays
-                table[suffix] = OutputFormat(write, **options)
-        return write
-
-    return register
-
-
-def find_format(table: dict[str, OutputFormat | str], suffix: str) -> OutputFormat:
-    """The format of a suffix in one of the tables."""
-    found = table[suffix]
-    if isinstance(found, str):
-        import_module(found)
-        found = table[suffix]
-    assert isinstance(found, OutputFormat)
-    return found

@@ -12,20 +12,15 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import merge_seams
 from torch_modal.geometry.vectors import vertex_normals
 from torch_modal.io.asset import Asset, Material, Part
-from torch_modal.io.formats import Animation, animation_format, mesh_format
-from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Json
+from torch_modal.io.formats import GLB_HOLDS, Animation
+from torch_modal.io.gltf import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, Document, Drawn, Json, animate, place_frames
 from torch_modal.io.gltf_asset import GltfAsset
-from torch_modal.io.morph import Drawn, animate, place_frames
 from torch_modal.io.normals import carry_together
 
 # Normals double the file. Beyond this size (POSITION alone) they are left out.
 LARGEST_FILE_WITH_NORMALS = 48 * 2**20
 
-HOLDS = ("texcoords", "normals", "colors", "materials")
-"""Features taken from a file of another format; of materials, colour, roughness and the texture of the colour."""
 
-
-@mesh_format(".glb", holds=HOLDS)
 def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> bytes:
     """One shape without an animation."""
     document, drawn, _ = _document(vertices[None], faces, asset, "shape")
@@ -33,14 +28,14 @@ def glb_bytes(vertices: FloatArray, faces: IntArray, asset: Asset | None) -> byt
     return document.to_glb()
 
 
-@animation_format(".glb")
 def write_glb(animation: Animation, path: Path) -> None:
     """Frame 0, a morph target for each further frame, and an animation of their weights.
 
     Key-frames are kept when frames are left out, and named in the animation's extras. Materials, textures and texture
     coordinates come from the asset; from a GLB or GLTF file also its nodes and everything else.
     """
-    shapes, faces, timing, name, keyframes, asset, max_targets, _ = animation
+    shapes, asset, timing, keyframes = animation.shapes, animation.asset, animation.timing, animation.keyframes
+    name, max_targets = animation.name, animation.max_targets
     if max_targets < 1:
         raise ValueError(f"max_targets must be at least 1, got {max_targets}.")
     kept = thinned(len(shapes), max_targets + 1, keyframes)
@@ -54,11 +49,11 @@ def write_glb(animation: Animation, path: Path) -> None:
     if not move_normals:
         warnings.warn(f"{name} is large: its normals stay those of frame 0.", stacklevel=3)
     if asset is not None:
-        asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else HOLDS)
+        asset.warn_lost(name, asset.keeps if isinstance(asset, GltfAsset) else GLB_HOLDS)
     if isinstance(asset, GltfAsset):
         document, drawn, nodes = asset.rebuilt(shapes[kept] if move_normals else shapes[:1])
     else:
-        document, drawn, nodes = _document(shapes[kept], faces, asset, Path(name).stem, move_normals)
+        document, drawn, nodes = _document(shapes[kept], animation.faces, asset, Path(name).stem, move_normals)
     place_frames(document, drawn, shapes[kept])
     if len(kept) > 1:
         times, shown = timing.knots(kept)
@@ -109,7 +104,7 @@ def _document(
         if part.colors is not None:
             primitive["attributes"]["COLOR_0"] = document.add(part.colors.astype(np.float32), "VEC4", ARRAY_BUFFER)
         primitives.append(primitive)
-        drawn.append(Drawn(primitive, part.vertices, None, own_normals))
+        drawn.append(Drawn(primitive, part.vertices, np.eye(4), own_normals))
     document.append("meshes", {"name": name, "primitives": primitives})
     document.append("nodes", {"name": name, "mesh": 0})
     document.append("scenes", {"name": "scene", "nodes": [0]})

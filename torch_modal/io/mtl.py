@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 from torch_modal.errors import MeshWarning
-from torch_modal.io.asset import Image, Material
+from torch_modal.io.asset import Material, as_image
 
 # Options of a texture line, with the number of words that follow; up to three for those of coordinates.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-clamp": 1}
@@ -124,17 +123,3 @@ def _name_in_copy(name: str) -> str:
     """Relative to the copy and inside of its folder."""
     place = Path(name)
     return place.name if place.is_absolute() or ".." in place.parts else place.as_posix()
-
-
-def as_image(data: bytes) -> Image | None:
-    """PNG and JPEG as they are, other pictures as PNG, or None."""
-    if (known := Image.of(data)) is not None:
-        return known
-    from PIL import Image as pillow
-
-    stream = io.BytesIO()
-    try:
-        pillow.open(io.BytesIO(data)).save(stream, format="PNG")
-    except OSError:
-        return None
-    return Image(stream.getvalue(), "image/png")

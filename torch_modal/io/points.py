@@ -1,14 +1,12 @@
 """PLY files of points: scans, markers, and splats of 3D Gaussian splatting."""
 
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torch_modal.arrays import FloatArray
-from torch_modal.io.asset import Asset
-from torch_modal.io.ply import PlyAsset
+from torch_modal.io.ply import PlyFile
 
 _QUATERNION = [f"rot_{i}" for i in range(4)]
 _SCALES = [f"scale_{i}" for i in range(3)]
@@ -25,8 +23,12 @@ _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
 _CHUNK = 65_536
 
 
-class PointFile(PlyAsset):
+class PointFile:
     """A PLY file whose vertices move, with or without faces; all else stays as it is.
+
+    Attributes:
+        positions: *Shape:* ``(P, 3)``.
+        is_splats: Whether the points are splats: with a rotation and logarithms of scales.
 
     Args:
         path: The file.
@@ -37,37 +39,25 @@ class PointFile(PlyAsset):
     """
 
     def __init__(self, path: Path) -> None:
-        Asset.__init__(self, path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file")
-        self.data = path.read_bytes()
         try:
-            self._read_header()
-            self.positions = self._columns("x", "y", "z")
+            self._file = PlyFile(path)
+            self.positions = self._file.columns("x", "y", "z")
         except (ValueError, KeyError, IndexError) as error:
             raise ValueError(f"{path} is no PLY file of points with x, y and z: {error}") from error
-        self.faces = np.zeros((0, 3), dtype=np.int64)
-        if self.is_splats and self._degree is None:
+        self._names = self._file.vertex.properties.keys()
+        self.is_splats = {*_QUATERNION, *_SCALES} <= self._names
+        #: Properties of the harmonics above degree 0, one channel after the other.
+        self._harmonics = sorted(
+            (name for name in self._names if name.startswith("f_rest_")),
+            key=lambda name: int(name.removeprefix("f_rest_")),
+        )
+        if self.is_splats and len(self._harmonics) not in [3 * (n * n - 1) for n in range(1, MOST_DEGREE + 2)]:
             raise ValueError(
                 f"{path} has {len(self._harmonics)} f_rest properties; splats of degree 0 to {MOST_DEGREE} have 0, 9, "
                 "24 or 45"
             )
-
-    @property
-    def is_splats(self) -> bool:
-        """Whether the points are splats: with a rotation and logarithms of scales."""
-        return {*_QUATERNION, *_SCALES} <= self._vertex.properties.keys()
-
-    @cached_property
-    def _harmonics(self) -> list[str]:
-        """Properties of the harmonics above degree 0, one channel after the other."""
-        names = (name for name in self._vertex.properties if name.startswith("f_rest_"))
-        return sorted(names, key=lambda name: int(name.removeprefix("f_rest_")))
-
-    @property
-    def _degree(self) -> int | None:
-        sizes = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(MOST_DEGREE + 1)}
-        return sizes.get(len(self._harmonics))
 
     def moved(self, positions: FloatArray, rotations: FloatArray, gradients: FloatArray) -> bytes:
         """The file with points that moved, and what turns with them: normals; of splats axes, scales and harmonics.
@@ -80,25 +70,24 @@ class PointFile(PlyAsset):
             gradients: Deformation gradients. *Shape:* ``(P, 3, 3)``.
         """
         new = dict(zip("xyz", positions.T, strict=True))
-        names = self._vertex.properties.keys()
-        if {*_NORMALS} <= names:
-            turned = np.einsum("pij,pj->pi", rotations, self._columns(*_NORMALS))
+        if {*_NORMALS} <= self._names:
+            turned = np.einsum("pij,pj->pi", rotations, self._file.columns(*_NORMALS))
             new |= dict(zip(_NORMALS, turned.T, strict=True))
         if self.is_splats:
             # SciPy's quaternions have the scalar last, and a length.
-            quaternions = np.roll(self._columns(*_QUATERNION), -1, axis=1)
+            quaternions = np.roll(self._file.columns(*_QUATERNION), -1, axis=1)
             quaternions[~quaternions.any(1), 3] = 1
             given = Rotation.from_quat(quaternions)
             turned = (Rotation.from_matrix(rotations) * given).as_quat()
             new |= dict(zip(_QUATERNION, np.roll(turned, 1, axis=1).T, strict=True))
             stretch = np.linalg.norm(gradients @ given.as_matrix(), axis=1)
-            scales = self._columns(*_SCALES) + np.log(np.maximum(stretch, np.finfo(np.float32).tiny))
+            scales = self._file.columns(*_SCALES) + np.log(np.maximum(stretch, np.finfo(np.float32).tiny))
             new |= dict(zip(_SCALES, scales.T, strict=True))
             if self._harmonics:
-                own = self._columns(*self._harmonics).reshape(len(positions), 3, -1)
+                own = self._file.columns(*self._harmonics).reshape(len(positions), 3, -1)
                 rotated = rotated_harmonics(own, rotations).reshape(len(positions), -1)
                 new |= dict(zip(self._harmonics, rotated.T, strict=True))
-        return self.with_columns(new)
+        return self._file.with_columns(new)
 
 
 def harmonics(directions: FloatArray, degree: int) -> FloatArray:

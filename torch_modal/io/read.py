@@ -1,7 +1,6 @@
 """Reading mesh files; the order and number of vertices stay."""
 
 import os
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +8,17 @@ import numpy as np
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.asset import Asset
+from torch_modal.io.gltf_asset import GltfAsset
+from torch_modal.io.obj import ObjAsset
+from torch_modal.io.ply import OffAsset, PlyAsset
 
-READERS = {
-    ".obj": "torch_modal.io.obj.ObjAsset",
-    ".ply": "torch_modal.io.ply.PlyAsset",
-    ".off": "torch_modal.io.off.OffAsset",
-    ".glb": "torch_modal.io.gltf_asset.GltfAsset",
-    ".gltf": "torch_modal.io.gltf_asset.GltfAsset",
+READERS: dict[str, type[Asset]] = {
+    ".obj": ObjAsset,
+    ".ply": PlyAsset,
+    ".off": OffAsset,
+    ".glb": GltfAsset,
+    ".gltf": GltfAsset,
 }
-"""The class for each suffix, imported when it is first used."""
 SUFFIXES = tuple(READERS)
 
 
@@ -67,8 +68,7 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
     try:
         if not path.stat().st_size:
             raise MeshError(f"{path}: the file is empty")
-        module, _, name = READERS[suffix].rpartition(".")
-        asset: Asset = getattr(import_module(module), name)(path)
+        asset = READERS[suffix](path)
     except MeshError:
         raise
     except Exception as error:  # Damaged files may raise any exception; the message names the file.

@@ -1,124 +1,134 @@
-"""Safetensors files with digests: damage is found before any number of a file is used.
+"""Safetensors files of the package: a format with a version, and digests that find damage before numbers are used.
 
-The tensor ``digests`` has a row of SHA-256 for the metadata and for each other tensor, in the order of their names. The
-first row covers the others, so that the header of a large file is checked without reading its numbers, and each tensor
-when it is read. Files without it, which earlier versions wrote, are read unchecked.
+The metadata have one entry, ``torch_modal``, which is JSON: the format, its version, and what else a caller adds.
+(safetensors does not keep the order of several entries, and equal files shall have equal bytes.) The tensor ``digests``
+has a row of SHA-256 for the header and for each other tensor, in the order of their names. The first row covers the
+others, so that opening a large file does not read its numbers; each tensor is compared with its row when it is read.
 """
 
-import contextlib
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor
 
+from torch_modal.autograd import lasting
+from torch_modal.io.files import write_atomically
+
 DIGESTS = "digests"
-
-# What safetensors raises for damaged files; its own error is no ValueError.
-_DAMAGED = (SafetensorError, ValueError, TypeError, KeyError, OverflowError, RuntimeError)
+ENTRY = "torch_modal"
 
 
-def to_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """A file of tensors on the CPU, with their digests."""
-    parts = {name: tensor.contiguous() for name, tensor in tensors.items()}
-    rows = [_digest(name, parts[name]) for name in sorted(parts)]
-    table = bytearray(b"".join([_head_digest(metadata, sorted(parts), rows), *rows]))
-    return save({**parts, DIGESTS: torch.frombuffer(table, dtype=torch.uint8).reshape(-1, 32)}, dict(metadata))
-
-
-def from_bytes(data: bytes, path: Path | str, kind: str = "safetensors") -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of a file, checked.
+def write_tensors(
+    path: Path, format: str, version: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
+) -> None:
+    """Write a whole file or nothing.
 
     Args:
-        data: The whole content.
-        path: Where it is from, for messages.
-        kind: What the file should be, for messages.
+        path: The file; its folder must exist.
+        format: Name of the format.
+        version: Version of the format.
+        tensors: On any device; copied where they share memory, which safetensors refuses.
+        metadata: Further entries of the header, which JSON can hold.
 
     Raises:
-        ValueError: It is damaged, or another file.
+        OSError: The file cannot be written.
     """
-    try:
-        tensors = load(data)
-        size = int.from_bytes(data[:8], "little")
-        metadata = json.loads(data[8 : 8 + size]).get("__metadata__", {})
-    except _DAMAGED as error:
-        raise ValueError(f"{path} is no {kind} file, or a damaged one: {error}") from error
-    if (digests := tensors.pop(DIGESTS, None)) is not None:
-        known = _checked(digests, metadata, list(tensors), path)
-        for name, tensor in tensors.items():
-            _check(known, name, tensor, path)
-    return tensors, metadata
+    header = json.dumps({"format": format, "version": version, **(metadata or {})}, sort_keys=True)
+    parts = {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()}
+    rows = [_digest(name, parts[name]) for name in sorted(parts)]
+    table = bytearray(b"".join([_header_digest(header, sorted(parts), rows), *rows]))
+    parts[DIGESTS] = torch.frombuffer(table, dtype=torch.uint8).reshape(-1, 32)
+    # Not safetensors' save_file: its files can be read by their owner alone, whatever the umask says.
+    write_atomically(path, save(parts, {ENTRY: header}))
 
 
 class TensorFile:
-    """A file that is mapped into memory, with checked metadata.
+    """A file that is open for reading and mapped into memory: tensors are read when they are used, and outlive it.
 
     Attributes:
-        metadata: Of the file.
-        shapes: Of its tensors, without their digests.
+        metadata: Entries of the header.
+        shapes: Shape of each tensor.
+
+    Args:
+        path: The file.
+        format: Format that it must have.
+        version: Version that it must have.
+        needs: Tensors that it must have.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is damaged, holds something else, or has another version.
     """
 
-    def __init__(self, file: Any, path: Path) -> None:
-        self._file, self._path = file, path
-        self.metadata: dict[str, str] = file.metadata() or {}
-        names = sorted(set(file.keys()) - {DIGESTS})
-        self.shapes = {name: tuple(file.get_slice(name).get_shape()) for name in names}
-        digests = file.get_tensor(DIGESTS) if DIGESTS in set(file.keys()) else None
-        self._digests = None if digests is None else _checked(digests, self.metadata, names, path)
+    def __init__(self, path: Path, format: str, version: str, needs: Sequence[str] = ()) -> None:
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no file {path}")
+        self.path = path
+        try:
+            self._file = safe_open(path, framework="pt", device="cpu")
+            header = (self._file.metadata() or {}).get(ENTRY, "")
+            names = sorted(self._file.keys())
+            digests = _bytes(self._file.get_tensor(DIGESTS)) if DIGESTS in names else b""
+        except SafetensorError as error:
+            raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
+        self.metadata = _parsed(header)
+        if self.metadata.get("format") != format:
+            raise ValueError(f"{path} holds no {format}: its format is {self.metadata.get('format')!r}")
+        if self.metadata.get("version") != version:
+            raise ValueError(
+                f"{path} has version {self.metadata.get('version')!r} of {format}, this program reads version "
+                f"{version!r}; make the file again"
+            )
+        names = [name for name in names if name != DIGESTS]
+        if missing := [name for name in needs if name not in names]:
+            raise ValueError(f"{path} lacks the tensors {', '.join(missing[:4])}; make the file again")
+        rows = [digests[i : i + 32] for i in range(32, len(digests), 32)]
+        if len(rows) != len(names) or digests[:32] != _header_digest(header, names, rows):
+            raise ValueError(f"{path} is damaged: its metadata and digests are not what was written")
+        self._digests = dict(zip(names, rows, strict=True))
+        self.shapes = {name: tuple(self._file.get_slice(name).get_shape()) for name in names}
 
+    @lasting
     def tensor(self, name: str) -> Tensor:
-        """One of them, checked; the mapping outlives the file.
+        """One of the tensors, compared with its digest.
 
         Raises:
             ValueError: It is not what was written.
         """
         found: Tensor = self._file.get_tensor(name)
-        if self._digests is not None:
-            _check(self._digests, name, found, self._path)
+        if self._digests[name] != _digest(name, found):
+            raise ValueError(f"{self.path} is damaged: its tensor {name!r} is not what was written")
         return found
 
-
-@contextlib.contextmanager
-def opened(path: Path) -> Iterator[TensorFile]:
-    """A file for reading.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is damaged, or no safetensors file.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            yield TensorFile(file, path)
-    except SafetensorError as error:
-        raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
+    @lasting
+    def tensors(self) -> dict[str, Tensor]:
+        """Copies of all tensors, which do not depend on the file any more."""
+        return {name: self.tensor(name).clone() for name in self.shapes}
 
 
 def _digest(name: str, tensor: Tensor) -> bytes:
     total = hashlib.sha256(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode())
-    total.update(tensor.detach().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    total.update(_bytes(tensor))
     return total.digest()
 
 
-def _head_digest(metadata: Mapping[str, str], names: list[str], rows: list[bytes]) -> bytes:
-    return hashlib.sha256(json.dumps([sorted(metadata.items()), names]).encode() + b"".join(rows)).digest()
+def _bytes(tensor: Tensor) -> bytes:
+    return tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
 
 
-def _checked(digests: Tensor, metadata: Mapping[str, str], names: list[str], path: Path | str) -> dict[str, bytes]:
-    """The digest of each tensor, if the metadata and these are what was written."""
-    table, names = digests.reshape(-1).view(torch.uint8).numpy().tobytes(), sorted(names)
-    first, *rows = (table[i : i + 32] for i in range(0, len(table), 32)) if table else [b""]
-    if len(rows) != len(names) or first != _head_digest(metadata, names, rows):
-        raise ValueError(f"{path} is damaged: its metadata and digests are not what was written")
-    return dict(zip(names, rows, strict=True))
+def _header_digest(header: str, names: Sequence[str], rows: Sequence[bytes]) -> bytes:
+    return hashlib.sha256(json.dumps([header, list(names)]).encode() + b"".join(rows)).digest()
 
 
-def _check(known: Mapping[str, bytes], name: str, tensor: Tensor, path: Path | str) -> None:
-    if known[name] != _digest(name, tensor):
-        raise ValueError(f"{path} is damaged: its tensor {name!r} is not what was written")
+def _parsed(header: str) -> dict[str, Any]:
+    try:
+        found = json.loads(header)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}

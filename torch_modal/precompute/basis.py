@@ -8,11 +8,10 @@ from typing import Any
 import torch
 
 from torch_modal.autograd import lasting, outlasting
-from torch_modal.io.files import write_atomically
-from torch_modal.io.tensors import from_bytes, to_bytes
+from torch_modal.io.tensors import TensorFile, write_tensors
 
-FORMAT = "torch_modal.precompute.basis"
-VERSION = "1"
+FORMAT = "torch_modal.basis"
+VERSION = "2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +113,7 @@ class ModalBasis:
         Raises:
             OSError: The file cannot be written.
         """
-        tensors = {name: tensor.cpu() for name, tensor in self._tensors().items()}
-        write_atomically(Path(path), to_bytes(tensors, {"format": FORMAT, "version": VERSION}))
+        write_tensors(Path(path), FORMAT, VERSION, self._tensors())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "ModalBasis":
@@ -131,17 +129,8 @@ class ModalBasis:
             FileNotFoundError: There is no such file.
             ValueError: The file is damaged, has other content or another format version.
         """
-        tensors, metadata = from_bytes(Path(path).read_bytes(), Path(path))
-        if metadata.get("format") != FORMAT:
-            raise ValueError(f"{path} holds no modal basis: its format is {metadata.get('format')!r}, not {FORMAT!r}")
-        if metadata.get("version") != VERSION:
-            raise ValueError(
-                f"{path} is a modal basis of version {metadata.get('version')!r}, this is the reader of "
-                f"version {VERSION!r}; extract the modes again"
-            )
-        names = {field.name for field in fields(cls)}
-        if names - tensors.keys():
-            raise ValueError(f"{path} lacks the tensors {', '.join(sorted(names - tensors.keys()))}")
+        names = [field.name for field in fields(cls)]
+        tensors = TensorFile(Path(path), FORMAT, VERSION, names).tensors()
         try:
             return cls(**{name: tensors[name] for name in names})
         except ValueError as error:

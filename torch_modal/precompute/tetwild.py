@@ -20,8 +20,8 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
-from torch_modal.io.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.parallel import StoppedError
+from torch_modal.precompute.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.surface import CanonicalSurface, outward
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
 

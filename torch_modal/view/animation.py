@@ -12,8 +12,7 @@ from torch_modal.arrays import Array
 from torch_modal.extras import require_installed
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import temporary_beside
-from torch_modal.io.formats import ANIMATION_FORMATS, Animation, find_format
-from torch_modal.io.timing import make_timing
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, make_timing
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
 from torch_modal.progress import Progress
 
@@ -27,7 +26,7 @@ def require_packages(path: Path) -> None:
         MissingPackageError: The message says which.
     """
     if path.suffix.lower() in ANIMATION_FORMATS:
-        found = find_format(ANIMATION_FORMATS, path.suffix.lower())
+        found = ANIMATION_FORMATS[path.suffix.lower()]
         require_installed(found.modules, found.extra, path.name)
 
 
@@ -118,6 +117,6 @@ def save_animation(
     path.parent.mkdir(parents=True, exist_ok=True)
     animation = Animation(shapes, triangles, timing, path.name, keyframes, asset, max_targets, progress)
     with temporary_beside(path, suffix) as temporary:
-        find_format(ANIMATION_FORMATS, suffix).write(animation, temporary)
+        ANIMATION_FORMATS[suffix].write(animation, temporary)
     logger.debug("wrote %s, %.1f kB", path, path.stat().st_size / 1000)
     return path

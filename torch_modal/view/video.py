@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from torch_modal.io.formats import Animation, animation_format
-from torch_modal.io.timing import resample
+from torch_modal.io.formats import Animation, resample
 from torch_modal.progress import ProgressReport
 from torch_modal.view.drawing import ByteArray, Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, centred, view_rotation
@@ -18,7 +17,6 @@ PICTURES_AT_ONCE = 24
 """Drawn by one process of the renderer."""
 
 
-@animation_format(".mp4", modules=("imageio", "imageio_ffmpeg"), extra="video")
 def write_mp4(animation: Animation, path: Path) -> None:
     """H.264."""
     import imageio.v2 as imageio
@@ -31,7 +29,6 @@ def write_mp4(animation: Animation, path: Path) -> None:
             writer.append_data(picture)
 
 
-@animation_format(".gif")
 def write_gif(animation: Animation, path: Path) -> None:
     """A GIF that repeats for ever."""
     from PIL import Image

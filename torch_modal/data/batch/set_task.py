@@ -26,9 +26,9 @@ from torch_modal.data.batch.tree import mesh_files
 from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, RECORD_FILE, open_set, why_not_replaceable
 from torch_modal.io.cache import CACHE_VERSION
 from torch_modal.io.files import write_atomically
-from torch_modal.io.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.method import Method
 from torch_modal.precompute.modes import QUALITIES
+from torch_modal.precompute.processes import describe_exit, end_process, last_line
 
 BOOT = """\
 import sys

@@ -1,30 +1,50 @@
-"""A sequence as USD: one mesh whose points change over time. Needs ``usd-core`` (``pip install torch_modal[usd]``)."""
+"""A sequence as positions over time: point caches (MDD, PC2, NPZ), for a mesh that is already there, and USD."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torch_modal.io.asset import CLAY, Asset, Polygons
-from torch_modal.io.formats import Animation, animation_format
-
-HOLDS = ("polygons", "texcoords", "colors")
+from torch_modal.io.asset import CLAY, Polygons
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, resample
 
 
-@animation_format(".usd", ".usda", ".usdc", modules=("pxr",), extra="usd")
+def write_mdd(animation: Animation, path: Path) -> None:
+    """LightWave's: big-endian counts, times in seconds, float32 positions, sampled at the rate of the timing."""
+    sampled = resample(animation.shapes, animation.timing.samples())
+    times = np.arange(len(sampled)) / animation.timing.fps
+    head = struct.pack(">2i", *sampled.shape[:2])
+    path.write_bytes(head + times.astype(">f4").tobytes() + sampled.astype(">f4").tobytes())
+
+
+def write_pc2(animation: Animation, path: Path) -> None:
+    """3ds Max's, version 1: one sample a frame from frame 0 on, float32 positions."""
+    sampled = resample(animation.shapes, animation.timing.samples())
+    head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, sampled.shape[1], 0.0, 1.0, len(sampled))
+    path.write_bytes(head + sampled.astype("<f4").tobytes())
+
+
+def write_npz(animation: Animation, path: Path) -> None:
+    """Arrays ``frames`` (N, V, 3), ``faces`` (F, 3), ``times`` (N,) in seconds and ``keyframes``, all as they are."""
+    shapes, keyframes = animation.shapes, np.asarray(animation.keyframes, np.int64)
+    times = animation.timing.knots()[0][: len(shapes)]
+    np.savez_compressed(path, frames=shapes, faces=animation.faces, times=times, keyframes=keyframes)
+
+
 def write_usd(animation: Animation, path: Path) -> None:
-    """Positions at the times of the frames; USD interpolates linearly between them.
+    """USD, by ``usd-core``: one mesh with positions at the times of the frames, linear between them.
 
     A time code is one frame of the timing. Polygons, texture coordinates and colours come from the asset. The suffix
     ``.usda`` is text, the others are binary.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-    shapes, faces, timing, name, _, asset, *_ = animation
+    shapes, faces, timing, asset = animation.shapes, animation.faces, animation.timing, animation.asset
     if asset is not None:
-        asset.warn_lost(name, HOLDS)
+        asset.warn_lost(animation.name, ANIMATION_FORMATS[".usd"].holds)
     polygons = Polygons(np.full(len(faces), 3), faces.reshape(-1)) if asset is None else asset.polygons()
     times, shown = timing.knots()
     codes = times * timing.fps
@@ -52,18 +72,12 @@ def write_usd(animation: Animation, path: Path) -> None:
         kind = Sdf.ValueTypeNames.TexCoord2fArray
         st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
         st.Set(Vt.Vec2fArray.FromNumpy(polygons.texcoords.astype(np.float32)))
-    colors = _vertex_colors(asset, shapes.shape[1])
+    colors = None
+    if asset is not None and "colors" in asset.carries:
+        colors = np.ones((shapes.shape[1], 3), np.float32)
+        for part in asset.parts():
+            if part.colors is not None:
+                colors[part.vertices] = part.colors[:, :3]
     shade = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant if colors is None else UsdGeom.Tokens.vertex)
     shade.Set([Gf.Vec3f(*CLAY[:3])] if colors is None else Vt.Vec3fArray.FromNumpy(colors))
     stage.GetRootLayer().Save()
-
-
-def _vertex_colors(asset: Asset | None, n_vertices: int) -> Any:
-    """Linear RGB, float32, or None. *Shape:* ``(V, 3)``."""
-    if asset is None or "colors" not in asset.carries:
-        return None
-    colors = np.ones((n_vertices, 3), np.float32)
-    for part in asset.parts():
-        if part.colors is not None:
-            colors[part.vertices] = part.colors[:, :3]
-    return colors
