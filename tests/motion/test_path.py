@@ -7,9 +7,8 @@ from itertools import pairwise
 
 import pytest
 import torch
-from conftest import Shapes, random_rotation
+from conftest import Shapes
 from torch import Tensor, nn
-from torch.func import vmap
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
@@ -123,16 +122,6 @@ def test_pairs_alone_are_the_layers(motion: Shapes) -> None:
     two = motion.pick(0, 1)
     smooth, straight = (Path(two.bases, two.faces, smooth=s)(two.keyframes, 0.4) for s in (True, False))
     assert torch.equal(smooth, straight), "two key-frames have no neighbours"
-
-
-@pytest.mark.parametrize("smooth", [True, False])
-def test_rigid_motions_of_all_keyframes(motion: Shapes, generator: torch.Generator, smooth: bool) -> None:
-    path = Path(motion.bases, motion.faces, smooth=smooth)
-    turn, move = random_rotation(generator), times(30.0, -20.0, 10.0)
-    at = times(0.2, 1.5, 3.7)
-    moved = path(motion.keyframes @ turn.mT + move, at)
-    wanted = path(motion.keyframes, at) @ turn.mT + move
-    assert largest(moved - wanted) < (1e-8 if smooth else 1e-6) * diagonal(wanted)
 
 
 def test_a_rigid_motion_is_smooth_too(bars: Shapes) -> None:
@@ -300,19 +289,6 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
     assert float(slope) == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-4)
     bare = Path(motion.bases, motion.faces)(motion.keyframes, 1.4)
     assert largest(shapes(stiffness).detach() - bare) > 1e-3
-
-
-def test_vmap_over_motions(path: Path, motion: Shapes) -> None:
-    many = torch.stack([motion.keyframes, motion.keyframes + 0.02])
-    found = vmap(lambda keyframes: path(keyframes, times(0.5, 2.5)))(many)
-    torch.testing.assert_close(found, path(many[:, None], times(0.5, 2.5)), rtol=0, atol=1e-9)
-
-
-def test_state_dict_round_trip(motion: Shapes) -> None:
-    own = Path(motion.bases, motion.faces, [0.0, 1.0, 1.5, 3.0, 4.0])
-    other = Path(motion.bases[::-1], motion.faces)
-    other.load_state_dict(own.state_dict())
-    assert torch.equal(other(motion.keyframes, 2.2), own(motion.keyframes, 2.2))
 
 
 # -------------------------------------------------------------------------------------------------------- exceptions

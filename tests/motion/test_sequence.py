@@ -130,12 +130,6 @@ def test_presets_are_those_of_the_layers(scattered: Shapes) -> None:
         torch.testing.assert_close(found, layer(*pair.keyframes), rtol=0, atol=1e-12)
 
 
-def test_is_public() -> None:
-    assert tm.subdivide is subdivide
-    assert tm.keyframe_places is keyframe_places
-    assert tm.linear_sequence is linear_sequence
-
-
 # ---------------------------------------------------------------------------------------------- the shapes between
 
 
@@ -227,15 +221,6 @@ def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: 
     # The same from the layers themselves.
     left = MidShape([pair.bases[0], pair.bases[nearest]], pair.faces, "paired", **PAIRED)(x_a, frames[2])
     assert largest(frames[1] - left) < 1e-9
-
-
-def test_nearest_key_frame_by_edge_lengths(scattered: Shapes) -> None:
-    pair = scattered.pick(0, 1)
-    segment = sequence._Segment((pair.bases[0], pair.bases[1]), pair.faces, tm.PRESETS["paper"], torch.device("cpu"))
-    weights = torch.ones(pair.keyframes.shape[1], dtype=torch.float64)
-    times = torch.tensor([0.0, 0.1, 0.3, 0.7, 0.9, 1.0], dtype=torch.float64)
-    shapes = blend(pair.keyframes[:1].expand(6, -1, -1), pair.keyframes[1:].expand(6, -1, -1), times, weights)
-    assert segment._nearest(shapes) == [0, 0, 0, 1, 1, 1]
 
 
 def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
