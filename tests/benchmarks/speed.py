@@ -144,7 +144,7 @@ def compare(arguments: argparse.Namespace) -> None:
         )
         if case is not None and peer_python():
             try:
-                theirs = min(by_peer(case, "first").seconds for _ in range(arguments.rounds))
+                theirs = min(by_peer(case).seconds for _ in range(arguments.rounds))
             except UnavailableError as error:
                 print(f"  morphomatics: {error}")
                 continue
