@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from conftest import Shapes
+from terms import Edges
 from torch import Tensor
 
 import torch_modal as tm
@@ -68,16 +69,6 @@ class Random(torch.nn.Module):
         with torch.random.fork_rng():
             torch.manual_seed(0)
             return self.own(x)
-
-
-class Edges(tm.Term):
-    """Lengths of edges."""
-
-    def elements(self, mesh: Any) -> Tensor:
-        return mesh.edges
-
-    def measure(self, edge_vectors: Tensor) -> Tensor:
-        return edge_vectors[0].norm()
 
 
 def in_between(shapes: Shapes, **options: Any) -> tm.InBetween:

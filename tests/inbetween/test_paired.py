@@ -3,6 +3,7 @@
 import pytest
 import torch
 from conftest import Shapes, modal
+from shapes import edge_error
 from torch import Tensor
 from torch.func import hessian, jacrev
 
@@ -122,8 +123,5 @@ def test_hand_lies_between_linear_and_joint(ends: tuple[int, int], truth: int, h
     for space in ("paired", "joint"):
         # On some meshings the wider spans end STALLED, at a collapsed triangle; the shape is as good.
         shapes[space] = MidShape(pair.bases, pair.faces, space, **modal()).solve(x_a, x_b).shapes
-    i, j = torch.tensor(connectivity.Connectivity(hands.faces.numpy()).edges).T
-    lengths = {name: torch.linalg.norm(x[i] - x[j], dim=1) for name, x in shapes.items()}
-    wanted = torch.linalg.norm(hands.keyframes[truth][i] - hands.keyframes[truth][j], dim=1)
-    errors = {name: float(((length - wanted).abs() / wanted).mean()) for name, length in lengths.items()}
+    errors = {name: edge_error(x, hands.keyframes[truth], hands.faces) for name, x in shapes.items()}
     assert errors["joint"] < errors["paired"] < errors["linear"], errors

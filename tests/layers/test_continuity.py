@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
+from shapes import apart
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -42,11 +43,6 @@ def trex(data_dir: Path) -> Shapes:
 def creature() -> Shapes:
     sample = load_sample("creature")
     return shapes_of(sample.keyframes[:3].double(), sample.faces, 15)
-
-
-def apart(x: Tensor, y: Tensor) -> float:
-    """Largest distance of vertices over the diagonal."""
-    return float((x - y).norm(dim=-1).max() / (x.amax(-2) - x.amin(-2)).norm(dim=-1).max())
 
 
 def largest_jump(layer: tm.InBetween, x_a: Tensor, x_b: Tensor, n: int) -> float:

@@ -1,7 +1,7 @@
 """Forward mode with respect to times, weights, amplitudes and stiffnesses; within other transforms; what has none."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
@@ -17,14 +17,7 @@ from torch_modal.geometry.rotations import about
 from torch_modal.inbetween.among import _aligned
 
 DOUBLE = torch.float64
-
-
-@pytest.fixture(autouse=True)
-def quiet_is_converged() -> Iterator[None]:
-    """A minimisation that does not converge fails the test, unless the test expects it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", tm.ConvergenceWarning)
-        yield
+pytestmark = pytest.mark.usefixtures("converged")
 
 
 class Case(NamedTuple):

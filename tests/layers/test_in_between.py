@@ -3,7 +3,7 @@
 import copy
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 import trimesh
 from bodies import bend, twisted_plate
 from conftest import Shapes, bent_bar, modal, random_rotation
+from shapes import diagonal
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
@@ -29,22 +30,11 @@ from torch_modal.solve.gauss_newton import GaussNewtonStep
 from torch_modal.solve.solver import Status
 
 DOUBLE = torch.float64
+pytestmark = pytest.mark.usefixtures("converged")
 
 
 def times(*values: float) -> Tensor:
     return torch.tensor(values, dtype=DOUBLE)
-
-
-def diagonal(x: Tensor) -> float:
-    return float((x.amax(-2) - x.amin(-2)).norm())
-
-
-@pytest.fixture(autouse=True)
-def quiet_is_converged() -> Iterator[None]:
-    """A minimisation that does not converge fails the test, unless the test expects it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", ConvergenceWarning)
-        yield
 
 
 @pytest.fixture(scope="module")

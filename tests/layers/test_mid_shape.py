@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, modal, random_rotation
+from shapes import diagonal, edge_error, largest
 from torch import Tensor
 from torch.func import functional_call
 
@@ -26,17 +27,9 @@ def moved(basis: ModalBasis, rotation: Tensor, move: Tensor, factor: float = 1.0
     return replace(basis, reference=reference, modes=modes, eigenvalues=basis.eigenvalues / factor**2)
 
 
-def diagonal(x: Tensor) -> float:
-    return float((x.amax(-2) - x.amin(-2)).norm(dim=-1).max())
-
-
 def linear(x_a: Tensor, x_b: Tensor, faces: Tensor) -> Tensor:
     weights = torch.from_numpy(connectivity.vertex_areas(x_a.numpy(), faces.numpy()))
     return blend(x_a, x_b, torch.tensor(0.5, dtype=torch.float64), weights)
-
-
-def largest(x: Tensor) -> float:
-    return float(x.abs().max())
 
 
 @pytest.fixture(scope="module", params=SPACES)
@@ -158,13 +151,6 @@ def test_coincident_vertices_are_survived(bars: Shapes) -> None:
 
 
 # ---------------------------------------------------------------------------------------------- on real shapes
-
-
-def edge_error(x: Tensor, truth: Tensor, faces: Tensor) -> float:
-    """Mean over edges of the relative error of their length."""
-    i, j = torch.tensor(connectivity.Connectivity(faces.numpy()).edges).T
-    lengths = torch.linalg.norm(truth[i] - truth[j], dim=1)
-    return float(((torch.linalg.norm(x[i] - x[j], dim=1) - lengths).abs() / lengths).mean())
 
 
 @pytest.mark.parametrize(

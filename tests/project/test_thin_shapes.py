@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from shapes import edge_error, edge_lengths
 from sheets import cylinder, rectangle, rolled
 from torch import Tensor
 
@@ -32,14 +33,8 @@ def roll(time: float, turns: float = 0.8) -> Tensor:
     return torch.from_numpy(cylinder(STRIP, time, partial(rolled, length=LENGTH, turns=turns)))
 
 
-def lengths(x: Tensor) -> Tensor:
-    i, j = torch.tensor(Connectivity(TRIANGLES).edges).T
-    return (x[..., j, :] - x[..., i, :]).norm(dim=-1)
-
-
 def strain(x: Tensor) -> float:
-    rest = lengths(roll(0.0))
-    return float(((lengths(x) - rest) / rest).abs().mean())
+    return edge_error(x, roll(0.0), FACES)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +74,7 @@ def test_draws_have_the_strain_of_the_sides(bases: list[tm.ModalBasis]) -> None:
         curvature = angles / (centres[i] - centres[j]).norm(dim=-1)
         sides = 0.5 * THICKNESS * size(flat.numpy(), TRIANGLES) * curvature
         assert float(sides.square().mean().sqrt()) == pytest.approx(given, rel=0.4)
-        assert float((lengths(drawn) / lengths(flat) - 1).abs().mean()) < given
+        assert float((edge_lengths(drawn, FACES) / edge_lengths(flat, FACES) - 1).abs().mean()) < given
 
 
 def test_commands_and_trees(
