@@ -15,7 +15,6 @@ from torch_modal.backends.torch.rests import Rests
 from torch_modal.backends.warp.backend import WarpBackend
 from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.energy.term import Mesh
-from torch_modal.inbetween.comparison import no_worse
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.solve.adjoint import ConvergenceWarning
 from torch_modal.solve.solver import Status
@@ -169,22 +168,11 @@ class TestDistortion:
         shell = tm.ShellEnergy(bars.faces)
         assert shell(shapes[0], collapsed[0]) > 100 * shell(shapes[0], ends[0])
 
-    def test_the_best_of_the_starts_is_taken(self) -> None:
-        x, starts = torch.zeros(3, 4, 3), [torch.full((3, 4, 3), value) for value in (1.0, 2.0)]
-        distortion = torch.tensor([[9.0, 9.0, 1.0], [1.0, 3.0, 1.0], [2.0, 2.0, 1.0]])
-        found, worse = no_worse(x, starts, distortion, torch.zeros(3))
-        assert worse.tolist() == [True, True, False] and found[:, 0, 0].tolist() == [1.0, 2.0, 0.0]
-
     def test_needles_have_a_bounded_weight(self) -> None:
         e, b = torch.tensor([1.0, 0, 0]), torch.tensor([0.5, -1e-3, 0])
         edge_vectors = torch.stack([torch.stack([e, torch.tensor([0.5, h, 0]), b]) for h in (0.866, 1e-3, 0.0)], -1)
         weights = _weights(edge_vectors[:, :, None].double())[0]
         assert weights[0] == pytest.approx(2 / 0.867, rel=1e-3) and weights[1:].tolist() == [8.0, 0.0]
-
-    def test_what_is_not_finite_is_worse(self) -> None:
-        x, start = torch.zeros(2, 4, 3), torch.ones(2, 4, 3)
-        found, worse = no_worse(x, [start], torch.tensor([[torch.nan, 1.0], [1.0, 1.0]]), torch.zeros(2))
-        assert worse.tolist() == [True, False] and torch.equal(found[0], start[0]) and torch.equal(found[1], x[1])
 
 
 def test_a_key_frame_is_returned_beside_one_that_is_not_finite(small_bars: Shapes) -> None:
