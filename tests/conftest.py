@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +16,9 @@ import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, lumped_mass, surface
 from threads import limit_threads
-from torch_modal.backends.torch.alignment import Pair
-from torch_modal.inbetween.samples import Samples
 
+from torch_modal.backends.torch.alignment import Pair
+from torch_modal.inbetween.samples import ConvergenceWarning, Samples
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.layers.mid_shape import MidShape
@@ -136,6 +137,14 @@ def women(data_dir: Path) -> Shapes:
     """A figure of 13,380 vertices at rest and in two steps of a walk, 30 modes each."""
     shapes = load_keyframes([data_dir / "mh-woman" / f"{n}.obj" for n in ("00-rest", "02-walk-a", "03-walk-b")])
     return Shapes(*shapes, extract_bases(*shapes, 30, progress=False))
+
+
+@pytest.fixture
+def converged() -> Iterator[None]:
+    """A minimisation that does not converge fails the test, unless the test expects it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ConvergenceWarning)
+        yield
 
 
 @pytest.fixture

@@ -1,11 +1,13 @@
-"""Every layer and transform, with a call of it: for what must hold of all of them, in worker processes too."""
+"""Every layer and random transform, with a call of it: for what must hold of all of them, in worker processes too."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from conftest import Shapes
+from terms import Edges
 from torch import Tensor
 
 import torch_modal as tm
@@ -17,9 +19,12 @@ class Case(NamedTuple):
     """A layer or transform."""
 
     make: Callable[[Shapes], Any]
-    """From key-frames with bases."""
-    call: Callable[[Any, Tensor], Any]
-    """From the layer and the key-frames. *Shape:* ``(3, V, 3)``."""
+    """From three key-frames with bases."""
+    call: Callable[[Any, Tensor], Tensor]
+    """From the layer and the key-frames, with leading dimensions where ``batched``. *Shape:* ``(..., 3, V, 3)``."""
+    result: Literal["shapes", "a ratio", "other"] = "shapes"
+    """Shapes move along with the key-frames and have their unit; a ratio depends on neither."""
+    batched: bool = True
 
 
 class Linear(torch.nn.Module):
@@ -44,11 +49,13 @@ class Step(torch.nn.Module):
         self.step = tm.GaussNewtonStep(tm.ModalEnergy(self.shell, shapes.bases[0].modes))
 
     def forward(self, x: Tensor, rest: Tensor) -> Tensor:
+        lead = x.shape[:-2]
+        x, rest = (shape.reshape(-1, *shape.shape[-2:]) for shape in (x, rest))
         placement = self.step.energy.place(x, self.shell.against(rest))
-        a = x.new_zeros(x.shape[0], self.n_modes)
+        a = x.new_zeros(len(x), self.n_modes)
         for _ in range(3):
             a = self.step(a, placement).amplitudes
-        return a
+        return a.view(*lead, self.n_modes)
 
 
 class Random(torch.nn.Module):
@@ -59,13 +66,20 @@ class Random(torch.nn.Module):
         self.own = kind(p=1.0, space=tm.ShapeSpace(shapes.bases, shapes.faces, times=None))
 
     def forward(self, x: Tensor) -> Tensor:
-        torch.manual_seed(0)
-        return self.own(x)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return self.own(x)
 
 
 def in_between(shapes: Shapes, **options: Any) -> tm.InBetween:
     """Of the first two key-frames."""
     return tm.InBetween(shapes.bases[:2], shapes.faces, **options)
+
+
+def with_own_term(shapes: Shapes) -> tm.InBetween:
+    """With stiffnesses that are tensors of the state."""
+    terms = (Edges(torch.tensor(3.0)),)
+    return in_between(shapes, objective=tm.Objective(alpha=torch.tensor(400.0), mu=torch.tensor(2.0), terms=terms))
 
 
 def decoder(shapes: Shapes) -> tm.ModalDecoder:
@@ -75,15 +89,15 @@ def decoder(shapes: Shapes) -> tm.ModalDecoder:
 
 
 def decoded(layer: tm.ModalDecoder, x: Tensor) -> Tensor:
-    """At two times."""
+    """At two times, of amplitudes and of key-frames."""
     amplitudes = torch.linspace(-1, 1, 2 * layer.n_modes).view(2, -1).to(x)
-    return layer(amplitudes, torch.tensor([0.5, 2.5]).to(x))
+    return layer(amplitudes, torch.tensor([0.5, 2.5]).to(x), keyframes=x)
 
 
 def passengers(shapes: Shapes) -> tm.Passengers:
     """Points about the first key-frame."""
     x = shapes.keyframes[0]
-    return tm.Passengers(x, shapes.faces, 1.01 * x[::3])
+    return tm.Passengers(x, shapes.faces, x[::3] + 0.01 * (x[::3] - x.mean(0)))
 
 
 def latent(layer: Any, x: Tensor) -> Tensor:
@@ -91,14 +105,14 @@ def latent(layer: Any, x: Tensor) -> Tensor:
     return layer(Linear(x), torch.tensor([[0.0, 0.0], [0.5, 0.1], [1.0, 0.0]]).to(x))
 
 
-def pair(layer: Any, x: Tensor) -> Any:
+def pair(layer: Any, x: Tensor) -> Tensor:
     """Of the first two shapes."""
-    return layer(x[:1], x[1:2])
+    return layer(x[..., 0, :, :], x[..., 1, :, :])
 
 
 def pair_in_time(layer: Any, x: Tensor) -> Tensor:
     """Of the first two shapes, at two times."""
-    return layer(x[0], x[1], torch.tensor([0.3, 0.6]).to(x))
+    return layer(x[..., 0, :, :], x[..., 1, :, :], torch.tensor([0.3, 0.6]).to(x))
 
 
 def set_in_time(layer: Any, x: Tensor) -> Tensor:
@@ -111,28 +125,31 @@ def blended(layer: Any, x: Tensor) -> Tensor:
     return layer(x, torch.tensor([[0.2, 0.3, 0.5], [0.334, 0.333, 0.333]]).to(x))
 
 
+COARSE = replace(tm.PRESETS["fast"].objective, coarse_faces=30)
+
 LAYERS: dict[str, Case] = {
     "InBetween": Case(in_between, pair_in_time),
     "InBetween, torch": Case(partial(in_between, solver=tm.Solver(backend="torch")), pair_in_time),
-    "InBetween, fast": Case(partial(in_between, preset="fast"), pair_in_time),
-    "MidShape, paper": Case(lambda s: tm.MidShape(s.bases[:2], s.faces, preset="paper"), pair),
+    "InBetween, fast": Case(partial(in_between, preset="fast", objective=COARSE), pair_in_time),
+    "InBetween, own term": Case(with_own_term, pair_in_time),
     "InBetween, contact": Case(partial(in_between, contact=True), pair_in_time),
+    "MidShape, paper": Case(lambda s: tm.MidShape(s.bases[:2], s.faces, preset="paper"), pair),
     "Blend": Case(lambda s: tm.Blend(s.bases, s.faces), blended),
     "Path": Case(lambda s: tm.Path(s.bases, s.faces), set_in_time),
     "Path, pairs": Case(lambda s: tm.Path(s.bases, s.faces, smooth=False), set_in_time),
     "Path, contact": Case(lambda s: tm.Path(s.bases, s.faces, contact=True), set_in_time),
-    "ModalDecoder": Case(decoder, decoded),
+    "ModalDecoder": Case(decoder, decoded, "other", batched=False),
     "Passengers": Case(passengers, lambda layer, x: layer(x)),
-    "Passengers, rotations": Case(passengers, lambda layer, x: layer.rotations(x)),
-    "GaussNewtonStep": Case(Step, pair),
-    "ShellEnergy": Case(lambda s: tm.ShellEnergy(s.faces), pair),
-    "ShellLoss": Case(lambda s: tm.losses.ShellLoss(s.faces), pair),
-    "LatentElasticity": Case(lambda s: tm.losses.LatentElasticity(s.faces), latent),
-    "PathEnergy": Case(lambda s: tm.losses.PathEnergy(s.faces), latent),
+    "Passengers, rotations": Case(passengers, lambda layer, x: layer.rotations(x), "other"),
+    "GaussNewtonStep": Case(Step, pair, "other"),
+    "ShellEnergy": Case(lambda s: tm.ShellEnergy(s.faces), pair, "other"),
+    "ShellLoss": Case(lambda s: tm.losses.ShellLoss(s.faces), pair, "a ratio"),
+    "LatentElasticity": Case(lambda s: tm.losses.LatentElasticity(s.faces), latent, "a ratio", batched=False),
+    "PathEnergy": Case(lambda s: tm.losses.PathEnergy(s.faces), latent, "a ratio", batched=False),
 }
 
 TRANSFORMS: dict[str, Case] = {
-    kind.__name__: Case(partial(Random, kind), lambda layer, x: layer(x))
+    kind.__name__: Case(partial(Random, kind), lambda layer, x: layer(x), batched=False)
     for kind in (
         tm.RandomBlend,
         tm.RandomExtrapolation,

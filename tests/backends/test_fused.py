@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
+from terms import Area, Spring
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 from torch_modal.geometry.hermite import Spacing
@@ -376,27 +377,8 @@ class TestLayers:
     def test_a_term_of_ones_own_is_beside_the_kernels(self, bars: Shapes, smooth: bool) -> None:
         """The same with kernels and without, with a gradient and without."""
 
-        class Area(tm.Term):
-            def elements(self, mesh: Mesh) -> Tensor:
-                return mesh.faces
-
-            def measure(self, edge_vectors: Tensor) -> Tensor:
-                return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
-
-        class Spring(tm.Term):
-            sampled = True
-
-            @property
-            def anchors(self) -> Tensor:
-                return bars.keyframes[0, :1] + 0.3
-
-            def elements(self, mesh: Mesh) -> Tensor:
-                return torch.tensor([[mesh.first_anchor, 5]])
-
-            def measure(self, edge_vectors: Tensor) -> Tensor:
-                return edge_vectors[0].square().sum()
-
-        objective = tm.Objective(terms=(Area(0.3), Volume(1.0), Spring(1e-3)))
+        spring = Spring([5], bars.keyframes[0, :1] + 0.3, 1e-3)
+        objective = tm.Objective(terms=(Area(0.3), Volume(1.0), spring))
         n, t = (3, 1.3) if smooth else (2, 0.3)
         found = []
         for kind in ("warp", "torch"):
@@ -496,11 +478,6 @@ class TestBackend:
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=folder)
         assert (result.returncode, result.stdout) == (0, "out\n")
         assert result.stderr == "before\nduring\nnative\nno end, after\npython\n"
-
-    def test_import_does_not_load_warp(self) -> None:
-        code = "import sys, torch_modal.layers.in_between; sys.exit('warp' in sys.modules)"
-        folder = Path(tm.__file__).parents[1]
-        assert subprocess.run([sys.executable, "-c", code], timeout=120, cwd=folder).returncode == 0
 
 
 def test_what_warp_says_of_itself_is_left_alone() -> None:

@@ -34,15 +34,6 @@ import torch_modal as tm
 SAMPLE = Path(tm.__file__).parent / "samples" / "hand"
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
-# Data sheets, dense, without sparsity: bytes per second, then flops per second in float32 and in float64. Float32 is
-# counted without TF32, which torch leaves off by default; float64 matrix products run on tensor cores.
-PEAKS = {
-    "H200": (4.8e12, 67e12, 67e12),
-    "H100": (3.35e12, 67e12, 67e12),
-    "A100": (2.0e12, 19.5e12, 19.5e12),
-    "L4": (0.3e12, 30e12, 0.47e12),
-}
-
 
 class Case:
     """A layer with samples to put through it."""
@@ -95,12 +86,6 @@ def there_and_back(case: Case, rows: slice, arguments: argparse.Namespace) -> tu
     return alone, recorded, backward
 
 
-def straight_line(case: Case, rows: slice, arguments: argparse.Namespace) -> float:
-    """Seconds of linear interpolation of the same vertices."""
-    x_a, x_b, t = (value[rows] for value in case.samples)
-    return clock(arguments, lambda: torch.lerp(x_a, x_b, t[:, None, None]))[0]
-
-
 def speed(arguments: argparse.Namespace, modes: int, dtype_name: str) -> None:
     """Print a table over batch sizes."""
     device, batches = arguments.device, sorted(arguments.batches)
@@ -119,15 +104,13 @@ def speed(arguments: argparse.Namespace, modes: int, dtype_name: str) -> None:
 
     loop: list[list[tuple[float, float, float]]] = []
     found: dict[int, list[tuple[float, float, float]]] = {n: [] for n in batches}
-    lines: dict[int, list[float]] = {n: [] for n in batches}
     for _ in range(arguments.repeats):
         loop.append([there_and_back(case, slice(i, i + 1), arguments) for i in range(n_single)])
         for n in batches:
             found[n].append(there_and_back(case, slice(0, n), arguments))
-            lines[n].append(straight_line(case, slice(0, n), arguments))
 
     print("  ms per in-between, median; x: throughput over the loop of single calls, same samples, same run")
-    print("  batch   forward    x    fwd+bwd    x   backward/forward   over linear interpolation")
+    print("  batch   forward    x    fwd+bwd    x   backward/forward")
     for n in batches:
         alone, recorded, backward = (1e3 * median(column) / n for column in zip(*found[n], strict=True))
         # A loop over more samples than are measured one by one takes in proportion.
@@ -140,62 +123,8 @@ def speed(arguments: argparse.Namespace, modes: int, dtype_name: str) -> None:
             for cost in (lambda s: s[0], lambda s: s[1] + s[2])
         )
         ratio = median(b / r for _, r, b in found[n])
-        print(
-            f"  {n:5d} {alone:9.2f} {forward_gain:5.2f} {recorded + backward:9.2f} {both_gain:5.2f} {ratio:12.2f} "
-            f"{alone / (1e3 * median(lines[n]) / n):18.0f} x"
-        )
-        if device == "cuda":
-            flops, moved = work(case, int(solution.n_steps[:n].max()), n)
-            share(flops, moved, median(s[0] for s in found[n]), n, dtype_name)
+        print(f"  {n:5d} {alone:9.2f} {forward_gain:5.2f} {recorded + backward:9.2f} {both_gain:5.2f} {ratio:12.2f}")
     print(f"  load average of the machine now: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-
-
-def work(case: Case, most_steps: int, batch: int) -> tuple[float, float]:
-    """Flops and bytes of a forward pass, at the least.
-
-    Counted for one sample and one iteration, with M = E + H + 1 measures, n unknowns, and R rows of 8 neighbours of the
-    coarse vertices:
-
-    - the Jacobian, 3 numbers of an edge and 9 of a hinge through the columns: 2 (3 E + 9 H) n flops; it is written
-      once, read and weighted, and both copies are read by the product: 4 M n numbers;
-    - J^T W J: 2 M n^2 flops;
-    - the second-order term: rows of eight 3 x 3 blocks on the columns, 2 * 3 * 24 R n, then 2 * 3 R n^2; the product
-      is written and read: 2 * 3 R n numbers;
-    - both Cholesky factorisations: 2 n^3 / 3 flops;
-    - two directions tried: 2 * 2 * 3 V_coarse n flops.
-
-    All samples of a batch are evaluated until the last one rests, and the derivatives once more to see that it does:
-    what rests is computed all the same. The fine shape costs 2 * 3 V n flops once. The columns are read once a batch
-    and iteration.
-    """
-    space: Any = case.layer.members[0].space
-    modal, n = space.energy.parts[0], space.n_unknowns
-    e, h = (part.corners.shape[1] for part in list(modal.energy.parts)[:2])
-    r = len(modal.tables.congruence.slots)
-    m, item = e + h + 1, case.samples[0].element_size()
-    first_order = 2 * (3 * e + 9 * h) * n + 2 * m * n**2
-    second_order = 144 * r * n + 6 * r * n**2
-    step = second_order + 2 * n**3 / 3 + 12 * space.frame.coarse.n_vertices * n
-    fine = 6 * space.frame.reference.shape[0] * n
-    flops = batch * ((most_steps + 1) * first_order + most_steps * step + fine)
-    numbers = batch * ((most_steps + 1) * 4 * m * n + most_steps * 6 * r * n)
-    columns = (most_steps + 1) * (3 * e + 9 * h + 27 * r) * n
-    return flops, item * (numbers + columns)
-
-
-def share(flops: float, moved: float, seconds: float, batch: int, dtype_name: str) -> None:
-    """Print the parts of the peaks."""
-    name = torch.cuda.get_device_name()
-    peaks = next((value for key, value in PEAKS.items() if key in name), None)
-    rates = f"{flops / seconds / 1e12:.3f} TFLOP/s, {moved / seconds / 1e9:.0f} GB/s"
-    if peaks is None:
-        print(f"        {rates}; the peaks of {name} are not in PEAKS")
-        return
-    bandwidth, arithmetic = peaks[0], peaks[1 if dtype_name == "float32" else 2]
-    print(
-        f"        {rates}: {100 * flops / seconds / arithmetic:.1f} % of peak arithmetic, "
-        f"{100 * moved / seconds / bandwidth:.1f} % of peak bandwidth"
-    )
 
 
 def memory(arguments: argparse.Namespace) -> None:

@@ -106,12 +106,6 @@ def joint(case: Case) -> Outcome:
     return by_layer(case, 30, **BARE)
 
 
-@method("joint 80/3000")
-def joint_fine(case: Case) -> Outcome:
-    """More modes and coarse faces."""
-    return by_layer(case, 80, objective=tm.Objective(base="linear", coarse_faces=3000), solver=BARE["solver"])
-
-
 @method("joint + rotations")
 def rotations(case: Case) -> Outcome:
     """As "accurate" without its local steps: onto a blend by local rotations, and not to the last digit."""
@@ -149,15 +143,9 @@ def full(case: Case) -> Outcome:
     )
 
 
-@method("global Froehlich-Botsch", half_only=True)
-def example_based(case: Case) -> Outcome:
-    """One reference with interpolated lengths, angles and volume, over all vertices, from a linear start."""
-    return by_full_space(case, lambda x_a, x_b, t, k: full_space(x_a, x_b, case.faces, t, example_based=True))
-
-
 @method("Froehlich-Botsch", half_only=True)
-def example_based_reduced(case: Case) -> Outcome:
-    """The same as its authors have it: on a decimated mesh, and back by deformation transfer."""
+def example_based(case: Case) -> Outcome:
+    """One reference with interpolated lengths and angles, on a decimated mesh, and back by deformation transfer."""
     reduced = ReducedPair(case.x_a, case.x_b, case.faces, 1000)
     return Outcome(*timed(lambda: torch.stack([froehlich_botsch(reduced, t) for t in case.times])))
 
@@ -174,19 +162,7 @@ def isometric_geodesic(case: Case) -> Outcome:
 @method("morphomatics")
 def differential_coordinates(case: Case) -> Outcome:
     """Differential coordinates with the first key-frame as the reference, as in the library's tutorial."""
-    return by_peer(case, "first")
-
-
-@method("morphomatics, mean")
-def differential_coordinates_of_mean(case: Case) -> Outcome:
-    """The same with the mean of both as the reference, as in the library's statistical shape model."""
-    return by_peer(case, "mean")
-
-
-@method("morphomatics, fundamental")
-def fundamental_coordinates(case: Case) -> Outcome:
-    """The library's coordinates of metric and curvature."""
-    return by_peer(case, "fundamental")
+    return by_peer(case)
 
 
 class InBetweens:
@@ -232,11 +208,10 @@ def peer_python() -> str | None:
     return given or (sys.executable if importlib.util.find_spec("morphomatics") else None)
 
 
-def by_peer(case: Case, kind: str, plain: bool = True, limit: float = PEER_SECONDS) -> Outcome:
+def by_peer(case: Case, limit: float = PEER_SECONDS) -> Outcome:
     """In-betweens by morphomatics, in a child process: its threads and its memory are its own.
 
-    With ``plain``, the note says how long it takes where it is not compiled. No answer within the limit, in seconds, is
-    an :class:`UnavailableError`.
+    No answer within the limit, in seconds, is an :class:`UnavailableError`.
     """
     python = peer_python()
     if python is None:
@@ -246,7 +221,7 @@ def by_peer(case: Case, kind: str, plain: bool = True, limit: float = PEER_SECON
     with tempfile.TemporaryDirectory() as scratch:
         request, answer = Path(scratch) / "request.npz", Path(scratch) / "answer.npz"
         arrays = {"x_a": case.x_a[used].numpy(), "x_b": case.x_b[used].numpy(), "faces": number[case.faces].numpy()}
-        np.savez(request, kind=kind, plain=plain, times=np.array(case.times), **arrays)
+        np.savez(request, times=np.array(case.times), **arrays)
         command = [python, str(Path(__file__).with_name("peer_worker.py")), str(request), str(answer)]
         environment = {**os.environ, **PEER_ENVIRONMENT}
         environment.pop("PYTHONPATH", None)
@@ -260,5 +235,4 @@ def by_peer(case: Case, kind: str, plain: bool = True, limit: float = PEER_SECON
         frames, seconds = torch.from_numpy(given["frames"]).to(case.x_a.dtype), float(given["seconds"])
     whole = torch.lerp(case.x_a, case.x_b, HALF).repeat(len(case.times), 1, 1)
     whole[:, used] = frames  # vertices of no face stay where they are
-    note = f"{1e3 * float(given['plain_seconds']):.1f} ms if not compiled" if plain else ""
-    return Outcome(whole, seconds, note)
+    return Outcome(whole, seconds)

@@ -1,6 +1,6 @@
 """Motion through many key-frames, smooth in time, against each pair alone.
 
-    python tests/benchmarks/motion.py [gallop hand-path grip unrelated] [--costs | --choices | --pictures FOLDER]
+    python tests/benchmarks/motion.py [gallop hand-path grip unrelated] [--costs]
 
 Distances are means over the vertices, in % of the diagonal, without any alignment; edge errors are means of
 ``|l - l_true| / l_true``, or, without a truth, of the strain against lengths that change evenly between key-frames.
@@ -12,7 +12,6 @@ the processor, of all threads, the best of several.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from statistics import fmean
 
 from measures import NAN
@@ -73,22 +72,9 @@ def main() -> None:
     """Print what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("motions", nargs="*", help=f"of {', '.join(MOTIONS)}; default: all")
-    parser.add_argument("--choices", action="store_true", help="compare limits, ends and times instead")
     parser.add_argument("--costs", action="store_true", help="costs alone")
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw trails and speeds there instead")
     args = parser.parse_args()
-    if args.pictures:
-        from motion_pictures import draw
-
-        draw(args.pictures)
-        return
-    head, row = TABLE, print_motion
-    if args.choices:
-        from motion_choices import CHOICES, print_choices
-
-        head, row = CHOICES, print_choices
-    elif args.costs:
-        head, row = COSTS, print_costs
+    head, row = (COSTS, print_costs) if args.costs else (TABLE, print_motion)
     print(head)
     print("|---" * (head.count("|") - 1) + "|")
     for name in args.motions or MOTIONS:

@@ -2,23 +2,18 @@
 
 The Python that runs this needs morphomatics, not torch or torch_modal. The shape space (gradient and divergence of the
 reference, factors of its Poisson system, compiled geodesic) is made before the clock starts; what is timed goes from
-key-frames to in-betweens. The geodesic is compiled by ``jax.jit``; where ``plain`` is set, how long it takes without is
-measured too.
+key-frames to in-betweens. The geodesic is compiled by ``jax.jit``.
 """
 
 import sys
-from collections.abc import Callable
 
 import jax
 import numpy as np
 from morphomatics.geom import Surface
-from morphomatics.manifold import DifferentialCoords, FundamentalCoords
+from morphomatics.manifold import DifferentialCoords
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from timing import timed
-
-MEAN_STEPS = 10
-MEAN_TOLERANCE = 1e-3
 
 
 class PinnedCoords(DifferentialCoords):
@@ -47,45 +42,23 @@ class PinnedCoords(DifferentialCoords):
         return x + (np.stack(gap, axis=1) / size)[self.piece]
 
 
-def space(kind: str, x_a: np.ndarray, x_b: np.ndarray, faces: np.ndarray) -> tuple:
-    """The shape space and its geodesic."""
-    made = (FundamentalCoords if kind == "fundamental" else PinnedCoords)(Surface(x_a.copy(), faces))
-
-    def geodesic(a: jax.Array, b: jax.Array, t: float) -> jax.Array:
-        return made.connec.exp(a, t * made.connec.log(a, b))
-
-    if kind == "mean":
-        # As the library's StatisticalShapeModel does: until the reference is the mean of both, or that diverges.
-        move, tolerance = np.inf, MEAN_TOLERANCE * x_a.std(axis=0).mean()
-        for _ in range(MEAN_STEPS):
-            mean = np.asarray(made.from_coords(geodesic(made.to_coords(x_a), made.to_coords(x_b), 0.5)))
-            last, move = move, np.linalg.norm(mean - made.ref.v, axis=1).max()
-            if move > last:
-                break
-            made.update_ref_geom(mean)
-            if move < tolerance:
-                break
-    return made, geodesic
-
-
 def main(request: str, answer: str) -> None:
     """Read key-frames, write frames and seconds."""
     given = np.load(request)
     x_a, x_b, faces = given["x_a"], given["x_b"], given["faces"]
-    made, geodesic = space(str(given["kind"]), x_a, x_b, faces)
+    made = PinnedCoords(Surface(x_a.copy(), faces))
 
-    def frames(geodesic: Callable) -> np.ndarray:
+    @jax.jit
+    def geodesic(a: jax.Array, b: jax.Array, t: float) -> jax.Array:
+        return made.connec.exp(a, t * made.connec.log(a, b))
+
+    def frames() -> np.ndarray:
         a, b = made.to_coords(x_a), made.to_coords(x_b)
-        found = []
-        for t in given["times"]:
-            x = np.asarray(made.from_coords(geodesic(a, b, float(t))))
-            found.append(made.centred(x, (1 - t) * x_a + t * x_b) if isinstance(made, PinnedCoords) else x)
-        return np.stack(found)
+        shapes = [np.asarray(made.from_coords(geodesic(a, b, float(t)))) for t in given["times"]]
+        return np.stack([made.centred(x, (1 - t) * x_a + t * x_b) for x, t in zip(shapes, given["times"], strict=True)])
 
-    compiled = jax.jit(geodesic)
-    result, seconds = timed(lambda: frames(compiled))
-    plain = timed(lambda: frames(geodesic))[1] if given["plain"] else np.nan
-    np.savez(answer, frames=result, seconds=seconds, plain_seconds=plain)
+    result, seconds = timed(frames)
+    np.savez(answer, frames=result, seconds=seconds)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ import torch
 from capture import table
 from eigensolvers import eigensolvers
 from numpy.typing import NDArray
-from solvers import solvers
 from threads import limit_threads
 
 import torch_modal as tm
@@ -36,7 +35,7 @@ IntArray = NDArray[np.int64]
 ROOT = Path(__file__).parents[2]
 BARE = {"edge_length_fac": 0.03, "epsilon": 2e-3}
 N_MODES = 30
-PARTS = ("speed", "threads", "memory", "carrying", "eigensolvers", "solvers", "capture")
+PARTS = ("speed", "threads", "memory", "carrying", "eigensolvers", "capture")
 MORE = {"hand": "mh-hand-path", "woman": "mh-woman"}
 
 
@@ -232,8 +231,6 @@ def main() -> None:
             for name in MORE:
                 keyframes, faces = sample(arguments.data / MORE[name], "0*")
                 eigensolvers(name, keyframes[0], faces)
-    if "solvers" in arguments.parts:
-        solvers(creature[0][0], creature[1])
     if "capture" in arguments.parts:
         meshes = [("creature", creature[0][0], creature[1])]
         if arguments.data.is_dir():

@@ -1,21 +1,17 @@
-"""What each preset costs and gives, and what the closed forms of the shell's terms save over ``torch.func``.
+"""Cost and quality of each preset.
 
     python tests/benchmarks/presets.py [--only TEXT ...]
-    python tests/benchmarks/presets.py --terms [--only TEXT ...]
 
-The first prints the table of docs/layer.md: in-betweens at t = 1/2 with 30 modes of each key-frame, their mean relative
+Prints the table of docs/benchmarks.md: in-betweens at t = 1/2 with 30 modes of each key-frame, their mean relative
 error of edge lengths where a truth is known, their energy over that of linear interpolation, the time of one, alone and
-with its gradient to both key-frames, and what the layer's ``state_dict`` holds. The second takes the derivatives of
-lengths, angles and volume from :class:`torch_modal.Term` instead, which has them from ``torch.func``. Times are
+with its gradient to both key-frames, and what the layer's ``state_dict`` holds. Times are
 processor time on one thread, best of several: what to read are the ratios, of one run.
 """
 
 import argparse
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import chain
-from typing import Any
 
 import cases
 import torch
@@ -28,41 +24,9 @@ from timing import timed
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.energy.bend import Bend
-from torch_modal.energy.stretch import Stretch
-from torch_modal.energy.volume import Volume
 
 N_MODES = 30
 REFERENCE = "accurate"
-
-
-class _Derived:
-    """Derivatives from ``torch.func`` in the place of closed forms."""
-
-    gradients = tm.Term.gradients
-    pairs = tm.Term.pairs
-    blocks = tm.Term.blocks
-
-
-class DerivedStretch(_Derived, Stretch):
-    """Edge lengths."""
-
-
-class DerivedBend(_Derived, Bend):
-    """Dihedral angles."""
-
-
-class DerivedVolume(_Derived, Volume):
-    """Enclosed volume."""
-
-
-@dataclass(frozen=True)
-class Derived(tm.Objective):
-    """The same objective, with derivatives of all terms from ``torch.func``."""
-
-    def all_terms(self) -> list[tm.Term]:
-        """Those of Eq. 5."""
-        return [DerivedStretch(self.alpha), DerivedBend(self.beta), DerivedVolume(self.gamma), *self.terms]
 
 
 def chosen(only: list[str]) -> Iterator[Case]:
@@ -126,34 +90,13 @@ def presets(only: list[str]) -> None:
         print(f"| {preset} | " + " | ".join(number(mean, ".3f") for mean in means) + " |")
 
 
-def terms(only: list[str]) -> None:
-    """Print how far results are apart, and how much longer it takes."""
-    exactly = tm.Solver()
-    print("| | distance, of the diagonal | of the gradient | time over closed forms | with gradient |")
-    print("|---|---|---|---|---|")
-    for case in chosen(only):
-        results: list[Any] = []
-        for objective in (tm.Objective(), Derived()):
-            layer = tm.InBetween(case.bases(N_MODES), case.faces, objective=objective, solver=exactly)
-            results.append([timed(alone(layer, case)), timed(with_gradient(layer, case))])
-        (shape, seconds), (gradient, both) = results[0]
-        (other, longer), (other_gradient, longest) = results[1]
-        diagonal = (case.x_a.amax(0) - case.x_a.amin(0)).norm()
-        apart = float((other - shape).norm(dim=-1).max() / diagonal)
-        gradient, other_gradient = torch.stack(gradient), torch.stack(other_gradient)
-        of_gradient = float((other_gradient - gradient).norm() / gradient.norm())
-        ratios = f"{longer / seconds:.2f} | {longest / both:.2f}"
-        print(f"| {case.name} | {apart:.0e} | {of_gradient:.0e} | {ratios} |", flush=True)
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--terms", action="store_true", help="closed forms against torch.func instead")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
     arguments = parser.parse_args()
     limit_threads()
-    (terms if arguments.terms else presets)(arguments.only)
+    presets(arguments.only)
 
 
 if __name__ == "__main__":

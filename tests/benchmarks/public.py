@@ -169,7 +169,7 @@ class Morphomatics:
         for i, (start, end) in enumerate(pairwise(when.tolist())):
             inside = tuple((t - start) / (end - start) for t in times.tolist() if start < t < end)
             try:
-                outcome = by_peer(Case("", both, i, i + 1, {}, inside), "first", plain=False, limit=60)
+                outcome = by_peer(Case("", both, i, i + 1, {}, inside), limit=60)
             except UnavailableError as error:
                 print(f"morphomatics: {error}", flush=True)
                 wanted = torch.tensor(inside, dtype=when.dtype) * (end - start) + start

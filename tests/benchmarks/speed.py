@@ -1,7 +1,7 @@
 """How fast in-betweens are: kernels against torch, against other versions of this package, and against morphomatics.
 
     python tests/benchmarks/speed.py [--before CHECKOUT] [--peer-python FILE] [--rounds 3]
-    python tests/benchmarks/speed.py --parts growth large first
+    python tests/benchmarks/speed.py --parts growth first
 
 Each side runs in processes of its own, on one thread, in turns; what is told are ratios of processor seconds, the best
 of all rounds, so that what else a machine does slows all sides. ``--before`` names the folder of another checkout, for
@@ -22,7 +22,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import fast_simplification
 import numpy as np
 import torch
 import trimesh
@@ -145,7 +144,7 @@ def compare(arguments: argparse.Namespace) -> None:
         )
         if case is not None and peer_python():
             try:
-                theirs = min(by_peer(case, "first").seconds for _ in range(arguments.rounds))
+                theirs = min(by_peer(case).seconds for _ in range(arguments.rounds))
             except UnavailableError as error:
                 print(f"  morphomatics: {error}")
                 continue
@@ -172,52 +171,6 @@ def growth(arguments: argparse.Namespace) -> None:
             print(
                 f"{shapes.shape[1]:>7} vertices, {backend:<5}: whole {1e3 * whole:7.1f} ms, modal {1e3 * modal:7.1f} ms"
             )
-        finer = [trimesh.remesh.subdivide(x.numpy(), faces.numpy()) for x in shapes]
-        shapes, faces = torch.tensor(np.stack([x for x, _ in finer])), torch.tensor(finer[0][1])
-
-
-def animal(n_faces: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Two poses of a body with six limbs, closed, of irregular triangles. *Shape:* ``(2, V, 3), (F, 3)``."""
-    ball = trimesh.creation.icosphere(7)
-    towards = np.array([(6, 5, -7), (6, -5, -7), (-6, 5, -7), (-6, -5, -7), (9, 0, 5), (-9, 0, 3)], dtype=float)
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    limbs = np.exp((ball.vertices @ towards.T - 1) / 0.04)
-    body = 30 * ball.vertices * (1 + limbs.sum(1, keepdims=True)) * (1.6, 0.8, 1.0)
-    x, faces = fast_simplification.simplify(body.astype(np.float32), ball.faces, target_count=n_faces)
-    angle = 0.01 * x[:, 0]
-    twisted = np.stack(
-        [
-            x[:, 0],
-            np.cos(angle) * x[:, 1] - np.sin(angle) * x[:, 2] + 0.002 * x[:, 0] ** 2,
-            np.sin(angle) * x[:, 1] + np.cos(angle) * x[:, 2],
-        ],
-        axis=1,
-    )
-    return torch.tensor(np.stack([x, twisted])).double(), torch.tensor(faces).long()
-
-
-def large(arguments: argparse.Namespace) -> None:
-    """What a layer, its first in-between and the next cost on a mesh of 42,000 vertices, and subdivided once."""
-    limit_threads()
-    shapes, faces = animal(84_000)
-    warm = tm.InBetween(tm.extract_bases(*animal(2_000)), animal(2_000)[1])
-    with torch.no_grad():
-        warm(*animal(2_000)[0], 0.5)
-    for _ in range(2):
-        bases = tm.extract_bases(shapes, faces)
-        found = []
-        for _ in range(arguments.rounds):
-            start = time.process_time()
-            layer = tm.InBetween(bases, faces)
-            spent = [time.process_time() - start]
-            for t in (0.5, 0.3):
-                start = time.process_time()
-                with torch.no_grad():
-                    layer(*shapes, t)
-                spent.append(time.process_time() - start)
-            found.append(spent)
-        making, first, then = np.min(found, axis=0)
-        print(f"{shapes.shape[1]:>7} vertices: layer {making:.2f} s, first in-between {first:.2f} s, next {then:.3f} s")
         finer = [trimesh.remesh.subdivide(x.numpy(), faces.numpy()) for x in shapes]
         shapes, faces = torch.tensor(np.stack([x for x, _ in finer])), torch.tensor(finer[0][1])
 
@@ -257,7 +210,7 @@ def first(arguments: argparse.Namespace) -> None:
         )
 
 
-PARTS = {"compare": compare, "growth": growth, "large": large, "first": first}
+PARTS = {"compare": compare, "growth": growth, "first": first}
 
 
 def main() -> None:

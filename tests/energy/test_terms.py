@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, modal
+from terms import Area, Pull, Spring
 from torch import Tensor, nn
 from torch_modal.inbetween.levels import coarse_values
 
@@ -20,62 +21,6 @@ from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 from torch_modal.energy.volume import Volume
 
 DOUBLE = torch.float64
-
-
-class Area(Term):
-    """Areas of all faces."""
-
-    def elements(self, mesh: Mesh) -> Tensor:
-        return mesh.faces
-
-    def measure(self, edge_vectors: Tensor) -> Tensor:
-        return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
-
-
-class Spring(Term):
-    """Vertices pulled to points of the caller's coordinates."""
-
-    sampled = True
-
-    def __init__(self, vertices: list[int], points: Tensor, stiffness: float | Tensor = 1.0) -> None:
-        super().__init__(stiffness)
-        self.vertices = vertices
-        self.register_buffer("points", points)
-
-    @property
-    def anchors(self) -> Tensor:
-        return self.points
-
-    def elements(self, mesh: Mesh) -> Tensor:
-        places = torch.arange(len(self.vertices))
-        return torch.stack([mesh.first_anchor + places, torch.tensor(self.vertices)], 1)
-
-    def measure(self, edge_vectors: Tensor) -> Tensor:
-        return edge_vectors[0].norm()
-
-    def at_rest(self, measures: Tensor) -> Tensor:
-        return torch.zeros_like(measures)
-
-
-class Pull(Term):
-    """All vertices of the mesh that the energy is evaluated on, pulled to one point of the caller's coordinates."""
-
-    def __init__(self, point: Tensor, stiffness: float = 1.0) -> None:
-        super().__init__(stiffness)
-        self.register_buffer("points", point[None])
-
-    @property
-    def anchors(self) -> Tensor:
-        return self.points
-
-    def elements(self, mesh: Mesh) -> Tensor:
-        vertices = torch.arange(mesh.n_vertices)
-        return torch.stack([torch.full_like(vertices, mesh.first_anchor), vertices], 1)
-
-    def measure(self, edge_vectors: Tensor) -> Tensor:
-        return edge_vectors[0].norm()
-
-    at_rest = Spring.at_rest
 
 
 def by_torch_func(kind: type[Term]) -> type[Term]:

@@ -143,6 +143,7 @@ def test_vmap_and_its_gradients(function: Callable[[Tensor], Tensor]) -> None:
     torch.testing.assert_close(slopes, truth)
 
 
+@pytest.mark.slow
 def test_dynamo() -> None:
     w = torch.cat([turns(angle, 2) for angle in ANGLES])
     for function in (exp, lambda w: log(exp(w)), through_quaternions):

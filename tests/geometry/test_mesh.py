@@ -30,18 +30,6 @@ def by_hand(faces: np.ndarray) -> dict[tuple[int, int], list[tuple[int, int]]]:
     return found
 
 
-def test_edges() -> None:
-    mesh = Connectivity(SQUARE)
-    assert mesh.edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
-    assert mesh.counts.tolist() == [1, 2, 1, 1, 1]
-    mesh = Connectivity(TETRAHEDRON)
-    assert mesh.edges.tolist() == [list(pair) for pair in itertools.combinations(range(4), 2)]
-    assert mesh.counts.tolist() == [2] * 6
-    mesh = Connectivity(FINS)
-    assert len(mesh.edges) == 7
-    assert mesh.counts.tolist() == [3, 1, 1, 1, 1, 1, 1]
-
-
 @pytest.mark.parametrize("offset", [0, 2**30], ids=["packed", "too many vertices to pack"])
 @pytest.mark.parametrize("seed", range(5))
 def test_everything_by_hand(seed: int, offset: int) -> None:
@@ -111,19 +99,6 @@ def test_hinge_of_faces_that_wind_against_each_other() -> None:
     assert {k, m} == {1, 3}
 
 
-def test_boundaries() -> None:
-    square = Connectivity(SQUARE)
-    assert square.boundary_edges.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
-    assert {tuple(e) for e in square.boundary_chain.tolist()} == {(0, 1), (1, 2), (2, 3), (3, 0)}
-    assert Connectivity(TETRAHEDRON).boundary_edges.shape == (0, 2)
-    assert Connectivity(TETRAHEDRON).boundary_chain.shape == (0, 2)
-    around_fins = {(1, 2), (2, 0), (0, 3), (3, 1), (1, 4), (4, 0)}
-    # Two of the three faces run along 01 in its direction, one against it: one is left over.
-    fins = Connectivity(FINS)
-    assert {tuple(e) for e in fins.boundary_chain.tolist()} == around_fins | {(0, 1)}
-    assert {tuple(sorted(e)) for e in around_fins} == {tuple(e) for e in fins.boundary_edges.tolist()}
-
-
 def test_pieces() -> None:
     mesh = Connectivity(np.concatenate([TETRAHEDRON + 1, SQUARE + 6]), n_vertices=11)
     assert mesh.vertex_pieces.tolist() == [0, 1, 1, 1, 1, 2, 3, 3, 3, 3, 4]
@@ -149,11 +124,6 @@ def test_agrees_with_trimesh(capsule: tuple[np.ndarray, np.ndarray]) -> None:
     np.testing.assert_array_equal(np.sort(rows[key, :2], 1), closed.face_adjacency_edges[theirs])
     np.testing.assert_array_equal(np.sort(rows[key, 2:], 1), np.sort(closed.face_adjacency_unshared[theirs], 1))
     assert connectivity.vertex_areas(vertices, faces).sum() == pytest.approx(closed.area, rel=1e-12)
-
-
-def test_neighbours_share_an_edge() -> None:
-    fan = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [1, 0, 7], [0, 1, 8]])
-    assert {tuple(pair) for pair in Connectivity(fan).face_neighbours.tolist()} == {(0, 1), (0, 3), (3, 4)}
 
 
 def test_spanning_forest_takes_what_is_cheap() -> None:

@@ -70,6 +70,7 @@ def test_derivatives_and_transforms(shape: tuple[Tensor, Tensor]) -> None:
     torch.testing.assert_close(mapped, vertex_normals(batch, faces))
 
 
+@pytest.mark.slow
 def test_dynamo(shape: tuple[Tensor, Tensor]) -> None:
     x, faces = shape
     compiled = torch.compile(lambda x: vertex_normals(x, faces), backend="aot_eager", fullgraph=True)

@@ -171,18 +171,6 @@ def time(t: float) -> Tensor:
     return torch.tensor(t, dtype=torch.float64)
 
 
-def test_fraction_ends(motion: RigidMotion, cloud: Tensor) -> None:
-    torch.testing.assert_close(motion.fraction(time(0)).apply(cloud), cloud, atol=1e-13, rtol=0)
-    torch.testing.assert_close(motion.fraction(time(1)).apply(cloud), motion.apply(cloud), atol=1e-12, rtol=0)
-
-
-def test_two_halves_are_the_whole(motion: RigidMotion, cloud: Tensor) -> None:
-    half = motion.fraction(time(0.5))
-    torch.testing.assert_close(half.rotation @ half.rotation, motion.rotation, atol=1e-13, rtol=0)
-    again = motion_by(half.rotation, half.target, motion.target)
-    torch.testing.assert_close(again.apply(half.apply(cloud)), motion.apply(cloud), atol=1e-12, rtol=0)
-
-
 def test_constant_speed_as_scipys_slerp(motion: RigidMotion) -> None:
     times = np.linspace(0, 1, 7)
     truth = Slerp([0, 1], Rotation.from_matrix(np.stack([np.eye(3), motion.rotation.numpy()])))(times)
@@ -230,13 +218,6 @@ def deformed(cloud: Tensor, generator: torch.Generator) -> Tensor:
     return (cloud + 0.5 * noise) @ about([0, 1, 1], 1.5).mT + 3
 
 
-def test_blend_ends_and_direction(cloud: Tensor, deformed: Tensor, weights: Tensor) -> None:
-    torch.testing.assert_close(blend(cloud, deformed, time(0), weights), cloud, atol=1e-12, rtol=0)
-    torch.testing.assert_close(blend(cloud, deformed, time(1), weights), deformed, atol=1e-12, rtol=0)
-    there, back = blend(cloud, deformed, time(0.3), weights), blend(deformed, cloud, time(0.7), weights)
-    torch.testing.assert_close(there, back, atol=1e-12, rtol=0)
-
-
 def test_blend_commutes_with_rigid_motions(
     cloud: Tensor, deformed: Tensor, weights: Tensor, generator: torch.Generator
 ) -> None:
@@ -257,10 +238,3 @@ def test_blend_of_a_rigid_motion_stays_congruent(cloud: Tensor, weights: Tensor)
     between = blend(cloud.expand(5, -1, -1), turned.expand(5, -1, -1), times, weights)
     truth = distances(cloud).expand(5, -1, -1)
     torch.testing.assert_close(distances(between), truth, atol=1e-11, rtol=0)
-
-
-def test_smoke_float32(cloud: Tensor, deformed: Tensor, weights: Tensor) -> None:
-    args = (cloud, deformed, time(0.5), weights)
-    single = blend(*(x.float() for x in args))
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), blend(*args), atol=1e-5, rtol=0)

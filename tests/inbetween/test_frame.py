@@ -1,16 +1,14 @@
 """The working frame: scale, alignment, coarse mesh and independent columns."""
 
-import numpy as np
 import pytest
 import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
-from torch_modal.backends.torch.alignment import Pair
+
+from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.canonical import size
 from torch_modal.inbetween.columns import Directions
 from torch_modal.inbetween.frame import Frame
-
-from torch_modal.geometry.canonical import CANONICAL_SIZE, size
-from torch_modal.precompute.coarsening import coarsen
 
 
 @pytest.fixture(scope="module")
@@ -28,22 +26,12 @@ def moved(bars: Shapes, generator: torch.Generator) -> Tensor:
 def test_size_is_100_and_centred(frame: Frame, bars: Shapes) -> None:
     reference = frame.reference
     sizes = [size(x.numpy(), bars.faces.numpy()) for x in bars.keyframes[:2]]
-    assert size(reference.numpy(), bars.faces.numpy()) == pytest.approx(
-        2 * CANONICAL_SIZE * sizes[0] / sum(sizes), rel=1e-13
-    )
+    assert size(reference.numpy(), bars.faces.numpy()) == pytest.approx(2 * CANONICAL_SIZE * sizes[0] / sum(sizes), rel=1e-13)
     assert (frame.weights[:, None] * reference).sum(0).abs().max() < 1e-11
     assert float(frame.weights.sum()) == pytest.approx(1)
     assert float(frame.coarse.weights.sum()) == pytest.approx(1)
     straight = bars.keyframes[0]
     torch.testing.assert_close(reference / frame.scale, straight - (frame.weights[:, None] * straight).sum(0))
-
-
-def test_coarsens_as_numpy_does(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
-    x = torch.randn(2, 3, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
-    clusters = frame.coarse.clusters.numpy()
-    by_hand = np.stack([x.numpy()[:, :, clusters == i].mean(2) for i in range(frame.coarse.n_vertices)], 2)
-    np.testing.assert_allclose(frame.coarsen(x).numpy(), by_hand, atol=1e-14)
-    assert len(frame.coarse.faces) <= 200 < len(bars.faces)
 
 
 def test_collapses_are_chosen_on_aligned_keyframes(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
@@ -56,19 +44,6 @@ def test_collapses_are_chosen_on_aligned_keyframes(frame: Frame, bars: Shapes, g
     first = bars.bases[0].modes
     turned, straight = other.modes(first, basis.modes @ turn.mT)[1], frame.modes(first, basis.modes)[1]
     torch.testing.assert_close(turned.turned(turned.given), straight.turned(straight.given), atol=1e-11, rtol=0)
-
-
-def test_place_and_restore(frame: Frame, moved: Tensor) -> None:
-    x_a, x_b = moved
-    pair = frame.place(x_a, x_b)
-    torch.testing.assert_close(pair.first[0], frame.reference, atol=1e-10, rtol=0)
-    at = torch.zeros(1, dtype=torch.float64)
-    torch.testing.assert_close(frame.restore(pair.first, pair, at), x_a, atol=1e-11, rtol=0)
-    torch.testing.assert_close(frame.restore(pair.second, pair, at + 1), x_b, atol=1e-11, rtol=0)
-    # The second is turned on to the first as well as it goes: no small rotation brings it closer.
-    arms = pair.first - (frame.weights[:, None] * pair.first).sum(-2, keepdim=True)
-    torque = (frame.weights[:, None] * torch.linalg.cross(arms, pair.second - pair.first)).sum(-2)
-    assert torque.abs().max() < 1e-10 * CANONICAL_SIZE**2
 
 
 def test_orthonormal_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
@@ -88,32 +63,6 @@ def test_orthonormal_columns(frame: Frame, bars: Shapes, generator: torch.Genera
     torch.testing.assert_close(columns.combine(a), torch.einsum("bn,nvc->bvc", a, columns.fine))
 
 
-def test_split_leaves_nothing_of_the_columns(frame: Frame, bars: Shapes, generator: torch.Generator) -> None:
-    directions = torch.randn(3, *bars.keyframes[0].shape, dtype=torch.float64, generator=generator)
-    columns = frame.elastic_columns(Directions(directions[:2]))
-    amplitudes, left = frame.split(frame.coarsen(directions), columns)
-    inner = torch.einsum("mvc,nvc->mn", left * frame.coarse.weights[:, None], columns.coarse)
-    assert inner.abs().max() < 1e-12
-    torch.testing.assert_close(left + frame.coarsen(columns.combine(amplitudes)), frame.coarsen(directions))
-    within = torch.tensor([[2.0, -3.0]], dtype=torch.float64)
-    amplitudes, left = frame.split(frame.coarsen(columns.combine(within)), columns)
-    torch.testing.assert_close(amplitudes, within)
-    assert left.abs().max() < 1e-9
-
-
-def test_elastic_columns_have_no_rigid_motion(frame: Frame, bars: Shapes) -> None:
-    both = frame.modes(*(basis.modes for basis in bars.bases[:2]))
-    columns, modes = frame.elastic_columns(*both), torch.cat([part.turned(part.given) for part in both])
-    assert len(frame.rigid.fine) == 6
-    both = torch.cat([frame.rigid.coarse, columns.coarse])
-    gram = torch.einsum("mvc,nvc->mn", both * frame.coarse.weights[:, None], both)
-    torch.testing.assert_close(gram, torch.eye(len(both), dtype=torch.float64), atol=1e-8, rtol=0)
-    # With the rigid motions, they span every mode.
-    span = torch.cat([frame.rigid.fine, columns.fine]).flatten(1)
-    fit = torch.linalg.lstsq(span.T, modes.flatten(1).T).solution.T @ span
-    torch.testing.assert_close(fit, modes.flatten(1), atol=1e-7 * float(modes.abs().max()), rtol=0)
-
-
 def test_one_basis_for_both_ends(bars: Shapes) -> None:
     frame = Frame(bars.keyframes[[0, 0]], bars.faces, 200)
     first, second = frame.modes(bars.bases[0].modes, bars.bases[0].modes)
@@ -125,17 +74,3 @@ def test_points_are_brought_where_shapes_are(frame: Frame, moved: Tensor) -> Non
     pair, t = frame.place(*moved), torch.tensor([0.3], dtype=torch.float64)
     x = pair.first + 1
     torch.testing.assert_close(frame.bring(frame.restore(x, pair, t), pair, t), x, atol=1e-9, rtol=0)
-
-
-def test_module(frame: Frame, bars: Shapes, moved: Tensor) -> None:
-    assert not frame.state_dict(), "all of it follows from the bases"
-    single = Frame(bars.keyframes[:2], bars.faces, 200).float()
-    pair = single.place(*moved.float())
-    assert isinstance(pair, Pair)
-    assert pair.first.dtype == torch.float32
-
-
-def test_keeps_what_coarsen_chose(frame: Frame, bars: Shapes) -> None:
-    references = torch.stack([frame.reference, frame.place(bars.keyframes[:1], bars.keyframes[1:2]).second[0]])
-    chosen = coarsen(references.numpy(), bars.faces.numpy(), 200)
-    np.testing.assert_array_equal(chosen.faces, frame.coarse.faces.numpy())

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
+from shapes import apart
 from torch import Tensor
-from torch.autograd import gradcheck
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.inbetween.comparison import SLACK, no_worse
 
 DOUBLE = torch.float64
 
@@ -42,11 +41,6 @@ def trex(data_dir: Path) -> Shapes:
 def creature() -> Shapes:
     sample = load_sample("creature")
     return shapes_of(sample.keyframes[:3].double(), sample.faces, 15)
-
-
-def apart(x: Tensor, y: Tensor) -> float:
-    """Largest distance of vertices over the diagonal."""
-    return float((x - y).norm(dim=-1).max() / (x.amax(-2) - x.amin(-2)).norm(dim=-1).max())
 
 
 def largest_jump(layer: tm.InBetween, x_a: Tensor, x_b: Tensor, n: int) -> float:
@@ -103,30 +97,10 @@ class TestOneFunction:
         assert apart(forth(x_a, x_b, 0.37), back(x_b, x_a, 0.63)) < 1e-6
 
 
-class TestComparison:
-    def test_shapes_are_blended_into_their_start(self) -> None:
-        x, start = torch.zeros(200, 1, 3, dtype=DOUBLE), torch.ones(200, 1, 3, dtype=DOUBLE)
-        own = torch.linspace(1, 1.3, 200, dtype=DOUBLE)
-        found, replaced = no_worse(x, [start], torch.stack([own, torch.ones_like(own)]), torch.zeros_like(own))
-        parts = found[:, 0, 0]
-        assert float(parts[0]) == 0 and float(parts[-1]) == 1 and bool((parts.diff() >= 0).all())
-        assert float(parts.diff().max()) < 0.03, "no step is larger than the slope of the blend"
-        assert torch.equal(replaced, own >= SLACK) and bool((parts[own < 1.1] == 0).all())
-
-    def test_gradient_of_the_blend(self) -> None:
-        x = torch.randn(2, 4, 3, dtype=DOUBLE, generator=torch.Generator().manual_seed(0)).requires_grad_()
-
-        def blended(x: Tensor) -> Tensor:
-            own = 1 + 0.2 * torch.sigmoid(x.sum((1, 2)))
-            distortion = torch.stack([own, torch.ones_like(own)])
-            return no_worse(x, [torch.ones_like(x)], distortion, torch.zeros_like(own))[0]
-
-        assert gradcheck(blended, x)
-
-    def test_nothing_is_worse_where_nothing_is_strained(self, hand: Shapes) -> None:
-        """Rigid motions: the in-betweens have distortions of rounding, and no status but CONVERGED."""
-        x = hand.keyframes[0]
-        turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -1, 0.3], [1, 0, 0.2], [-0.3, -0.2, 0]], dtype=DOUBLE))
-        layer = tm.InBetween([hand.bases[0]] * 2, hand.faces)
-        found = layer.solve(x, x @ turn.mT + 3.0, torch.linspace(0, 1, 11, dtype=DOUBLE))
-        assert bool(found.solution.converged.all())
+def test_nothing_is_worse_where_nothing_is_strained(hand: Shapes) -> None:
+    """Rigid motions: the in-betweens have distortions of rounding, and no status but CONVERGED."""
+    x = hand.keyframes[0]
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -1, 0.3], [1, 0, 0.2], [-0.3, -0.2, 0]], dtype=DOUBLE))
+    layer = tm.InBetween([hand.bases[0]] * 2, hand.faces)
+    found = layer.solve(x, x @ turn.mT + 3.0, torch.linspace(0, 1, 11, dtype=DOUBLE))
+    assert bool(found.solution.converged.all())

@@ -2,19 +2,19 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
-from conftest import Shapes, random_rotation
+from conftest import Shapes
+from shapes import diagonal, edge_error, largest
+from terms import Area
 from torch import Tensor, nn
-from torch.func import vmap
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry import hermite
-from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.motion.path import Path
 
 DOUBLE = torch.float64
@@ -22,14 +22,6 @@ DOUBLE = torch.float64
 
 def times(*values: float) -> Tensor:
     return torch.tensor(values, dtype=DOUBLE)
-
-
-def largest(x: Tensor) -> float:
-    return float(x.abs().max())
-
-
-def diagonal(x: Tensor) -> float:
-    return float((x.amax(-2) - x.amin(-2)).norm(dim=-1).max())
 
 
 @pytest.fixture(scope="module")
@@ -123,16 +115,6 @@ def test_pairs_alone_are_the_layers(motion: Shapes) -> None:
     two = motion.pick(0, 1)
     smooth, straight = (Path(two.bases, two.faces, smooth=s)(two.keyframes, 0.4) for s in (True, False))
     assert torch.equal(smooth, straight), "two key-frames have no neighbours"
-
-
-@pytest.mark.parametrize("smooth", [True, False])
-def test_rigid_motions_of_all_keyframes(motion: Shapes, generator: torch.Generator, smooth: bool) -> None:
-    path = Path(motion.bases, motion.faces, smooth=smooth)
-    turn, move = random_rotation(generator), times(30.0, -20.0, 10.0)
-    at = times(0.2, 1.5, 3.7)
-    moved = path(motion.keyframes @ turn.mT + move, at)
-    wanted = path(motion.keyframes, at) @ turn.mT + move
-    assert largest(moved - wanted) < (1e-8 if smooth else 1e-6) * diagonal(wanted)
 
 
 def test_a_rigid_motion_is_smooth_too(bars: Shapes) -> None:
@@ -276,18 +258,11 @@ def test_gradients_against_central_differences(motion: Shapes, smooth: bool) -> 
 def test_gradients_reach_a_term(motion: Shapes) -> None:
     """A course is at rest; what pulls at it is felt, and so is its stiffness."""
 
-    class Area(tm.Term):
-        def elements(self, mesh: "tm.energy.term.Mesh") -> Tensor:  # type: ignore[name-defined]
-            return mesh.faces
-
-        def measure(self, edge_vectors: Tensor) -> Tensor:
-            return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
-
-        def at_rest(self, measures: Tensor) -> Tensor:
-            return 0.9 * measures
+    class Shrinking(Area):
+        part = 0.9
 
     def shapes(stiffness: Tensor) -> Tensor:
-        objective = tm.Objective(terms=(Area(stiffness),), coarse_faces=200)
+        objective = tm.Objective(terms=(Shrinking(stiffness),), coarse_faces=200)
         return Path(motion.bases, motion.faces, objective=objective)(motion.keyframes, 1.4)
 
     stiffness = nn.Parameter(torch.tensor(200.0, dtype=DOUBLE))
@@ -302,41 +277,40 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
     assert largest(shapes(stiffness).detach() - bare) > 1e-3
 
 
-def test_vmap_over_motions(path: Path, motion: Shapes) -> None:
-    many = torch.stack([motion.keyframes, motion.keyframes + 0.02])
-    found = vmap(lambda keyframes: path(keyframes, times(0.5, 2.5)))(many)
-    torch.testing.assert_close(found, path(many[:, None], times(0.5, 2.5)), rtol=0, atol=1e-9)
-
-
-def test_state_dict_round_trip(motion: Shapes) -> None:
-    own = Path(motion.bases, motion.faces, [0.0, 1.0, 1.5, 3.0, 4.0])
-    other = Path(motion.bases[::-1], motion.faces)
-    other.load_state_dict(own.state_dict())
-    assert torch.equal(other(motion.keyframes, 2.2), own(motion.keyframes, 2.2))
-
-
 # -------------------------------------------------------------------------------------------------------- exceptions
 
 
-def test_exception(path: Path, motion: Shapes) -> None:
-    make: Callable[..., Path] = Path
-    for at in (-0.1, 4.2, math.nan):
-        with pytest.raises(ValueError, match="between the times of the first and the last key-frame, 0 and 4"):
-            path(motion.keyframes, at)
-    with pytest.raises(ValueError, match=r"shape \(\.\.\., 5, V, 3\); got \(4, 164, 3\)"):
-        path(motion.keyframes[:4], 0.5)
-    with pytest.raises(ValueError, match="does not broadcast against motions"):
-        path(motion.keyframes.expand(2, -1, -1, -1), torch.rand(3))
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        *((lambda path, x, at=at: path(x, at), "between the times of .*, 0 and 4") for at in (-0.1, 4.2, math.nan)),
+        (lambda path, x: path(x[:4], 0.5), r"shape \(\.\.\., 5, V, 3\); got \(4, 164, 3\)"),
+        (lambda path, x: path(x.expand(2, -1, -1, -1), torch.rand(3)), "does not broadcast against motions"),
+        (lambda path, x: path.insert(2.0), "already"),
+    ],
+)
+def test_what_a_call_refuses(call: Any, message: str, path: Path, motion: Shapes) -> None:
+    with pytest.raises(ValueError, match=message):
+        call(path, motion.keyframes)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"times": [0.0, 1.0]}, r"one time for each key-frame: \(5,\)"),
+        ({"times": [0.0, 1.0, 2.0, 3.0, 4.0], "cyclic": True}, r"and one when the first comes again: \(6,\)"),
+        ({"times": [0.0, 1.0, 1.0, 3.0, 4.0]}, "must ascend"),
+        ({"preset": "paper"}, "middle of a pair only"),
+    ],
+)
+def test_what_a_path_refuses(options: Any, message: str, motion: Shapes) -> None:
+    with pytest.raises(ValueError, match=message):
+        Path(motion.bases, motion.faces, **options)
+
+
+def test_too_few_key_frames_and_pairs_alone(motion: Shapes) -> None:
     with pytest.raises(ValueError, match="two key-frames or more, got 1"):
-        make(motion.bases[:1], motion.faces)
-    with pytest.raises(ValueError, match=r"one time for each key-frame: \(5,\)"):
-        make(motion.bases, motion.faces, [0.0, 1.0])
-    with pytest.raises(ValueError, match=r"and one when the first comes again: \(6,\)"):
-        make(motion.bases, motion.faces, [0.0, 1.0, 2.0, 3.0, 4.0], cyclic=True)
-    with pytest.raises(ValueError, match="must ascend"):
-        make(motion.bases, motion.faces, [0.0, 1.0, 1.0, 3.0, 4.0])
-    with pytest.raises(ValueError, match="middle of a pair only"):
-        make(motion.bases, motion.faces, preset="paper")
+        Path(motion.bases[:1], motion.faces)
     with pytest.raises(ValueError, match="knows pairs only"):
         tm.subdivide(motion.keyframes, motion.faces, bases=motion.bases, smooth=True, preset="paper")
 
@@ -347,9 +321,7 @@ def test_exception(path: Path, motion: Shapes) -> None:
 def errors(path: Path, keyframes: Tensor, at: Tensor, truth: Tensor) -> tuple[float, float]:
     """Mean distance of vertices, and mean relative error of edge lengths."""
     x = path(keyframes, at)
-    start, end = torch.tensor(Connectivity(path.layer.faces.numpy()).edges).T
-    now, wanted = ((y[:, end] - y[:, start]).norm(dim=-1) for y in (x, truth))
-    return float((x - truth).norm(dim=-1).mean()), float(((now - wanted).abs() / wanted).mean())
+    return float((x - truth).norm(dim=-1).mean()), edge_error(x, truth, path.layer.faces)
 
 
 def test_the_sample_creature(cache_folder: object) -> None:
@@ -420,17 +392,18 @@ def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> N
     moved = passing + 0.05
     editor.replace(3, moved)
     assert torch.equal(editor.path(editor.keyframes, 2.3), moved)
-    with pytest.raises(ValueError, match="already"):
-        path.insert(2.0)
-    with pytest.raises(ValueError, match="between the times"):
-        editor.insert(9.0)
-    with pytest.raises(IndexError, match="6 key-frames"):
-        editor.replace(6, moved)
-    with pytest.raises(ValueError, match="holds finite numbers"):
-        editor.replace(0, moved * math.nan)
+    editor.replace(-1, motion.keyframes[-1] + 0.1)  # counted from the end
+    torch.testing.assert_close(editor.shapes(), editor.path(editor.keyframes, editor.times()), rtol=0, atol=1e-9)
+    for number, shape, error, message in (
+        (6, moved, IndexError, "6 key-frames"),
+        (0, moved * math.nan, ValueError, "holds finite numbers"),
+    ):
+        with pytest.raises(error, match=message):
+            editor.replace(number, shape)
+    assert path.insert(2.0 + 1e-9).times.tolist() == [0, 1, 2, 2.0 + 1e-9, 3, 4]
 
 
-@pytest.mark.parametrize("turns", [-2, -1, 1, 3])
+@pytest.mark.parametrize("turns", [-2, 1])
 def test_a_key_frame_of_another_period_is_that_of_the_first(motion: Shapes, turns: int) -> None:
     """Times of a cycle are taken modulo the period: an inserted key-frame too."""
     own = motion.pick(0, 1, 2)
@@ -444,7 +417,7 @@ def test_a_key_frame_of_another_period_is_that_of_the_first(motion: Shapes, turn
 
 
 @pytest.mark.parametrize("cyclic", [False, True])
-@pytest.mark.parametrize("t", [math.nan, math.inf, -math.inf, 0.2, 0.2 + 1e-16, 0.8, -0.4, 5.0])
+@pytest.mark.parametrize("t", [math.nan, -math.inf, 0.2 + 1e-16, 0.8, -0.4, 5.0])
 def test_an_insert_that_fails_changes_nothing(bars: Shapes, cyclic: bool, t: float) -> None:
     own = bars.pick(0, 1, 2)
     path = Path(own.bases, own.faces, times(0.2, 0.6, 0.8, 1.4)[: 3 + cyclic], cyclic=cyclic)
@@ -516,10 +489,6 @@ def test_times_of_an_editor_are_even(motion: Shapes) -> None:
     assert editor.times().tolist() == [0, 0.25, 0.5, 0.75, 1, 1.75, 2.5, 3.25, 4]
 
 
-def test_key_frames_may_be_close_in_time(path: Path) -> None:
-    assert path.insert(2.0 + 1e-9).times.tolist() == [0, 1, 2, 2.0 + 1e-9, 3, 4]
-
-
 def test_an_inserted_key_frame_borrows_the_modes_around_it(motion: Shapes) -> None:
     x, path = motion.keyframes, Path(motion.bases, motion.faces, smooth=False)
     pinned = path(x, 1.3) + 0.05
@@ -542,10 +511,3 @@ def test_a_path_scheme_outlasts_an_insert(motion: Shapes) -> None:
     assert largest(near[1::2] - near[::2]) < 1e-4
     away = Path(motion.bases, motion.faces).insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3))
     assert largest(away[1] - away[0]) > 3e-4, "without it, the motion goes on"
-
-
-def test_key_frames_may_be_counted_from_the_end(motion: Shapes, path: Path) -> None:
-    editor = tm.PathEditor(path, motion.keyframes, steps=2)
-    editor.shapes()
-    editor.replace(-1, motion.keyframes[-1] + 0.1)
-    torch.testing.assert_close(editor.shapes(), path(editor.keyframes, editor.times()), rtol=0, atol=1e-9)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes, random_rotation
+from shapes import edge_lengths, largest
 from torch import Tensor
 
 import torch_modal as tm
@@ -33,10 +34,6 @@ def scattered(bars: Shapes) -> Shapes:
         keyframes.append(x @ turn.mT + 20 * torch.randn(3, dtype=torch.float64, generator=generator))
         bases.append(replace(basis, reference=keyframes[-1], modes=basis.modes @ turn.mT))
     return Shapes(torch.stack(keyframes), bars.faces, bases)
-
-
-def largest(x: Tensor) -> float:
-    return float(x.abs().max())
 
 
 # ------------------------------------------------------------------------------------------------------- places
@@ -113,27 +110,12 @@ def test_takes_arrays_and_two_keyframes(scattered: Shapes) -> None:
     assert not frames.requires_grad
 
 
-def test_steps_on_the_fine_mesh_by_default(scattered: Shapes) -> None:
-    pair = scattered.pick(0, 1)
-    options: dict[str, Any] = {"bases": pair.bases, "progress": False, **COARSE}
-    default = subdivide(pair.keyframes, pair.faces, 1, **options)[1]
-    without = subdivide(pair.keyframes, pair.faces, 1, solver=Solver(local_steps=0), **options)[1]
-    torch.testing.assert_close(default, MidShape(pair.bases, pair.faces, **COARSE)(*pair.keyframes), rtol=0, atol=1e-12)
-    assert largest(default - without) > 1e-5
-
-
 def test_presets_are_those_of_the_layers(scattered: Shapes) -> None:
     pair = scattered.pick(0, 1)
     for preset in tm.PRESETS:
         found = subdivide(pair.keyframes, pair.faces, 1, bases=pair.bases, preset=preset, progress=False)[1]
         layer = MidShape(pair.bases, pair.faces, preset=preset)
         torch.testing.assert_close(found, layer(*pair.keyframes), rtol=0, atol=1e-12)
-
-
-def test_is_public() -> None:
-    assert tm.subdivide is subdivide
-    assert tm.keyframe_places is keyframe_places
-    assert tm.linear_sequence is linear_sequence
 
 
 # ---------------------------------------------------------------------------------------------- the shapes between
@@ -208,34 +190,16 @@ def test_fill_lies_on_the_geodesics_between_subdivided_shapes(scattered: Shapes)
     assert largest(filled[3] - shapes[1]) < 1e-9
 
 
-def test_paired_space_borrows_the_nearest_modes(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    used: list[tuple[int, int]] = []
-    wrapped = sequence._Segment._layer
-
-    def record(self: Any, a: int, b: int) -> MidShape:
-        used.append((a, b))
-        return wrapped(self, a, b)
-
-    monkeypatch.setattr(sequence._Segment, "_layer", record)
-    x_a, x_b = scattered.keyframes[:2]
+def test_paired_space_borrows_the_nearest_modes(scattered: Shapes) -> None:
     pair = scattered.pick(0, 1)
     frames = subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, progress=False, **PAIRED)
-    i, j = torch.tensor(connectivity.Connectivity(pair.faces.numpy()).edges).T
-    lengths = [torch.linalg.norm(x[i] - x[j], dim=1) for x in (x_a, x_b, frames[2])]
-    nearest = int((lengths[2] - lengths[1]).norm() < (lengths[2] - lengths[0]).norm())
-    assert used == [(0, 1), (0, nearest), (nearest, 1)]
-    # The same from the layers themselves.
-    left = MidShape([pair.bases[0], pair.bases[nearest]], pair.faces, "paired", **PAIRED)(x_a, frames[2])
-    assert largest(frames[1] - left) < 1e-9
-
-
-def test_nearest_key_frame_by_edge_lengths(scattered: Shapes) -> None:
-    pair = scattered.pick(0, 1)
-    segment = sequence._Segment((pair.bases[0], pair.bases[1]), pair.faces, tm.PRESETS["paper"], torch.device("cpu"))
-    weights = torch.ones(pair.keyframes.shape[1], dtype=torch.float64)
-    times = torch.tensor([0.0, 0.1, 0.3, 0.7, 0.9, 1.0], dtype=torch.float64)
-    shapes = blend(pair.keyframes[:1].expand(6, -1, -1), pair.keyframes[1:].expand(6, -1, -1), times, weights)
-    assert segment._nearest(shapes) == [0, 0, 0, 1, 1, 1]
+    middle, *ends = (edge_lengths(x, pair.faces) for x in (frames[2], *pair.keyframes))
+    nearest = pair.bases[int((middle - ends[1]).norm() < (middle - ends[0]).norm())]
+    for frame, bases, shapes in (
+        (frames[1], [pair.bases[0], nearest], (pair.keyframes[0], frames[2])),
+        (frames[3], [nearest, pair.bases[1]], (frames[2], pair.keyframes[1])),
+    ):
+        assert largest(frame - MidShape(bases, pair.faces, "paired", **PAIRED)(*shapes)) < 1e-9
 
 
 def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:

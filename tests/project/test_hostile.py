@@ -152,18 +152,6 @@ def test_two_processes_fill_the_same_cache(tmp_path: Path) -> None:
     assert np.allclose(*[[float(line) for line in out.split()] for out, _ in first], rtol=0.2)
 
 
-@pytest.mark.slow
-def test_a_truncated_cache_is_computed_again(tmp_path: Path) -> None:
-    assert start(tmp_path).communicate(timeout=240)[0]
-    for entry in tmp_path.iterdir():
-        entry.write_bytes(entry.read_bytes()[:-100])
-    process = start(tmp_path)
-    out, errors = process.communicate(timeout=240)
-    assert process.returncode == 0, errors
-    assert all(float(line) > 0 for line in out.split())
-    assert start(tmp_path).communicate(timeout=240)[0] == out, "the entries were replaced by whole ones"
-
-
 class Bars(Dataset):  # type: ignore[type-arg]
     """Bases made inside of data-loader workers."""
 

@@ -26,34 +26,24 @@ def space(bars: Shapes) -> tm.ShapeSpace:
     return tm.ShapeSpace(bars.bases, bars.faces)
 
 
-def everything(bars: Shapes, space: tm.ShapeSpace) -> dict[str, Callable[[Tensor], Any]]:
-    """What takes key-frames ``(3, V, 3)``."""
-    bases, faces = bars.bases, bars.faces
-    found: dict[str, Callable[[Tensor], Any]] = {
-        "subdivide": lambda x: tm.subdivide(x, faces, 1, bases=bases, preset="fast", progress=False),
-        "linear_sequence": lambda x: tm.linear_sequence(x, tm.keyframe_places(3, 1)),
-        "InBetween": lambda x: tm.InBetween(bases, faces, "fast")(x[0], x[1], 0.3),
-        "Blend": lambda x: tm.Blend(bases, faces, "fast")(x, torch.tensor([0.2, 0.3, 0.5], dtype=x.dtype)),
-        "Path": lambda x: tm.Path(bases, faces, preset="fast")(x, 0.7),
-        "Passengers": lambda x: tm.Passengers(x[0], faces, x[0] + 0.01)(x),
-        "ShellLoss": lambda x: tm.losses.ShellLoss(faces)(x, x[0]),
-        "fit": lambda x: space.fit(x[1, ::10], torch.arange(0, x.shape[1], 10)),
-        "components": lambda x: space.components().coordinates(x),
-        "self_contacts": lambda x: tm.self_contacts(x, faces),
-    }
-    for name, make in TRANSFORMS.items():
-        found[name] = make(space=space, generator=torch.Generator().manual_seed(0))
-    return found
+FUNCTIONS: dict[str, Callable[[Shapes, tm.ShapeSpace, Tensor], Any]] = {
+    "subdivide": lambda s, _, x: tm.subdivide(x, s.faces, 1, bases=s.bases, preset="fast", progress=False),
+    "linear_sequence": lambda s, _, x: tm.linear_sequence(x, tm.keyframe_places(3, 1)),
+    "fit": lambda s, space, x: space.fit(x[1, ::10], torch.arange(0, x.shape[1], 10)),
+    "components": lambda s, space, x: space.components().coordinates(x),
+    "self_contacts": lambda s, _, x: tm.self_contacts(x, s.faces),
+    **{
+        name: lambda s, space, x, make=make: make(space=space, generator=torch.Generator().manual_seed(0))(x)
+        for name, make in TRANSFORMS.items()
+    },
+}
 
 
-NAMES = ["subdivide", "linear_sequence", "InBetween", "Blend", "Path", "Passengers", "ShellLoss", "fit", "components"]
-NAMES += ["self_contacts", *TRANSFORMS]
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FUNCTIONS)
 def test_nothing_that_is_given_changes(bars: Shapes, space: tm.ShapeSpace, name: str) -> None:
+    """Layers: tests/layers/test_contract.py."""
     given, before, state = bars.keyframes.clone(), bars.keyframes.clone(), torch.get_rng_state()
-    everything(bars, space)[name](given)
+    FUNCTIONS[name](bars, space, given)
     assert torch.equal(given, before)
     assert torch.equal(torch.get_rng_state(), state), "PyTorch's own random numbers were drawn"
 

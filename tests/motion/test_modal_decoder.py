@@ -1,0 +1,159 @@
+"""The decoder of amplitudes: a function of its state, whatever it was used for before."""
+
+import copy
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import Shapes
+from torch import Tensor
+from torch.func import grad, vmap
+
+import torch_modal as tm
+
+DOUBLE = torch.float64
+TIMES = torch.tensor([0.0, 1.0, 3.0], dtype=DOUBLE)
+AMPLITUDES = torch.tensor([[1.0, -2.0, 3.0], [0.5, 0.0, -1.0]], dtype=DOUBLE)
+
+
+def decoder_of(shapes: Shapes, i: int = 0) -> tm.ModalDecoder:
+    basis = shapes.bases[i]
+    return tm.ModalDecoder(shapes.keyframes, shapes.faces, TIMES, basis.reference, basis.modes)
+
+
+def values(decoder: tm.ModalDecoder) -> Tensor:
+    return decoder(AMPLITUDES[:, None], torch.tensor([0.3, 1.0, 2.2], dtype=DOUBLE))
+
+
+@pytest.fixture
+def others(small_bars: Shapes) -> Shapes:
+    """Other shapes of the same faces, in another order and size."""
+    bases = [
+        tm.ModalBasis(2.0 * basis.reference, basis.eigenvalues, basis.modes.flip(0), basis.rigid_eigenvalues)
+        for basis in small_bars.bases[::-1]
+    ]
+    return Shapes(2.0 * small_bars.keyframes.flip(0), small_bars.faces, bases)
+
+
+@pytest.mark.parametrize("assign", [False, True])
+def test_a_loaded_state(small_bars: Shapes, others: Shapes, assign: bool) -> None:
+    decoder, other = decoder_of(small_bars), decoder_of(others, 1)
+    before, wanted = values(decoder), values(other)
+    assert float((before - wanted).abs().max()) > 1
+    decoder.load_state_dict(copy.deepcopy(other.state_dict()), assign=assign)
+    torch.testing.assert_close(values(decoder), wanted, rtol=0, atol=1e-12)
+    assert torch.equal(decoder.size, other.size)
+
+
+def test_loose_pieces_come_along_with_a_loaded_state(small_bars: Shapes, others: Shapes) -> None:
+    n = small_bars.keyframes.shape[1]
+
+    def two(shapes: Shapes, factor: float) -> Shapes:
+        faces = torch.cat([small_bars.faces, small_bars.faces + n])
+        bases = [
+            tm.ModalBasis(
+                torch.cat([basis.reference, basis.reference + 9]),
+                basis.eigenvalues,
+                torch.cat([basis.modes, factor * basis.modes + factor], 1),
+                basis.rigid_eigenvalues,
+            )
+            for basis in shapes.bases
+        ]
+        return Shapes(torch.cat([shapes.keyframes, shapes.keyframes + 9], 1), faces, bases)
+
+    decoder, other = decoder_of(two(small_bars, 1.0)), decoder_of(two(others, -2.0), 1)
+    values(decoder)
+    decoder.load_state_dict(other.state_dict())
+    torch.testing.assert_close(values(decoder), values(other), rtol=0, atol=1e-12)
+
+
+def test_edited_in_place(small_bars: Shapes) -> None:
+    decoder = decoder_of(small_bars)
+    before = values(decoder)
+    for edit in (
+        lambda: decoder.keyframes[1].mul_(1.2),
+        lambda: decoder.keyframes.data[2].add_(0.1),  # which counts no version
+        lambda: decoder.times[1].add_(0.5),
+    ):
+        edit()
+        shapes = Shapes(decoder.keyframes.clone(), small_bars.faces, small_bars.bases)
+        basis = shapes.bases[0]
+        fresh = tm.ModalDecoder(shapes.keyframes, shapes.faces, decoder.times, basis.reference, basis.modes)
+        wanted, found = values(fresh), values(decoder)
+        assert float((wanted - before).abs().max()) > 1e-2
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+        before = found
+
+
+def test_functional_call(small_bars: Shapes) -> None:
+    decoder = decoder_of(small_bars)
+    before = values(decoder)
+    moved = 1.5 * small_bars.keyframes
+    wanted = values(decoder_of(Shapes(moved, small_bars.faces, small_bars.bases)))
+    given = AMPLITUDES[:, None], torch.tensor([0.3, 1.0, 2.2], dtype=DOUBLE)
+    found = torch.func.functional_call(decoder, {"keyframes": moved}, given)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+    torch.testing.assert_close(values(decoder), before, rtol=0, atol=0)
+
+
+def test_mapped_times(small_bars: Shapes) -> None:
+    layer, times = decoder_of(small_bars), torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
+    a = torch.linspace(-1, 1, 4 * layer.n_modes, dtype=DOUBLE).view(4, -1)
+
+    def slope(a: Tensor, t: Tensor) -> Tensor:
+        return grad(lambda u: layer(a, u).square().sum())(t)
+
+    truth = torch.stack([slope(*own) for own in zip(a, times, strict=True)])
+    torch.testing.assert_close(vmap(layer)(a, times), layer(a, times), rtol=0, atol=1e-12)
+    torch.testing.assert_close(vmap(slope)(a, times), truth, rtol=0, atol=1e-9)
+    for call in (vmap(lambda t: layer(a[0], t)), grad(lambda t: layer(a[0], t[0]).sum())):
+        with pytest.raises(ValueError, match="t lies between the times"):
+            call(times + 9)
+
+
+def exported(layer: tm.ModalDecoder, given: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
+    """With a batch of any size."""
+    batch = {0: torch.export.Dim("batch")}
+    return torch.export.export(layer, given, dynamic_shapes=(batch,) * len(given), strict=False)
+
+
+@pytest.mark.parametrize("n, dtype", [(2, DOUBLE), (2, torch.float32), pytest.param(3, DOUBLE, marks=pytest.mark.slow)])
+def test_export(n: int, dtype: torch.dtype, bars: Shapes) -> None:
+    x, basis, times = bars.keyframes[:n], bars.bases[0], torch.arange(n).double() ** 2
+    layer = tm.ModalDecoder(x, bars.faces, times, basis.reference, basis.modes).to(dtype)
+    generator = torch.Generator().manual_seed(0)
+    a = 3 * torch.randn(5, layer.n_modes, generator=generator, dtype=DOUBLE).to(dtype)
+    t = torch.linspace(0, float(times[-1]), 5, dtype=dtype)
+    motions = 0.1 * torch.randn(5, 6, generator=generator, dtype=DOUBLE).to(dtype)
+    if n == 2:  # another program: with the tables of its intervals, which are made by a call
+        layer(a, t)
+    program = exported(layer, (a[:2], t[:2], motions[:2])).module()
+    truth = layer(a, t, motions)
+    torch.testing.assert_close(program(a, t, motions), truth, rtol=0, atol=1e-12 if dtype == DOUBLE else 1e-5)
+    slopes = []
+    for each in (program, layer):
+        leaf = a.clone().requires_grad_()
+        slopes += torch.autograd.grad(each(leaf, t, motions).square().sum(), leaf)
+    torch.testing.assert_close(*slopes, rtol=1e-6 if dtype == DOUBLE else 1e-3, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_export_of_loose_pieces_to_a_file(small_bars: Shapes, tmp_path: Path) -> None:
+    x = torch.cat([small_bars.keyframes, small_bars.keyframes + 5], 1)
+    faces = torch.cat([small_bars.faces, small_bars.faces + small_bars.keyframes.shape[1]])
+    modes = small_bars.bases[0].modes.repeat(1, 2, 1)
+    layer = tm.ModalDecoder(x, faces, [0.0, 1.0, 2.0, 3.0], x[0], modes)  # a cycle
+    a, t = torch.linspace(-1, 1, 6, dtype=DOUBLE).view(2, 3), torch.tensor([2.5, 7.25], dtype=DOUBLE)
+    layer(a[:1], torch.arange(3) + 0.5)
+    torch.export.save(exported(layer, (a, t)), tmp_path / "decoder.pt2")
+    torch.save((a, t), tmp_path / "given.pt")
+    code = (
+        "import torch; from torch_modal import ModalDecoder\n"
+        "program = torch.export.load('decoder.pt2').module(); torch.save(program(*torch.load('given.pt')), 'x.pt')"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(tm.__file__).parents[1])}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, timeout=120)
+    torch.testing.assert_close(torch.load(tmp_path / "x.pt"), layer(a, t), rtol=0, atol=1e-12)

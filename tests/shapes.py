@@ -1,0 +1,34 @@
+"""Measures of shapes that tests compare."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_modal.geometry.connectivity import Connectivity
+
+
+def largest(x: Tensor) -> float:
+    """Largest absolute number."""
+    return float(x.abs().max())
+
+
+def diagonal(x: Tensor) -> float:
+    """Diagonal of the bounding box, of the largest of several shapes."""
+    return float((x.amax(-2) - x.amin(-2)).norm(dim=-1).max())
+
+
+def apart(x: Tensor, y: Tensor) -> float:
+    """Largest distance of vertices over the diagonal."""
+    return float((x - y).norm(dim=-1).max()) / diagonal(y)
+
+
+def edge_lengths(x: Tensor, faces: Tensor | np.ndarray) -> Tensor:
+    """Lengths of all edges. *Shape:* ``(..., V, 3) -> (..., E)``."""
+    i, j = torch.tensor(Connectivity(np.asarray(faces)).edges).T
+    return (x[..., i, :] - x[..., j, :]).norm(dim=-1)
+
+
+def edge_error(x: Tensor, truth: Tensor, faces: Tensor | np.ndarray) -> float:
+    """Mean relative error of edge lengths."""
+    found, wanted = (edge_lengths(y, faces) for y in (x, truth))
+    return float(((found - wanted).abs() / wanted).mean())

@@ -1,0 +1,69 @@
+"""Energy terms of a user's own."""
+
+import torch
+from torch import Tensor
+
+from torch_modal.energy.term import Mesh, Term
+
+
+class Edges(Term):
+    """Lengths of edges."""
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        return mesh.edges
+
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return edge_vectors[0].norm()
+
+
+class Area(Term):
+    """Areas of all faces, a part of those at rest."""
+
+    part = 1.0
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        return mesh.faces
+
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return 0.5 * torch.linalg.cross(edge_vectors[0], edge_vectors[1]).norm()
+
+    def at_rest(self, measures: Tensor) -> Tensor:
+        return self.part * measures
+
+
+class Spring(Term):
+    """Some vertices of the fine mesh pulled to points of the caller's coordinates."""
+
+    sampled = True
+
+    def __init__(self, vertices: list[int], points: Tensor, stiffness: float | Tensor = 1.0) -> None:
+        super().__init__(stiffness)
+        self.vertices = vertices
+        self.register_buffer("points", points)
+
+    @property
+    def anchors(self) -> Tensor:
+        return self.points
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        places = torch.arange(len(self.vertices))
+        return torch.stack([mesh.first_anchor + places, torch.tensor(self.vertices)], 1)
+
+    def measure(self, edge_vectors: Tensor) -> Tensor:
+        return edge_vectors[0].norm()
+
+    def at_rest(self, measures: Tensor) -> Tensor:
+        return torch.zeros_like(measures)
+
+
+class Pull(Spring):
+    """All vertices of the mesh that the energy is evaluated on, pulled to one point."""
+
+    sampled = False
+
+    def __init__(self, point: Tensor, stiffness: float = 1.0) -> None:
+        super().__init__([], point[None], stiffness)
+
+    def elements(self, mesh: Mesh) -> Tensor:
+        vertices = torch.arange(mesh.n_vertices)
+        return torch.stack([torch.full_like(vertices, mesh.first_anchor), vertices], 1)
