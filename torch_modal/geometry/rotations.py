@@ -125,7 +125,7 @@ def about(half: Tensor) -> Tensor:
 def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean of K rotations, where the weighted sum of their relative logarithms vanishes.
 
-    Of two rotations it is the geodesic. It has first derivatives only.
+    Of two rotations it is a point of the geodesic; of more than two it has first derivatives only.
 
     Args:
         rotations: Quaternions with the signs of :func:`agreeing`. *Shape:* ``(4, ..., K, F)``.
@@ -134,6 +134,9 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(4, ..., F)``.
     """
+    if rotations.shape[-2] == 2:
+        first, second = rotations.unbind(-2)
+        return product(first, power(product(conjugate(first), second), weights[..., 1, :]))
     with torch.no_grad():
         found = (weights * rotations).sum(-2)
         found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)
