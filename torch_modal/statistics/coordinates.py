@@ -22,8 +22,8 @@ from torch_modal.geometry.triangle_frames import (
 # Logarithmic strains beyond this, a factor of 3,000, are those of triangles without area.
 MOST_STRAIN = 8.0
 
-# Triangles below this part of the mean area have the rotation of a neighbour, passed on in so many rounds, and no strain:
-# their own would be rounding.
+# Triangles below this part of the mean area have the rotation of a neighbour, passed on in so many rounds, and no
+# strain: their own would be rounding.
 SMALLEST_AREA, FLAT_ROUNDS = 1e-9, 8
 
 
