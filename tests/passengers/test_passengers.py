@@ -197,11 +197,7 @@ def test_empty_batches_copies_and_inference_mode(bars: Shapes) -> None:
         found = each(shapes)
         torch.testing.assert_close(found, expected)
         found.sum().backward()
-
-
-def test_no_points(bars: Shapes) -> None:
-    passengers = tm.Passengers(bars.keyframes[0], bars.faces, torch.zeros(0, 3))
-    assert passengers(bars.keyframes).shape == (3, 0, 3)
+    assert tm.Passengers(bars.keyframes[0], bars.faces, torch.zeros(0, 3))(bars.keyframes).shape == (3, 0, 3)
 
 
 @pytest.mark.parametrize(

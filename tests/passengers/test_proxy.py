@@ -60,20 +60,19 @@ def test_detail_is_that_of_both_ends(rough: tuple[Tensor, Tensor]) -> None:
     proxy = Proxy(keyframes[:2], faces, 300)
     for passengers, carrier, x in zip(proxy.passengers, proxy.keyframes, keyframes, strict=False):
         torch.testing.assert_close(passengers(carrier), x, rtol=0, atol=1e-12)
-    half = proxy.carried(proxy.keyframes[[0, 0, 0]], [0, 2], keyframes[[0, 1]])
+    # From the first to the last, and from there, as in a cycle, to the first.
+    found = proxy.carried(proxy.keyframes[[0, 0, 0, 0]], [0, 2, 4], keyframes[:2])
     own, other = (passengers(proxy.keyframes[0]) for passengers in proxy.passengers)
-    torch.testing.assert_close(half[1], 0.5 * (own + other))
+    torch.testing.assert_close(found[[1, 3]], 0.5 * (own + other).expand(2, -1, -1))
 
 
-@pytest.mark.parametrize("proxy, words", [(-1, "from 100 on"), (20, "from 100 on"), (0.5, "from 100 on")])
-def test_sizes(bars: Shapes, proxy: float, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize("proxy", [-1, 20, 0.5])
+def test_sizes(bars: Shapes, proxy: float) -> None:
+    with pytest.raises(ValueError, match="from 100 on"):
         tm.subdivide(bars.keyframes, bars.faces, proxy=proxy)  # type: ignore[arg-type]
-
-
-def test_bases_of_the_whole_mesh(bars: Shapes) -> None:
     with pytest.raises(ValueError, match="bases belong to the whole mesh"):
         tm.subdivide(bars.keyframes, bars.faces, bases=bars.bases, proxy=120)
+    assert [proxy_size(None, n) for n in (100_000, 100_001)] == [0, 20_000]
 
 
 def test_the_command(rough: tuple[Tensor, Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,15 +83,6 @@ def test_the_command(rough: tuple[Tensor, Tensor], tmp_path: Path, capsys: pytes
     assert "moved by a proxy of 30" in capsys.readouterr().out
     frames = tm.load_keyframes(sorted((tmp_path / "out").glob("frame-*.obj"))).keyframes
     assert len(frames) == 3 and torch.equal(frames[[0, 2]], keyframes[:2])
-
-
-def test_detail_of_the_last_interval_of_a_cycle(rough: tuple[Tensor, Tensor]) -> None:
-    """From the last key-frame's to the first one's."""
-    keyframes, faces = rough
-    proxy = Proxy(keyframes[:2], faces, 300)
-    found = proxy.carried(proxy.keyframes[[0, 0, 0, 0]], [0, 2, 4], keyframes[:2])
-    first, last = (passengers(proxy.keyframes[0]) for passengers in proxy.passengers)
-    torch.testing.assert_close(found[3], 0.5 * (last + first))
 
 
 def test_each_vertex_follows_its_own_part() -> None:
@@ -106,7 +96,3 @@ def test_each_vertex_follows_its_own_part() -> None:
     moved = proxy.keyframes[0] + torch.tensor([0.0, 0.0, 5.0]) * inner[:, None]
     found = proxy.passengers[0](moved) - both
     torch.testing.assert_close(found[: len(x)], torch.zeros_like(x), rtol=0, atol=1e-9)
-
-
-def test_large_meshes_have_a_proxy() -> None:
-    assert [proxy_size(None, n) for n in (100_000, 100_001)] == [0, 20_000]

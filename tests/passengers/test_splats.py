@@ -98,24 +98,19 @@ class TestCarry:
         self, meshes: list[str], bars: Shapes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         write_splats(tmp_path / "scene.ply", bars.keyframes[0].numpy())
-        assert (
-            cli.main(["carry", *meshes, "--points", str(tmp_path / "scene.ply"), "--out", str(tmp_path / "out")]) == 0
-        )
+        out = tmp_path / "out"
+        command = ["carry", *meshes, "--points", str(tmp_path / "scene.ply"), "--out", str(out)]
+        assert cli.main(command) == 0
         assert "164 splats" in capsys.readouterr().out
-        found = trimesh.load(tmp_path / "out" / "scene-0001.ply")
+        before = (out / "scene-0001.ply").read_bytes()
+        assert cli.main(command) == 1, "nothing is overwritten"
+        assert (out / "scene-0001.ply").read_bytes() == before
+        found = trimesh.load(out / "scene-0001.ply")
         np.testing.assert_allclose(found.vertices, bars.keyframes[1], atol=1e-5)
         scan = trimesh.PointCloud(bars.keyframes[0].numpy() * 1.01)
         (tmp_path / "scan.ply").write_bytes(scan.export(file_type="ply", encoding="ascii"))
-        assert cli.main(["carry", *meshes, "--points", str(tmp_path / "scan.ply"), "--out", str(tmp_path / "out")]) == 0
-        assert len(trimesh.load(tmp_path / "out" / "scan-0000.ply").vertices) == 164
-
-    def test_nothing_is_overwritten(self, meshes: list[str], bars: Shapes, tmp_path: Path) -> None:
-        write_splats(tmp_path / "scene.ply", bars.keyframes[0].numpy())
-        command = ["carry", *meshes, "--points", str(tmp_path / "scene.ply"), "--out", str(tmp_path / "out")]
-        assert cli.main(command) == 0
-        before = (tmp_path / "out" / "scene-0001.ply").read_bytes()
-        assert cli.main(command) == 1
-        assert (tmp_path / "out" / "scene-0001.ply").read_bytes() == before
+        assert cli.main(["carry", *meshes, "--points", str(tmp_path / "scan.ply"), "--out", str(out)]) == 0
+        assert len(trimesh.load(out / "scan-0000.ply").vertices) == 164
 
     def test_a_file_without_points(self, meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (tmp_path / "scene.ply").write_text("nothing")

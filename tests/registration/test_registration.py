@@ -207,13 +207,6 @@ def test_flaws_of_the_target(pair: tuple[Mesh, Mesh, np.ndarray], flaw: str) -> 
     assert torch.isfinite(result.positions).all()
 
 
-def test_another_body_is_doubtful(pair: tuple[Mesh, Mesh, np.ndarray]) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    result = register(*pair[0], np.array(ball.vertices), np.array(ball.faces), progress=False)
-    assert result.doubtful
-    assert any("landmarks" in line for line in result.warnings)
-
-
 def test_mirrored_landmarks_are_doubtful(pair: tuple[Mesh, Mesh, np.ndarray]) -> None:
     """The template and its mirror image: the map of right distances turns the surface over."""
     rest, faces = pair[0]
@@ -291,7 +284,7 @@ def test_pieces_and_winding() -> None:
     rest, faces = limbs(2)
     both = MeshSurface(np.vstack([rest, 0.1 * rest]), np.vstack([faces, faces + len(rest)]))
     assert len(largest_pieces(both).vertices) == len(rest)
-    np.testing.assert_array_equal(outward(rest, faces), outward(rest, faces[:, ::-1])[:, ::-1][:, ::-1][:, [0, 1, 2]])
+    np.testing.assert_array_equal(outward(rest, faces), outward(rest, faces[:, ::-1]))
     small, used = referenced(rest, faces[:4])
     np.testing.assert_array_equal(small.vertices, rest[used])
 
@@ -485,14 +478,6 @@ def test_skin_that_stretches_is_found_with_landmarks() -> None:
     import registration
 
     assert registration.one("creature", 3, 0, "non-manifold", 1017, True)["mean"] < 1.2
-
-
-@pytest.mark.slow
-def test_hand_in_another_pose(data_dir: Path) -> None:
-    import registration
-
-    row = registration.one("mh-hand", 0, 3, "none", 3, False)
-    assert row["confidence"] >= 0.5 and row["mean"] < 1.3 and row["p95"] < 4.0
 
 
 @pytest.mark.slow

@@ -162,20 +162,13 @@ def test_second_derivatives_are_refused(space: tm.ShapeSpace, bars: Shapes) -> N
         torch.autograd.grad(space.fit(leaf, picked).shape.sum(), leaf, create_graph=True)
 
 
-@pytest.mark.parametrize("scale", [1e3, 1e-3])
-def test_points_in_other_units(space: tm.ShapeSpace, bars: Shapes, scale: float) -> None:
-    picked = markers(bars.keyframes[1], 12)
-    with pytest.raises(ValueError, match="in other units"):
-        space.fit(scale * bars.keyframes[1][picked], picked)
-
-
 def test_a_keyframe_comes_back(space: tm.ShapeSpace, bars: Shapes) -> None:
     picked = markers(bars.keyframes[1])
-    for near in (None, 1, torch.tensor([0.0, 1.0, 0.0])):
+    for near in (None, torch.tensor([0.0, 1.0, 0.0])):
         assert far(space.fit(bars.keyframes[1][picked], picked, near=near).shape, bars.keyframes[1]) < 0.01
 
 
-@pytest.mark.parametrize("near", [0, 1, 2, -1])
+@pytest.mark.parametrize("near", [0, 2, -2])
 def test_what_points_leave_open_is_as_in_the_likely_key_frame(space: tm.ShapeSpace, bars: Shapes, near: int) -> None:
     """Three corners of one triangle say where the shape is and nothing of its pose."""
     picked = bars.faces[0]
@@ -231,6 +224,13 @@ def test_arguments_that_do_not_fit(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         space.fit(points, vertices, near=near)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e-3])
+def test_points_in_other_units(space: tm.ShapeSpace, bars: Shapes, scale: float) -> None:
+    picked = markers(bars.keyframes[1], 12)
+    with pytest.raises(ValueError, match="in other units"):
+        space.fit(scale * bars.keyframes[1][picked], picked)
 
 
 class TestPatches:

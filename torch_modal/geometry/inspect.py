@@ -102,7 +102,7 @@ def principal_extents(points: FloatArray) -> FloatArray:
 
 
 def is_flat(points: FloatArray) -> bool:
-    """Whether points lie in a plane. *Shape:* ``(V, 3)``."""
+    """True for points in a plane. *Shape:* ``(V, 3)``."""
     extents = principal_extents(points)
     return bool(extents[2] <= FLATNESS * extents[0])
 

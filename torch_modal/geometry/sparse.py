@@ -108,7 +108,7 @@ def _free_factors() -> None:
 
 @cache
 def _is_served(device: torch.device) -> bool:
-    """Whether ``cholespy`` supports the device: the first GPU, if the driver library is found by its plain name."""
+    """True for devices of ``cholespy``: the first GPU only if the driver library is found by its plain name."""
     if device.type != "cuda" or device.index or cholespy is None or torch.version.cuda is None:
         return device.type == "cpu"
     try:

@@ -63,7 +63,7 @@ class LatentElasticity(nn.Module):
         way in which they move.
 
         Args:
-            decoder: Of latents ``(B, n)`` into shapes ``(B, V, 3)``, each for itself: no normalisation over the batch.
+            decoder: Maps latents ``(B, n)`` to shapes ``(B, V, 3)``, each for itself: no normalisation over the batch.
             z: *Shape:* ``(..., n)``.
             generator: Source of random directions.
 
@@ -137,7 +137,7 @@ class PathEnergy(nn.Module):
         """The energy of each path.
 
         Args:
-            decoder: Of latents ``(B, n)`` into shapes ``(B, V, 3)``.
+            decoder: Maps latents ``(B, n)`` to shapes ``(B, V, 3)``.
             codes: T of 2 or more. *Shape:* ``(..., T, n)``.
 
         Returns:

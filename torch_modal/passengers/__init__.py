@@ -1,1 +1,1 @@
-"""What shapes carry: points, splats and fine meshes that follow a coarser one."""
+"""Points, splats and fine meshes that follow a coarser shape."""

@@ -30,7 +30,7 @@ def binding(
 
     Args:
         points: *Shape:* ``(P, 3)``.
-        vertices: Of the carrier. *Shape:* ``(V, 3)``.
+        vertices: Vertices of the carrier. *Shape:* ``(V, 3)``.
         faces: *Shape:* ``(F, 3)``.
         anchors: Known vertex of the carrier near each point, -1 where none is known. *Shape:* ``(P,)``.
 

@@ -19,7 +19,7 @@ def proxy_size(wanted: int | None, n_vertices: int) -> int:
 
     Args:
         wanted: As for :func:`torch_modal.subdivide`.
-        n_vertices: Of the mesh.
+        n_vertices: Number of vertices of the mesh.
 
     Raises:
         ValueError: ``wanted`` is out of range.
@@ -44,7 +44,7 @@ class Proxy:
     def __init__(self, keyframes: Tensor, faces: Tensor, n_vertices: int) -> None:
         fine = keyframes.detach().double().cpu()
         coarse = coarsen(fine.numpy(), faces.detach().cpu().numpy(), 2 * n_vertices)
-        #: Of the carrier. *Shape:* ``(F_coarse, 3)``.
+        #: Faces of the carrier. *Shape:* ``(F_coarse, 3)``.
         self.faces = torch.from_numpy(coarse.faces)
         own = torch.from_numpy(coarse.restrict(fine.numpy()))
         first = Passengers(own[0], self.faces, fine[0], torch.from_numpy(coarse.clusters))
@@ -61,7 +61,7 @@ class Proxy:
         Args:
             shapes: *Shape:* ``(T, V_coarse, 3)``.
             places: Frames of the key-frames; one more than there are, if the first comes again.
-            keyframes: What is put there. *Shape:* ``(K, V, 3)``.
+            keyframes: Key-frames at these places. *Shape:* ``(K, V, 3)``.
 
         Returns:
             *Shape:* ``(T, V, 3)``.

@@ -96,7 +96,7 @@ def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | Fl
 
     Args:
         path: A text file. Each line names one vertex of each mesh, counted from 0, or gives three coordinates for each.
-        n_meshes: How many meshes the landmarks are for.
+        n_meshes: Number of meshes.
 
     Returns:
         Vertices, int64, *shape* ``(n, n_meshes)``, or points, float64, *shape* ``(n, n_meshes, 3)``.

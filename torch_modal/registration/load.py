@@ -45,7 +45,7 @@ def load_keyframes(
         same_subject: True for poses of one body; different bodies need five landmarks or more.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Keep registrations on disk, and find them there.
-        progress: Of the registration, see :data:`torch_modal.progress.Progress`.
+        progress: Progress of registrations, see :data:`torch_modal.progress.Progress`.
         report: Called with a line about each registration.
 
     Returns:

@@ -27,9 +27,9 @@ class Distances(NamedTuple):
     mean: float
     """Area-weighted mean."""
     percentile_95: float
-    """Of the vertices."""
+    """95th percentile over the vertices."""
     max: float
-    """Of the vertices."""
+    """Maximum over the vertices."""
 
     @classmethod
     def between(cls, surface: MeshSurface, other: MeshSurface, diagonal: float) -> "Distances":

@@ -1,1 +1,1 @@
-"""What a handful of shapes has in common: mean, components, further members, and poses that meet observations."""
+"""Statistics of a handful of shapes: mean, components, further members, and poses that meet observations."""

@@ -22,8 +22,8 @@ from torch_modal.geometry.triangle_frames import (
 # Logarithmic strains beyond this, a factor of 3,000, are those of triangles without area.
 MOST_STRAIN = 8.0
 
-# Triangles smaller than this part of the mean turn as a neighbour does, from neighbour to neighbour at most so often,
-# and do not stretch: their own rotations and strains would be rounding.
+# Triangles below this part of the mean area have the rotation of a neighbour, passed on in so many rounds, and no
+# strain: their own would be rounding.
 SMALLEST_AREA, FLAT_ROUNDS = 1e-9, 8
 
 
@@ -33,9 +33,9 @@ class BendingCoordinates:
     Sums and multiples of them are shapes again: edges keep their lengths where triangles turn. They are the
     rotation-strain coordinates of Huang et al. 2011 with finite rotations in the place of infinitesimal ones.
 
-    What no triangle says has columns of its own, after those of the triangles: for each piece but the largest, how far
-    its centre is from where the vertices that it follows take it, and for each vertex of no face, how far it moves;
-    in sizes of the mean. E is the number of all columns.
+    After the columns of the triangles there is one for each piece but the largest, the offset of its centre from the
+    motion of the vertices that it follows, and one for each vertex of no face, its displacement; in sizes of the mean.
+    E is the number of all columns.
 
     Args:
         mean: The shape whose coordinates are zero, float64 on the CPU. *Shape:* ``(V, 3)``.
@@ -94,7 +94,7 @@ class BendingCoordinates:
         return torch.cat([on_faces, torch.cat([offsets, torch.zeros_like(offsets)], 1)], 2)
 
     def _followed(self, shapes: Tensor) -> list[tuple[Tensor, RigidMotion]]:
-        """Where the vertices that it follows take the centre of each loose piece. *Shape:* ``(B, V, 3)``."""
+        """Centre and motion of each loose piece, by the vertices that it follows. *Shape:* ``(B, V, 3)``."""
         found = []
         for row, (_, anchors) in zip(self.centres, self.reconstruction.loose, strict=True):
             before = self.mean[anchors].expand(len(shapes), -1, -1)
@@ -107,7 +107,7 @@ class BendingCoordinates:
         return torch.cat([fields[..., self.faces].mean(-1), fields @ self.centres.mT, fields[..., self._unused]], -1)
 
     def carries(self, vertices: Tensor) -> Tensor:
-        """Whether each column beyond those of the triangles moves a vertex. *Shape:* ``(n,) -> (n, E - F)``."""
+        """Columns beyond those of the triangles that move a vertex, as a mask. *Shape:* ``(n,) -> (n, E - F)``."""
         return torch.cat([self.centres[:, vertices].mT > 0, vertices[:, None] == self._unused], 1)
 
     def aligned(self, shapes: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ class BendingCoordinates:
         return best_fit(shapes, self.mean.expand_as(shapes), self.reconstruction.areas).apply(shapes)
 
     def sides(self, coordinates: Tensor) -> Sides:
-        """The sides that triangles ask for. *Shape:* ``(B, 6, E)``."""
+        """Target sides of the triangles. *Shape:* ``(B, 6, E)``."""
         rows = coordinates[..., : len(self.faces)].movedim(1, 0)
         return bent_sides(BentTriangles(rows[:3], (rows[3], rows[4], rows[5])), self.frames)
 
@@ -140,8 +140,8 @@ class Components:
     Args:
         coordinates: About the mean.
         bending: Those of the given shapes. *Shape:* ``(K, 6, E)``.
-        n: How many, at most one less than there are shapes.
-        origin: What was subtracted from the shapes. *Shape:* ``(3,)``.
+        n: Number of components, at most K - 1.
+        origin: Point that was subtracted from the shapes. *Shape:* ``(3,)``.
     """
 
     @lasting
@@ -158,7 +158,7 @@ class Components:
         self.variances = values.square() / max(len(bending) - 1, 1)
         #: Part of the whole variance that each has. *Shape:* ``(n,)``.
         self.shares = values.square() / off.square().sum().clamp_min(torch.finfo(off.dtype).tiny)
-        #: Of root mean square one over the area. *Shape:* ``(n, 6, E)``.
+        #: Directions of root mean square one over the area. *Shape:* ``(n, 6, E)``.
         self.directions = torch.einsum(
             "kn,kjf->njf", left / values.clamp_min(torch.finfo(off.dtype).tiny), bending - self._average
         )

@@ -68,7 +68,7 @@ class Variation:
             mean = coordinates.shapes(coordinates.of(shapes).mean(0, keepdim=True))[0]
         self.coordinates = BendingCoordinates(mean, faces)
         self.faces = faces
-        #: Of the mean, in the caller's units.
+        #: Size of the mean, in the caller's units.
         self.size = self.coordinates.size
         #: The given shapes, turned on to the mean. *Shape:* ``(K, V, 3)``.
         self.shapes = self.coordinates.aligned(shapes)
@@ -86,7 +86,7 @@ class Variation:
         closed = all(encloses(x, mesh.connectivity) for x in self.shapes)
         #: Measures of the given shapes, at a size of 100.
         self.rest = self.fine.energy.rest_of(self.scale * self.shapes)
-        #: Of the three terms of Eq. 5. *Shape of each:* ``(1, 1)``.
+        #: Stiffnesses of the three terms of Eq. 5. *Shape of each:* ``(1, 1)``.
         self.stiffness = [mean.new_full((1, 1), value) for value in (ALPHA, BETA, GAMMA if closed else 0.0)]
 
     def __len__(self) -> int:
@@ -142,8 +142,8 @@ class Variation:
         add up to one.
 
         Args:
-            weights: Of the shape. *Shape:* ``(K,)``.
-            factors: Of :meth:`draw`. *Shape:* ``(K, n - 1)``.
+            weights: Weights of the given shapes. *Shape:* ``(K,)``.
+            factors: Factors from :meth:`draw`. *Shape:* ``(K, n - 1)``.
 
         Returns:
             *Shape:* ``(V, 3)``, ``(K, V)``.
@@ -171,7 +171,7 @@ class Patches:
 
     Args:
         mean: A shape. *Shape:* ``(V, 3)``.
-        reconstruction: Of its connectivity; its loose pieces are as far from the others as they are in space.
+        reconstruction: Poisson problem of the connectivity; gaps to loose pieces are measured in space.
     """
 
     def __init__(self, mean: Tensor, reconstruction: Reconstruction) -> None:
@@ -191,7 +191,7 @@ class Patches:
         bumps = torch.exp(-2 * (distances / max(reach, np.finfo(float).tiny)) ** 2)
         #: Part of each vertex that belongs to each patch. *Shape:* ``(P, V)``.
         self.shares = bumps / bumps.sum(0).clamp_min(torch.finfo(bumps.dtype).tiny)
-        #: Of the vertices in each patch; they add up to one. *Shape:* ``(P, V)``.
+        #: Masses of the vertices in each patch, with sum one. *Shape:* ``(P, V)``.
         self.masses = bumps * reconstruction.areas
         self.masses = self.masses / self.masses.sum(1, keepdim=True).clamp_min(torch.finfo(bumps.dtype).tiny)
         #: Along the surface, between centres. *Shape:* ``(P, P)``.
