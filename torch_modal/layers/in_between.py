@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, full_precision, lasting, outlasting, require_numbers, transformed
-from torch_modal.contact.rounds import ContactRounds
+from torch_modal.contact.in_between import ContactBetween
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
 from torch_modal.geometry.crossings import require_contact
@@ -118,7 +118,7 @@ class InBetween(nn.Module):
     @property
     def kind(self) -> type[Between]:
         """What the members are."""
-        return ContactRounds if self.objective.contact else Between
+        return ContactBetween if self.objective.contact else Between
 
     @property
     def places(self) -> Sequence[Sequence[int]]:

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers
-from torch_modal.contact.search import refuse_transforms
-from torch_modal.contact.trajectory import push_apart
+from torch_modal.contact.active import refuse_transforms
+from torch_modal.contact.in_between import push_apart
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.hermite import Tangents, around, located, wrapped
 from torch_modal.inbetween.samples import InBetweenResult, Samples

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.backends.choice import choose
-from torch_modal.contact.trajectory import push_apart
+from torch_modal.contact.in_between import push_apart
 from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact
