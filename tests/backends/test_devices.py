@@ -21,7 +21,7 @@ from torch_modal.inbetween.samples import Samples
 
 import torch_modal as tm
 from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
-from torch_modal.contact.search import Contacts
+from torch_modal.contact.active import ContactEnergy, Contacts
 from torch_modal.energy.energy import Energy
 from torch_modal.geometry.rigid import RigidMotion
 from torch_modal.inbetween.settings import PRESETS
@@ -107,11 +107,6 @@ def assert_there(tree: Any) -> None:
             assert_there(part)
 
 
-def contacts(mode: FakeTensorMode) -> Contacts:
-    """Two samples, of which each holds a vertex."""
-    return Contacts(torch.arange(2, device="cuda"), there(ELEMENTS, mode), blank(2, 2), blank(2, 2))
-
-
 def steps(energy: Energy, x: Tensor, reference: Any) -> None:
     """All that a step of all vertices does but for its length."""
     rows = energy.extend(x.movedim(-1, 0).contiguous())
@@ -176,6 +171,6 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
 
 def test_contacts() -> None:
     with gpu() as mode, torch.no_grad():
-        held = contacts(mode)
-        assert_there(held.rows(torch.tensor([1], device="cuda")))
-        assert_there(held.of_all(torch.arange(2, device="cuda")))
+        x, contacts = blank(2, 30, 3), Contacts(torch.arange(2, device="cuda"), there(ELEMENTS, mode))
+        energy = ContactEnergy(contacts, blank(30), x)
+        assert_there([energy.missing(x), energy.value(x)])

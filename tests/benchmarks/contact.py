@@ -1,16 +1,15 @@
-"""Contact: what is left of crossings, what it costs, whether it pops, and key-frames that pass through themselves.
+"""Contact: intersections that are left, cost, and accelerations.
 
     python tests/benchmarks/contact.py
     python tests/benchmarks/contact.py --cases hand legs --rows crossings cost
     python tests/benchmarks/contact.py --pictures docs/images
 
 Each case is two key-frames, subdivided into 33 shapes with and without contact. *Far* pairs of triangles are those of
-parts that went through each other (docs/contact.md); of those that are left, *new* are the ones of which neither
-triangle has a corner that is inside in a key-frame. Energies are those of Eq. 5 without the contact term, at each time
-between both key-frames, over those without contact, and over those without contact after as many steps of all vertices
-(``steps``, the sum and the most of a shape). Times are of the processor, with one thread. The legs are the sample
-creature's, made by ``examples/make_samples.py``: they swing past each other in one line. Draws are those of
-``draws.py``; gradients are compared with central differences, with what is held kept.
+parts that pass through each other (docs/contact.md). Energies are those of Eq. 5 without the contact term, at each time
+between both key-frames, over those without contact after as many steps of all vertices (the sum, and the most of a
+shape). Times are of the processor, with one thread. The legs are the sample creature's, made by
+``examples/make_samples.py``: they swing past each other in one line. Gradients are compared with central differences,
+with the active contacts kept. Random draws with contact: ``draws.py --contact``.
 """
 
 import argparse
@@ -28,10 +27,9 @@ from threads import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.contact.trajectory import ROUNDS
+from torch_modal.contact.active import ContactSearch
+from torch_modal.contact.separate import ROUNDS
 from torch_modal.data.samples import load_sample
-from torch_modal.geometry.connectivity import Connectivity
-from torch_modal.geometry.crossings import Crossings
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LEVELS = 5
@@ -135,54 +133,24 @@ def peak(frames: Tensor) -> float:
 
 def crossings(names: list[str]) -> Iterator[tuple[Case, Run]]:
     """The main table."""
-    head = ("far, sum", "most", "left", "frames", "new", "energy", "steps", "most", "peak", "ratio", "s", "times")
+    head = ("far, sum", "most", "left", "frames", "deepest", "energy", "most", "peak", "ratio", "s", "times")
     print(f"\n{'':16s}" + "".join(f"{word:>10s}" for word in head))
     for name in names:
         case = CASES[name]()
         if case is None:
             continue
         found = run(case)
-        contacts = [
+        before, after = (
             tm.self_contacts(frames, case.faces, ignore=case.keyframes) for frames in (found.plain, found.apart)
-        ]
-        before, after = (each.n_far for each in contacts)
-        new = (~inside(case)[case.faces[contacts[1].pairs[contacts[1].far]]]).flatten(1).all(1)
-        plain, apart, polished = (energies(x, case) for x in (found.plain, found.apart, found.polished))
+        )
+        deepest = 100 * float(after.depth.max() / (case.keyframes[0].amax(0) - case.keyframes[0].amin(0)).norm())
+        apart, polished = (energies(x, case) for x in (found.apart, found.polished))
         peaks = peak(found.plain), peak(found.apart)
-        line = f"{case.name:16s}{int(before.sum()):10d}{int(before.max()):10d}{int(after.sum()):10d}"
-        line += (
-            f"{int((after > 0).sum()):10d}{int(new.sum()):10d}{float(apart.sum() / plain.sum()):10.4f}"
-            f"{float(apart.sum() / polished.sum()):10.4f}{float((apart / polished).max()):10.4f}"
-        )
-        line += f"{peaks[1]:8.3f} %{peaks[1] / peaks[0]:10.2f}{found.seconds[1]:10.2f}"
-        print(line + f"{found.seconds[1] / found.seconds[0]:10.2f}", flush=True)
-        shapes_left(case, found, before, after, contacts[0].depth)
+        line = f"{case.name:16s}{int(before.n_far.sum()):10d}{int(before.n_far.max()):10d}{int(after.n_far.sum()):10d}"
+        line += f"{int((after.n_far > 0).sum()):10d}{deepest:8.2f} %{float(apart.sum() / polished.sum()):10.4f}"
+        line += f"{float((apart / polished).max()):10.4f}{peaks[1]:8.3f} %{peaks[1] / peaks[0]:10.2f}"
+        print(line + f"{found.seconds[1]:10.2f}{found.seconds[1] / found.seconds[0]:10.2f}", flush=True)
         yield case, found
-
-
-def shapes_left(case: Case, found: Run, before: Tensor, after: Tensor, depth: Tensor) -> None:
-    """Shapes with far pairs left: how deep they were without contact, and how far sides could have been moved.
-
-    A displacement that vanishes at both key-frames and is accelerated by at most ``A`` is at most ``A k (n - k) / 2``
-    after ``k`` of ``n`` frames; ``A`` is 1.3 times the peak, so that it is for vertices with no acceleration of their
-    own.
-    """
-    diagonal = float((case.keyframes[0].amax(0) - case.keyframes[0].amin(0)).norm())
-    n, most = len(after) - 1, 1.3 * peak(found.plain)
-    for k in torch.nonzero(after).flatten().tolist():
-        deep, room = 100 * float(depth[k].max()) / diagonal, most * k * (n - k) / 2
-        allowed = "one side" if deep <= room else "both sides" if deep <= 2 * room else "no"
-        print(
-            f"    shape {k:2d}: {int(before[k]):4d} pairs without, {int(after[k]):4d} with; {deep:.2f} % deep without, "
-            f"room of a side {room:.2f} %: allowed for {allowed}",
-            flush=True,
-        )
-
-
-def inside(case: Case) -> Tensor:
-    """Vertices that are inside the surface in a key-frame. *Shape:* ``(V,)``."""
-    mesh = Connectivity(case.faces.numpy(), case.keyframes.shape[1])
-    return torch.from_numpy(Crossings(mesh, case.keyframes.double().numpy()).known_inside)
 
 
 def edges(case: Case, found: Run) -> None:
@@ -228,39 +196,32 @@ def untouched() -> None:
     print(f"\nnothing touches ({case.name}): {found.seconds[1] / found.seconds[0]:.2f} times, same shapes: {same}")
 
 
-def draws() -> None:
-    """How many random in-betweens have new crossings, without and with contact."""
-    import draws as drawn
-
-    print("\nrandom in-betweens, without and with contact")
-    for name, n in (("hand", 100), ("woman", 40)):
-        for contact in (False, True):
-            print(f"{name + (', contact' if contact else ''):18s}", end="")
-            drawn.measure(name, n, n, ["RandomInBetween"], contact)
-
-
 def gradients() -> None:
     """Of a weighted sum of the sample hand's vertices at t = 7/8, against central differences."""
-    from torch_modal.contact.rounds import ContactRounds
-
     case = sample_hand()
     layer = tm.InBetween(tm.extract_bases(case.keyframes, case.faces, 20, progress=False), case.faces, contact=True)
-    search, first = ContactRounds.found, []
+    search, found = ContactSearch.__call__, []
+    calls = 0
 
     def held(*given: Any) -> Any:
-        first.extend([] if first else [search(*given)])
-        return first[0]
+        nonlocal calls
+        if calls == len(found):
+            found.append(search(*given))
+        calls += 1
+        return found[calls - 1]
 
     def shape(given: list[Tensor]) -> Tensor:
+        nonlocal calls
+        calls = 0
         return layer(given[0], given[1], given[2])
 
     x_a, x_b = case.keyframes
     weights, way = torch.cos(7 * x_a), 0.01 * torch.sin(9 * x_a + 1)
     given = [x.clone().requires_grad_() for x in (x_a, x_b, torch.tensor(0.875, dtype=x_a.dtype))]
     try:
-        ContactRounds.found = held  # type: ignore[method-assign]
-        found = torch.autograd.grad((shape(given) * weights).sum(), given)
-        print(f"\ngradients with {int((first[0].rounds[-1].weights > 0).sum())} vertices held, relative difference")
+        ContactSearch.__call__ = held  # type: ignore[method-assign]
+        gradient = torch.autograd.grad((shape(given) * weights).sum(), given)
+        print(f"\ngradients with {len(found[0][0].shapes)} vertices held, relative difference")
         parts = (("first key-frame", way, 1e-4), ("second", way, 1e-4), ("t", torch.ones_like(given[2]), 1e-6))
         for i, (name, moved, size) in enumerate(parts):
             values = []
@@ -268,44 +229,9 @@ def gradients() -> None:
                 there = [x.detach() + sign * size * moved if k == i else x.detach() for k, x in enumerate(given)]
                 values.append(float((shape([x.requires_grad_() for x in there]).detach() * weights).sum()))
             true = (values[0] - values[1]) / (2 * size)
-            print(f"  {name:16s}{abs(float((found[i] * moved).sum()) / true - 1):10.1e}", flush=True)
+            print(f"  {name:16s}{abs(float((gradient[i] * moved).sum()) / true - 1):10.1e}", flush=True)
     finally:
-        ContactRounds.found = search  # type: ignore[method-assign]
-
-
-def selfish(sizes: tuple[int, ...] = (10, 100, 1000)) -> None:
-    """Key-frames of the hand that pass through themselves: fingertips are moved into what is beside them."""
-    case = sample_hand()
-    bases = tm.extract_bases(case.keyframes, case.faces, 30, progress=False)
-    print(f"\nkey-frames that cross{'pairs':>12s}{'far':>8s}{'left':>8s}{'said':>8s}{'s':>8s}")
-    for wanted in sizes:
-        keyframes = crossed(case, wanted)
-        number = int(tm.self_contacts(keyframes[0], case.faces).number)
-        own = Case("", keyframes, case.faces)
-        plain, _ = subdivided(own, bases, contact=False)
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            apart, seconds = subdivided(own, bases, contact=True)
-        far = [int(tm.self_contacts(x, case.faces, ignore=keyframes).n_far.sum()) for x in (plain, apart)]
-        told = any("key-frame 0 passes through itself" in str(warning.message) for warning in said)
-        print(f"{wanted:21d}{number:12d}{far[0]:8d}{far[1]:8d}{'yes' if told else 'no':>8s}{seconds:8.1f}", flush=True)
-
-
-def crossed(case: Case, wanted: int) -> Tensor:
-    """The key-frames, with the fingers of the first pushed together until so many pairs cross."""
-    keyframes = case.keyframes.clone()
-    x = case.keyframes[0]
-    height = ((x[:, 1] - 0.45) / 0.3).clamp(0, 1)  # the fingers
-    low, high = 0.0, 1.2
-    for _ in range(12):
-        middle = (low + high) / 2
-        moved = x.clone()
-        moved[:, 0] = x[:, 0] * (1 - middle * height)
-        number = int(tm.self_contacts(moved, case.faces).number)
-        low, high = (middle, high) if number < wanted else (low, middle)
-    keyframes[0] = x
-    keyframes[0, :, 0] = x[:, 0] * (1 - high * height)
-    return keyframes
+        ContactSearch.__call__ = search  # type: ignore[method-assign]
 
 
 def pictures(folder: Path, case: Case, found: Run) -> None:
@@ -341,9 +267,7 @@ if __name__ == "__main__":
     limit_threads()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
-    parser.add_argument(
-        "--rows", nargs="+", default=["crossings", "singles", "cost", "keyframes", "draws", "gradients"]
-    )
+    parser.add_argument("--rows", nargs="+", default=["crossings", "singles", "cost", "gradients"])
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the sample hand and the legs")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -357,9 +281,5 @@ if __name__ == "__main__":
         singles(given.cases)
     if "cost" in given.rows:
         untouched()
-    if "keyframes" in given.rows:
-        selfish()
     if "gradients" in given.rows:
         gradients()
-    if "draws" in given.rows:
-        draws()

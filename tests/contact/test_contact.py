@@ -1,4 +1,4 @@
-"""In-betweens whose parts are kept from passing through each other: alone, as a course, and their gradients."""
+"""In-betweens whose parts do not pass through each other: alone, along a trajectory, and their gradients."""
 
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,14 @@ from torch_modal.inbetween.samples import Samples
 import torch_modal as tm
 from torch_modal import trees
 from torch_modal.cli import main as cli
-from torch_modal.contact import rounds as contact_rounds
-from torch_modal.contact import together
-from torch_modal.contact import trajectory as contact
+from torch_modal.contact import in_between as contact_layer
+from torch_modal.contact import modal, separate
 from torch_modal.contact.acceleration import AccelerationLimit
-from torch_modal.contact.active import ActiveContacts, Pull, settled
-from torch_modal.contact.detect import Search, _nearest_faces
-from torch_modal.contact.rounds import ContactRounds
-from torch_modal.contact.search import Contacts, ContactSearch
-from torch_modal.contact.splines import splines, through
+from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
+from torch_modal.contact.detect import _nearest_faces
+from torch_modal.contact.separate import Trajectory, through
 from torch_modal.data.samples import load_sample, sample_files
-from torch_modal.energy.contact import Contact
-from torch_modal.energy.energy import Energy, Reference
-from torch_modal.energy.term import Mesh, Term
+from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
 from torch_modal.motion import path as path_module
@@ -71,46 +66,47 @@ def stuck_in_first(hand: Shapes) -> Shapes:
     return Shapes(crossed, hand.faces, hand.bases)
 
 
-# ---------------------------------------------------------------------------------------------------------------- term
-def test_term_measures_the_height_over_a_plane(generator: torch.Generator) -> None:
-    x = torch.randn(9, 3, dtype=DOUBLE, generator=generator)
-    elements = torch.tensor([[0, 1, 2, 5], [3, 4, 5, 8], [6, 7, 8, 0]])
-    energy = Energy(Mesh.of(torch.tensor([[0, 1, 2], [3, 4, 5], [6, 7, 8]]), 9), [Contact(elements)], sampled=True)
-    heights = energy.parts[0].measures(energy.parts[0].edge_vectors(energy.extend(x[energy.vertices].T)))
-    for (a, b, c, v), height in zip(x[elements].unbind(0), heights, strict=True):
-        normal = torch.linalg.cross(b - a, c - a)
-        assert float(height) == pytest.approx(float((v - b) @ normal / normal.norm()), abs=1e-12)
-
-
-def test_term_has_the_derivatives_of_torch_func(generator: torch.Generator) -> None:
-    edge_vectors = torch.randn(3, 3, 2, 5, dtype=DOUBLE, generator=generator)
-    term = Contact(torch.zeros(5, 4, dtype=torch.int64))
-    torch.testing.assert_close(term.gradients(edge_vectors), Term.gradients(term, edge_vectors), rtol=1e-12, atol=1e-12)
-
-
-def test_a_pull_has_the_derivatives_of_its_value(generator: torch.Generator) -> None:
-    x, places, field = torch.randn(3, 2, 5, 3, dtype=DOUBLE, generator=generator)
-    pull = Pull(places, torch.rand(5, dtype=DOUBLE, generator=generator))
-    at = pull.at(x)
-    torch.testing.assert_close(at.value, (pull.weights * ((x - places) ** 2).sum(-1)).sum(-1))
-    gradient, product = torch.func.jvp(torch.func.grad(lambda x: pull.value(x).sum()), (x,), (field,))
-    torch.testing.assert_close((at.gradient, at.product(field)), (gradient, product))
-    unit = torch.tensor([1.0, 0, 0], dtype=DOUBLE).expand_as(x)
-    torch.testing.assert_close(at.diagonal[..., 0], at.product(unit)[..., 0])
-
-
-def test_term_is_one_sided(generator: torch.Generator) -> None:
-    faces, elements = torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1, 2, 3]])
+# ------------------------------------------------------------------------------------------------------------ energies
+def test_contact_energy_is_that_of_heights_below_the_gap() -> None:
     x = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0]], dtype=DOUBLE).repeat(3, 1, 1)
     x[:, 3, 2] = torch.tensor([-0.1, 0.1, 0.3])
-    energy = Energy(Mesh.of(faces, 4), [Contact(elements, gap=0.2)], sampled=True)
-    gaps = torch.full((3, 1, 1), 0.2, dtype=DOUBLE)
-    reference = Reference((gaps,), (torch.full_like(gaps[:, 0], 5.0),), torch.zeros(3, dtype=DOUBLE))
-    rows = energy.extend(x.movedim(-1, 0))
-    assert energy.value(rows, reference).tolist() == pytest.approx([5 * 0.3**2, 5 * 0.1**2, 0])
-    (at,) = energy.linearise(rows, reference)
-    assert at.slope[:, 0].tolist() == pytest.approx([-3.0, -1.0, 0])
-    assert at.curvature[:, 0].tolist() == [10, 10, 0]
+    contacts = Contacts(torch.arange(3), torch.tensor([[0, 1, 2, 3]]).repeat(3, 1))
+    energy = ContactEnergy(contacts, torch.tensor([9, 9, 9, 2.0]), x)
+    assert energy.value(x).tolist() == pytest.approx([6000 * 0.25**2, 6000 * 0.05**2, 0])
+    assert energy.at(x).gradient[:, 3, 2].tolist() == pytest.approx([-12000 * 0.25, -12000 * 0.05, 0])
+
+
+@pytest.mark.parametrize("kind", ["contact", "pull"])
+def test_energies_have_the_derivatives_of_their_values(kind: str, generator: torch.Generator) -> None:
+    x, places, field = torch.randn(3, 2, 9, 3, dtype=DOUBLE, generator=generator)
+    areas = torch.rand(9, dtype=DOUBLE, generator=generator)
+    elements = torch.tensor([[0, 1, 2, 5], [3, 4, 5, 8], [6, 7, 8, 0]]).repeat(2, 1)
+    contacts = Contacts(torch.arange(2).repeat_interleave(3), elements)
+    energy: Any = ContactEnergy(contacts, areas, x) if kind == "contact" else Pull(places, areas)
+    at = energy.at(x)
+    torch.testing.assert_close(at.value, energy.value(x))
+    gradient, full = torch.func.jvp(torch.func.grad(lambda x: energy.value(x).sum()), (x,), (field,))
+    torch.testing.assert_close(at.gradient, gradient)
+    if kind == "pull":
+        torch.testing.assert_close(at.product(field), full)
+    else:  # Gauss-Newton's: along the gradient of each height
+        missing, heights = energy.missing(x)
+        rate = (field.view(-1, 3).T[:, energy.corners] * heights.transpose(0, 1)).sum((0, 1))
+        curvature = (2 * energy.weights * (missing < 0) * rate**2).sum()
+        torch.testing.assert_close((at.product(field) * field).sum(), curvature)
+    unit = torch.zeros_like(x)
+    unit[0, 5, 0] = 1
+    torch.testing.assert_close(at.diagonal[0, 5, 0], at.product(unit)[0, 5, 0])
+
+
+def test_contacts_of_vertices_that_have_none_any_more_stay_active() -> None:
+    former = Contacts(torch.tensor([0, 0, 1]), torch.tensor([[0, 1, 2, 9], [3, 4, 5, 8], [0, 1, 2, 9]]))
+    now = Contacts(torch.tensor([0, 1]), torch.tensor([[0, 1, 3, 9], [3, 4, 5, 7]]))
+    both = now.beside(former)
+    found = {(i, *element) for i, element in zip(both.shapes.tolist(), both.elements.tolist(), strict=True)}
+    assert found == {(0, 0, 1, 3, 9), (0, 3, 4, 5, 8), (1, 3, 4, 5, 7), (1, 0, 1, 2, 9)}
+    some = both.rows(torch.tensor([1]))
+    assert some.shapes.tolist() == [0, 0] and some.elements[:, 3].tolist() == [7, 9]
 
 
 # --------------------------------------------------------------------------------------------------------------- layer
@@ -139,32 +135,37 @@ def test_layer_pushes_fingers_apart(hand: Shapes) -> None:
 def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     x_a, x_b = hand.keyframes
     layer = tm.InBetween(hand.bases, hand.faces, contact=True)
-    member = layer.members[0]
-    first: list[Any] = []
-    search = ContactRounds.found
+    member, search = layer.members[0], ContactSearch.__call__
+    found: list[Any] = []
+    calls = 0
 
     def kept(*given: Any) -> Any:
-        if not first:
-            first.append(search(*given))
-        return first[0]
+        nonlocal calls
+        if calls == len(found):
+            found.append(search(*given))
+        calls += 1
+        return found[calls - 1]
 
-    monkeypatch.setattr(ContactRounds, "found", kept)
+    monkeypatch.setattr(ContactSearch, "__call__", kept)
 
-    def samples(x_a: Tensor, x_b: Tensor, t: Tensor) -> Samples:
-        return Samples(x_a[None], x_b[None], None, t, layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape))
+    def shape(x_a: Tensor, x_b: Tensor, t: Tensor) -> Tensor:
+        nonlocal calls
+        calls = 0
+        mu, stiffness = layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape)
+        return member(Samples(x_a[None], x_b[None], None, t, mu, stiffness), None).shapes[0]
 
     given = [x_a.clone(), x_b.clone(), torch.tensor([0.875], dtype=DOUBLE)]
     for tensor in given:
         tensor.requires_grad_()
-    shapes = member(samples(*given), None).shapes[0]
-    assert len(first[0].rounds[0].elements) > 10
+    shapes = shape(*given)
+    assert len(found) >= separate.ROUNDS[0] and len(found[0][0].shapes) > 10
     weights = torch.cos(7 * x_a)
     gradients = torch.autograd.grad((shapes * weights).sum(), given)
     direction = 0.01 * torch.sin(9 * x_a + 1)
 
     def value(*arguments: Tensor) -> float:
         moved = [argument.clone().requires_grad_() for argument in arguments]  # as if for a gradient: to the tolerance
-        return float((member(samples(*moved), None).shapes[0].detach() * weights).sum())
+        return float((shape(*moved).detach() * weights).sum())
 
     at = [tensor.detach() for tensor in given]
     # Small: where a contact becomes active, the steps jump.
@@ -227,7 +228,7 @@ def test_a_shape_is_never_made_worse(frogs: Shapes, pair: tuple[int, int], times
 def test_a_push_that_moves_too_much_is_not_kept(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     x_a, x_b = hand.keyframes
     layers = [tm.InBetween(hand.bases, hand.faces, contact=contact) for contact in (False, True)]
-    monkeypatch.setattr(contact_rounds, "MOST_MOVED", 1e-3)
+    monkeypatch.setattr(separate, "MOST_MOVED", 1e-3)
     with torch.no_grad():
         plain = layers[0](x_a, x_b, 0.875)
         kept, solution = layers[1].solve(x_a, x_b, 0.875)
@@ -237,25 +238,24 @@ def test_a_push_that_moves_too_much_is_not_kept(hand: Shapes, monkeypatch: pytes
 
 def test_the_round_with_the_fewest_crossings_is_kept(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     layer = tm.InBetween(hand.bases, hand.faces, contact=True)
-    step, taken = ContactRounds._step, []
+    steps, taken = contact_layer._steps, []
 
-    def worsening(self: ContactRounds, batch: Any, x: Tensor, active: Contacts) -> Tensor:
-        # Most of a push first; then back to the shape without contact.
-        taken.append(torch.lerp(x, step(self, batch, x, active), 0.9) if not taken else start[0])
-        return taken[-1]
+    def worsening(*given: Any) -> Any:
+        step = steps(*given)
 
-    found, start = ContactRounds.found, []
+        def relax(x: Tensor, some: Tensor, beside: Any) -> Tensor:
+            # Most of a push first; then back to the shape without contact.
+            taken.append(x)
+            n = len(taken) - separate.ROUNDS[0]
+            return step(x, some, beside) if n < 0 else x if n == 0 else taken[0]
 
-    def starting(self: ContactRounds, batch: Any, x: Tensor, search: ContactSearch) -> Any:
-        start.append(x)
-        return found(self, batch, x, search)
+        return relax
 
-    monkeypatch.setattr(ContactRounds, "_step", worsening)
-    monkeypatch.setattr(ContactRounds, "found", starting)
+    monkeypatch.setattr(contact_layer, "_steps", worsening)
     with torch.no_grad():
         shape, solution = layer.solve(*hand.keyframes, 0.875)
         plain = tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, 0.875)
-    assert len(taken) > 1
+    assert len(taken) > separate.ROUNDS[0]
     assert int(solution.n_crossing) == int(far(shape, hand)) < int(far(plain, hand))
 
 
@@ -292,42 +292,42 @@ def test_rounding_does_not_choose_among_faces_around_the_nearest_point() -> None
         assert f[chosen].tolist() == [2, 5]
 
 
+def unlimited(n: int, n_vertices: int, most: float = 10.0) -> Trajectory:
+    """A trajectory at rest, with a limit of accelerations between frames."""
+    limit = AccelerationLimit(
+        torch.zeros(n + 2, n_vertices, 3), torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1), (False, False), most
+    )
+    return Trajectory(torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1], limit, None)
+
+
 def test_a_displacement_fades_out_where_it_makes_shapes_worse() -> None:
     n = 15
-    differences = torch.eye(n + 2, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
-    turns = torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1)
-    limit = AccelerationLimit(torch.zeros(3, n, 2, dtype=DOUBLE), differences, turns, 10.0)
-    field = torch.ones(3, n, 2, dtype=DOUBLE)
+    field = torch.ones(n, 2, 3, dtype=DOUBLE)
 
     class Fake:
-        t = torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1]
-
         def __init__(self, worse: list[int]) -> None:
-            self.worse, self.n_far = worse, torch.full((n,), 2)
+            self.worse = worse
 
-        def count(self, x: Tensor) -> None:
+        def count(self, x: Tensor) -> Tensor:
             moved = x.abs().amax((1, 2)) > 1e-9
-            self.n_far = torch.tensor([3 if i in self.worse and moved[i] else 1 + 1 * ~moved[i] for i in range(n)])
+            return torch.tensor([3 if i in self.worse and moved[i] else 1 + 1 * ~moved[i] for i in range(n)])
 
-    for worse in ([], [7], [3, 4]):
+    for worse in ([], [7], [3, 4], list(range(n))):
         fake: Any = Fake(worse)
-        found = contact._never_worse(torch.zeros(n, 2, 3, dtype=DOUBLE), field, fake, limit)
-        assert found is not None and bool((fake.n_far <= 2).all())
-        assert float(found[:, worse].abs().sum()) == 0 and float(found[:, 12].min()) == 1
-    every: Any = Fake(list(range(n)))
-    none = contact._never_worse(torch.zeros(n, 2, 3, dtype=DOUBLE), field, every, limit)
-    assert none is not None and not bool(none.any())
+        found, n_far = separate._never_worse(torch.zeros_like(field), field, fake, unlimited(n, 2), torch.full((n,), 2))
+        assert bool((n_far <= 2).all()) and float(found[worse].abs().sum()) == 0
+        assert float(found[12].min()) == (len(worse) < n)
 
 
 def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    def folding(member: Between, grid: Samples, shapes: Tensor) -> contact.Displacement:
+    def folding(member: Between, grid: Samples, shapes: Tensor) -> contact_layer.Displacement:
         """One half of the hand onto the other."""
         own = member.frame.bring(shapes, trees.picked(member.placed(grid), grid.which), grid.t)
         side = own[..., 0] - own[..., 0].mean(-1, keepdim=True)
-        field = torch.zeros_like(own).movedim(-1, 0).contiguous()
-        field[0] = -2 * side.clamp_min(0)
+        field = torch.zeros_like(own)
+        field[..., 0] = -2 * side.clamp_min(0)
         none = torch.zeros(len(shapes), dtype=torch.int64)
-        return contact.Displacement(field, grid.t, none, none)
+        return contact_layer.Displacement(field, grid.t, none, none)
 
     t = torch.tensor([0.3, 0.45], dtype=DOUBLE)
     with torch.no_grad():
@@ -377,74 +377,41 @@ def test_missing_extra_is_said_before_any_work(hand: Shapes, monkeypatch: pytest
             make()
 
 
-def test_what_was_pushed_out_of_reach_is_held_on() -> None:
-    first, second = torch.tensor([[0, 1, 2, 9], [3, 4, 5, 8]]), torch.tensor([[0, 1, 3, 9], [3, 4, 5, 7]])
-    samples = torch.arange(2)
-    former = Contacts(samples, first, torch.tensor([[1.0, 2], [3, 4]]), torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
-    now = Contacts(samples, second, torch.tensor([[5.0, 0], [0, 6]]), torch.tensor([[0.5, 0.15], [0.15, 0.6]]))
-    both = now.beside(former)
-    found = {
-        (s, *element): (weight, gap)
-        for s in range(2)
-        for element, weight, gap in zip(
-            both.elements.tolist(), both.weights[s].tolist(), both.gaps[s].tolist(), strict=True
-        )
-        if weight
-    }
-    values = {key: tuple(round(x, 6) for x in value) for key, value in found.items()}
-    assert values == {
-        (0, 0, 1, 3, 9): (5, 0.5),  # what holds a vertex now is all that does
-        (0, 3, 4, 5, 8): (2, 0.2),
-        (1, 3, 4, 5, 7): (6, 0.6),
-        (1, 0, 1, 2, 9): (3, 0.3),
-        (1, 3, 4, 5, 8): (4, 0.4),
-    }
-
-
 def test_counting_finds_what_searching_finds(hand: Shapes) -> None:
-    x_a, x_b = (100 * x[None] for x in hand.keyframes)
-    t = torch.tensor([0.25, 0.875], dtype=DOUBLE)
     with torch.no_grad():
-        x = 100 * tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, t)
-    mesh = Mesh.of(hand.faces, hand.keyframes.shape[1])
-    search = ContactSearch(mesh, x_a, x_b, torch.zeros(2, dtype=torch.int64), t)
-    assert search(x) is not None
-    found = search.n_far.tolist()
-    assert found[0] == 0 < found[1] and list(search.crossing(x, [0, 1])) == [1]
-    search.count(x)
-    assert search.n_far.tolist() == search.n_left.tolist() == found
+        x = 100 * tm.InBetween(hand.bases, hand.faces)(*hand.keyframes, torch.tensor([0.25, 0.875], dtype=DOUBLE))
+    search = ContactSearch(Mesh.of(hand.faces, x.shape[1]), 100 * hand.keyframes, torch.ones(x.shape[1]), 2)
+    contacts, n_far = search(x, torch.arange(2))
+    assert contacts.shapes.unique().tolist() == [1] and int(n_far[0]) == 0 < int(n_far[1])
+    assert search.count(x).tolist() == n_far.tolist()
 
 
 # ------------------------------------------------------------------------------------------------ steps of each shape
-def first_interval(hand: Shapes, t: Tensor, smooth: bool, backend: Any) -> tuple[Between, Samples, Pair]:
-    """Times between the first two key-frames of a hand that closes and opens."""
-    three = hand.pick(0, 1, 0)
-    path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
-    member = path.layer.members[0]
-    samples = path.samples(three.keyframes[None], 0, torch.zeros(len(t), dtype=torch.int64), t)
-    return member, samples, member.placed(samples)
-
-
-@pytest.mark.parametrize("smooth", [False, True], ids=["pair", "course"])
-def test_kernels_and_torch_settle_alike(hand: Shapes, smooth: bool) -> None:
+@pytest.mark.parametrize("smooth", [False, True], ids=["pair", "trajectory"])
+def test_kernels_and_torch_step_alike(hand: Shapes, smooth: bool) -> None:
     pytest.importorskip("warp")
-    t = torch.tensor([0.2, 0.75 if smooth else 0.875], dtype=DOUBLE)
+    # Between the first two key-frames of a hand that closes and opens; no parts meet in the first shape.
+    t, three = torch.tensor([0.2, 0.75 if smooth else 0.875], dtype=DOUBLE), hand.pick(0, 1, 0)
     results = []
     for backend in ("torch", "warp"):
-        member, samples, pair = first_interval(hand, t, smooth, backend)
+        path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
+        member = path.layer.members[0]
+        samples = path.samples(three.keyframes[None], 0, torch.zeros(2, dtype=torch.int64), t)
+        pair = member.placed(samples)
         x = member.frame.bring(member(samples, None).shapes, trees.picked(pair, samples.which), t)
-        search = ContactSearch(member.mesh, pair.first, pair.second, samples.which, t)
-        active = search(x)
-        assert active is not None and active.samples.tolist() == [1]
-        active = active.of_all(torch.arange(2))
-        # One shape is free, the other is held, and a corner of both is pulled elsewhere.
+        search = contact_layer._search(member, pair, 0, 2)
+        active, _ = search(x, torch.arange(2))
+        assert active.shapes.unique().tolist() == [1]
+        # One shape is free, the other has contacts, and a corner of both is pulled elsewhere.
         distance = (x[0] - x[0].amin(0)).norm(dim=-1)
         corner = distance <= distance.kthvalue(40).values
-        pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas[0])
-        y = settled(member, samples, pair, x, active, pull, 10)
-        y = settled(member, samples, pair, y, active, pull, 10)
-        term = ActiveContacts(active, x)
-        before, pushed = (term.value(z.contiguous()) for z in (x, y))
+        pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas)
+        steps = contact_layer._steps(member, member.rests(samples, pair, None))
+        y, beside = x, separate._energies(active, pull, search.areas)
+        for _ in range(2):
+            y = steps(y, torch.arange(2), beside)
+        contact = ContactEnergy(active, search.areas, x)
+        before, pushed = (contact.value(z.contiguous()) for z in (x, y))
         assert float(pushed[0]) == 0 and float(pushed[1]) < 0.3 * float(before[1])
         assert bool((pull.value(y) < 0.5 * pull.value(x)).all())
         results.append(y)
@@ -460,18 +427,7 @@ def test_some_samples_keep_what_is_theirs(which: Tensor | None) -> None:
     torch.testing.assert_close([some.mu, some.stiffness[0][:, 0]], [10 * some.t, 20 * some.t])
 
 
-# ------------------------------------------------------------------------------------------------------------ sequence
-def test_splines_vanish_at_the_ends_and_know_their_curvature() -> None:
-    t = torch.linspace(0, 1, 4001, dtype=DOUBLE)
-    values, bend = splines(t, 8)
-    assert values.shape == (4001, 9) and float(values[[0, -1]].abs().max()) == 0
-    second = (values[2:] - 2 * values[1:-1] + values[:-2]) * 4000**2
-    torch.testing.assert_close(second.T @ second / 4000, bend, rtol=2e-3, atol=2e-3 * float(bend.max()))
-    at = torch.tensor([0.3], dtype=DOUBLE, requires_grad=True)
-    (slope,) = torch.autograd.grad(splines(at, 8).values[0, 3], at)
-    assert float(slope) == pytest.approx(float((values[1201, 3] - values[1199, 3]) * 2000), rel=1e-5)
-
-
+# ---------------------------------------------------------------------------------------------------------- trajectory
 def test_values_in_time_lie_on_a_curve_through_them() -> None:
     times = torch.tensor([0.2, 0.5, 0.6, 0.9], dtype=DOUBLE)
     torch.testing.assert_close(through(times, times), torch.eye(4, dtype=DOUBLE))
@@ -484,7 +440,7 @@ def test_values_in_time_lie_on_a_curve_through_them() -> None:
     assert float(slope) == pytest.approx(float((line[301] - line[299]) * 500), rel=1e-4)
 
 
-def test_course_is_free_of_crossings_and_does_not_pop(hand: Shapes, caplog: pytest.LogCaptureFixture) -> None:
+def test_trajectory_is_free_of_crossings_and_does_not_pop(hand: Shapes, caplog: pytest.LogCaptureFixture) -> None:
     options = {"bases": hand.bases, "progress": False}
     plain = tm.subdivide(hand.keyframes, hand.faces, 5, **options)
     with caplog.at_level("INFO"):
@@ -510,71 +466,31 @@ def test_path_takes_any_time(hand: Shapes) -> None:
     assert torch.equal(shapes[3], hand.keyframes[1])
 
 
-def test_what_a_keyframe_has_is_tolerated_beside_it_and_fades(hand: Shapes) -> None:
-    mesh = Connectivity(hand.faces.numpy(), hand.keyframes.shape[1])
-    known = hand.keyframes.numpy().copy()
-    x = hand.keyframes[0]
-    tip = x[:, 0].argmin()
-    known[0, :, 0] += (0.22 * torch.exp(-(((x - x[tip]).norm(dim=-1) / 0.12) ** 2))).numpy()
-    search = Search(Crossings(mesh, known))
-    depth = search.tolerated
-    assert depth[:, 1].max() == 0 < depth[:, 0].max() < 0.1 and depth[tip, 0] > 0
-    assert np.linalg.norm(known[0][depth[:, 0] > 0] - known[0][tip], axis=1).max() < 0.5 * search.crossings.diagonal
-    slack = np.array([[2.0, 0.0]])
-    trajectory = [float(search.tolerance(slack, t)[0, 0]) for t in (0.0, 0.02, 0.05, 0.07, 0.5)]
-    assert trajectory[0] == 1 and trajectory[3:] == [0, 0] and sorted(trajectory, reverse=True) == trajectory
-    pairs = np.array([[int(face) for face in torch.nonzero((hand.faces == tip).any(1)).flatten()[:2]]])
-    assert search.n_left(pairs, 0.02) == 0 and search.n_left(pairs, 0.5) == 1
-
-
-def test_in_a_course_nothing_is_tolerated(hand: Shapes) -> None:
-    stuck = stuck_in_first(hand)
-    first, second = (100 * x[None] for x in stuck.keyframes)
-    mesh, t = Mesh.of(hand.faces, hand.keyframes.shape[1]), torch.tensor([0.02], dtype=DOUBLE)
-    at_tip = torch.nonzero((hand.faces == hand.keyframes[0, :, 0].argmin()).any(1)).flatten()
-    pairs = at_tip[:2].numpy()[None]
-    alone, trajectory = (ContactSearch(mesh, first, second, None, t, is_tolerant=each) for each in (True, False))
-    assert alone.has_crossed and trajectory.has_crossed
-    assert alone._counts(0, pairs) == (1, 0) and trajectory._counts(0, pairs) == (1, 1)
-
-
-def test_no_more_is_tolerated_than_a_keyframe_is_deep(hand: Shapes) -> None:
-    # A vertex in the finger beside it is also behind faces on that finger's far side.
-    stuck = stuck_in_first(hand)
-    search = Search(Crossings(Connectivity(hand.faces.numpy(), hand.keyframes.shape[1]), stuck.keyframes.numpy()))
-    deep = search.tolerated
-    assert deep[:, 0].max() > 0 == deep[:, 1].max()
-    x = 0.9 * stuck.keyframes[0] + 0.1 * hand.keyframes[0]
-    active = search(x.numpy(), search.crossings.within(deep[:, 0] > 0, 0.02))
-    beside = np.maximum(deep[active.vertices], deep[hand.faces.numpy()[active.faces]].max(1))
-    assert (beside[:, 0] > 0).sum() > 10
-    np.testing.assert_array_equal(active.slack[beside > 0], beside[beside > 0])
-
-
 def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> None:
-    differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
-    differences = 64 * torch.cat([differences, 2 * torch.eye(7, dtype=DOUBLE)[:1]])  # and it goes on at the start
-    trajectory = 8 * torch.randn(3, 8, 5, dtype=DOUBLE, generator=generator)
-    seen = torch.randn(3, 7, 5, dtype=DOUBLE, generator=generator)
-    seen[..., 4] *= 1e-3
+    shapes = torch.randn(9, 5, 3, dtype=DOUBLE, generator=generator).cumsum(0) / 20
+    seen = torch.randn(7, 5, 3, dtype=DOUBLE, generator=generator)
+    seen[:, 4] *= 1e-3
     # The coordinates of displacements turn as time goes on; accelerations are seen from outside.
     angle = torch.linspace(0, 1.2, 7, dtype=DOUBLE)
     turns = torch.eye(3, dtype=DOUBLE).repeat(7, 1, 1)
     turns[:, 0, 0], turns[:, 1, 1] = angle.cos(), angle.cos()
     turns[:, 1, 0], turns[:, 0, 1] = angle.sin(), -angle.sin()
-    wanted = torch.einsum("tij,itv->jtv", turns, seen)
-    found, kept = AccelerationLimit(trajectory, differences, turns, 25.0).nearest(wanted)
+    limit = AccelerationLimit(shapes, turns, (True, False), 0.4)
+    wanted = torch.einsum("tij,tvi->tvj", turns, seen)
+    found, kept = limit.nearest(wanted)
     assert kept.tolist() == [0, 1, 2, 3]
-    assert torch.equal(found[..., 4], wanted[..., 4]) and not torch.equal(found[..., 0], wanted[..., 0])
-    turned = torch.einsum("tij,jtv->itv", turns, found)
-    assert float((trajectory + differences @ turned).norm(dim=0).max()) < 25.0 * 1.02
+    assert torch.equal(found[:, 4], wanted[:, 4]) and not torch.equal(found[:, 0], wanted[:, 0])
+    turned = torch.einsum("tij,tvj->tvi", turns, found)
+    displaced = shapes.clone()
+    displaced[1:-1] += turned
+    assert float((displaced[2:] - 2 * displaced[1:-1] + displaced[:-2]).norm(dim=-1).max()) < 0.4 * 1.02
     for v in range(4):
 
         def room(x: np.ndarray, v: int = v) -> np.ndarray:
-            rows = trajectory[..., v].numpy() + x.reshape(3, 7) @ differences.numpy().T
-            return 25.0**2 - (rows**2).sum(0)
+            rows = limit.trajectory[:, v].numpy() + limit.differences.numpy() @ x.reshape(7, 3)
+            return 0.4**2 - (rows**2).sum(1)
 
-        goal = seen[..., v].numpy().ravel()
+        goal = seen[:, v].numpy().ravel()
         best = minimize(
             lambda x, goal=goal: ((x - goal) ** 2).sum(),
             goal,
@@ -583,13 +499,13 @@ def test_nearest_displacement_within_the_limit(generator: torch.Generator) -> No
             method="SLSQP",
             options={"maxiter": 300},
         )
-        assert float(((turned[..., v] - seen[..., v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
+        assert float(((turned[:, v] - seen[:, v]) ** 2).sum()) == pytest.approx(best.fun, rel=0.02)
 
 
 @pytest.mark.filterwarnings("ignore:in .* in-betweens looked at")
-def test_limit_keeps_a_course_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limit_keeps_a_trajectory_from_popping(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     # Three times the peak acceleration, if nothing but this little weight held it.
-    monkeypatch.setattr(together, "SMOOTHNESS", 0.02)
+    monkeypatch.setattr(modal, "SMOOTHNESS", 0.02)
     options = {"bases": hand.bases, "progress": False}
     plain = tm.subdivide(hand.keyframes, hand.faces, 4, **options)
     frames = tm.subdivide(hand.keyframes, hand.faces, 4, contact=True, **options)
@@ -658,44 +574,32 @@ def test_scanned_like_figure_walks_with_few_crossings(women: Shapes) -> None:
 def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shapes on springs of different stiffness, held below the limit: SciPy finds the same rest."""
     n, places = 7, 2 * torch.randn(7, 3, 3, dtype=DOUBLE, generator=generator)
-    springs = torch.tensor([1.0, 30, 1, 5, 1, 0.2, 3], dtype=DOUBLE)
-    differences = torch.eye(9, dtype=DOUBLE).diff(n=2, dim=0)[:, 1:-1]
-    limit = AccelerationLimit(torch.zeros(3, 7, 3, dtype=DOUBLE), differences, torch.eye(3).repeat(7, 1, 1).double(), 1)
+    springs = torch.tensor([1.0, 30, 1, 5, 1, 0.2, 3], dtype=DOUBLE)[:, None, None]
+    nothing = Contacts(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4, dtype=torch.int64))
 
     class Fake:
-        t = torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1]
-        areas = torch.ones(1, 3, dtype=DOUBLE)
-        n_far = torch.full((n,), 99)
+        areas, n_far = torch.ones(3, dtype=DOUBLE), 99
 
-        def is_watched(self, some: Tensor) -> Tensor:
-            return torch.ones(len(some), dtype=torch.bool)
+        def __call__(self, x: Tensor, some: Tensor) -> tuple[Contacts, Tensor]:
+            self.n_far -= 1  # the last is the best
+            return nothing, torch.full((len(some),), self.n_far)
 
-        def count(self, x: Tensor, some: object = None) -> None:
-            self.n_far = self.n_far - 1  # the last is the best
+    def relax(x: Tensor, some: Tensor, beside: Any) -> Tensor:
+        pulls = [energy for energy in beside(slice(None), x) if isinstance(energy, Pull)]
+        found: Tensor = springs * places + sum(pull.weights[:, None] * pull.to for pull in pulls)
+        return found / (springs + sum(pull.weights[:, None] for pull in pulls))
 
-        def __call__(self, x: Tensor, some: object) -> None:
-            return None
-
-        def rows(self, some: Tensor) -> Tensor:
-            return some
-
-    def rest(member: Any, own: Tensor, pair: Any, x: Tensor, active: Any, pull: Pull, n_products: int) -> Tensor:
-        own_springs = springs[own, None, None]
-        pulls = pull.weights[:, None]
-        found: Tensor = (own_springs * places[own] + pulls * pull.to) / (own_springs + pulls)
-        return found
-
-    monkeypatch.setattr(contact, "settled", rest)
-    monkeypatch.setattr(contact, "ROUNDS", (4, 90))
-    monkeypatch.setattr(contact, "PULL", 3.0)
-    start = torch.zeros_like(places)
-    fake: Any = Fake()
-    x = contact._at_rest(fake, fake, fake, start, start, fake, torch.arange(n), fake, limit)
+    monkeypatch.setattr(separate, "ROUNDS", (4, 90))
+    monkeypatch.setattr(separate, "PULL", 3.0)
+    start, fake, trajectory = torch.zeros_like(places), Fake(), unlimited(n, 3, 1.0)
+    given: Any = start, start, relax, fake, trajectory, nothing, torch.arange(n), torch.full((n,), 99)
+    x, _ = separate._settled(*given)
+    differences = trajectory.limit.differences.numpy()
     for v in range(3):
         best = minimize(
-            lambda d, v=v: float((springs.numpy()[:, None] * (d.reshape(n, 3) - places[:, v].numpy()) ** 2).sum()),
+            lambda d, v=v: float((springs[:, 0].numpy() * (d.reshape(n, 3) - places[:, v].numpy()) ** 2).sum()),
             np.zeros(3 * n),
-            constraints={"type": "ineq", "fun": lambda d: 1 - ((differences.numpy() @ d.reshape(n, 3)) ** 2).sum(1)},
+            constraints={"type": "ineq", "fun": lambda d: 1 - ((differences @ d.reshape(n, 3)) ** 2).sum(1)},
             method="SLSQP",
             options={"maxiter": 500},
         )

@@ -13,7 +13,6 @@ from conftest import random_rotation
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.contact.detect import nearest_on_triangles
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
@@ -225,16 +224,6 @@ def test_linear_hand_goes_through_itself_and_its_keyframes_do_not() -> None:
     assert found.number.tolist()[:2] == [0, 0]
     assert int(found.n_new[2]) == int(found.number[2]) > 20 and int(found.n_far[2]) > 0
     assert int(found.n_far[2]) < int(found.n_new[2])  # most of it are folds
-
-
-def test_nearest_points_on_triangles(generator: torch.Generator) -> None:
-    rng = np.random.default_rng(0)
-    points, corners = rng.normal(size=(500, 3)), rng.normal(size=(500, 3, 3))
-    corners[:20, 2] = corners[:20, 1]  # without an area
-    feet = nearest_on_triangles(points, corners)
-    wanted = trimesh.triangles.closest_point(corners[20:], points[20:])
-    np.testing.assert_allclose(feet[20:], wanted, atol=1e-12)
-    assert np.isfinite(feet).all()
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,23 @@
-r"""A bound on the accelerations that a displacement adds to a trajectory, so that nothing pops.
+r"""A bound on the accelerations of a trajectory of shapes with a displacement added, so that nothing pops.
 
-With the accelerations :math:`a` of a trajectory of shapes, and a displacement :math:`d` that is added to it,
+With the accelerations :math:`a` of the trajectory, and the displacement :math:`d`,
 
 .. math:: |a_{iv} + \ddot d_{iv}| \le \bar a
 
-at each time and vertex. Both are differences of shapes that follow each other: what one sees.
+at each time and vertex. Both are second differences of consecutive shapes, in the unit of time between two of them.
 """
 
 import torch
 from torch import Tensor
 
+ROOM = 1.27
+"""Largest acceleration of a vertex, times that of the trajectory."""
+LEAST_LIMIT = 30.0
+"""Smallest bound, at a diagonal of 100 and a duration of 1: a straight trajectory must bend, too."""
 ROUNDS = 200
-"""Of :meth:`AccelerationLimit.nearest`, at most."""
+"""Most iterations of :meth:`AccelerationLimit.nearest`."""
 TOLERANCE = 0.01
-"""How far over the limit it may leave a vertex, as a part of it."""
+"""Relative excess over the bound at which the iteration stops."""
 RELAXATION = 1.7
 PENALTY = 0.5
 
@@ -22,60 +26,76 @@ class AccelerationLimit:
     """A bound on accelerations.
 
     Args:
-        trajectory: Accelerations without the displacement. *Shape:* ``(3, N, V)``.
-        differences: Accelerations of a displacement from what it is at each time. *Shape:* ``(N, T)``.
-        turns: From the coordinates in which displacements are given, to those of the accelerations. *Shape:*
-            ``(T, 3, 3)``.
-        most: The largest that is allowed, of a vertex.
+        shapes: Even times of a trajectory, with both ends, which have no displacement, in the coordinates of the
+            viewer. *Shape:* ``(T + 2, V, 3)``.
+        rotations: Rotations from the coordinates of displacements to those of the viewer. *Shape:* ``(T, 3, 3)``.
+        goes_on: Whether the motion continues beyond the first and the last shape. Each side has half of the room
+            there: the motion must not bounce off a key-frame.
+        most: The bound. Default: :data:`ROOM` times the largest acceleration, or :data:`LEAST_LIMIT`.
     """
 
-    def __init__(self, trajectory: Tensor, differences: Tensor, turns: Tensor, most: float) -> None:
-        self.trajectory, self.differences, self.turns, self.most = trajectory, differences, turns, most
+    def __init__(
+        self,
+        shapes: Tensor,
+        rotations: Tensor,
+        goes_on: tuple[bool, bool] = (False, False),
+        most: float | None = None,
+    ) -> None:
+        x = shapes.double().nan_to_num()
+        own = x[2:] - 2 * x[1:-1] + x[:-2]
+        each = torch.eye(len(x), dtype=x.dtype, device=x.device)[:, 1:-1]
+        second = each[2:] - 2 * each[1:-1] + each[:-2]
+        ends = [i for i, beyond in zip((0, -1), goes_on, strict=True) if beyond]
+        #: Accelerations of the trajectory. *Shape:* ``(N, V, 3)``.
+        self.trajectory = torch.cat([own, *(own[i][None] for i in ends)])
+        #: Accelerations of a displacement from its values at each time. *Shape:* ``(N, T)``.
+        self.differences = torch.cat([second, *(2 * each[1:-1][i][None] for i in ends)])
+        self.rotations = rotations.double()
+        least = LEAST_LIMIT / (len(x) - 1) ** 2
+        self.most = max(ROOM * float(own.norm(dim=-1).max()), least) if most is None else most
 
     def nearest(self, wanted: Tensor) -> tuple[Tensor, Tensor]:
-        """The displacement nearest to a wanted one, in least squares, that keeps each vertex below the limit.
+        """Find the displacement nearest to a wanted one, in least squares, that keeps each vertex below the bound.
 
-        Vertices do not know of each other here, and what is below the limit is left as it is. The rest is a convex
-        problem for each vertex, and solved by the alternating direction method of multipliers (Boyd et al. 2011).
+        It is a convex problem for each vertex, solved by the alternating direction method of multipliers (Boyd et al.
+        2011). Vertices below the bound stay as they are.
 
         Args:
-            wanted: At each time. *Shape:* ``(3, T, V)``.
+            wanted: At each time. *Shape:* ``(T, V, 3)``.
 
         Returns:
-            It, and the vertices that were kept back. *Shape:* ``(3, T, V), (m,)``.
+            The displacement, and the vertices that were limited. *Shape:* ``(T, V, 3), (m,)``.
         """
-        seen = torch.einsum("tij,jtv->itv", self.turns, wanted)
-        own = torch.nonzero((self.trajectory + self.differences @ seen).norm(dim=0).amax(0) > self.most).flatten()
+        rows, seen = self.differences, torch.einsum("tij,tvj->tvi", self.rotations, wanted.double())
+        added = self.trajectory + torch.tensordot(rows, seen, 1)
+        own = torch.nonzero(added.norm(dim=-1).amax(0) > self.most).flatten()
         if not len(own):
             return wanted, own
-        goal, trajectory = (x[..., own].double().movedim(0, 1).flatten(1) for x in (seen, self.trajectory))
-        # In frames: the unit of time drops out.
-        unit = float(self.differences.abs().max()) / 2
-        rows, trajectory, most = self.differences.double() / unit, trajectory / unit, self.most / unit
+        # Components before vertices: sums of three long rows are fast.
+        goal, trajectory = (x[:, own].movedim(-1, 1).flatten(1) for x in (seen, self.trajectory))
         inverse = torch.linalg.inv(torch.eye(rows.shape[1]).to(rows) + PENALTY * rows.T @ rows)
-        # What is found, and the accelerations there, of what accelerations are pulled to.
+        # The displacement, and its accelerations, of the accelerations that it is pulled to.
         pull, freely = PENALTY * inverse @ rows.T, inverse @ goal
         reach, rest = rows @ pull, rows @ freely + trajectory
-        split, dual = _clipped(rows @ goal + trajectory, most), torch.zeros_like(trajectory)
+        split, dual = self._clipped(rows @ goal + trajectory), torch.zeros_like(trajectory)
         for _ in range(ROUNDS):
             pulled = split - dual - trajectory
             reached = torch.addmm(rest, reach, pulled)
-            if float(_lengths(reached).max()) <= (1 + TOLERANCE) * most:
+            if float(_lengths(reached).max()) <= (1 + TOLERANCE) * self.most:
                 break
             relaxed = RELAXATION * reached + (1 - RELAXATION) * split + dual
-            split = _clipped(relaxed, most)
+            split = self._clipped(relaxed)
             dual = relaxed - split
-        found = torch.addmm(freely, pull, pulled).unflatten(1, (3, -1)).to(wanted)
-        return wanted.index_copy(2, own, torch.einsum("tij,tiv->jtv", self.turns, found)), own
+        found = torch.einsum("tij,tiv->tvj", self.rotations, torch.addmm(freely, pull, pulled).unflatten(1, (3, -1)))
+        return wanted.index_copy(1, own, found.to(wanted)), own
+
+    def _clipped(self, rows: Tensor) -> Tensor:
+        """Vectors shortened to the bound where they are longer. *Shape:* ``(N, 3 V)``."""
+        part = (self.most / _lengths(rows).clamp_min(torch.finfo(rows.dtype).tiny)).clamp_max(1)
+        return (rows.unflatten(1, (3, -1)) * part[:, None]).flatten(1)
 
 
 def _lengths(rows: Tensor) -> Tensor:
     """*Shape:* ``(N, 3 V) -> (N, V)``."""
     x, y, z = rows.unflatten(1, (3, -1)).unbind(1)
     return (x * x + y * y + z * z).sqrt()
-
-
-def _clipped(rows: Tensor, most: float) -> Tensor:
-    """Vectors shortened to a length where they are longer. *Shape:* ``(N, 3 V)``."""
-    part = (most / _lengths(rows).clamp_min(torch.finfo(rows.dtype).tiny)).clamp_max(1)
-    return (rows.unflatten(1, (3, -1)) * part[:, None]).flatten(1)

@@ -1,117 +1,223 @@
-"""The contact energy of many shapes, its derivatives, and Newton steps of all vertices with it."""
+r"""Active contacts of one shape or more: their search and their energy.
 
+With the height :math:`g` of a vertex over the plane of a face, the energy of the active contacts is
+:math:`\sum_m k A_m \min(g_m - \bar g, 0)^2`, with the area ``A`` around the vertex and the gap :math:`\bar g`. It is
+zero, with its first derivative, where the gap is kept.
+"""
+
+from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torch_modal import trees
-from torch_modal.backends.torch.alignment import Pair
-from torch_modal.backends.torch.fine_steps import FurtherDerivatives, FurtherEnergy
-from torch_modal.contact.search import Contacts
-from torch_modal.energy.contact import Contact
-from torch_modal.geometry.vectors import pick
-from torch_modal.inbetween.between import Between
-from torch_modal.inbetween.samples import Samples
+from torch_modal.autograd import transformed
+from torch_modal.backends.torch.fine_steps import FurtherDerivatives
+from torch_modal.contact.detect import Search
+from torch_modal.energy.term import Mesh
+from torch_modal.geometry.crossings import Crossings, FloatArray, IntArray
+from torch_modal.geometry.vectors import cross, inverse, norm, pick
+
+GAP = 0.15
+"""Distance that is kept, at a diagonal of 100."""
+STIFFNESS = 3000.0
+"""``k``, at that diagonal; stretching has 500."""
 
 
-class ActiveContacts:
-    """The contact term of the active contacts: pairs of a shape and an element.
+def refuse_transforms(x: Tensor) -> None:
+    """Refuse shapes whose numbers cannot be read, or whose tangents would be lost: the search is not torch's.
+
+    Raises:
+        RuntimeError: They are within a transform of ``torch.func``, or have a tangent.
+    """
+    if transformed(x):
+        raise RuntimeError(
+            "shapes with contact have no forward mode, and no transforms of torch.func: take torch.autograd.grad, or "
+            "contact=False"
+        )
+
+
+class Contacts(NamedTuple):
+    """Active contacts of T shapes: pairs of a vertex and a face."""
+
+    shapes: Tensor
+    """The shape of each. *Shape:* ``(N,)``."""
+    elements: Tensor
+    """The corners of the face, then the vertex. *Shape:* ``(N, 4)``."""
+
+    def rows(self, some: Tensor) -> "Contacts":
+        """Contacts of some shapes, counted anew. *Shape:* ``(S,)``."""
+        at, place = torch.nonzero(self.shapes[:, None] == some, as_tuple=True)
+        return Contacts(place, self.elements[at])
+
+    def beside(self, former: "Contacts") -> "Contacts":
+        """Add the former contacts of vertices that have none now: without them, what was pushed out falls back."""
+        own, before = (each.shapes * (1 + _last(self, former)) + each.elements[:, 3] for each in (self, former))
+        kept = ~torch.isin(before, own)
+        shapes = torch.cat([self.shapes, former.shapes[kept]])
+        return Contacts(shapes, torch.cat([self.elements, former.elements[kept]]))
+
+
+def _last(*contacts: Contacts) -> int:
+    """Largest vertex index."""
+    return max(int(each.elements.max()) if len(each.elements) else 0 for each in contacts)
+
+
+class ContactSearch:
+    """Search for active contacts of T shapes between the same known shapes.
+
+    Vertices beside an intersection are watched in all later searches.
 
     Args:
-        active: Of all shapes.
-        like: The shapes, whose dtype it has. *Shape:* ``(T, V, 3)``.
+        mesh: The mesh.
+        known: Shapes whose own intersections stay as they are, in the frame. *Shape:* ``(K, V, 3)``.
+        areas: Areas of the vertices, constants of the gradient. *Shape:* ``(V,)``.
+        n_shapes: T.
+        pairs: The ``search`` of :class:`~torch_modal.geometry.crossings.Crossings`.
     """
 
-    def __init__(self, active: Contacts, like: Tensor) -> None:
-        n = like.shape[1]
-        #: The shape of each, and which element it is. *Shape:* ``(N,)``.
-        self.shapes, which = torch.nonzero(active.weights > 0, as_tuple=True)
-        #: The vertices of each, in rows of all shapes. *Shape:* ``(4, N)``.
-        self.corners = (active.elements[which] + (self.shapes * n)[:, None]).T.contiguous()
-        self.weights, self.gaps = (own[self.shapes, which].to(like) for own in (active.weights, active.gaps))
-        self.term, self.n_shapes = Contact(active.elements), len(active.weights)
+    def __init__(
+        self,
+        mesh: Mesh,
+        known: Tensor,
+        areas: Tensor,
+        n_shapes: int,
+        pairs: Callable[[FloatArray], IntArray] | None = None,
+    ) -> None:
+        shapes = known.detach().double().cpu().numpy()
+        self.search = Search(Crossings(mesh.connectivity, shapes, search=pairs))
+        self.faces = torch.tensor(mesh.connectivity.faces)
+        self.areas = areas
+        self.watched = np.zeros((n_shapes, known.shape[1]), dtype=bool)
 
-    def _missing(self, flat: Tensor) -> tuple[Tensor, Tensor]:
-        first, *others = (pick(flat, corner) for corner in self.corners)
-        edge_vectors = torch.stack([other - first for other in others])
-        return edge_vectors, self.term.difference(self.term.measures(edge_vectors), self.gaps)
+    def __call__(self, x: Tensor, some: Tensor) -> tuple[Contacts, Tensor]:
+        """Contacts of some of the shapes, and their numbers of far pairs. *Shape:* ``(T, V, 3), (S,) -> (S,)``."""
+        shapes, elements, n_far = [], [], []
+        for i in some.tolist():
+            if not bool(x[i].isfinite().all()):
+                n_far.append(0)
+                continue
+            found = self.search(_numbers(x[i]), self.watched[i])
+            self.watched[i] = found.watched
+            vertices, faces = torch.from_numpy(found.vertices), torch.from_numpy(found.faces)
+            shapes.append(torch.full_like(vertices, i))
+            elements.append(torch.cat([self.faces[faces], vertices[:, None]], 1))
+            n_far.append(found.n_far)
+        every = torch.cat([torch.zeros(0, dtype=torch.int64), *shapes]).to(x.device)
+        corners = torch.cat([torch.zeros(0, 4, dtype=torch.int64), *elements]).to(x.device)
+        return Contacts(every, corners), torch.tensor(n_far, dtype=torch.int64, device=x.device)
+
+    def count(self, x: Tensor) -> Tensor:
+        """Numbers of far pairs of triangles. *Shape:* ``(S, V, 3) -> (S,)``, int64."""
+        crossings = self.search.crossings
+        counts = [len(crossings.far_pairs(_numbers(own))) if bool(own.isfinite().all()) else 0 for own in x]
+        return torch.tensor(counts, dtype=torch.int64, device=x.device)
+
+    def depth(self, x: Tensor) -> float:
+        """Depth of the deepest contact of a shape, with the gap. *Shape:* ``(V, 3)``."""
+        shape = _numbers(x)
+        pairs = self.search.crossings.far_pairs(shape)
+        return GAP + max(float(self.search.depth(shape, pairs).max()), self.search.crossings.reach(shape, pairs))
+
+    def watch(self, contacts: Contacts, around: int) -> None:
+        """Watch the surroundings of contacts, in their shapes and in so many neighbours in time on either side."""
+        before = self.watched.copy()
+        for i in contacts.shapes.unique().tolist():
+            vertices = contacts.elements[contacts.shapes == i].unique().cpu().numpy()
+            before[max(0, i - around) : i + around + 1] |= self.search.crossings.grown(vertices, 2)
+        self.watched = before
+
+
+def _numbers(x: Tensor) -> FloatArray:
+    return x.detach().double().cpu().numpy()  # type: ignore[no-any-return]
+
+
+class ContactEnergy:
+    """Energy of the active contacts of a batch, beside that of the mesh.
+
+    Args:
+        contacts: Those of the batch.
+        areas: Areas of the vertices. *Shape:* ``(V,)``.
+        like: The batch, whose dtype it has. *Shape:* ``(B, V, 3)``.
+    """
+
+    def __init__(self, contacts: Contacts, areas: Tensor, like: Tensor) -> None:
+        self.shapes, elements = contacts
+        #: The vertices of each contact, in rows of all shapes. *Shape:* ``(4, N)``.
+        self.corners = (elements + (self.shapes * like.shape[1])[:, None]).T.contiguous()
+        self.weights = STIFFNESS * areas.to(like)[elements[:, 3]]
+
+    def missing(self, x: Tensor, near: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Missing distances, at most zero, and gradients of the heights in the corners.
+
+        Args:
+            x: *Shape:* ``(B, V, 3)``.
+            near: Contacts to look at. Default: all. *Shape:* ``(n,)``.
+
+        Returns:
+            *Shape:* ``(n,), (4, 3, n)``.
+        """
+        corners = self.corners if near is None else self.corners[:, near]
+        first, *others = (pick(_rows(x), corner) for corner in corners)
+        side, other, to_vertex = (corner - first for corner in others)
+        doubled = cross(side, other)
+        length = norm(doubled)
+        per_length = inverse(length, length <= 0)
+        normal = doubled * per_length
+        height = (normal * to_vertex).sum(0)
+        within = (to_vertex - height * normal) * per_length
+        gradients = torch.stack([cross(other, within), cross(within, side), normal])
+        return (height - GAP).clamp_max(0), torch.cat([-gradients.sum(0)[None], gradients])
 
     def value(self, x: Tensor) -> Tensor:
-        """Of each shape. *Shape:* ``(T, V, 3) -> (T,)``."""
-        return self._summed(self.weights * self._missing(_flat(x))[1] ** 2)
+        """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""
+        return self._summed(x, self.weights * self.missing(x)[0] ** 2)
 
     def at(self, x: Tensor) -> FurtherDerivatives:
-        """Of the vertices that are too near. *Shape:* ``(T, V, 3)``."""
-        edge_vectors, missing = self._missing(_flat(x))
+        """Derivatives, of which the contacts that keep the gap have none. *Shape:* ``(B, V, 3)``."""
+        missing = self.missing(x)[0]
         near = torch.nonzero(missing).flatten()
-        corners, gradients = self.corners[:, near].flatten(), self.term.gradients(edge_vectors[..., near])
-        on_corners = torch.cat([-gradients.sum(0), *gradients], -1)
+        corners, gradients = self.corners[:, near].flatten(), self.missing(x, near)[1]
+        on_corners = gradients.transpose(0, 1).flatten(1)
         stiffness = 2 * self.weights[near].repeat(4)
         gradient, diagonal = torch.zeros_like(x), x.new_zeros(*x.shape[:-1], 6)
-        _flat(gradient).index_add_(1, corners, stiffness * missing[near].repeat(4) * on_corners)
+        _rows(gradient).index_add_(1, corners, stiffness * missing[near].repeat(4) * on_corners)
         blocks = (stiffness * on_corners)[:, None] * on_corners
-        _flat(diagonal).index_add_(1, corners, blocks.flatten(0, 1)[[0, 1, 2, 4, 5, 8]])
+        _rows(diagonal).index_add_(1, corners, blocks.flatten(0, 1)[[0, 1, 2, 4, 5, 8]])
 
         def product(field: Tensor) -> Tensor:
-            rate = (pick(_flat(field), corners) * on_corners).sum(0).unflatten(0, (4, -1)).sum(0)
+            rate = (pick(_rows(field), corners) * on_corners).sum(0).unflatten(0, (4, -1)).sum(0)
             out = torch.zeros_like(x)
-            _flat(out).index_add_(1, corners, stiffness * rate.repeat(4) * on_corners)
+            _rows(out).index_add_(1, corners, stiffness * rate.repeat(4) * on_corners)
             return out
 
-        return FurtherDerivatives(self._summed(self.weights * missing**2), gradient, diagonal, product)
+        return FurtherDerivatives(self._summed(x, self.weights * missing**2), gradient, diagonal, product)
 
-    def _summed(self, each: Tensor) -> Tensor:
-        """*Shape:* ``(N,) -> (T,)``."""
-        return each.new_zeros(self.n_shapes).index_add(0, self.shapes, each)
+    def _summed(self, x: Tensor, each: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3), (N,) -> (B,)``."""
+        return x.new_zeros(len(x)).index_add(0, self.shapes, each)
 
 
 class Pull(NamedTuple):
-    """A term that pulls vertices to places."""
+    """Springs that pull vertices to places."""
 
     to: Tensor
-    """The places. *Shape:* ``(T, V, 3)``."""
+    """The places. *Shape:* ``(B, V, 3)``."""
     weights: Tensor
-    """Of the squared distances. *Shape:* ``(V,)``."""
-
-    def rows(self, some: slice, like: Tensor) -> "Pull":
-        """Of some shapes, in the dtype of a tensor."""
-        return Pull(self.to[some].to(like), self.weights.to(like))
+    """Weights of the squared distances. *Shape:* ``(V,)``."""
 
     def value(self, x: Tensor) -> Tensor:
-        """Of each shape. *Shape:* ``(T, V, 3) -> (T,)``."""
+        """Energy of each shape. *Shape:* ``(B, V, 3) -> (B,)``."""
         return (self.weights * ((x - self.to) ** 2).sum(-1)).sum(-1)
 
     def at(self, x: Tensor) -> FurtherDerivatives:
-        """*Shape:* ``(T, V, 3)``."""
+        """*Shape:* ``(B, V, 3)``."""
         twice = 2 * self.weights[:, None]
         diagonal = (twice * twice.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])).expand(len(x), -1, -1)
         return FurtherDerivatives(self.value(x), twice * (x - self.to), diagonal, lambda field: twice * field)
 
 
-@torch.no_grad()
-def settled(
-    member: Between, samples: Samples, pair: Pair, x: Tensor, active: Contacts, pull: Pull, n_products: int
-) -> Tensor:
-    """A Newton step of all vertices of each shape, with its active contacts, never uphill.
-
-    Args:
-        member: In-betweens of the pair of key-frames.
-        samples: Of that pair, with the times of the shapes.
-        pair: The key-frames in the frame.
-        x: Where to start. *Shape:* ``(T, V, 3)``.
-        active: Of all shapes.
-        pull: What pulls them elsewhere.
-        n_products: Iterations of conjugate gradients.
-    """
-    anchors = member.anchors(trees.picked(pair, samples.which), samples.t)
-
-    def beside(own: slice, like: Tensor) -> list[FurtherEnergy]:
-        return [ActiveContacts(active.rows(own), like), pull.rows(own, like)]
-
-    return member.fine.relax(x, member.rests(samples, pair, anchors), [(1, n_products)], beside)
-
-
-def _flat(x: Tensor) -> Tensor:
-    """Components first, in place. *Shape:* ``(T, V, c) -> (c, T V)``."""
+def _rows(x: Tensor) -> Tensor:
+    """Components first, in place. *Shape:* ``(B, V, c) -> (c, B V)``."""
     return x.view(-1, x.shape[-1]).T

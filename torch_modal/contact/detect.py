@@ -1,40 +1,36 @@
-"""Search for contacts: which vertices must stay in front of which faces. NumPy and SciPy only.
+"""Search for contacts: vertices that must stay in front of faces. NumPy and SciPy only.
 
-A contact pairs a vertex with a face where parts went through each other, or nearly touch beside such a place. It never
-pairs a vertex with a face that it was behind in a known shape: what touches or crosses itself there stays as it is.
+A contact pairs a vertex with a face where parts pass through each other, or nearly touch beside such a place. It never
+pairs a vertex with a face that it was behind in a known shape: a self-intersection of a key-frame stays as it is there.
 """
 
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from torch_modal.geometry.closest import closest_on_triangles
 from torch_modal.geometry.crossings import BoolArray, Crossings, FloatArray, IntArray, Surface
 from torch_modal.geometry.triangle_pairs import dot
 
 # Lengths are parts of the diagonal.
 REACH = 0.06
-"""How deep a vertex may be to be pushed out."""
+"""Largest depth of a vertex that is pushed out."""
 NEAR = 0.015
-"""How far in front of a face a vertex is watched, beside a place where parts went through each other."""
+"""Largest distance in front of a face at which a vertex beside an intersection is watched."""
 FACING = -0.1
-"""Most cosine between the normals of a vertex and of a face that face each other."""
+"""Largest cosine between the normals of a vertex and of a face that face each other."""
 DEEP = 0.12
-"""Distance along the surface, from a crossing, within which penetrating vertices are searched."""
-SPREAD = 0.05
-"""How far along the surface from where a key-frame passes through itself the same depth is tolerated."""
-LENIENT = 0.06
-"""Part of the time between two key-frames over which what crosses in one of them is pushed out of a shape alone."""
+"""Distance along the surface, from an intersection, within which penetrating vertices are searched."""
 _STRAIGHT = 0.7
-"""Least part of the distance that lies along the face's normal; less is beside the face, not before it."""
+"""Least part of the distance that lies along the face's normal; with less, the vertex is beside the face."""
 _BEHIND = 0.02
-"""Of the mean edge length: how far behind a face a vertex that is not inside may lie, which is rounding of a fold."""
+"""Part of the mean edge length: how far behind a face a vertex outside may lie, which is rounding of a fold."""
 _TIE = 1e-6
-"""Lengths that differ by less than this part of them are equal but for rounding."""
+"""Lengths that differ by less than this part are equal but for rounding."""
 _NEAREST = 64
-"""Faces, by their centres, among which the nearest to a vertex is looked for; four times as many from inside."""
+"""Number of faces, by their centres, among which the nearest is searched; four times as many from inside."""
 
 
 class FoundContacts(NamedTuple):
@@ -44,12 +40,10 @@ class FoundContacts(NamedTuple):
     """*Shape:* ``(n,)``."""
     faces: IntArray
     """*Shape:* ``(n,)``."""
-    slack: FloatArray
-    """How deep they may be beside each known shape; 0 where nothing passes through itself. *Shape:* ``(n, K)``."""
-    far: IntArray
-    """Pairs of triangles that went through each other. *Shape:* ``(P, 2)``."""
+    n_far: int
+    """Number of far pairs of triangles."""
     watched: BoolArray
-    """Vertices beside places where they do, or did in an earlier search. *Shape:* ``(V,)``."""
+    """Vertices beside intersections of this and of earlier searches. *Shape:* ``(V,)``."""
 
 
 class Search:
@@ -65,71 +59,33 @@ class Search:
         self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
         self._known = [Surface(crossings, x) for x in crossings.known]
 
-    def __call__(self, x: FloatArray, watched: BoolArray | None = None) -> FoundContacts:
-        """The active contacts of a shape.
+    def __call__(self, x: FloatArray, watched: BoolArray) -> FoundContacts:
+        """Find the contacts of a shape; none where no parts pass through each other.
 
         Args:
             x: *Shape:* ``(V, 3)``.
-            watched: Of earlier searches: what was pushed apart is watched on. *Shape:* ``(V,)``.
+            watched: Vertices of earlier searches. *Shape:* ``(V,)``.
         """
         crossings = self.crossings
         pairs = crossings.far_pairs(x)
-        seeds = np.zeros(len(x), dtype=bool) if watched is None else watched.copy()
-        none = np.zeros(0, np.int64)
-        if not len(pairs) and not seeds.any():
-            return FoundContacts(none, none, np.zeros((0, len(self._known))), pairs, seeds)
+        if not len(pairs):
+            none = np.zeros(0, np.int64)
+            return FoundContacts(none, none, 0, watched)
         corners = np.zeros(len(x), dtype=bool)
         corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
         before = crossings.known_inside
         surface = Surface(crossings, x)
-        winds = crossings.winds(surface, crossings.within(corners, DEEP) | (seeds & before))
+        winds = crossings.winds(surface, crossings.within(corners, DEEP) | (watched & before))
         inside = crossings.hanging(winds & ~before, corners)
-        seeds |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
+        seeds = watched | crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
         # What was inside in a key-frame is not to go in elsewhere.
         stuck = winds & before & seeds
-        return FoundContacts(*self.opposite(surface, seeds, inside, stuck), pairs, seeds)
-
-    def tolerance(self, slack: FloatArray, t: float) -> FloatArray:
-        """How much of what crosses in both key-frames is tolerated between them: all at their times, nothing later.
-
-        Args:
-            slack: Depths in the key-frames. *Shape:* ``(..., 2)``.
-            t: The time, from 0 to 1.
-
-        Returns:
-            From 0 to 1; 0 where there is no depth. *Shape:* ``(..., 2)``.
-        """
-        part = np.clip(1 - np.array([t, 1 - t]) / LENIENT, 0, 1)
-        return (slack > 0) * part  # type: ignore[no-any-return]
-
-    def n_left(self, pairs: IntArray, t: float) -> int:
-        """How many pairs of faces are not beside what is tolerated. *Shape:* ``(P, 2)``."""
-        if not len(pairs) or not self._known:
-            return len(pairs)
-        slack = self.tolerated[self.crossings.mesh.faces[pairs]].max((1, 2))
-        return int((self.tolerance(slack, t) <= 0).all(1).sum())
-
-    @cached_property
-    def tolerated(self) -> FloatArray:
-        """How deep each known shape passes through itself around each vertex. *Shape:* ``(V, K)``."""
-        crossings = self.crossings
-        found = np.zeros((crossings.mesh.n_vertices, len(crossings.known)))
-        alone = Search(Crossings(crossings.mesh, crossings.known[:0], crossings.like))
-        for k, (x, pairs) in enumerate(zip(crossings.known, crossings.pairs_of_known, strict=True)):
-            deep = alone.depth(x, pairs[crossings.far_apart(pairs)])
-            own = np.flatnonzero(deep)
-            patch = connected_components(crossings.adjacency[own][:, own], directed=False)[1]
-            for number in np.unique(patch):
-                mine = np.zeros(len(x), dtype=bool)
-                mine[own[patch == number]] = True
-                around = crossings.within(mine, SPREAD)
-                found[around, k] = np.maximum(found[around, k], deep[mine].max())
-        return found
+        return FoundContacts(*self.opposite(surface, seeds, inside, stuck), len(pairs), seeds)
 
     def opposite(
         self, surface: Surface, seeds: BoolArray, inside: BoolArray, stuck: BoolArray
-    ) -> tuple[IntArray, IntArray, FloatArray]:
-        """The nearest face before which, or of what is inside, behind which each vertex lies.
+    ) -> tuple[IntArray, IntArray]:
+        """Find the nearest face in front of which each vertex lies, or behind which, if it is inside.
 
         Args:
             surface: The shape.
@@ -138,25 +94,20 @@ class Search:
             stuck: Vertices that are inside the surface, and were in a known shape. *Shape:* ``(V,)``.
 
         Returns:
-            Vertices, faces and slack of :class:`FoundContacts`.
+            Vertices and faces. *Shape:* ``(n,), (n,)``.
         """
         crossings, corners = self.crossings, self.crossings.mesh.faces
         reach, near = REACH * crossings.diagonal, NEAR * crossings.diagonal
         some = np.flatnonzero(seeds[corners].any(1))
         tree = cKDTree(surface.centres[some])
         within = inside | stuck
-        parts = []
-        for chosen, radius in ((seeds & ~within, near + 1.5 * self._edge), (within, reach)):
-            own = np.flatnonzero(chosen)
-            if len(own):
-                n = min(_NEAREST if chosen is not within else 4 * _NEAREST, len(some))
-                distance, found = tree.query(surface.x[own], n, distance_upper_bound=radius)
-                there = np.isfinite(distance.reshape(-1))
-                parts.append((np.repeat(own, n)[there], some[found.reshape(-1)[there]]))
-        if not parts:
-            none = np.zeros(0, np.int64)
-            return none, none, np.zeros((0, len(self._known)))
-        v, f = (np.concatenate(part) for part in zip(*parts, strict=True))
+        parts = [np.zeros((2, 0), np.int64)]
+        for chosen, radius, n in ((seeds & ~within, near + 1.5 * self._edge, _NEAREST), (within, reach, 4 * _NEAREST)):
+            own, n = np.flatnonzero(chosen), min(n, len(some))
+            distance, found = tree.query(surface.x[own], n, distance_upper_bound=radius)
+            there = np.isfinite(distance.reshape(-1))
+            parts.append(np.stack([np.repeat(own, n)[there], some[found.reshape(-1)[there]]]))
+        v, f = np.concatenate(parts, 1)
         v, f = _kept(dot(surface.vertex_normals[v], surface.normals[f]) < FACING, v, f)
         v, f = _kept(~(corners[f] == v[:, None]).any(1), v, f)
         height = _heights(surface, v, f)
@@ -164,28 +115,21 @@ class Search:
         v, f, height = _kept(keep, v, f, height)
         distance = _distances(surface, v, f)
         v, f, distance = _kept(np.abs(height) > _STRAIGHT * distance - 1e-9 * reach, v, f, distance)
-        slack: list[FloatArray] = []
         for known in self._known:
-            side = _heights(known, v, f)
-            behind = side <= -1e-3 * self._edge
+            behind = _heights(known, v, f) <= -1e-3 * self._edge
             behind[behind] = _distances(known, v[behind], f[behind]) <= 1.5 * reach
-            keep = ~behind | stuck[v]
-            slack = [part[keep] for part in slack] + [np.where(behind, -side, 0.0)[keep]]
-            v, f, distance = _kept(keep, v, f, distance)
+            v, f, distance = _kept(~behind | stuck[v], v, f, distance)
         first = _nearest_faces(v, f, distance, _heights(surface, v, f))
-        v, f, both = v[first], f[first], np.stack(slack, 1)[first] if slack else np.zeros((len(first), 0))
-        # What is in a part also lies behind its far side, deeper than it went in.
-        own = np.maximum(self.tolerated[v], self.tolerated[corners[f]].max(1))
-        both = np.where(own > 0, own, both)
+        v, f = v[first], f[first]
         # Folds are inside, too, where they are in a key-frame.
         keep = np.ones(len(v), dtype=bool)
         keep[stuck[v]] = crossings.separated(v[stuck[v]], corners[f[stuck[v]]])
-        return v[keep], f[keep], both[keep]
+        return v[keep], f[keep]
 
     def depth(self, x: FloatArray, pairs: IntArray) -> FloatArray:
-        """How deep vertices are inside where parts went through each other; 0 elsewhere.
+        """Penetration depth of vertices where parts pass through each other; 0 elsewhere.
 
-        That is the distance to the nearest face that faces them, other than of the patch that went in with them.
+        It is the distance to the nearest face that faces them, other than of the patch that went in with them.
 
         Args:
             x: *Shape:* ``(V, 3)``.
@@ -219,27 +163,26 @@ class Search:
 
 
 def _heights(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
-    """Of vertices over the planes of faces. *Shape:* ``(n,), (n,) -> (n,)``."""
+    """Heights of vertices over the planes of faces. *Shape:* ``(n,), (n,) -> (n,)``."""
     return dot(surface.x[v] - surface.x[surface.faces[f, 0]], surface.normals[f])
 
 
 def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
-    """From vertices to faces. *Shape:* ``(n,), (n,) -> (n,)``."""
-    offset = surface.x[v] - nearest_on_triangles(surface.x[v], surface.x[surface.faces[f]])
-    return np.sqrt(dot(offset, offset))  # type: ignore[no-any-return]
+    """Distances of vertices from faces. *Shape:* ``(n,), (n,) -> (n,)``."""
+    return closest_on_triangles(surface.x[v], surface.x[surface.faces[f]])[1]
 
 
 def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:
-    """Which pairs are those of each vertex with its nearest face.
+    """Indices of the pairs of each vertex with its nearest face.
 
-    Faces around the nearest point share it, and rounding would choose among them: the one whose plane is farthest is
-    taken, and of those in one plane the first.
+    Several faces may share the nearest point, and rounding would choose among them: the face whose plane is farthest
+    is used, and the first of those in one plane.
 
     Args:
         v: Vertices. *Shape:* ``(n,)``.
         f: Faces. *Shape:* ``(n,)``.
-        distance: From the face. *Shape:* ``(n,)``.
-        height: Over its plane. *Shape:* ``(n,)``.
+        distance: Distances from the faces. *Shape:* ``(n,)``.
+        height: Heights over their planes. *Shape:* ``(n,)``.
     """
     chosen = np.arange(len(v))
     for lengths, sign in ((distance, 1), (np.abs(height), -1)):
@@ -254,30 +197,3 @@ def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: Float
 
 def _kept(keep: BoolArray, *arrays: Any) -> list[Any]:
     return [array[keep] for array in arrays]
-
-
-def nearest_on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
-    """The nearest point of each triangle to a point of its own. *Shape:* ``(n, 3), (n, 3, 3) -> (n, 3)``.
-
-    The foot on the plane where it lies within the triangle, otherwise the nearest of those on the three sides.
-    """
-    a, b, c = corners.transpose(1, 0, 2)
-    u, v, w = b - a, c - a, points - a
-    uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
-    determinant = uu * vv - uv * uv
-    flat = determinant <= 1e-300
-    scale = np.where(flat, 1, determinant)
-    s, t = (vv * uw - uv * vw) / scale, (uu * vw - uv * uw) / scale
-    best = a + s[:, None] * u + t[:, None] * v
-    outside = np.flatnonzero((s < 0) | (t < 0) | (s + t > 1) | flat)
-    least = np.full(len(outside), np.inf)
-    p = points[outside]
-    for start, end in ((a, b), (b, c), (c, a)):
-        from_, along = start[outside], end[outside] - start[outside]
-        squared = dot(along, along)
-        share = np.clip(dot(p - from_, along) / np.where(squared > 0, squared, 1), 0, 1)
-        foot = from_ + share[:, None] * along
-        distance = dot(p - foot, p - foot)
-        nearer = distance < least
-        best[outside[nearer]], least[nearer] = foot[nearer], distance[nearer]
-    return best

@@ -4,9 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_modal.arrays import FloatArray
+from torch_modal.arrays import BoolArray, FloatArray
 from torch_modal.contact.detect import Search
 from torch_modal.errors import MeshError
 from torch_modal.geometry.connectivity import Connectivity
@@ -75,38 +76,38 @@ def self_contacts(x: Any, faces: Any, ignore: Any = None) -> SelfContacts:
             "counted from 0"
         )
     mesh = Connectivity(corners, shapes.shape[1])
-    found, depths = [], []
-    crossings = None
-    for shape in shapes:
+    n = len(shapes)
+    pairs, new, far = [np.zeros((0, 2), np.int64)], [np.zeros(0, bool)], [np.zeros(0, bool)]
+    depth, crossings = np.zeros(shapes.shape[:2]), None
+    for i, shape in enumerate(shapes):
         if crossings is None or not len(known):
             crossings = Crossings(mesh, known, known[0] if len(known) else shape)
             search = Search(crossings)
         if not crossings.diagonal > 0:
             raise MeshError("all vertices of a shape lie at one place: it has no size")
-        pairs = crossings.pairs(shape)
-        far = crossings.is_far(pairs)
-        found.append((pairs, crossings.is_new(pairs), far))
-        depths.append(search.depth(shape, pairs[far]))
+        pairs.append(crossings.pairs(shape))
+        new.append(crossings.is_new(pairs[-1]))
+        far.append(crossings.is_far(pairs[-1]))
+        depth[i] = search.depth(shape, pairs[-1][far[-1]])
     lead, device = given.shape[:-2], given.device
+    of_shape = np.repeat(np.arange(n), [len(own) for own in pairs[1:]])
+    every, are_new, are_far = (np.concatenate(parts) for parts in (pairs, new, far))
 
-    def tensor(parts: list[Any], like: tuple[int, ...]) -> Tensor:
-        whole = np.concatenate([np.zeros(like, parts[0].dtype if parts else np.int64), *parts])
-        return torch.from_numpy(whole).to(device)
+    def tensor(array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(device)
 
-    def counted(parts: list[Any]) -> Tensor:
-        return torch.tensor([int(part.sum()) for part in parts], dtype=torch.int64, device=device).reshape(lead)
+    def counted(which: slice | BoolArray) -> Tensor:
+        return tensor(np.bincount(of_shape[which], minlength=n)).reshape(lead)
 
-    every, new, far_ones = zip(*found, strict=True) if found else ([], [], [])
-    depth = torch.from_numpy(np.stack(depths) if depths else np.zeros(shapes.shape[:2]))
     return SelfContacts(
-        tensor([np.full(len(pairs), i) for i, pairs in enumerate(every)], (0,)).long(),
-        tensor(list(every), (0, 2)).long(),
-        tensor(list(new), (0,)).bool(),
-        tensor(list(far_ones), (0,)).bool(),
-        depth.to(device, given.dtype).reshape(given.shape[:-1]),
-        counted([np.ones(len(pairs)) for pairs in every]),
-        counted(list(new)),
-        counted(list(far_ones)),
+        shape=tensor(of_shape),
+        pairs=tensor(every),
+        new=tensor(are_new),
+        far=tensor(are_far),
+        depth=tensor(depth).to(given.dtype).reshape(given.shape[:-1]),
+        number=counted(slice(None)),
+        n_new=counted(are_new),
+        n_far=counted(are_far),
     )
 
 

@@ -31,6 +31,12 @@ class Derivatives(NamedTuple):
     resolution: Tensor
     """Gradient norm that the rounding of the positions alone explains. *Shape:* ``(B,)``."""
 
+    @property
+    def hessian(self) -> Tensor:
+        """The full Hessian. *Shape:* ``(B, n, n)``."""
+        assert self.second_order is not None
+        return self.gauss_newton + self.second_order
+
 
 class Placement(NamedTuple):
     """The affine space of each sample, ``x(a) = base + columns a``, and its reference."""

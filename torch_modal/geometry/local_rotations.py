@@ -66,6 +66,7 @@ class LocalRotations(nn.Module):
             avoids what is a sliver in any. *Shape:* ``(K, V, 3)``.
     """
 
+    reference: Tensor
     faces: Tensor
     sides: Tensor
     side_signs: Tensor

@@ -39,7 +39,8 @@ class Objective:
             broadcasts against the samples. *Shape:* ``(...)``.
         terms: Further terms of the energy.
         anchor: ``rho``, the weight of the mean squared distance of the shape from the blend by local rotations, at a
-            size of 100, in the joint space. Without it there are many minima of almost the same energy, between which shapes jump.
+            size of 100, in the joint space. Without it there are many minima of almost the same energy, between which
+            shapes jump.
         coarse_faces: Faces of the mesh that the energy is evaluated on in the modal space.
         contact: True to keep parts from passing through each other (docs/contact.md). It needs the extra
             ``contact``, and the joint space.

@@ -100,6 +100,7 @@ class InBetweenSolver(nn.Module):
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = no_worse(x, starts, solution, self.distortion, compared, SLACK)
+        x, solution = self.finished(x, solution, rests)
         if report is not None:
             warn_of_starts(solution)
         valid = (solution.status != Status.INVALID)[:, None, None]
@@ -119,6 +120,10 @@ class InBetweenSolver(nn.Module):
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
         solution = Solution(*values)
         return self.space.lift(solution.amplitudes, base), solution
+
+    def finished(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
+        """Shapes and solutions as they are; a solver with contacts goes on from them. *Shape:* ``(B, V, 3)``."""
+        return x, solution
 
     def relaxed(self, x: Tensor, rests: RestShapes) -> Tensor:
         """Local steps and polish: deformation that the modes cannot represent. *Shape:* ``(B, V, 3)``."""

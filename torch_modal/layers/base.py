@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision, lasting, outlasting, require_numbers
+from torch_modal.contact.in_between import ContactSolver
 from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume, encloses
 from torch_modal.inbetween.results import InBetweenResult, Samples, report
@@ -92,7 +93,7 @@ class InBetweenLayer(nn.Module):
 
     @lasting
     def _build(self) -> None:
-        """Build everything that follows from the bases, in float64 on the CPU, and bring it to their dtype and device."""
+        """Build everything that follows from the bases, in float64 on the CPU, then of their dtype and device."""
         like = self.bases[0].reference
         references, modes = (
             [getattr(basis, name).double().cpu() for basis in self.bases] for name in ("reference", "modes")
@@ -102,7 +103,8 @@ class InBetweenLayer(nn.Module):
         #: True where there is a volume to be kept: not in sheets, whose energy has two terms.
         self.encloses = all(encloses(x, connectivity) for x in references)
         given = torch.stack(references), modes, Mesh(connectivity), list(self.terms), self.objective, self.solver
-        self.core = InBetweenSolver(*given).to(like)
+        kind = ContactSolver if self.objective.contact else InBetweenSolver
+        self.core = kind(*given).to(like)
 
     @lasting
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "InBetweenLayer":

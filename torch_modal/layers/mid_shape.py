@@ -1,12 +1,12 @@
 """The shape half-way between two key-frames, as a layer."""
 
-from collections.abc import Sequence
 from typing import Any, Literal
 
 from torch import Tensor, nn
 
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings, with_space
+from torch_modal.layers.base import Bases
 from torch_modal.layers.in_between import InBetween
 from torch_modal.precompute.basis import ModalBasis
 
@@ -30,7 +30,7 @@ class MidShape(nn.Module):
 
     def __init__(
         self,
-        bases: ModalBasis | Sequence[ModalBasis],
+        bases: Bases,
         faces: Tensor,
         space: Literal["joint", "paired"] | None = None,
         mu: float | Tensor | None = None,

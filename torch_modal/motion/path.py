@@ -10,9 +10,12 @@ from torch import Tensor, nn
 from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.energies import RestShapes
+from torch_modal.contact.active import refuse_transforms
+from torch_modal.contact.in_between import push_apart
 from torch_modal.energy.shell import ALPHA, BETA
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import require_contact
+from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
 from torch_modal.inbetween.results import InBetweenResult, unminimised, warn_of_starts, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
@@ -25,6 +28,9 @@ from torch_modal.motion.cubics import Scheme, located, wrapped
 from torch_modal.motion.spline import Knots, Spline
 from torch_modal.solve.implicit import Report
 from torch_modal.solve.minimise import Solution
+
+# Even times between two key-frames at which a path looks for contacts.
+N_SEARCHED = 31
 
 # Times that differ by no more than rounding, relative to the larger one, are the same.
 SAME_TIME = 2e-15
@@ -91,6 +97,8 @@ class Path(nn.Module):
         self.contact = objective.contact
         if self.contact:
             require_contact()
+        #: Number of even times in an interval at which contacts are searched.
+        self.n_searched = N_SEARCHED
         self.objective = replace(objective, contact=False)
         self.register_buffer("times", checked_times(times, n, cyclic))
         self.bases = nn.ModuleList(own)
@@ -99,11 +107,11 @@ class Path(nn.Module):
         #: The path scheme; None for the default.
         self.scheme = smooth if callable(smooth) else None
         given: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
-        #: In-betweens of each interval; of a smooth path none, or, with further terms, what minimises them.
+        #: In-betweens of each interval; of a smooth path none, or, with contact or further terms, those of all bases.
         self.layers: Any = nn.ModuleList()
         if not self.smooth:
             self.layers.extend(InBetween([own[i], own[j]], self.faces, **given) for i, j in self._pairs())
-        elif self.objective.terms:
+        elif self.objective.terms or self.contact:
             self.layers.append(Blend(own, self.faces, **given))
         self._build()
         self.register_load_state_dict_post_hook(lambda path, _: path._build())
@@ -191,14 +199,11 @@ class Path(nn.Module):
 
         def of_interval(i: int, rows: Tensor | slice) -> InBetweenResult:
             own, at = which[rows], u[rows]
-            ends = flat[own][:, list(self._pairs()[i])]
-            if knots is None:
-                return self.layers[i].solved(ends, torch.stack([1 - at, at], -1), at.shape, report)
-            found = self._on_spline(knots, i, own, at, report)
-            return self._in_contact(knots, flat, i, own, at, found) if self.contact else found
+            found = self._of_interval(knots, flat, i, own, at, report)
+            return self._separated(knots, flat, i, own, at, found) if self.contact else found
 
         result = by_interval(segment, len(self._pairs()), of_interval)
-        if self.layers and self.smooth:
+        if knots is not None and self.objective.terms:
             # Each shape is compared with itself.
             x = result.shapes[:, None]
             result = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape, report)
@@ -206,6 +211,48 @@ class Path(nn.Module):
         ends = torch.stack([flat[which, k] for k in pairs.unbind(-1)], 1).to(keyframes.dtype)
         exact = with_exact_keyframes(result.shapes, ends, torch.stack([1 - u, u], -1))
         return result._replace(shapes=exact).unflattened(lead)
+
+    def _of_interval(
+        self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor, report: Report | None
+    ) -> InBetweenResult:
+        """Shapes of one interval, without contact. *Shape:* ``(L, K, V, 3), (B,), (B,) -> (B, V, 3)``."""
+        if knots is not None:
+            return self._on_spline(knots, i, which, u, report)
+        ends = flat[which][:, list(self._pairs()[i])]
+        return self.layers[i].solved(ends, torch.stack([1 - u, u], -1), u.shape, report)  # type: ignore[no-any-return]
+
+    def _separated(
+        self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor, result: InBetweenResult
+    ) -> InBetweenResult:
+        """Shapes of one interval pushed apart, by a displacement found at even times of each motion."""
+        refuse_transforms(result.shapes)
+        layer, pair, n = self.layers[0 if self.smooth else i], list(self._pairs()[i]), len(self._pairs())
+        core, even = layer.core, torch.arange(1, self.n_searched + 1).to(u) / (self.n_searched + 1)
+        shapes, left = result.shapes.clone(), torch.zeros_like(result.solution.status)
+
+        def placed(own: Tensor, at: Tensor) -> tuple[Pose, Tensor | None, Tensor]:
+            """The poses, the rest shapes of a pair, and the key-frames in the frame."""
+            if knots is not None:
+                return self.spline.pose(knots, i, own, at), None, knots.shapes[i : i + 2, own[0]]
+            rests, pose, _ = core.alignment(flat[own][:, pair], torch.stack([1 - at, at], -1))
+            return pose, rests, rests[0]
+
+        for motion in which.unique().tolist():
+            with torch.no_grad():
+                own = torch.full_like(even, motion, dtype=torch.int64)
+                pose, known, ends = placed(own, even)
+                x = core.alignment.bring(self._of_interval(knots, flat, i, own, even, None).shapes, pose)
+                pulls = torch.stack([1 - even, even], -1)
+                pulls = torch.ones_like(pulls[:, :1]) if known is None else pulls
+                rests = RestShapes(x[:, None] if known is None else known, pulls, layer.stiffness_of(even, even.shape))
+                goes_on = self.smooth and (self.cyclic or i > 0), self.smooth and (self.cyclic or i < n - 1)
+                both = torch.stack([ends, flat[motion, pair]])
+                found = push_apart(core, x, even, rests, pose, both, goes_on)
+            mine = torch.nonzero(which == motion).flatten()
+            pose = placed(which[mine], u[mine])[0]
+            pushed, left[mine] = found.apply(core.alignment.bring(result.shapes[mine], pose), u[mine])
+            shapes = shapes.index_copy(0, mine, core.alignment.restore(pushed, pose))
+        return InBetweenResult(shapes, result.solution._replace(n_crossing=left))
 
     def _on_spline(self, knots: Knots, i: int, which: Tensor, u: Tensor, report: Report | None) -> InBetweenResult:
         """Shapes of one interval. *Shape:* ``(B,), (B,) -> (B, V, 3)``."""
@@ -232,7 +279,8 @@ class Path(nn.Module):
         wanted = (self.n_keyframes, *reference.shape)
         if keyframes.shape[-3:] != wanted:
             raise ValueError(
-                f"keyframes of this path have the shape (..., {wanted[0]}, {wanted[1]}, 3); got {tuple(keyframes.shape)}"
+                f"keyframes of this path have the shape (..., {', '.join(map(str, wanted))}); got "
+                f"{tuple(keyframes.shape)}"
             )
         if keyframes.device != reference.device:
             raise ValueError(
@@ -284,4 +332,4 @@ def joined(parts: Sequence[InBetweenResult], order: Tensor) -> InBetweenResult:
     wide = [nn.functional.pad(p.solution.amplitudes, (0, widest - p.solution.amplitudes.shape[-1])) for p in parts]
     columns = [wide, *zip(*(part.solution[1:] for part in parts), strict=True)]
     values = [None if column[0] is None else torch.cat(list(column))[order] for column in columns]
-    return InBetweenResult(torch.cat([part.shapes for part in parts])[order], Solution(*values))
+    return InBetweenResult(torch.cat([part.shapes for part in parts])[order], Solution(*values))  # type: ignore[arg-type]

@@ -169,6 +169,7 @@ def _along_path(
         warn_of_starts(result.solution)
         if chosen.objective.contact:
             total += len(when) - 2
+            assert result.solution.n_crossing is not None
             left += int((result.solution.n_crossing > 0).sum())
         yield result.shapes
     if chosen.objective.contact:
@@ -191,25 +192,18 @@ def _by_recursion(
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         ends = (i, (i + 1) % len(keyframes))
         layers: dict[tuple[int, int], MidShape] = {}
-
-        def layer(
-            a: int, b: int, ends: tuple[int, int] = ends, layers: dict[tuple[int, int], MidShape] = layers
-        ) -> MidShape:
-            if (a, b) not in layers:
-                own = [bases[ends[a]], bases[ends[b]]]
-                own = torch.stack(own) if isinstance(bases, Tensor) else own
-                made = MidShape(own, faces.cpu(), objective=chosen.objective, solver=chosen.solver)
-                layers[a, b] = made.to(keyframes.device)
-            return layers[a, b]
-
+        for a, b in [(0, 1)] if chosen.objective.space == "joint" else [(0, 1), (0, 0), (1, 1)]:
+            own = bases[[ends[a], ends[b]]] if isinstance(bases, Tensor) else [bases[ends[a]], bases[ends[b]]]
+            made = MidShape(own, faces.cpu(), objective=chosen.objective, solver=chosen.solver)
+            layers[a, b] = made.to(keyframes.device)
         shapes = keyframes[list(ends)]
         for _ in range(levels):
             if chosen.objective.space == "joint":
-                mids = layer(0, 1)(shapes[:-1], shapes[1:])
+                mids = layers[0, 1](shapes[:-1], shapes[1:])
             else:
                 nearest = _nearest(shapes, edges)
                 each = zip(nearest[:-1], nearest[1:], shapes[:-1], shapes[1:], strict=True)
-                mids = torch.stack([layer(a, b)(x, y) for a, b, x, y in each])
+                mids = torch.stack([layers[a, b](x, y) for a, b, x, y in each])
             shapes = torch.cat([torch.stack([shapes[:-1], mids], 1).flatten(0, 1), shapes[-1:]])
             bar.update()
         shapes = shapes if n_frames is None else _resample(shapes, n, weights)

@@ -127,7 +127,7 @@ def _directions(derivatives: Derivatives, damping: float | None) -> Tensor:
 
     *Shape:* ``(2, B, n)``.
     """
-    hessians = torch.stack([derivatives.gauss_newton, derivatives.gauss_newton + derivatives.second_order])
+    hessians = torch.stack([derivatives.gauss_newton, derivatives.hessian])
     hessians = ridged(hessians, damping)
     factor, info = torch.linalg.cholesky_ex(hessians)
     definite = info == 0

@@ -85,7 +85,7 @@ def _adjoint(
     placement = trees.filled(tree, tensors)
     converged = (status == Status.CONVERGED)[:, None]
     derivatives = energy.derivatives(amplitudes, placement)
-    hessian = ridged(derivatives.gauss_newton + derivatives.second_order)
+    hessian = ridged(derivatives.hessian)
     eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
     matrix = torch.where(converged[..., None], hessian, eye)
 

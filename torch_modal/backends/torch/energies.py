@@ -32,7 +32,7 @@ class RestShapes(NamedTuple):
     anchors: Tensor | None = None
     """Fixed points of the terms, where they have some. *Shape:* ``(B, P, 3)``."""
 
-    def rows(self, some: slice) -> "RestShapes":
+    def rows(self, some: slice | Tensor) -> "RestShapes":
         """Rest shapes of some of the samples."""
         anchors = None if self.anchors is None else self.anchors[some]
         return RestShapes(self.shapes[some], self.weights[some], [each[some] for each in self.stiffness], anchors)

@@ -167,7 +167,7 @@ class WarpModalEnergy(ModalEnergy):
         """As in the base class."""
         if not isinstance(reference, ShellReference):
             return super().place(base, reference, anchors)
-        return Placement(base.double(), reference)
+        return Placement(base.double(), reference)  # type: ignore[arg-type]
 
     def _plain(self, placement: Placement, direction: Tensor | None = None) -> Placement | None:
         """The placement for torch; None where it, and a direction in the amplitudes, are for kernels."""

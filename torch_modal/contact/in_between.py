@@ -1,0 +1,138 @@
+"""In-betweens whose parts do not pass through each other: each sample alone, or all times between two key-frames."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.backends.torch.energies import Beside, RestShapes
+from torch_modal.contact.acceleration import AccelerationLimit
+from torch_modal.contact.active import ContactSearch, refuse_transforms
+from torch_modal.contact.modal import ModalModel
+from torch_modal.contact.separate import Trajectory, separate, through
+from torch_modal.geometry.connectivity import vertex_areas
+from torch_modal.inbetween.alignment import Pose
+from torch_modal.inbetween.joint import JointSpace
+from torch_modal.inbetween.results import InBetweenResult, Samples
+from torch_modal.inbetween.solver import InBetweenSolver
+from torch_modal.solve.implicit import Report
+from torch_modal.solve.minimise import Solution
+
+PRODUCTS = 20
+"""Iterations of conjugate gradients in a Newton step with contacts, which are stiff."""
+
+
+class ContactSolver(InBetweenSolver):
+    """In-betweens whose parts do not pass through each other. Arguments as for :class:`InBetweenSolver`.
+
+    Samples are separated independently; those without intersections are the ones without contact.
+    """
+
+    def forward(self, samples: Samples, report: Report | None) -> InBetweenResult:
+        """Solve. Arguments as for :class:`InBetweenSolver`.
+
+        Samples with contacts are solved again alone: rounding depends on the batch, and contacts amplify it.
+        """
+        whole = super().forward(samples, report)
+        n_crossing = whole.solution.n_crossing
+        if len(samples.weights) == 1 or n_crossing is None or not bool(n_crossing.any()):
+            return whole
+        some = torch.nonzero(n_crossing).flatten()
+        parts = [super(ContactSolver, self).forward(samples.rows(slice(i, i + 1)), None) for i in some.tolist()]
+        each = zip(whole.solution, *(part.solution for part in parts), strict=True)
+        merged = (values[0].index_copy(0, some, torch.cat(values[1:])) for values in each)  # type: ignore[union-attr, arg-type]
+        shapes = whole.shapes.index_copy(0, some, torch.cat([part.shapes for part in parts]))
+        return InBetweenResult(shapes, Solution(*merged))
+
+    def finished(self, x: Tensor, solution: Solution, rests: RestShapes) -> tuple[Tensor, Solution]:
+        """Shapes and solutions with the numbers of far pairs; only one sample alone is separated."""
+        refuse_transforms(x)
+        searches = [contact_search(self, own, 1) for own in rests.shapes]
+        if len(x) == 1:
+            x, _, n_crossing = separate(x, _steps(self, rests), searches[0])
+        else:
+            counts = [search.count(own[None]) for search, own in zip(searches, x, strict=True)]
+            n_crossing = torch.cat([torch.zeros_like(solution.status[:0]), *counts])
+        return x, solution._replace(n_crossing=n_crossing)
+
+
+class Displacement(NamedTuple):
+    """The displacement that separates the shapes between two key-frames, at all times."""
+
+    field: Tensor | None
+    """At the times of the shapes, in their frame; None where nothing intersects. *Shape:* ``(T, V, 3)``."""
+    times: Tensor
+    """*Shape:* ``(T,)``."""
+    n_crossing: Tensor
+    """Numbers of far pairs that are left. *Shape:* ``(T,)``, int64."""
+    search: ContactSearch
+
+    def apply(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Displace shapes at any times; between those of the field, along a cubic spline.
+
+        A shape that would have more far pairs stays as it is. The gradient reaches shapes and times; the field is a
+        constant.
+
+        Args:
+            x: In the frame. *Shape:* ``(B, V, 3)``.
+            u: *Shape:* ``(B,)``.
+
+        Returns:
+            The shapes, and the far pairs that are left in each. *Shape:* ``(B, V, 3), (B,)``.
+        """
+        if self.field is None:
+            return x, torch.zeros_like(u, dtype=torch.int64)
+        if torch.equal(u, self.times) and not u.requires_grad:
+            return x + self.field, self.n_crossing
+        found = x + torch.tensordot(through(self.times, u), self.field, 1)
+        before, after = self.search.count(x), self.search.count(found)
+        return torch.where((after <= before)[:, None, None], found, x), torch.minimum(after, before)
+
+
+@torch.no_grad()
+def push_apart(
+    core: InBetweenSolver, x: Tensor, u: Tensor, rests: RestShapes, pose: Pose, ends: Tensor, goes_on: tuple[bool, bool]
+) -> Displacement:
+    """Find the displacement that separates the parts of shapes between two key-frames.
+
+    Args:
+        core: Has the energy and, where there are some, the modes.
+        x: The shapes in the frame. *Shape:* ``(T, V, 3)``.
+        u: Their times, even, between 0 and 1. *Shape:* ``(T,)``.
+        rests: Rest shapes of the energy of each.
+        pose: Of each.
+        ends: The key-frames in the frame, then in the caller's coordinates. *Shape:* ``(2, 2, V, 3)``.
+        goes_on: True where the motion goes on before the first and after the last key-frame.
+    """
+    scale = core.alignment.scale
+    seen = torch.cat([ends[1, :1], core.alignment.restore(x, pose), ends[1, 1:]]) * scale
+    limit = AccelerationLimit(seen, pose.rotation, goes_on)
+
+    def model(some: Tensor) -> ModalModel:
+        space = core.space
+        placement = space.place(x[some], rests.rows(some), u[some])
+        zeros = x.new_zeros(len(some), space.energy.n_amplitudes)
+        found = space.energy.derivatives(zeros, placement, second_order=False)
+        stiffness = found.gauss_newton - space.energy.anchor * torch.eye(zeros.shape[1]).to(found.gauss_newton)
+        return ModalModel(space.basis.fine, core.alignment.weights, found.gradient.to(u), stiffness.to(u))
+
+    search = contact_search(core, ends[0], len(u))
+    trajectory = Trajectory(u, limit, model if isinstance(core.space, JointSpace) else None)
+    found = separate(x, _steps(core, rests), search, trajectory)
+    field = None if found.x is x else found.x - x
+    return Displacement(field, u, found.n_crossing, contact_search(core, ends[0], 1))
+
+
+def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> ContactSearch:
+    """Search in shapes between key-frames. *Shape:* ``(K, V, 3)``."""
+    connectivity = core.mesh.connectivity
+    reference = core.alignment.reference.detach().cpu().double().numpy()
+    areas = vertex_areas(reference, connectivity.faces)
+    pairs = core.backend.crossings(connectivity, reference)
+    return ContactSearch(core.mesh, ends, torch.from_numpy(areas).to(ends), n_shapes, pairs)
+
+
+def _steps(core: InBetweenSolver, rests: RestShapes) -> Callable[[Tensor, Tensor, Beside], Tensor]:
+    """Newton steps of all vertices of some of the shapes, with energies beside that of the terms."""
+    return lambda x, some, beside: core.fine.relax(x, rests.rows(some), [(1, PRODUCTS)], beside)

@@ -1,0 +1,94 @@
+r"""First displacement of a trajectory: in the modes, smooth in time, zero at both ends.
+
+With amplitudes :math:`c_s` at the times of some shapes, and the cubic spline through them in between, it is the one of
+
+.. math:: \min_c \sum_s E_s(x_s + \Phi c_s) + \lambda \sum_v A_v \int |\ddot d_v|^2 dt
+
+for the energies with contact, of which the elastic part is replaced with its second-order model at the shapes.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.backends.torch.fine_steps import step_length
+from torch_modal.contact.active import ContactEnergy
+
+SMOOTHNESS = 30.0
+"""``lambda``, at a diagonal of 100, with the time between the ends as the unit."""
+SOFTNESS = 0.1
+"""Factor of the contact term: the modes alone would resolve contacts with far more energy than necessary."""
+STEPS = 2
+"""Newton steps."""
+
+
+class ModalModel(NamedTuple):
+    """Second-order model of the elastic energy of S shapes in n modes."""
+
+    modes: Tensor
+    """*Shape:* ``(n, V, 3)``."""
+    masses: Tensor
+    """Masses of the vertices, parts of the whole. *Shape:* ``(V,)``."""
+    gradient: Tensor
+    """*Shape:* ``(S, n)``."""
+    stiffness: Tensor
+    """*Shape:* ``(S, n, n)``."""
+
+
+def modal_displacement(model: ModalModel, x: Tensor, contact: ContactEnergy, accelerations: Tensor) -> Tensor:
+    """Take Newton steps, never uphill.
+
+    Args:
+        model: Model of the shapes.
+        x: The shapes. *Shape:* ``(S, V, 3)``.
+        contact: Their active contacts.
+        accelerations: Second differences of the spline through values of the shapes, between N even times.
+            *Shape:* ``(N, S)``.
+
+    Returns:
+        The displacement of the shapes. *Shape:* ``(S, V, 3)``.
+    """
+    modes, rate = model.modes.flatten(1), len(accelerations) + 1
+    gram = (model.modes * model.masses[:, None]).flatten(1) @ modes.T
+    # Half the Hessian of the squared acceleration, by row and column of the amplitudes of each shape.
+    bend = rate**3 * accelerations.T @ accelerations
+    smooth = SMOOTHNESS * bend[:, None, :, None] * gram[:, None, :]
+
+    def displaced(a: Tensor) -> Tensor:
+        return x + (a @ modes).view_as(x)
+
+    def value(a: Tensor) -> Tensor:
+        elastic = (model.gradient * a).sum() + 0.5 * torch.einsum("si,sij,sj->", a, model.stiffness, a)
+        return elastic + SOFTNESS * contact.value(displaced(a)).sum() + torch.einsum("ia,iajb,jb->", a, smooth, a)
+
+    a = torch.zeros_like(model.gradient)
+    for _ in range(STEPS):
+        pushed, hardened = _in_modes(contact, displaced(a), model.modes)
+        gradient = model.gradient + torch.einsum("sij,sj->si", model.stiffness, a) + SOFTNESS * pushed
+        gradient = gradient + 2 * torch.einsum("iajb,jb->ia", smooth, a)
+        own = model.stiffness + SOFTNESS * hardened
+        hessian = 2 * smooth.reshape(a.numel(), -1) + torch.block_diag(*own)
+        ridge = 1e-9 * hessian.diagonal().mean()
+        factor, info = torch.linalg.cholesky_ex(hessian + ridge * torch.eye(len(hessian)).to(hessian))
+        if int(info):
+            break
+        step = -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view_as(a)
+        a = a + step_length(value(a), (gradient * step).sum(), value(a + step), step.abs().amax()) * step
+    return displaced(a) - x
+
+
+def _in_modes(contact: ContactEnergy, x: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradient and Gauss-Newton Hessian of the contact energy in the modes.
+
+    *Shape:* ``(S, V, 3), (n, V, 3) -> (S, n), (S, n, n)``.
+    """
+    missing, gradients = contact.missing(x)
+    n, (n_shapes, n_vertices) = len(modes), x.shape[:2]
+    gradient, hessian = x.new_zeros(n_shapes, n), x.new_zeros(n_shapes, n, n)
+    for i in contact.shapes[missing < 0].unique().tolist():
+        own = torch.nonzero((contact.shapes == i) & (missing < 0)).flatten()
+        rates = torch.einsum("nkmc,kcm->mn", modes[:, contact.corners[:, own] - i * n_vertices], gradients[..., own])
+        weighted = 2 * contact.weights[own, None] * rates
+        gradient[i], hessian[i] = missing[own] @ weighted, rates.T @ weighted
+    return gradient, hessian

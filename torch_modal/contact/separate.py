@@ -1,0 +1,225 @@
+r"""Separation of parts that pass through each other, in one shape or in all shapes of a trajectory.
+
+The displacement :math:`d` is zero where nothing has to be done, and is the one of
+
+.. math:: \min_d \sum_i E_i(x_i + d_i) \quad \text{such that no vertex is accelerated too much}
+
+with the contact term in the energies. The alternating direction method of multipliers (Boyd et al. 2011) alternates
+two steps: each shape takes a Newton step of all vertices with its active contacts, and all are brought to the nearest
+displacement within the bound on accelerations. A shape alone has no such bound, and takes the Newton steps only.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_modal.backends.torch.energies import Beside
+from torch_modal.contact.acceleration import AccelerationLimit
+from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
+from torch_modal.contact.modal import ModalModel, modal_displacement
+
+LOOKED_AT = 8
+"""Number of shapes that are looked at first: without intersections there, nothing is done."""
+SOLVED = 16
+"""Number of shapes that take steps; the others follow along a cubic spline."""
+BESIDE = 0.125
+"""Duration beside a key-frame that intersects itself, in which all shapes take steps."""
+AROUND = 2
+"""Neighbours in time of shapes with contacts, in which the same vertices are watched."""
+ROUNDS = 4, 8
+"""Least and largest number of rounds."""
+PULL = 40.0
+"""Stiffness of the pull to the bounded displacement, by area; a contact has 3,000."""
+MOST_MOVED = 3.0
+"""Largest displacement of a vertex of a shape alone, times the depth of its contacts."""
+FADE = 0.0625
+"""Duration over which the displacement is faded out beside a shape that it makes worse, at first."""
+
+
+class Trajectory(NamedTuple):
+    """Shapes at T even times between two ends, which have no displacement."""
+
+    t: Tensor
+    """Times in (0, 1). *Shape:* ``(T,)``."""
+    limit: AccelerationLimit
+    """The bound on accelerations."""
+    model: Callable[[Tensor], ModalModel] | None
+    """Model of the elastic energy of some of the shapes in modes, *shape* ``(S,)``; None: without a start in modes."""
+
+
+class Separated(NamedTuple):
+    """Shapes after the separation."""
+
+    x: Tensor
+    """*Shape:* ``(T, V, 3)``."""
+    n_before: Tensor
+    """Number of far pairs of triangles of each shape before. *Shape:* ``(T,)``."""
+    n_crossing: Tensor
+    """Number of far pairs that are left. *Shape:* ``(T,)``."""
+
+
+def separate(
+    start: Tensor,
+    relax: Callable[[Tensor, Tensor, Beside], Tensor],
+    search: ContactSearch,
+    trajectory: Trajectory | None = None,
+) -> Separated:
+    """Separate the parts of T shapes that pass through each other; the shapes as they are, where none do.
+
+    No shape has more far pairs than before. Of one shape, no vertex is moved by more than :data:`MOST_MOVED` times the
+    depth of its contacts, and the steps with the contacts that were found are recorded for gradients.
+
+    Args:
+        start: The shapes in the frame, with a diagonal of 100. *Shape:* ``(T, V, 3)``.
+        relax: Takes a Newton step of all vertices of some of the shapes, given those, their indices and energies beside
+            the elastic one. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
+        search: Search for contacts between the known shapes.
+        trajectory: Times, limit and modes of several shapes; None for one shape alone.
+    """
+    n, device = len(start), start.device
+    every, nothing = torch.arange(n, device=device), torch.zeros(n, dtype=torch.int64, device=device)
+    stride = -(-n // LOOKED_AT)
+    if not bool(search.count(start[stride - 1 :: stride]).any()):
+        return Separated(start, nothing, nothing)
+    active, n_before = search(start, every)
+    search.watch(active, AROUND)
+    chosen = every if trajectory is None else _chosen(trajectory.t, search)
+    x = start
+    if trajectory is not None and trajectory.model is not None:
+        contact = ContactEnergy(active.rows(chosen), search.areas, start)
+        spline = through(trajectory.t[chosen], trajectory.t)
+        bend = (trajectory.limit.differences[:n] @ spline.double()).to(start)
+        moved = modal_displacement(trajectory.model(chosen), start[chosen], contact, bend)
+        x = start + torch.tensordot(spline, moved, 1)
+    x, n_crossing = _settled(start, x, relax, search, trajectory, active, chosen, n_before)
+    if trajectory is not None:
+        x, n_crossing = _never_worse(start, x - start, search, trajectory, n_before)
+    return Separated(x, n_before, n_crossing)
+
+
+def _chosen(t: Tensor, search: ContactSearch) -> Tensor:
+    """Shapes of a trajectory that take steps. *Shape:* ``(T,) -> (S,)``."""
+    # The first and the last hardly cost energy, and would be bent by what is done to the next.
+    stride = max(1, (len(t) + 1) // SOLVED)
+    chosen = torch.zeros(len(t), dtype=torch.bool, device=t.device)
+    chosen[stride - 1 :: stride] = chosen[0] = chosen[-1] = True
+    if len(search.search.crossings.known_pairs):
+        chosen |= (t < BESIDE) | (t > 1 - BESIDE)
+    return torch.nonzero(chosen).flatten()
+
+
+def _settled(
+    start: Tensor,
+    x: Tensor,
+    relax: Callable[[Tensor, Tensor, Beside], Tensor],
+    search: ContactSearch,
+    trajectory: Trajectory | None,
+    active: Contacts,
+    chosen: Tensor,
+    n_before: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Alternate the steps of each shape with the bound on all; the round with the fewest far pairs.
+
+    Args:
+        start: Without contact. *Shape:* ``(T, V, 3)``.
+        x: Where the rounds begin. *Shape:* ``(T, V, 3)``.
+        relax: As for :func:`separate`.
+        search: Likewise.
+        trajectory: Likewise.
+        active: Contacts of all shapes.
+        chosen: Shapes that take steps. *Shape:* ``(S,)``.
+        n_before: Far pairs of ``start``. *Shape:* ``(T,)``.
+
+    Returns:
+        The shapes, and their numbers of far pairs. *Shape:* ``(T, V, 3), (T,)``.
+    """
+    every, n_far, best, n_best = torch.arange(len(x), device=x.device), n_before, start, n_before
+    most = MOST_MOVED * search.depth(start[0]) if trajectory is None else math.inf
+    # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
+    alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
+    for k in range(1, ROUNDS[1] + 1):
+        energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), search.areas)
+        alone = x.index_copy(0, chosen, relax(alone[chosen], chosen, energies))
+        if trajectory is None:
+            x = alone
+        else:
+            wanted = (alone + dual - start)[chosen]
+            if len(chosen) < len(x):
+                wanted = torch.tensordot(through(trajectory.t[chosen], trajectory.t), wanted, 1)
+            moved, limited = trajectory.limit.nearest(wanted)
+            x = start + moved
+            dual = dual.index_add(0, chosen, (alone - x)[chosen])
+            springs[limited] = PULL * search.areas[limited]
+        some = every if k == ROUNDS[0] else torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
+        found, counts = search(x, some)
+        active, n_far = found.beside(active), n_far.index_copy(0, some, counts)
+        if k < ROUNDS[0]:
+            continue
+        if int(n_far.sum()) <= int(n_best.sum()) and float((x - start).detach().norm(dim=-1).max()) <= most:
+            best, n_best = x, n_far
+        if not bool(n_far.any()):
+            break
+        chosen = torch.unique(torch.cat([chosen, torch.nonzero(n_far).flatten()]))
+    return best, n_best
+
+
+def _energies(active: Contacts, pull: Pull, areas: Tensor) -> Beside:
+    """Energies beside the elastic one of the shapes that take steps, of which a slice is relaxed at a time."""
+
+    def beside(own: slice, like: Tensor) -> Sequence[ContactEnergy | Pull]:
+        some = torch.arange(len(pull.to), device=like.device)[own]
+        energies: list[ContactEnergy | Pull] = [ContactEnergy(active.rows(some), areas, like)]
+        if bool(pull.weights.any()):
+            energies.append(Pull(pull.to[own].to(like), pull.weights.to(like)))
+        return energies
+
+    return beside
+
+
+def _never_worse(
+    start: Tensor, field: Tensor, search: ContactSearch, trajectory: Trajectory, n_before: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Fade the displacement out around shapes in which it adds far pairs.
+
+    Where that adds some to other shapes, it is faded out around these, too, and where it does not help, twice as far:
+    at last, nothing is moved.
+
+    Args:
+        start: Without contact. *Shape:* ``(T, V, 3)``.
+        field: The displacement. *Shape:* ``(T, V, 3)``.
+        search: As for :func:`separate`.
+        trajectory: Likewise.
+        n_before: Far pairs of ``start``. *Shape:* ``(T,)``.
+
+    Returns:
+        The shapes, and their numbers of far pairs. *Shape:* ``(T, V, 3), (T,)``.
+    """
+    t, found, reach, bad = trajectory.t, field, FADE, torch.zeros_like(n_before, dtype=torch.bool)
+    while reach <= 1:
+        n_far = search.count(start + found)
+        worse = n_far > n_before
+        if not bool(worse.any()):
+            return start + found, n_far
+        if not bool((worse & ~bad).any()):
+            reach = 2 * reach
+        bad = bad | worse
+        distance = ((t[:, None] - t[bad]).abs().amin(1) / reach).clamp_max(1)
+        found, _ = trajectory.limit.nearest(field * (distance**2 * (3 - 2 * distance))[:, None, None])
+    return start, n_before
+
+
+def through(times: Tensor, t: Tensor) -> Tensor:
+    """Weights of a cubic spline through values at given times, and zero at 0 and 1. *Shape:* ``(T,), (B,) -> (B, T)``.
+
+    Their first derivative in ``t`` comes as a gradient.
+    """
+    from scipy.interpolate import CubicSpline  # 0.1 s, only where it is needed
+
+    knots = torch.cat([times.new_zeros(1), times.detach(), times.new_ones(1)]).double().cpu().numpy()
+    at = t.detach().double().cpu().numpy()
+    spline = CubicSpline(knots, torch.eye(len(knots)).numpy(), bc_type="natural")
+    values, slopes = (torch.from_numpy(f(at)[:, 1:-1]).to(t) for f in (spline, spline.derivative()))
+    return values + slopes * (t - t.detach())[:, None] if t.requires_grad else values
