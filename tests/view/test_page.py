@@ -649,7 +649,7 @@ def test_landmarks_that_cannot_be_shown(
     pages = ["--page", str(tmp_path / "page.html")]
     assert main(["view", *map(str, two), "--landmarks", str(file), *pages]) == 1
     assert "names vertex 99999 of mesh 1" in capsys.readouterr().err
-    for wrong in (["--linear"], ["--names", "a"], ["--live"]):
+    for wrong in (["--linear"], ["--names", "a"]):
         with pytest.raises(SystemExit):
             main(["view", *map(str, two), *pages, *wrong, "--landmarks"])
     with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""``torch-modal view``: shapes of files as a page, opened in the browser or written; key-frames in a live session."""
+"""``torch-modal view``: shapes of files as a page, opened in the browser or written."""
 
 from __future__ import annotations
 
@@ -26,10 +26,7 @@ The page is one HTML file that needs no network. Shapes are numbered mesh files,
 folder of them, or a GLB that `subdivide` or save_animation wrote.
 
 With --landmarks, they are meshes of any connectivity, side by side, on which vertices
-that belong together are picked, for `register` and `subdivide --register`.
-
-With --live, they are key-frames, and in-betweens are computed while you drag
-the time, the stiffnesses, single modes, or handles of the key-frames."""
+that belong together are picked, for `register` and `subdivide --register`."""
 
 EXAMPLES = """\
 examples:
@@ -38,9 +35,7 @@ examples:
   write a page of three sequences side by side:
     torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
   pick landmarks on two meshes, and save them as the file that --landmarks of `register` takes:
-    torch-modal view cat.obj dog.obj --landmarks
-  drag in-betweens of two key-frames (pip install 'torch_modal[view]'):
-    torch-modal view --live open.obj fist.obj"""
+    torch-modal view cat.obj dog.obj --landmarks"""
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -86,18 +81,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a page to pick landmarks of two meshes or more; with a FILE, those of it are there already",
     )
-    sub.add_argument("--live", action="store_true", help="a live session of key-frames, in place of a page")
-    sub.add_argument(
-        "--port", type=number(int, 1), metavar="N", default=8080, help="of --live, the first to try (default: 8080)"
-    )
     add_common(sub, overwrite="replace the file if it exists (default: refuse)", cache_dir=None, all_of=False)
 
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
-    if args.live:
-        _live(args)
-        return
     check_name(args, "--page", args.page, PAGES)
     if args.landmarks:
         _landmarks(args)
@@ -158,23 +146,6 @@ def _landmarks(args: argparse.Namespace) -> None:
     named = _named(args.names or [path.name for path in args.meshes], meshes)
     page = tm.show_landmarks(named, rows, title="Landmarks")
     _open(page, f"{len(meshes)} meshes to pick landmarks on", args)
-
-
-def _live(args: argparse.Namespace) -> None:
-    """Key-frames in a live session, until Ctrl-C."""
-    others = ("page", "compare", "linear", "names", "landmarks")
-    _refuse(args, others, "belong to pages; --live shows what is computed now")
-    if len(args.meshes) < 2:
-        args.fail("--live needs two key-frames or more")
-
-    import torch_modal as tm
-    from torch_modal.view.live import require_viser
-
-    require_viser()
-    session = tm.live(*tm.load_keyframes(args.meshes), port=args.port)
-    print(f"open {session.url} in a browser; Ctrl-C ends the session", flush=True)
-    webbrowser.open(session.url)
-    session.wait()
 
 
 def _refuse(args: argparse.Namespace, options: tuple[str, ...], why: str) -> None:
