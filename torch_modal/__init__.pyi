@@ -72,10 +72,9 @@ from .solve.solver import Status as Status
 from .statistics.components import Components as Components
 from .statistics.fit import Fitted as Fitted
 from .view.animation import save_animation as save_animation
-from .view.document import Page as Page
+from .view.page import Page as Page
 from .view.page import show as show
 from .view.page import show_landmarks as show_landmarks
-from .view.page import write_page as write_page
 from .view.picture import render_sequence as render_sequence
 
 __version__: str

@@ -14,7 +14,7 @@ from torch_modal.cli.output import check_name, check_output
 from torch_modal.io.formats import PAGES
 
 if TYPE_CHECKING:
-    from torch_modal.view.document import Page
+    from torch_modal.view.page import Page
 
 SUMMARY = "show sequences of shapes, in a page for the browser"
 
