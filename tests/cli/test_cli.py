@@ -15,7 +15,6 @@ import torch
 from conftest import listen_to_ctrl_c
 
 import torch_modal as tm
-from torch_modal import progress
 from torch_modal.cli import demo
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
@@ -46,12 +45,6 @@ def coarse_tetrahedra(monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the mesher's time; nothing here depends on how fine the tetrahedra are."""
     coarse = TetrahedraSettings(edge_length_fac=0.05, epsilon=3e-3)
     monkeypatch.setitem(modes_module.QUALITIES, "fast", coarse)
-
-
-@pytest.fixture(autouse=True)
-def no_progress_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine there would be some; one test asks for them."""
-    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 1e9)
 
 
 @pytest.fixture

@@ -174,19 +174,19 @@ def test_what_cannot_be_shown(changes: dict[str, Any], message: str) -> None:
 # -------------------------------------------------------------------------------------------------------- its input
 def test_animation_is_read_back(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray], growing: np.ndarray) -> None:
     path = tm.save_animation(growing, ball[1], tmp_path / "a.glb", fps=12, keyframe_indices=[0, 4], cyclic=True)
-    read = read_shapes([path])
-    np.testing.assert_allclose(read.frames, growing, atol=1e-6)
-    np.testing.assert_array_equal(read.faces, ball[1])
-    assert read[2:] == ([0, 4], 12.0, None, True)
+    frames, faces, options = read_shapes([path])
+    np.testing.assert_allclose(frames, growing, atol=1e-6)
+    np.testing.assert_array_equal(faces, ball[1])
+    assert options == {"keyframe_indices": [0, 4], "fps": 12.0, "cyclic": True}
     with pytest.warns(UserWarning, match="holds 4 of the 7"):
         tm.save_animation(growing, ball[1], path, fps=12, keyframe_indices=[0, 3, 6], max_targets=3, overwrite=True)
-    thin = read_shapes([path])
-    kept = np.rint(12 * np.array(thin.times)).astype(int)
-    np.testing.assert_allclose(thin.frames, growing[kept], atol=1e-6)
-    assert [kept[i] for i in thin.keyframe_indices or []] == [0, 3, 6]
-    assert thin.fps == pytest.approx(3 / 0.5)
+    thin, _, options = read_shapes([path])
+    kept = np.rint(12 * np.array(options["times"])).astype(int)
+    np.testing.assert_allclose(thin, growing[kept], atol=1e-6)
+    assert kept[options["keyframe_indices"]].tolist() == [0, 3, 6]
+    assert options["fps"] == pytest.approx(3 / 0.5)
     tm.save_animation(growing[:1], ball[1], path, overwrite=True)
-    assert read_shapes([path]).frames.shape == (1, *growing[0].shape)
+    assert read_shapes([path])[0].shape == (1, *growing[0].shape)
 
 
 def test_folder_is_read_in_its_numbers_order(tmp_path: Path, ball: tuple[np.ndarray, np.ndarray]) -> None:
@@ -194,7 +194,7 @@ def test_folder_is_read_in_its_numbers_order(tmp_path: Path, ball: tuple[np.ndar
     for n in (10, 2, 1):
         trimesh.Trimesh(vertices + n, faces, process=False).export(tmp_path / f"f{n}.ply")
     (tmp_path / "notes.txt").write_text("not a mesh")
-    starts = read_shapes([tmp_path]).frames[:, 0] - vertices[0]
+    starts = read_shapes([tmp_path])[0][:, 0] - vertices[0]
     np.testing.assert_allclose(starts, np.array([[1], [2], [10]]).repeat(3, axis=1), atol=1e-5)
     (tmp_path / "other.obj").write_text("v 0 0 0")
     with pytest.raises(MeshError, match="several kinds"):

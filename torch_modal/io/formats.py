@@ -33,7 +33,7 @@ MESH_FORMATS: dict[str, OutputFormat | str] = {
 }
 ANIMATION_FORMATS: dict[str, OutputFormat | str] = {
     ".glb": "torch_modal.io.glb",
-    **dict.fromkeys((".mp4", ".gif"), "torch_modal.view.video"),
+    **dict.fromkeys((".mp4", ".gif"), "torch_modal.view.animation"),
     **dict.fromkeys((".usd", ".usda", ".usdc"), "torch_modal.io.usd"),
     **dict.fromkeys((".mdd", ".pc2", ".npz"), "torch_modal.io.point_cache"),
 }

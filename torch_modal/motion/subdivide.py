@@ -80,7 +80,7 @@ def subdivide(
         proxy: Vertices of a coarser mesh, by the same edge collapses in all key-frames, that moves in the place of the
             mesh and carries its detail (docs/passengers.md). 0: none. Default: 20,000 for meshes of more than 100,000
             vertices whose bases are not given.
-        progress: What is said while it goes on: see :data:`torch_modal.progress.Progress`.
+        progress: See :data:`torch_modal.progress.Progress`.
 
     Returns:
         The sequence in the caller's coordinates, dtype and device, the key-frames bit for bit at their places. *Shape:*

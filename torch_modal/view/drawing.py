@@ -25,11 +25,7 @@ ByteArray = NDArray[np.uint8]
 
 CHILD_SECONDS = 300.0
 SMOOTH_FACES = 30_000  # matplotlib draws at least so many
-LIGHTS = (
-    ((-2, 3, 4), 0.82),
-    ((4, 1, 3), 0.30),
-    ((0, -3, 2), 0.14),
-)  # from where, as the viewer sees it; how bright
+LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directions as the viewer sees them; brightness
 
 
 class Scene(NamedTuple):

@@ -79,7 +79,9 @@ def pack_frames(numbers: NDArray[np.uint16]) -> str:
 
 def pack_faces(faces: IntArray) -> str:
     """Faces ``(F, 3)`` as text: the difference of each corner from the one before."""
-    return _pack(np.diff(faces.reshape(-1).astype(np.int32), prepend=np.int32(0)))
+    steps = faces.reshape(-1).astype(np.int32)
+    steps[1:] -= steps[:-1].copy()
+    return _pack(steps)
 
 
 def _pack(numbers: NDArray[np.signedinteger]) -> str:
