@@ -111,7 +111,7 @@ def draw(out: Path, folder: Path) -> None:
         chrome.find_element("id", "wireframe").click()
         time.sleep(1.0)
         canvas = chrome.find_element("id", "canvas").rect
-        for x, y in ((0.27, 0.26), (0.74, 0.3), (0.6, 0.83)):
+        for x, y in ((0.27, 0.26), (0.765, 0.345), (0.545, 0.84)):
             builder = ActionBuilder(chrome)
             place = (canvas["x"] + x * canvas["width"], canvas["y"] + y * canvas["height"])
             builder.pointer_action.move_to_location(*map(round, place)).click()

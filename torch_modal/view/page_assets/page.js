@@ -61,7 +61,8 @@ class Viewer {
     this.hidden = new Set();
     this.overlaid = this.playing = false;
     this.forward = true;
-    this.frame = this.drawn = this.busy = 0;
+    this.frame = 0;
+    this.drawn = this.busy = 0; // pictures so far, and milliseconds that they took
     this.shapeChanged = this.viewChanged = true;
     this.stage = new Stage(find("canvas"), find("cells"), actors, () => (this.viewChanged = true));
     this.#connect();
@@ -279,6 +280,27 @@ class Viewer {
     requestAnimationFrame(turn);
   }
 
+  /** Nothing moves, and all is drawn. */
+  get idle() {
+    return !(this.playing || this.shapeChanged || this.viewChanged);
+  }
+
+  /** The present position of a vertex, in the coordinates of the caller. */
+  positionOf(vertex, sequence = 0) {
+    const { position, group } = this.actors[sequence];
+    const steps = position.array.slice(3 * vertex, 3 * vertex + 3);
+    return group.origin.map((start, axis) => start + group.step * steps[axis]);
+  }
+
+  /** Where a vertex is seen, in pixels of the window. */
+  placeOf(vertex, sequence = 0) {
+    const actor = this.actors[sequence];
+    const cell = this.stage.cells.find(({ actors }) => actors.includes(actor));
+    const { left, top } = cell.element.getBoundingClientRect();
+    const { x, y } = cell.placeOf(actor, vertex);
+    return { x: left + x, y: top + y };
+  }
+
   // ------------------------------------------------------------------------------------------------ controls
   #connect() {
     const on = (id, event, act) => find(id).addEventListener(event, act);
@@ -381,43 +403,8 @@ async function main() {
   const viewer = new Viewer(data, actors);
   find("message").hidden = true;
   viewer.start();
-  requestAnimationFrame(() => setTimeout(() => (window.torchModal.readyAfter = performance.now())));
-  // For scripts around the page; frames may have fractions.
-  window.torchModal = {
-    seek: (frame) => viewer.seek(frame),
-    get frame() {
-      return viewer.frame;
-    },
-    /** What Copy gives. */
-    get text() {
-      return viewer.text;
-    },
-    /** Nothing moves, and all is drawn. */
-    get idle() {
-      return !(viewer.playing || viewer.shapeChanged || viewer.viewChanged);
-    },
-    /** Pictures drawn so far. */
-    get drawn() {
-      return viewer.drawn;
-    },
-    /** Milliseconds that the page's scripts took for them. */
-    get busy() {
-      return viewer.busy;
-    },
-    /** The present position of a vertex, in the coordinates of the caller. */
-    positionOf(vertex, sequence = 0) {
-      const { position, group } = actors[sequence];
-      const steps = position.array.slice(3 * vertex, 3 * vertex + 3);
-      return group.origin.map((start, axis) => start + group.step * steps[axis]);
-    },
-    /** Where a vertex is seen, in pixels of the window. */
-    placeOf(vertex, sequence = 0) {
-      const cell = viewer.stage.cells.find((candidate) => candidate.actors.includes(actors[sequence]));
-      const { left, top } = cell.element.getBoundingClientRect();
-      const { x, y } = cell.placeOf(actors[sequence], vertex);
-      return { x: left + x, y: top + y };
-    },
-  };
+  window.torchModal = viewer; // for scripts around the page
+  requestAnimationFrame(() => setTimeout(() => (viewer.readyAfter = performance.now())));
 }
 
 main().catch((error) => {
