@@ -226,9 +226,9 @@ def test_command(
     assert len(set(packed)) == 1, "the ball grows linearly"
     assert main(arguments) == 1
     assert "--overwrite" in capsys.readouterr().err
-    assert main([*arguments, "--overwrite", "--names", "a", "b", "c", "--keyframes", "0", "3", "6", "--quiet"]) == 0
+    assert main([*arguments, "--overwrite", "--keyframes", "0", "3", "6", "--quiet"]) == 0
     data = data_of(tm.Page(out.read_text(encoding="utf-8")))
-    assert [one["name"] for one in data["groups"][0]["sequences"]] == ["a", "b", "c"]
+    assert [one["name"] for one in data["groups"][0]["sequences"]] == list(names)
     assert data["keyframes"] == [0, 3, 6]
 
     opened: list[str] = []
@@ -268,7 +268,7 @@ def test_command_says_what_is_wrong(
     assert not Path("page.html").exists()
 
 
-@pytest.mark.parametrize("arguments", [["--page", "page.png"], ["--names", "a", "b"], ["--fps", "0"]])
+@pytest.mark.parametrize("arguments", [["--page", "page.png"], ["--fps", "0"]])
 def test_command_refuses_wrong_usage(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as leaving:
         main(["view", "a.glb", *arguments])
@@ -600,7 +600,7 @@ def test_landmarks_that_cannot_be_shown(
     pages = ["--page", str(tmp_path / "page.html")]
     assert main(["view", *map(str, two), "--landmarks", str(file), *pages]) == 1
     assert "names vertex 99999 of mesh 1" in capsys.readouterr().err
-    for wrong in (["--linear"], ["--names", "a"]):
+    for wrong in (["--linear"], ["--keyframes", "0"]):
         with pytest.raises(SystemExit):
             main(["view", *map(str, two), *pages, *wrong, "--landmarks"])
     with pytest.raises(SystemExit):

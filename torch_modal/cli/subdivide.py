@@ -69,16 +69,16 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         choices=[suffix[1:] for suffix in MESH_FORMATS],
         help="of the numbered frames (default: that of the first key-frame, with all that its file carries)",
     )
-    group = sub.add_argument_group("animation")
+    group, positive = sub.add_argument_group("animation"), number(float, 0, above=True)
     group.add_argument(
         "--duration",
-        type=number(float, 0, above=True),
+        type=positive,
         metavar="SECONDS",
         help="of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)",
     )
     group.add_argument(
         "--fps",
-        type=number(float, 0, above=True),
+        type=positive,
         metavar="X",
         help="frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)",
     )

@@ -32,9 +32,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence"
     )
     sub.add_argument(
-        "--names", nargs="+", metavar="NAME", help="of the sequences, in their order (default: of files or folders)"
-    )
-    sub.add_argument(
         "--keyframes",
         nargs="+",
         type=number(int, 0),
@@ -42,12 +39,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help="which frames are key-frames, from 0 (default: the GLB's, or the first and the last)",
     )
     sub.add_argument("--cyclic", action="store_true", help="the last frame leads on to the first")
-    sub.add_argument(
-        "--fps",
-        type=number(float, 0, above=True),
-        metavar="X",
-        help="frames a second (default: the GLB's, or 24)",
-    )
+    rate = number(float, 0, above=True)
+    sub.add_argument("--fps", type=rate, metavar="X", help="frames a second (default: the GLB's, or 24)")
     sub.add_argument("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
     sub.add_argument(
         "--page",
@@ -93,10 +86,6 @@ def run(args: argparse.Namespace) -> None:
         args.fail("--landmarks needs two meshes or more")
     if args.linear:
         names.append("linear")
-    if args.names and len(args.names) != len(names):
-        what = "meshes" if args.landmarks else "sequences"
-        args.fail(f"--names names {len(args.names)} {what}, but there are {len(names)}")
-    names = args.names or names
     if len(set(names)) < len(names):
         names = [f"{name} {number}" for number, name in enumerate(names, 1)]
     if args.page:
