@@ -69,7 +69,7 @@ def build_parser() -> argparse.ArgumentParser:
         description, _, examples = rest.rpartition("\n\n")
         sub = subparsers.add_parser(
             name,
-            help=summary[0].lower() + summary[1:].removesuffix("."),
+            help=summary[:1].lower() + summary[1:].removesuffix("."),
             description=description,
             epilog=examples,
             formatter_class=Formatter,
