@@ -23,7 +23,6 @@ def description_for_pypi() -> str:
 
 
 EXTRAS = {
-    "view": ["viser>=1.1"],  # a session in which key-frames are deformed by hand
     "pictures": ["pyvista>=0.46"],  # pictures and videos in better light, on the graphics card
     "video": ["imageio[ffmpeg]>=2.28"],  # MP4
     "usd": ["usd-core>=24.5"],
@@ -112,6 +111,7 @@ setup(
                 "mypy>=1.11",
                 "pygltflib>=1.16",
                 "selenium>=4.20",
+                "viser>=1.1",  # examples/live.py
                 "h5py>=3.11",
             ],
             *["build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6", "setuptools>=77"],

@@ -265,16 +265,16 @@ def write_shape_pages(app: Sphinx) -> None:
         }
         page.unlink(missing_ok=True)
         keys = places[:-1] if sample.cyclic else places
-        tm.write_page(
+        shown = tm.show(
             rows,
             sample.faces,
-            page,
             keyframe_indices=keys,
             fps=2**levels * 6,
             cyclic=sample.cyclic,
             view=sample.view,
             title=f"torch_modal: {name}",
         )
+        shown.save(page)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

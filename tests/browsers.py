@@ -68,16 +68,18 @@ def open_browser(width: int = 1200, height: int = 800, *extra: str) -> Iterator[
         chrome.quit()
 
 
-def open_page(chrome: Chrome, path: Path) -> float:
-    """Open a page of shapes; milliseconds from the navigation to after its first picture."""
+def open_page(chrome: Chrome, path: Path, frame: str | None = None) -> float:
+    """Open a page of shapes, or one that has it in a frame; milliseconds from the navigation to its first picture."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     chrome.get(path.absolute().as_uri())
+    if frame:
+        chrome.switch_to.frame(chrome.find_element("css selector", frame))
     # A message says that it is loading, is hidden, or says what is wrong.
     script = (
         "const message = document.querySelector('#message');"
         "if (window.torchModal?.readyAfter) return window.torchModal.readyAfter;"
-        "return message.hidden || message.innerText.startsWith('Loading') ? null : message.innerText"
+        "return !message || message.hidden || message.innerText.startsWith('Loading') ? null : message.innerText"
     )
     ready = WebDriverWait(chrome, READY_SECONDS).until(lambda driver: driver.execute_script(script))
     if not isinstance(ready, (int, float)):

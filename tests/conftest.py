@@ -16,9 +16,9 @@ import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, lumped_mass, surface
 from threads import limit_threads
-
 from torch_modal.backends.torch.alignment import Pair
 from torch_modal.inbetween.samples import ConvergenceWarning, Samples
+
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.layers.mid_shape import MidShape

@@ -71,12 +71,9 @@ from .solve.minimise import Status as Status
 from .statistics.coordinates import Components as Components
 from .statistics.fit import Fitted as Fitted
 from .view.animation import save_animation as save_animation
-from .view.document import Page as Page
-from .view.live import LiveSession as LiveSession
-from .view.live import live as live
+from .view.page import Page as Page
 from .view.page import show as show
 from .view.page import show_landmarks as show_landmarks
-from .view.page import write_page as write_page
 from .view.picture import render_sequence as render_sequence
 
 __version__: str

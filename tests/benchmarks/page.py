@@ -1,18 +1,19 @@
-"""What a page of shapes weighs, how long it takes to load, and how many frames a second it draws.
+"""Size and speed of a page of shapes, and the pictures of docs/viewing.md.
 
-    python tests/benchmarks/page.py [--repeats 3] [--size 1280 720]
+    python tests/benchmarks/page.py [--repeats 3]
+    python tests/benchmarks/page.py --pictures docs/images
 
-The sample creature, its longest edges split to 8,000 vertices: 33 shapes of one interval, and 193 of it there and back
-six times (by which nothing is saved), alone and beside linear interpolation. Sizes are also given in relation to the
-positions as float32 in base64. Loading is from the navigation to the first picture, in the page's own clock, and beside
-that of a page of one tetrahedron, which is what the browser and its graphics need. Frames a second are counted while
-the page plays, with nothing coloured and with edge strain, and ms are what the page's scripts take for each. The
-browser draws in software, on the processor's cores: with a graphics card, the scripts are what is left.
+The sample creature: 33 shapes of one interval, and 193 of it there and back six times (by which nothing is saved),
+alone and beside linear interpolation. Sizes are also given in relation to the positions as float32 in base64. Loading
+is from the navigation to the first picture, in the page's own clock. While the page plays, pictures a second are
+counted, and the milliseconds that the page's scripts take for each. The browser draws in software: with a graphics
+card, the scripts are what is left.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import statistics
 import sys
 import tempfile
@@ -20,12 +21,11 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
-from browsers import find_browser, open_browser, open_page
+from browsers import open_browser, open_page
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
@@ -33,121 +33,103 @@ from torch_modal.data.samples import load_sample
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
-VERTICES = 8000
 LEVELS = 5  # 32 intervals between two key-frames
 SECONDS = 4.0
 
 
-def split_edges(frames: NDArray[np.float64], faces: NDArray[np.int64], n_vertices: int) -> tuple[NDArray, NDArray]:
-    """Split long edges in the middle, at most one of each face, until there are so many vertices."""
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    lengths = np.linalg.norm(frames[0, edges[:, 0]] - frames[0, edges[:, 1]], axis=1)
-    around: dict[tuple[int, int], list[int]] = {}
-    for number, (a, b, c) in enumerate(faces.tolist()):
-        for pair in ((a, b), (b, c), (c, a)):
-            around.setdefault((min(pair), max(pair)), []).append(number)
-    middles, whole, parts = [], np.ones(len(faces), dtype=bool), []
-    for a, b in edges[np.argsort(-lengths)].tolist():
-        mine = around[(a, b)]
-        if len(middles) == n_vertices - frames.shape[1] or not whole[mine].all():
-            continue
-        new = frames.shape[1] + len(middles)
-        middles.append((a, b))
-        whole[mine] = False
-        for face in faces[mine].tolist():
-            parts += [[new if v == b else v for v in face], [new if v == a else v for v in face]]
-    ends = np.array(middles)
-    added = 0.5 * (frames[:, ends[:, 0]] + frames[:, ends[:, 1]])
-    return np.concatenate([frames, added], axis=1), np.concatenate([faces[whole], np.array(parts)])
-
-
-def play(chrome: Chrome, seconds: float = SECONDS) -> tuple[float, float]:
+def play(chrome: Chrome) -> tuple[float, float]:
     """Pictures drawn in a second while the page plays, and milliseconds that its scripts take for each."""
-    button = chrome.find_element("id", "play")
-    button.click()
+    chrome.find_element("id", "play").click()
     time.sleep(0.5)
     script = "return [torchModal.drawn, torchModal.busy, performance.now()]"
     before = chrome.execute_script(script)
-    time.sleep(seconds)
+    time.sleep(SECONDS)
     drawn, busy, milliseconds = (end - start for start, end in zip(before, chrome.execute_script(script), strict=True))
-    button.click()
     return 1000 * drawn / milliseconds, busy / drawn
 
 
-def main() -> None:
+def measure(repeats: int, folder: Path) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=3, help="loads of each page; the median counts")
-    parser.add_argument("--size", type=int, nargs=2, default=(1280, 720), metavar="PIXELS", help="of the window")
-    arguments = parser.parse_args()
-    find_browser()
-
     sample = load_sample("creature")
     keyframes = sample.keyframes[:2]
-    bases = tm.extract_bases(keyframes, sample.faces, 30)
-    rows = [
-        tm.subdivide(keyframes, sample.faces, LEVELS, bases=bases),
-        tm.linear_sequence(keyframes, tm.keyframe_places(2, LEVELS)),
-    ]
-    split = [split_edges(frames.numpy(), sample.faces.numpy(), VERTICES) for frames in rows]
-    ours, linear = (torch.from_numpy(frames) for frames, _ in split)
-    faces = torch.from_numpy(split[0][1])
-    print(f"{ours.shape[1]} vertices, {len(faces)} faces; window {arguments.size[0]} x {arguments.size[1]}")
-
-    short = len(ours)
-    there_and_back = [n if n < short else 2 * (short - 1) - n for n in range(2 * (short - 1))]
+    ours = tm.subdivide(keyframes, sample.faces, LEVELS)
+    linear = tm.linear_sequence(keyframes, tm.keyframe_places(2, LEVELS))
+    there_and_back = [*range(len(ours)), *range(len(ours) - 2, 0, -1)]
     way = [*(3 * there_and_back), 0]
-    corners = torch.eye(4, 3, dtype=torch.float64) * torch.linspace(1, 2, short)[:, None, None]
-    sides = torch.tensor([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
     pages = {
-        "tetrahedron": ({"a": corners}, sides),
-        f"{short} shapes": ({"a": ours}, faces),
-        f"{short} shapes, with linear": ({"a": ours, "b": linear}, faces),
-        f"{len(way)} shapes": ({"a": ours[way]}, faces),
-        f"{len(way)} shapes, with linear": ({"a": ours[way], "b": linear[way]}, faces),
+        f"{len(ours)} shapes": {"a": ours},
+        f"{len(ours)} shapes, with linear": {"a": ours, "b": linear},
+        f"{len(way)} shapes": {"a": ours[way]},
+        f"{len(way)} shapes, with linear": {"a": ours[way], "b": linear[way]},
     }
-    header = (
-        ("MB", 7),
-        ("/ float32", 11),
-        ("write s", 9),
-        ("load s", 8),
-        ("/ tetr.", 9),
-        ("fps", 6),
-        ("ms", 7),
-        ("strain fps", 12),
-        ("ms", 7),
-    )
-    print(f"{'page':<26}" + "".join(f"{name:>{width}}" for name, width in header))
-    base = None
+    print(f"{ours.shape[1]} vertices\n{'page':<26}{'MB':>7}{'/ float32':>11}{'load s':>8}{'a second':>10}{'ms':>7}")
+    for name, sequences in pages.items():
+        path = tm.show(sequences, sample.faces, view=sample.view).save(folder / "page.html", overwrite=True)
+        loads = []
+        for _ in range(repeats):
+            with open_browser(1280, 720) as chrome:
+                loads.append(open_page(chrome, path) / 1000)
+                rate, busy = play(chrome)
+        size = path.stat().st_size
+        plain = sum(4 / 3 * 4 * frames.numel() for frames in sequences.values())
+        load = statistics.median(loads)
+        print(f"{name:<26}{size / 1e6:>7.2f}{size / plain:>11.2f}{load:>8.2f}{rate:>10.0f}{busy:>7.2f}", flush=True)
+
+
+def save(chrome: Chrome, path: Path) -> None:
+    """Save the window as it is, when all is drawn."""
+    time.sleep(2.0)
+    Image.open(io.BytesIO(chrome.get_screenshot_as_png())).convert("RGB").save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+
+
+def draw(out: Path, folder: Path) -> None:
+    """Draw the closing hand beside linear interpolation and the truth, and the gallop overlaid, with trails."""
+    from selenium.webdriver.common.actions.action_builder import ActionBuilder
+
+    hand, creature = load_sample("hand"), load_sample("creature")
+    places = tm.keyframe_places(2, 2)
+    rows = {
+        "torch_modal": tm.subdivide(hand.keyframes, hand.faces, 2),
+        "linear": tm.linear_sequence(hand.keyframes, places),
+        "truth": torch.cat([hand.keyframes[:1], hand.truth, hand.keyframes[1:]]),
+    }
+    closing = tm.show(rows, hand.faces, keyframe_indices=places, view=hand.view, title="Closing hand")
+    keyframes, places = creature.keyframes[:3], tm.keyframe_places(3, 3)
+    rows = {
+        "torch_modal": tm.subdivide(keyframes, creature.faces, 3),
+        "linear": tm.linear_sequence(keyframes, places),
+    }
+    gallop = tm.show(rows, creature.faces, keyframe_indices=places, view=creature.view, title="Gallop")
+    with open_browser(1240, 760) as chrome:
+        open_page(chrome, closing.save(folder / "hand.html"))
+        chrome.execute_script("torchModal.seek(2)")
+        save(chrome, out / "page.png")
+        open_page(chrome, gallop.save(folder / "gallop.html"))
+        chrome.execute_script("torchModal.seek(12)")
+        chrome.find_element("css selector", "#layout button[value=over]").click()
+        chrome.find_element("id", "wireframe").click()
+        time.sleep(1.0)
+        canvas = chrome.find_element("id", "canvas").rect
+        for x, y in ((0.27, 0.26), (0.765, 0.345), (0.545, 0.84)):
+            builder = ActionBuilder(chrome)
+            place = (canvas["x"] + x * canvas["width"], canvas["y"] + y * canvas["height"])
+            builder.pointer_action.move_to_location(*map(round, place)).click()
+            builder.perform()
+        save(chrome, out / "page-picked.png")
+
+
+def main() -> None:
+    """Measure, or draw the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=3, help="loads of each page; the median counts")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw the pictures there instead")
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        for name, (sequences, triangles) in pages.items():
-            start = time.perf_counter()
-            path = tm.write_page(sequences, triangles, Path(folder, "page.html"), view=sample.view, overwrite=True)
-            written = time.perf_counter() - start
-            loads = []
-            for _ in range(arguments.repeats):
-                with open_browser(*arguments.size) as chrome:
-                    loads.append(open_page(chrome, path) / 1000)
-                    if len(loads) < arguments.repeats:
-                        continue
-                    rates = []
-                    for measure in ("", "strain"):
-                        chrome.execute_script(
-                            "const s = document.getElementById('measure'); s.value = arguments[0];"
-                            "s.dispatchEvent(new Event('change'))",
-                            measure,
-                        )
-                        time.sleep(1.0)
-                        rates += play(chrome)
-            load = statistics.median(loads)
-            base = base or load
-            plain = sum(4 / 3 * 4 * frames.numel() for frames in sequences.values())
-            size = path.stat().st_size
-            print(
-                f"{name:<26}{size / 1e6:>7.2f}{size / plain:>11.2f}{written:>9.2f}{load:>8.2f}{load / base:>9.2f}"
-                f"{rates[0]:>6.0f}{rates[1]:>7.2f}{rates[2]:>12.0f}{rates[3]:>7.2f}",
-                flush=True,
-            )
+        if arguments.pictures:
+            draw(arguments.pictures, Path(folder))
+        else:
+            measure(arguments.repeats, Path(folder))
 
 
 if __name__ == "__main__":

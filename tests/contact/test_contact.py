@@ -9,7 +9,6 @@ import torch
 from conftest import Shapes
 from scipy.optimize import minimize
 from torch import Tensor
-from torch_modal.backends.torch.alignment import Pair
 from torch_modal.inbetween.between import Between
 from torch_modal.inbetween.samples import Samples
 

@@ -4,11 +4,10 @@ import pytest
 import torch
 from conftest import Shapes, random_rotation
 from torch import Tensor
-
-from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.canonical import size
 from torch_modal.inbetween.columns import Directions
 from torch_modal.inbetween.frame import Frame
+
+from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +25,9 @@ def moved(bars: Shapes, generator: torch.Generator) -> Tensor:
 def test_size_is_100_and_centred(frame: Frame, bars: Shapes) -> None:
     reference = frame.reference
     sizes = [size(x.numpy(), bars.faces.numpy()) for x in bars.keyframes[:2]]
-    assert size(reference.numpy(), bars.faces.numpy()) == pytest.approx(2 * CANONICAL_SIZE * sizes[0] / sum(sizes), rel=1e-13)
+    assert size(reference.numpy(), bars.faces.numpy()) == pytest.approx(
+        2 * CANONICAL_SIZE * sizes[0] / sum(sizes), rel=1e-13
+    )
     assert (frame.weights[:, None] * reference).sum(0).abs().max() < 1e-11
     assert float(frame.weights.sum()) == pytest.approx(1)
     assert float(frame.coarse.weights.sum()) == pytest.approx(1)

@@ -6,10 +6,12 @@ from conftest import Shapes, modal
 from shapes import edge_error
 from torch import Tensor
 from torch.func import hessian, jacrev
-
 from torch_modal.backends.torch.alignment import Pair
-from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.backends.torch.fine_energy import FineEnergy
+from torch_modal.inbetween.frame import Frame
+from torch_modal.inbetween.levels import Levels
+
+from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.stretch import Stretch
@@ -17,8 +19,6 @@ from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.geometry import connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.inbetween.frame import Frame
-from torch_modal.inbetween.levels import Levels
 from torch_modal.inbetween.paired import PairedPlacement, PairedProblem, PairedSpace
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape

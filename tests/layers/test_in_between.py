@@ -16,18 +16,18 @@ from conftest import Shapes, bent_bar, modal, random_rotation
 from shapes import diagonal
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
+from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning
+from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
-from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.gauss_newton import GaussNewtonStep
-from torch_modal.solve.solver import Status
 
 DOUBLE = torch.float64
 pytestmark = pytest.mark.usefixtures("converged")

@@ -264,8 +264,7 @@ def test_carried_tetrahedra_that_are_too_distorted_for_modes(
 
     monkeypatch.setattr(solving, "solve", fails_if_carried)
     poses = np.stack([POINTS, POINTS + 1.0])
-    modes.extract_bases(
-        poses, COMPACT, 5, mesher="tetwild", cache=False, progress=lambda done, *_: counted.append(done)
-    )
+    monkeypatch.setattr("torch_modal.progress.ProgressReport.update", lambda self: counted.append(1))
+    modes.extract_bases(poses, COMPACT, 5, mesher="tetwild", cache=False)
     assert len(meshed) == 2
-    assert max(counted) == 4
+    assert len(counted) == 4

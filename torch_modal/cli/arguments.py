@@ -1,19 +1,16 @@
-"""Types of arguments, and the groups of arguments that several commands share."""
+"""Types of arguments, options that several commands share, and checks of output paths before any work."""
 
 import argparse
-from collections.abc import Callable
+import os
+import re
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from torch_modal.io.formats import PICTURES
+
 OVERWRITE = "replace files that exist (default: refuse)"
 CACHE_DIR = "folder of tetrahedra and modes (default: TORCH_MODAL_CACHE, or the user's cache folder)"
-
-
-class Formatter(argparse.RawDescriptionHelpFormatter):
-    """Help texts as they are, with a wide column for options."""
-
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=30, width=100)
 
 
 def number(kind: Callable[[str], Any], low: float, above: bool = False) -> Callable[[str], Any]:
@@ -40,13 +37,37 @@ def times(text: str) -> list[float]:
         raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,0.4,1") from None
 
 
-def add_out(sub: argparse.ArgumentParser, metavar: str, text: str) -> None:
-    """``--out``, which must be given."""
-    sub.add_argument("--out", type=Path, required=True, metavar=metavar, help=text)
+def file_name(suffixes: Collection[str]) -> Callable[[str], Path]:
+    """An argument type: a file with one of these endings."""
+
+    def convert(text: str) -> Path:
+        if Path(text).suffix.lower() not in suffixes:
+            *others, last = suffixes
+            raise argparse.ArgumentTypeError(f"must end in {', '.join(others)} or {last}, got {text!r}")
+        return Path(text)
+
+    return convert
+
+
+def add_meshes(sub: argparse.ArgumentParser, text: str) -> None:
+    """The meshes that a command reads."""
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help=text)
+
+
+def add_out(
+    sub: argparse.ArgumentParser, metavar: str, text: str, kind: Callable[[str], Path] = Path, required: bool = True
+) -> None:
+    """``--out``."""
+    sub.add_argument("--out", type=kind, required=required, metavar=metavar, help=text)
+
+
+def add_picture(sub: argparse.ArgumentParser, text: str) -> None:
+    """``--picture``."""
+    sub.add_argument("--picture", type=file_name(PICTURES), metavar="FILE", help=f"{text}, as .png or .pdf")
 
 
 def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:
-    """How often intervals are halved."""
+    """``--levels`` of subdivision."""
     sub.add_argument(
         "--levels",
         type=number(int, lowest),
@@ -57,7 +78,7 @@ def add_levels(sub: argparse.ArgumentParser, lowest: int) -> None:
 
 
 def add_modes(sub: argparse.ArgumentParser) -> None:
-    """What modes are computed, and how."""
+    """Options of `extract_bases`."""
     sub.add_argument(
         "--modes",
         type=number(int, 1),
@@ -87,6 +108,19 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
     )
 
 
+def add_registration(sub: argparse.ArgumentParser) -> None:
+    """Options of the registration of meshes of different connectivity."""
+    sub.add_argument(
+        "--landmarks",
+        type=Path,
+        metavar="FILE",
+        help="lines of vertex numbers, counted from 0, or of coordinates: a column for each mesh",
+    )
+    sub.add_argument(
+        "--across", action="store_true", help="the meshes are different subjects; needs five landmarks or more"
+    )
+
+
 def add_common(
     sub: argparse.ArgumentParser, *, overwrite: str = OVERWRITE, cache_dir: str | None = CACHE_DIR, all_of: bool = True
 ) -> None:
@@ -96,7 +130,7 @@ def add_common(
         sub: The command's parser.
         overwrite: Help of ``--overwrite``.
         cache_dir: Help of ``--cache-dir``; None: there is no such option.
-        all_of: Whether there are ``--no-cache`` and ``--verbose`` too.
+        all_of: Add ``--no-cache`` and ``--verbose`` too.
     """
     group = sub.add_argument_group("files and messages")
     group.add_argument("--overwrite", action="store_true", help=overwrite)
@@ -106,16 +140,16 @@ def add_common(
         group.add_argument("--no-cache", action="store_true", help="neither read the cache nor write to it")
         group.add_argument("--verbose", action="store_true", help="also report each step")
     group.add_argument("--quiet", action="store_true", help="report warnings and errors only")
-    add_debug(group)
 
 
 def caching(args: argparse.Namespace) -> dict[str, Any]:
-    """Options of computations that the group "files and messages" sets."""
-    return {
-        "cache_dir": args.cache_dir,
-        "cache": not args.no_cache,
-        "progress": False if args.quiet else None,
-    }
+    """Options of computations from the group "files and messages"."""
+    return {"cache_dir": args.cache_dir, "cache": not args.no_cache, "progress": False if args.quiet else None}
+
+
+def mode_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Options of `extract_bases` besides the number of modes."""
+    return {"method": args.method, "mesher": args.mesher, "settings": args.quality, **caching(args)}
 
 
 def reporter(args: argparse.Namespace) -> Callable[[str], None]:
@@ -123,6 +157,39 @@ def reporter(args: argparse.Namespace) -> Callable[[str], None]:
     return (lambda _: None) if args.quiet else (lambda line: print(line, flush=True))
 
 
-def add_debug(group: Any) -> None:
-    """``--debug``, which every command has."""
-    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+def is_file(args: argparse.Namespace, suffixes: Collection[str]) -> bool:
+    """Decide whether --out names a file of one of these endings, or a folder; leaves with the usage for other files."""
+    if args.out.suffix.lower() in suffixes:
+        return True
+    # An ending has letters, unlike the number of a version; a folder that exists may have any name.
+    if re.fullmatch(r"\.\w*[A-Za-z]\w*", args.out.suffix) and not args.out.is_dir():
+        what = f"a file ending in {', '.join(suffixes)}, or a folder" if suffixes else "a folder here"
+        args.fail(f"--out is {what}, got {args.out.name!r}; a folder whose name has an ending must exist")
+    return False
+
+
+def check_output(files: Sequence[Path], inputs: Iterable[Path], overwrite: bool) -> None:
+    """Raise if an output file could not or must not be written.
+
+    Args:
+        files: Files that will be written, or that exist and belong to an earlier result.
+        inputs: Files that are read, and must not be replaced.
+        overwrite: Files that exist may be replaced.
+
+    Raises:
+        ValueError: The message names the file and the reason.
+    """
+    read = {path.resolve() for path in inputs}
+    for file in files:
+        if file.resolve() in read:
+            raise ValueError(f"{file} is one of the meshes that are read; choose another name")
+        if file.is_dir():
+            raise ValueError(f"{file} is a folder; a file is to be written there")
+        if file.exists() and not overwrite:
+            raise ValueError(f"{file} exists; --overwrite replaces it")
+    for above in dict.fromkeys(file.parent for file in files):
+        there = next(parent for parent in (above, *above.absolute().parents) if parent.exists())
+        if not there.is_dir():
+            raise ValueError(f"{there} is a file, so nothing can be written below it; choose another name")
+        if not os.access(there, os.W_OK):
+            raise ValueError(f"the folder {there} cannot be written; choose another one")

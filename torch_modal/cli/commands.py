@@ -1,118 +1,243 @@
-"""The commands of the command line, from parsed arguments to files and printed lines.
+"""Commands of one step each: ``register``, ``check``, ``carry``, ``modes`` and ``cache`` of ``torch-modal``.
 
 Each checks its output paths before any heavy import and any work.
 """
 
 import argparse
-import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from torch_modal.cli.arguments import caching, reporter
-from torch_modal.cli.output import check_name, check_output
-from torch_modal.io.formats import ANIMATION_FORMATS, PICTURES
+from torch_modal.cli.arguments import (
+    CACHE_DIR,
+    add_common,
+    add_meshes,
+    add_modes,
+    add_out,
+    add_picture,
+    add_registration,
+    caching,
+    check_output,
+    file_name,
+    is_file,
+    mode_options,
+    reporter,
+)
+from torch_modal.io.formats import MESH_FORMATS
+
+CROSSES = 3
+"""Exit status of `check` when parts newly pass through each other."""
 
 
-def subdivide(args: argparse.Namespace) -> None:
-    """Run ``torch-modal subdivide``."""
-    if len(args.meshes) < 2:
-        args.fail("subdivide needs two key-frames or more")
-    if args.contact and args.preset == "paper":
-        args.fail("--contact needs one shape for each in-between; --preset paper has two")
-    if (args.landmarks or args.across) and not args.register:
-        args.fail("--landmarks and --across are for --register")
-    check_name(args, "--picture", args.picture, PICTURES)
-    if args.cyclic and (args.ping_pong or args.ease):
-        args.fail(
-            f"--{'ping-pong' if args.ping_pong else 'ease'} is for sequences that begin and end; a cycle does not"
-        )
-    from torch_modal.view.animation import require_packages
+def add_register(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``register``."""
+    sub.add_argument("meshes", nargs=2, type=Path, metavar="MESH", help="the template, and the target")
+    text = f"the template laid onto the target, {', '.join(MESH_FORMATS)}"
+    add_out(sub, "FILE", text, file_name(MESH_FORMATS))
+    sub.add_argument("--keep-doubtful", action="store_true", help="write a doubtful result too, with a warning")
+    add_registration(sub)
+    add_common(sub)
 
-    single = _is_file(args, *ANIMATION_FORMATS)
-    animation = args.out if single else args.out / "animation.glb"
-    files = [animation, *([args.picture] if args.picture else [])]
-    fmt = args.format or {".gltf": "glb"}.get(args.meshes[0].suffix.lower(), args.meshes[0].suffix.lower()[1:])
-    pattern = None if single else f"frame-*.{fmt}"
-    check_output(files, args.meshes, args.overwrite, folder=args.out, pattern=pattern)
-    require_packages(animation)
+
+def register(args: argparse.Namespace) -> None:
+    """One mesh's connectivity laid onto others.
+
+    Lay the connectivity of the first mesh onto another mesh of the same subject, or,
+    with --across and landmarks, of another one. Key-frames of different connectivity
+    become key-frames of one.
+
+    A report is printed; a doubtful result is an error. Landmarks help: a text file
+    with a line for each, which names one vertex of each mesh, counted from 0.
+
+    Examples:
+      torch-modal register open.obj scan.ply --out wrapped.obj
+      landmarks are picked on a page, and saved there as pairs.txt:
+        torch-modal view cat.obj dog.obj --landmarks
+        torch-modal register cat.obj dog.obj --across --landmarks pairs.txt --out wrapped.obj
+    """
+    check_output([args.out], args.meshes, args.overwrite)
 
     import torch_modal as tm
-    from torch_modal.passengers.proxy import Proxy, proxy_size
+    from torch_modal.io.write import save_mesh
+    from torch_modal.registration.landmarks import landmark_table
+    from torch_modal.registration.load import ADVICE
 
-    n, spread = len(args.meshes), {"cyclic": args.cyclic, "n_frames": args.frames, "times": args.times}
-    places = tm.keyframe_places(n, args.levels, **spread)
-    when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
+    template, target = map(tm.open_asset, args.meshes)
+    marks = None
+    if args.landmarks is not None:
+        table = landmark_table(args.landmarks, [template.positions, target.positions])
+        marks = table[:, 0], table[:, 1]
+    found = tm.register(
+        template.positions,
+        template.faces,
+        target.positions,
+        target.faces,
+        landmarks=marks,
+        same_subject=not args.across,
+        **caching(args),
+    )
     report = reporter(args)
-    registration = {"register": args.register, "landmarks": args.landmarks, "same_subject": not args.across}
-    keyframes, faces = tm.load_keyframes(args.meshes, **registration, **caching(args), report=report)
-    asset = tm.open_asset(args.meshes[0])
-    welded = tm.weld_seams(keyframes, faces)
-    progress = False if args.quiet else None
-    n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
-    carrier = Proxy(welded.keyframes, welded.faces, n_proxy) if n_proxy else None
-    moving = (carrier.keyframes, carrier.faces) if carrier else (welded.keyframes, welded.faces)
-    bases = tm.extract_bases(*moving, args.modes, **_precompute_options(args))
-    solved = tm.subdivide(
-        *moving,
-        args.levels,
-        bases=bases,
-        **spread,
-        smooth=args.smooth,
-        progress=progress,
-        preset=args.preset,
-        contact=args.contact,
+    report(found.summary())
+    if found.doubtful:
+        why = f"the result is doubtful: {'; '.join(found.warnings)}"
+        if not args.keep_doubtful:
+            raise ValueError(f"{why}. To help it, {ADVICE}; --keep-doubtful writes it all the same")
+        warnings.warn(why, stacklevel=2)
+    save_mesh(found.positions, template.faces, args.out, args.overwrite, template)
+    report(f"written: {args.out}")
+
+
+def add_check(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``check``."""
+    add_meshes(sub, "meshes of one connectivity")
+    sub.add_argument(
+        "--keyframes", nargs="+", type=Path, default=[], metavar="FILE", help="meshes whose own crossings are known"
     )
-    if carrier:
-        report(f"moved by a proxy of {carrier.keyframes.shape[1]} vertices (--proxy 0: by the whole mesh)")
-        solved = carrier.carried(solved, places, welded.keyframes)
-    frames = welded.scatter(solved)
-    keys = [place for place in places if place < len(frames)]
-    frames[keys] = keyframes
-    seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
-    report(f"{len(keyframes)} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
-    if not single:
-        written = tm.save_frames(frames, faces, args.out, fmt, overwrite=args.overwrite, asset=asset)
-        report(f"frames:    {written[0]} to {written[-1].name}")
-        _warn_of_leftovers(args.out, pattern, written)
-    tm.save_animation(
-        frames,
-        faces,
-        animation,
-        args.fps,
-        keyframe_indices=keys,
-        cyclic=args.cyclic,
-        overwrite=args.overwrite,
-        duration=args.duration,
-        ping_pong=args.ping_pong,
-        ease=args.ease,
-        times=when,
-        asset=asset,
-        progress=progress,
-    )
-    report(f"animation: {animation}")
+    add_picture(sub, "draw the meshes with crossings in colour")
+    add_common(sub, overwrite="replace the picture if it exists (default: refuse)", cache_dir=None, all_of=False)
+
+
+def check(args: argparse.Namespace) -> int:
+    """Parts that pass through each other, in key-frames and results.
+
+    Count for each mesh the triangles that pass through others, and colour them in a
+    picture. All meshes have the same faces.
+
+    With --keyframes, crossings of the key-frames are not counted as new; far ones are of
+    two parts that went through each other, not crossings that grew or folds. Without, all
+    are new.
+
+    exit status: 0 nothing passes through anything far, 3 something does
+
+    Examples:
+      torch-modal check open.obj fist.obj
+      torch-modal check out/frame-*.obj --keyframes open.obj fist.obj --picture crossings.png
+    """
     if args.picture:
-        rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
-        tm.render_sequence(rows, faces, args.picture, keyframe_indices=keys, overwrite=args.overwrite)
-        report(f"picture:   {args.picture}")
+        check_output([args.picture], [*args.meshes, *args.keyframes], args.overwrite)
+    from torch_modal.geometry.crossings import require_contact
+
+    require_contact()
+
+    import torch_modal as tm
+
+    report, n = reporter(args), len(args.keyframes)
+    shapes, faces = tm.load_keyframes([*args.keyframes, *args.meshes])
+    welded = tm.weld_seams(shapes, faces)
+    keyframes, shapes = welded.keyframes[:n], welded.keyframes[n:]
+    found = tm.self_contacts(shapes, welded.faces, keyframes if n else None)
+    used = shapes[0][welded.faces.unique()]
+    diagonal = float((used.amax(0) - used.amin(0)).norm())
+    columns = {"pairs": found.number, **({"new": found.n_new} if n else {}), "far": found.n_far}
+    width = max(len(str(mesh)) for mesh in args.meshes)
+    report(" " * width + "".join(f"{name:>9s}" for name in (*columns, "depth")))
+    for i, mesh in enumerate(args.meshes):
+        deepest = 100 * float(found.depth[i].max()) / diagonal
+        report(f"{mesh!s:{width}s}" + "".join(f"{int(c[i]):9d}" for c in columns.values()) + f"{deepest:7.2f} %")
+    report(
+        "pairs of triangles that cross; far: of two parts that went through each other"
+        + (", and cross in no key-frame" if n else "")
+        + "; depth: of the deepest vertex there, in % of the diagonal"
+    )
+    if args.picture:
+        marks = shapes.new_zeros(shapes.shape[:2])  # of each vertex: 0, 1 for a crossing, 2 for a new one
+        for value, chosen in ((1.0, slice(None)), (2.0, found.new)):
+            marks[found.shape[chosen].repeat_interleave(6), welded.faces[found.pairs[chosen]].flatten()] = value
+        tm.render_sequence(
+            {"crossings": shapes},
+            welded.faces,
+            args.picture,
+            columns=min(len(args.meshes), 8),
+            keyframe_indices=[0],
+            colors={"crossings": marks},
+            color_label="1: crosses, 2: new" if n else "2: crosses",
+            overwrite=args.overwrite,
+        )
+        report(f"picture: {args.picture}")
+    return CROSSES if bool(found.n_far.any()) else 0
+
+
+def add_carry(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``carry``."""
+    add_meshes(sub, "meshes of one connectivity; the points lie on the first")
+    sub.add_argument("--points", type=Path, required=True, metavar="FILE.ply", help="points, or splats")
+    add_out(sub, "FOLDER", "for a PLY file for each mesh")
+    add_common(sub, cache_dir=None, all_of=False)
+
+
+def carry(args: argparse.Namespace) -> None:
+    """Points, scans or splats that follow a sequence of meshes.
+
+    Bind the points of a PLY file to the first mesh, and move them with all others: a scan,
+    markers, an accessory, or the splats of 3D Gaussian splatting, whose axes, scales and
+    harmonics turn along. All that the file has besides stays as it is.
+
+    Examples:
+      torch-modal subdivide open.obj fist.obj --out hand/
+      torch-modal carry hand/frame-*.obj --points scene.ply --out splats/
+    """
+    files = [args.out / f"{args.points.stem}-{i:04d}.ply" for i in range(len(args.meshes))]
+    check_output(files, [*args.meshes, args.points], args.overwrite)
+
+    import torch
+
+    import torch_modal as tm
+    from torch_modal.io.files import write_files
+    from torch_modal.io.points import PointFile
+    from torch_modal.progress import ProgressReport
+
+    given = PointFile(args.points)
+    shapes, faces = tm.load_keyframes(args.meshes)
+    passengers = tm.Passengers(shapes[0], faces, torch.from_numpy(given.positions).to(shapes))
+    with ProgressReport(len(files), "meshes", False if args.quiet else None) as bar, torch.no_grad():
+
+        def moved() -> Iterator[tuple[Path, bytes]]:
+            for file, x in zip(files, shapes, strict=True):
+                parts = (passengers(x), passengers.rotations(x), passengers.gradients(x))
+                yield file, given.moved(*(part.double().numpy() for part in parts))
+                bar.update()
+
+        write_files(moved())
+    kind = "splats" if given.is_splats else "points"
+    reporter(args)(f"{len(passengers)} {kind}: {files[0]} to {files[-1].name}")
+
+
+def add_modes_command(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``modes``."""
+    add_meshes(sub, "key-frames of one connectivity")
+    add_out(sub, "FILE_OR_FOLDER", "FILE.safetensors for one mesh, or a folder for a file of each mesh's name")
+    add_modes(sub)
+    add_common(sub)
 
 
 def modes(args: argparse.Namespace) -> None:
-    """Run ``torch-modal modes``."""
-    if _is_file(args, ".safetensors"):
-        if len(args.meshes) > 1:
-            args.fail(f"--out {args.out} is one file, but there are {len(args.meshes)} meshes; name a folder")
-        files = [args.out]
-    else:
+    """Vibration modes of key-frames, as safetensors.
+
+    Compute the vibration modes of key-frames: the lowest elastic modes of the solid
+    that each surface encloses, restricted to the surface, or of the surface itself
+    where it is open or thin.
+
+    They are what `subdivide` computes first. Read the files with
+    torch_modal.ModalBasis.load. With --mesher tetwild, which is not deterministic, two
+    runs without the cache give slightly different modes.
+
+    Examples:
+      torch-modal modes horse.obj --out horse.safetensors
+      torch-modal modes gait-?.ply --modes 50 --out bases
+    """
+    files = [args.out]
+    if not is_file(args, [".safetensors"]):
         files = [args.out / f"{mesh.stem}.safetensors" for mesh in args.meshes]
         if len(set(files)) < len(files):
             args.fail("two meshes have the same file name, so their bases would too; take them one by one")
+    elif len(args.meshes) > 1:
+        args.fail(f"--out {args.out} is one file, but there are {len(args.meshes)} meshes; name a folder")
     check_output(files, args.meshes, args.overwrite)
 
     import torch_modal as tm
 
     keyframes, faces = tm.load_keyframes(args.meshes)
-    bases = tm.extract_bases(keyframes, faces, args.modes, **_precompute_options(args))
+    bases = tm.extract_bases(keyframes, faces, args.modes, **mode_options(args))
     report = reporter(args)
     shown = min(8, args.modes)
     report(f"{'lowest elastic modes':24s}" + "".join(f"{i + 1:>10d}" for i in range(shown)))
@@ -127,27 +252,30 @@ def modes(args: argparse.Namespace) -> None:
     report(f"bases: {files[0]}" + (f" to {files[-1].name}" if len(files) > 1 else ""))
 
 
-def demo(args: argparse.Namespace) -> None:
-    """Run ``torch-modal demo``."""
-    names = [args.sample] if args.sample else ["creature", "hand"]
-    if _looks_like_file(args.out):
-        args.fail(f"--out is a folder here, got the file name {args.out.name!r}")
-    check_output([args.out / f"{name}{suffix}" for name in names for suffix in (".glb", ".png")], (), args.overwrite)
-
-    from torch_modal.cli.demo import run_demo
-
-    run_demo(
-        names,
-        args.out,
-        levels=args.levels,
-        n_modes=args.modes,
-        precompute=_precompute_options(args),
-        report=reporter(args),
+def add_cache(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``cache``."""
+    which = sub.add_mutually_exclusive_group()
+    which.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
+    which.add_argument(
+        "--shrink",
+        metavar="SIZE",
+        help="remove what was not used for the longest, until the rest is no larger than SIZE (500M, 4G)",
     )
+    sub.add_argument("--cache-dir", metavar="DIR", help=CACHE_DIR)
 
 
 def cache(args: argparse.Namespace) -> None:
-    """Run ``torch-modal cache``."""
+    """Size of the cache of tetrahedra and modes.
+
+    Say how large the cache is, where tetrahedra and modes are kept between runs.
+
+    It never takes more than 4 GiB, or what the environment variable TORCH_MODAL_CACHE_LIMIT
+    says (500M, 10G): what was not used for the longest makes room for what is new.
+
+    Examples:
+      torch-modal cache --shrink 1G
+      torch-modal cache --clear
+    """
     from torch_modal.io import cache as cached
 
     folder = args.cache_dir or cached.default_cache_dir()
@@ -160,32 +288,3 @@ def cache(args: argparse.Namespace) -> None:
     size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
     limit = f"{cached.size_limit() / 2**20:g} MiB"
     print(f"{size} removed from {folder}" if removed else f"{size} in {folder} (limit: {limit})")
-
-
-def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Options of `extract_bases`."""
-    return {"method": args.method, "mesher": args.mesher, "settings": args.quality, **caching(args)}
-
-
-def _is_file(args: argparse.Namespace, *suffixes: str) -> bool:
-    """Whether --out names a file of one of these suffixes rather than a folder."""
-    if args.out.suffix.lower() in suffixes:
-        return True
-    if _looks_like_file(args.out):
-        args.fail(
-            f"--out is a file ending in {', '.join(suffixes)}, or a folder, got {args.out.name!r}; a folder whose name "
-            "has an ending must exist"
-        )
-    return False
-
-
-def _looks_like_file(out: Path) -> bool:
-    """Whether a name has an ending: letters, not the number of a version, and no folder has it already."""
-    return re.fullmatch(r"\.\w*[A-Za-z]\w*", out.suffix) is not None and not out.is_dir()
-
-
-def _warn_of_leftovers(folder: Path, pattern: str | None, written: list[Path]) -> None:
-    """Warn of frames of an earlier, longer run, which look like the end of this one."""
-    left = sorted(set(folder.glob(pattern or "")) - set(written))
-    if left:
-        warnings.warn(f"{folder} also holds {len(left)} frames of an earlier run, from {left[0].name}", stacklevel=2)

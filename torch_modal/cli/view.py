@@ -1,4 +1,4 @@
-"""``torch-modal view``: shapes of files as a page, opened in the browser or written; key-frames in a live session."""
+"""``torch-modal view``: shapes of files as a page, opened in the browser or written."""
 
 from __future__ import annotations
 
@@ -9,43 +9,16 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch_modal.cli.arguments import add_common, number
-from torch_modal.cli.output import check_name, check_output
+from torch_modal.cli.arguments import add_common, add_meshes, check_output, file_name, number
 from torch_modal.io.formats import PAGES
 
 if TYPE_CHECKING:
-    from torch_modal.view.document import Page
-
-SUMMARY = "show sequences of shapes, in a page for the browser"
-
-DESCRIPTION = """\
-Show sequences of shapes in a page: play, orbit, compare, colour by edge strain,
-distance or volume change, pick vertices and copy their indices.
-
-The page is one HTML file that needs no network. Shapes are numbered mesh files, a
-folder of them, or a GLB that `subdivide` or save_animation wrote.
-
-With --landmarks, they are meshes of any connectivity, side by side, on which vertices
-that belong together are picked, for `register` and `subdivide --register`.
-
-With --live, they are key-frames, and in-betweens are computed while you drag
-the time, the stiffnesses, single modes, or handles of the key-frames."""
-
-EXAMPLES = """\
-examples:
-  open a page of an animation, beside linear interpolation of its key-frames:
-    torch-modal view hand.glb --linear
-  write a page of three sequences side by side:
-    torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
-  pick landmarks on two meshes, and save them as the file that --landmarks of `register` takes:
-    torch-modal view cat.obj dog.obj --landmarks
-  drag in-betweens of two key-frames (pip install 'torch_modal[view]'):
-    torch-modal view --live open.obj fist.obj"""
+    from torch_modal.view.page import Page
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``view``."""
-    sub.add_argument("meshes", nargs="+", type=Path, metavar="FILE", help="shapes in their order, a folder, or one GLB")
+    add_meshes(sub, "shapes in their order, a folder, or one GLB")
     sub.add_argument(
         "--compare",
         nargs="+",
@@ -59,9 +32,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--linear", action="store_true", help="also show linear interpolation of the key-frames of the first sequence"
     )
     sub.add_argument(
-        "--names", nargs="+", metavar="NAME", help="of the sequences, in their order (default: of files or folders)"
-    )
-    sub.add_argument(
         "--keyframes",
         nargs="+",
         type=number(int, 0),
@@ -69,15 +39,14 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help="which frames are key-frames, from 0 (default: the GLB's, or the first and the last)",
     )
     sub.add_argument("--cyclic", action="store_true", help="the last frame leads on to the first")
-    sub.add_argument(
-        "--fps",
-        type=number(float, 0, above=True),
-        metavar="X",
-        help="frames a second (default: the GLB's, or 24)",
-    )
+    rate = number(float, 0, above=True)
+    sub.add_argument("--fps", type=rate, metavar="X", help="frames a second (default: the GLB's, or 24)")
     sub.add_argument("--up", choices=("y", "z"), help="what is up (default: Y, unless the first shape is flat in Y)")
     sub.add_argument(
-        "--page", type=Path, metavar="FILE", help="write the page there, as .html (default: a temporary file, opened)"
+        "--page",
+        type=file_name(PAGES),
+        metavar="FILE",
+        help="write the page there, as .html (default: a temporary file, opened)",
     )
     sub.add_argument(
         "--landmarks",
@@ -86,132 +55,89 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a page to pick landmarks of two meshes or more; with a FILE, those of it are there already",
     )
-    sub.add_argument("--live", action="store_true", help="a live session of key-frames, in place of a page")
-    sub.add_argument(
-        "--port", type=number(int, 1), metavar="N", default=8080, help="of --live, the first to try (default: 8080)"
-    )
     add_common(sub, overwrite="replace the file if it exists (default: refuse)", cache_dir=None, all_of=False)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Run the command."""
-    if args.live:
-        _live(args)
-        return
-    check_name(args, "--page", args.page, PAGES)
-    if args.landmarks:
-        _landmarks(args)
-        return
+    """Show sequences of shapes, in a page for the browser.
+
+    Show sequences of shapes in a page: play, orbit, compare, pick vertices and copy their
+    indices.
+
+    The page is one HTML file that needs no network. Shapes are numbered mesh files, a
+    folder of them, or a GLB that `subdivide` or save_animation wrote.
+
+    With --landmarks, they are meshes of any connectivity, side by side, on which vertices
+    that belong together are picked, for `register` and `subdivide --register`.
+
+    Examples:
+      open a page of an animation, beside linear interpolation of its key-frames:
+        torch-modal view hand.glb --linear
+      write a page of three sequences side by side:
+        torch-modal view ours/ --compare other/ --compare truth/frame-*.ply --page hands.html
+      pick landmarks on two meshes, and save them as the file that --landmarks of `register` takes:
+        torch-modal view cat.obj dog.obj --landmarks
+    """
     given = [args.meshes, *args.compare]
-    n_sequences = len(given) + args.linear
-    if args.names and len(args.names) != n_sequences:
-        args.fail(f"--names names {len(args.names)} sequences, but there are {n_sequences}")
-    if args.page:
-        check_output([args.page], chain(*given), args.overwrite, option="--page")
-
-    import torch_modal as tm
-
-    sequences, first = _sequences(given, args)
-    page = tm.show(
-        sequences,
-        first.faces,
-        keyframe_indices=first.keyframe_indices if args.keyframes is None else args.keyframes,
-        times=first.times,
-        fps=args.fps or first.fps or 24.0,
-        cyclic=args.cyclic or first.cyclic,
-        up=args.up,
-        title=next(iter(sequences)),
-    )
-    shapes = next(iter(sequences.values()))
-    times = f"{len(sequences)} x " if len(sequences) > 1 else ""
-    _open(page, f"{times}{len(shapes)} shapes of {shapes.shape[1]} vertices", args)
-
-
-def _open(page: Page, what: str, args: argparse.Namespace) -> None:
-    """Write the page; open it unless --page names a file."""
-    # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
-    path = args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html")
-    written = page.save(path, args.overwrite)
-    if not args.quiet:
-        print(f"{what}: {written}", flush=True)
-    if not args.page and not webbrowser.open(written.absolute().as_uri()):
-        print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {written}")
-
-
-def _landmarks(args: argparse.Namespace) -> None:
-    """Meshes of any connectivity, to pick landmarks on."""
-    _refuse(args, ("compare", "linear", "keyframes"), "belong to sequences; --landmarks shows single meshes")
-    if len(args.meshes) < 2:
+    names = [path.name for path in args.meshes] if args.landmarks else [_name(paths) for paths in given]
+    if args.landmarks and (args.compare or args.linear or args.keyframes):
+        args.fail("--compare, --linear and --keyframes belong to sequences; --landmarks shows single meshes")
+    if args.landmarks and len(names) < 2:
         args.fail("--landmarks needs two meshes or more")
-    if args.names and len(args.names) != len(args.meshes):
-        args.fail(f"--names names {len(args.names)} meshes, but there are {len(args.meshes)}")
+    if args.linear:
+        names.append("linear")
+    if len(set(names)) < len(names):
+        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
     if args.page:
-        inputs = args.meshes if args.landmarks is True else [*args.meshes, Path(args.landmarks)]
-        check_output([args.page], inputs, args.overwrite, option="--page")
+        inputs = [] if args.landmarks in (None, True) else [Path(args.landmarks)]
+        check_output([args.page], [*chain(*given), *inputs], args.overwrite)
 
+    page, what = (_landmarks if args.landmarks else _sequences)(names, given, args)
+    # Without --page it goes to a temporary folder, and stays: the browser reads it after this process.
+    path = page.save(args.page or Path(tempfile.mkdtemp(prefix="torch_modal-"), "page.html"), args.overwrite)
+    if not args.quiet:
+        print(f"{what}: {path}", flush=True)
+    if not args.page and not webbrowser.open(path.absolute().as_uri()):
+        print(f"no browser was found to open it; open it yourself, or write it elsewhere with --page: {path}")
+
+
+def _landmarks(names: list[str], given: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
+    """A page to pick landmarks on meshes of any connectivity, and what it shows."""
     import torch_modal as tm
     from torch_modal.io.read import read_mesh
     from torch_modal.registration.landmarks import landmark_vertices
 
-    meshes = [read_mesh(path) for path in args.meshes]
+    meshes = [read_mesh(path) for path in given[0]]
     rows = None if args.landmarks is True else landmark_vertices(args.landmarks, [points for points, _ in meshes])
-    named = _named(args.names or [path.name for path in args.meshes], meshes)
-    page = tm.show_landmarks(named, rows, title="Landmarks")
-    _open(page, f"{len(meshes)} meshes to pick landmarks on", args)
+    page = tm.show_landmarks(dict(zip(names, meshes, strict=True)), rows, title="Landmarks")
+    return page, f"{len(meshes)} meshes to pick landmarks on"
 
 
-def _live(args: argparse.Namespace) -> None:
-    """Key-frames in a live session, until Ctrl-C."""
-    others = ("page", "compare", "linear", "names", "landmarks")
-    _refuse(args, others, "belong to pages; --live shows what is computed now")
-    if len(args.meshes) < 2:
-        args.fail("--live needs two key-frames or more")
-
+def _sequences(names: list[str], given: list[list[Path]], args: argparse.Namespace) -> tuple[Page, str]:
+    """A page that plays sequences of the same faces, and what it shows."""
     import torch_modal as tm
-    from torch_modal.view.live import require_viser
-
-    require_viser()
-    session = tm.live(*tm.load_keyframes(args.meshes), port=args.port)
-    print(f"open {session.url} in a browser; Ctrl-C ends the session", flush=True)
-    webbrowser.open(session.url)
-    session.wait()
-
-
-def _refuse(args: argparse.Namespace, options: tuple[str, ...], why: str) -> None:
-    """Exit with the usage if options are given that mean nothing here."""
-    given = [f"--{option}" for option in options if getattr(args, option)]
-    if given:
-        args.fail(f"{', '.join(given)} {why}")
-
-
-def _sequences(given: list[list[Path]], args: argparse.Namespace) -> tuple[dict[str, Any], Any]:
-    """The sequences under their names, and the first as it was read."""
     from torch_modal.io.read import require_same_mesh
     from torch_modal.view.page_input import read_shapes
 
-    read = [read_shapes(paths) for paths in given]
-    first = read[0]
-    for paths, other in zip(given[1:], read[1:], strict=True):
-        require_same_mesh(given[0][0], first.frames[0], first.faces, paths[0], other.frames[0], other.faces)
-        if len(other.frames) != len(first.frames):
+    first, faces, options = read_shapes(given[0])
+    shapes = [first]
+    for paths in given[1:]:
+        frames, other_faces, _ = read_shapes(paths)
+        require_same_mesh(given[0][0], first[0], faces, paths[0], frames[0], other_faces)
+        if len(frames) != len(first):
             raise ValueError(
-                f"{paths[0]} has {len(other.frames)} shapes, {given[0][0]} has {len(first.frames)}; sequences are "
-                "compared shape by shape, so both need as many"
+                f"{paths[0]} has {len(frames)} shapes, {given[0][0]} has {len(first)}; sequences are compared shape by "
+                "shape, so both need as many"
             )
-    shapes = [one.frames for one in read]
-    names = [_name(paths) for paths in given]
+        shapes.append(frames)
+    asked = {"keyframe_indices": args.keyframes, "fps": args.fps, "cyclic": args.cyclic or None, "up": args.up}
+    options |= {name: value for name, value in asked.items() if value is not None}
     if args.linear:
-        keys = args.keyframes or first.keyframe_indices or [0, len(first.frames) - 1]
-        shapes.append(_linear(first.frames, sorted(set(keys)), args.cyclic or first.cyclic))
-        names.append("linear")
-    return _named(args.names or names, shapes), first
-
-
-def _named(names: list[str], values: list[Any]) -> dict[str, Any]:
-    """Values under their names, which get a number each if some are the same."""
-    if len(set(names)) < len(names):
-        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
-    return dict(zip(names, values, strict=True))
+        keys = options.get("keyframe_indices") or [0, len(first) - 1]
+        shapes.append(_linear(first, sorted(set(keys)), options.get("cyclic", False)))
+    page = tm.show(dict(zip(names, shapes, strict=True)), faces, **options, title=names[0])
+    times = f"{len(shapes)} x " if len(shapes) > 1 else ""
+    return page, f"{times}{len(first)} shapes of {first.shape[1]} vertices"
 
 
 def _name(paths: list[Path]) -> str:

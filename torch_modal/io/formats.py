@@ -55,8 +55,8 @@ MESH_FORMATS = {
 }
 ANIMATION_FORMATS = {
     ".glb": OutputFormat("torch_modal.io.glb:write_glb", GLB_HOLDS),
-    ".mp4": OutputFormat("torch_modal.view.video:write_mp4", (), ("imageio", "imageio_ffmpeg"), "video"),
-    ".gif": OutputFormat("torch_modal.view.video:write_gif"),
+    ".mp4": OutputFormat("torch_modal.view.animation:write_mp4", (), ("imageio", "imageio_ffmpeg"), "video"),
+    ".gif": OutputFormat("torch_modal.view.animation:write_gif"),
     **dict.fromkeys(
         (".usd", ".usda", ".usdc"),
         OutputFormat("torch_modal.io.animations:write_usd", ("polygons", "texcoords", "colors"), ("pxr",), "usd"),

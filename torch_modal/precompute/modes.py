@@ -129,8 +129,7 @@ def extract_bases(
         timeout: Time limit of fTetWild for a key-frame, in seconds.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
-        progress: Whether a bar shows key-frame and stage; by default on terminals, with lines of the log elsewhere. Or
-            a function ``(done, total, what)``, which may be called from several threads, one at a time.
+        progress: A bar with key-frame and stage: see :data:`torch_modal.progress.Progress`.
 
     Returns:
         One basis for each key-frame: float64, on the CPU, without gradient.

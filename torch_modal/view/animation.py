@@ -1,10 +1,11 @@
-"""A sequence as one file that plays; its suffix chooses the format."""
+"""A sequence as one file that plays; its suffix chooses the format. Those that are drawn, MP4 and GIF, stand here."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,19 @@ from torch_modal.arrays import Array
 from torch_modal.extras import require_installed
 from torch_modal.io.asset import Asset
 from torch_modal.io.files import temporary_beside
-from torch_modal.io.formats import ANIMATION_FORMATS, Animation, make_timing
+from torch_modal.io.formats import ANIMATION_FORMATS, Animation, make_timing, resample
 from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing
-from torch_modal.progress import Progress
+from torch_modal.progress import Progress, ProgressReport
+from torch_modal.view.drawing import ByteArray, Scene, draw
+from torch_modal.view.picture import BETWEEN_COLOR, centred, view_rotation
 
 logger = logging.getLogger("torch_modal")
+
+PIXELS = 640
+"""The longer side of a picture of a video."""
+
+PICTURES_AT_ONCE = 24
+"""Drawn by one process of the renderer."""
 
 
 def require_packages(path: Path) -> None:
@@ -79,8 +88,7 @@ def save_animation(
             begins again. Default: evenly. The duration stays what it is.
         asset: The mesh file that the frames come from (:func:`torch_modal.open_asset`). GLB gets its materials,
             textures, texture coordinates, colours and normals, USD its polygons, texture coordinates and colours.
-        progress: Of drawing a video: whether a bar shows it; by default on terminals, with lines of the log elsewhere.
-            Or a function ``(done, total, what)``.
+        progress: A bar while a video is drawn: see :data:`torch_modal.progress.Progress`.
 
     Returns:
         The file.
@@ -120,3 +128,45 @@ def save_animation(
         ANIMATION_FORMATS[suffix].write(animation, temporary)
     logger.debug("wrote %s, %.1f kB", path, path.stat().st_size / 1000)
     return path
+
+
+def write_mp4(animation: Animation, path: Path) -> None:
+    """H.264."""
+    import imageio.v2 as imageio
+
+    options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "error"}
+    pictures = _pictures(animation)
+    writer: Any = imageio.get_writer(path, format="FFMPEG", mode="I", fps=animation.timing.fps, **options)
+    with writer:
+        for picture in pictures:
+            writer.append_data(picture)
+
+
+def write_gif(animation: Animation, path: Path) -> None:
+    """A GIF that repeats for ever."""
+    from PIL import Image
+
+    # GIF counts in hundredths of a second, and players slow down below two of them.
+    milliseconds = max(20, 10 * round(100 / animation.timing.fps))
+    first, *others = map(Image.fromarray, _pictures(animation))
+    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+
+def _pictures(animation: Animation) -> list[ByteArray]:
+    """The sequence drawn from one place, at the rate of its timing."""
+    shapes, faces = animation.shapes, animation.faces
+    places = animation.timing.samples()
+    # A frame that is shown twice, as on the way back, is drawn once.
+    unique, which = np.unique(places, return_inverse=True)
+    points = resample(shapes, unique) @ view_rotation(shapes[0], None, None).T
+    points, half = centred(points[None])
+    # H.264 stores colour for blocks of two by two.
+    size = np.maximum((PIXELS * half / half.max() / 2).round() * 2, 2).astype(np.int64)
+    paint = np.broadcast_to((np.array(BETWEEN_COLOR) * 255).round().astype(np.uint8), points[0].shape)
+    images: list[ByteArray] = []
+    with ProgressReport(len(unique), "pictures", animation.progress, unit="picture") as report:
+        for start in range(0, len(unique), PICTURES_AT_ONCE):
+            part = slice(start, start + PICTURES_AT_ONCE)
+            images += list(draw(Scene(points[0, part], paint[part].copy(), faces, half, size), "auto"))
+            report.update(len(images) - start)
+    return [images[number] for number in which.reshape(-1)]

@@ -25,11 +25,7 @@ ByteArray = NDArray[np.uint8]
 
 CHILD_SECONDS = 300.0
 SMOOTH_FACES = 30_000  # matplotlib draws at least so many
-LIGHTS = (
-    ((-2, 3, 4), 0.82),
-    ((4, 1, 3), 0.30),
-    ((0, -3, 2), 0.14),
-)  # from where, as the viewer sees it; how bright
+LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directions as the viewer sees them; brightness
 
 
 class Scene(NamedTuple):
@@ -56,13 +52,9 @@ def _draw_pyvista(scene: Scene) -> ByteArray:
     plotter.enable_ssao(radius=0.25, bias=0.01, kernel_size=128, blur=True)
     plotter.enable_parallel_projection()
     depth = float(np.abs(scene.points[..., 2]).max()) * scale + 1.0
-    plotter.camera.position, plotter.camera.focal_point, plotter.camera.up = (
-        (0, 0, 2 * depth),
-        (0, 0, 0),
-        (0, 1, 0),
-    )
-    plotter.camera.parallel_scale = 1.0
-    plotter.camera.clipping_range = (0.5 * depth, 3.5 * depth)
+    camera = plotter.camera
+    camera.position, camera.focal_point, camera.up = (0, 0, 2 * depth), (0, 0, 0), (0, 1, 0)
+    camera.parallel_scale = 1.0
     images: list[ByteArray] = []
     for points, colors in zip(scene.points, scene.colors, strict=True):
         mesh = pv.PolyData(points * scale, corners.reshape(-1))
@@ -79,7 +71,7 @@ def _draw_pyvista(scene: Scene) -> ByteArray:
             specular_power=12,
             reset_camera=False,
         )
-        plotter.camera.clipping_range = (0.5 * depth, 3.5 * depth)
+        camera.clipping_range = (0.5 * depth, 3.5 * depth)
         images.append(plotter.screenshot(None, return_img=True))
         plotter.remove_actor(actor, reset_camera=False)
     plotter.close()
@@ -136,22 +128,16 @@ def _draw_matplotlib(scene: Scene) -> ByteArray:
     return np.stack(images)
 
 
-_CHILD = """
-import sys
-sys.path.insert(0, sys.argv[1])
-from torch_modal.view.drawing import _child_main
-_child_main(sys.argv[2])
-"""
+def _child_command() -> list[str]:
+    program = "import sys; sys.path.insert(0, sys.argv[1]); from torch_modal.view import drawing; drawing._child_main()"
+    return [sys.executable, "-c", program, str(Path(__file__).parents[2])]
 
 
-def _child_command(folder: str) -> list[str]:
-    return [sys.executable, "-c", _CHILD, str(Path(__file__).parents[2]), folder]
-
-
-def _child_main(folder: str) -> None:
-    with np.load(Path(folder, "scene.npz")) as stored:
+def _child_main() -> None:
+    """Draw the scene of the current folder, where the images go too."""
+    with np.load("scene.npz") as stored:
         scene = Scene(**{name: stored[name] for name in Scene._fields})
-    np.save(Path(folder, "images.npy"), _draw_pyvista(scene))
+    np.save("images.npy", _draw_pyvista(scene))
 
 
 def _draw_in_child(scene: Scene) -> ByteArray:
@@ -160,15 +146,12 @@ def _draw_in_child(scene: Scene) -> ByteArray:
         np.savez(Path(folder, "scene.npz"), **scene._asdict())
         try:
             # The folder is the working directory so that a core file goes with it.
-            done = subprocess.run(
-                _child_command(folder), cwd=folder, capture_output=True, timeout=CHILD_SECONDS, check=False
-            )
+            done = subprocess.run(_child_command(), cwd=folder, capture_output=True, timeout=CHILD_SECONDS, check=False)
         except subprocess.TimeoutExpired:
             raise RuntimeError(f"it did not finish within {CHILD_SECONDS:g} s") from None
         if done.returncode != 0:
-            said = done.stderr.decode(errors="replace").strip().splitlines()
-            ending = f"signal {-done.returncode}" if done.returncode < 0 else f"status {done.returncode}"
-            raise RuntimeError(f"its process ended with {ending}" + (f": {said[-1]}" if said else ""))
+            said = last_line(done.stderr.decode(errors="replace"))
+            raise RuntimeError(f"its process ended with {describe_exit(done.returncode)}{said and f': {said}'}")
         stored = Path(folder, "images.npy")
         if not stored.is_file():
             raise RuntimeError("it left no images")

@@ -1,22 +1,82 @@
-"""Pages that play sequences of shapes, or on which landmarks are picked, packed by page_data.py into one HTML file."""
+"""A page that plays sequences of shapes, or on which landmarks are picked: one HTML file without any other.
+
+It joins the files in page_assets with the shapes of page_data.py. Its content security policy allows its own scripts by
+their hashes and forbids all else, so that text in file names or titles cannot run.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import html
+import json
+import re
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from torch_modal.arrays import Array, FloatArray, IntArray
-from torch_modal.io.write import check_frames, check_indices, to_numpy
-from torch_modal.view.document import Page, checked_path, document
-from torch_modal.view.page_data import grid_of, pack_faces, pack_frames, quantise
-from torch_modal.view.picture import check_sequences, check_view, up_axis, view_rotation
+from torch_modal.arrays import Array
+from torch_modal.io.files import write_file
+from torch_modal.io.formats import PAGES
+from torch_modal.io.write import check_frames, check_indices, check_suffix, refuse_existing, to_numpy
+from torch_modal.version import __version__
+from torch_modal.view.page_data import pack_group
+from torch_modal.view.picture import check_sequences, check_view
 
-COMMON_SCRIPTS = ("dom.js", "decode.js", "measure.js", "stage.js")
-SCRIPTS = (*COMMON_SCRIPTS, "timeline.js", "page.js")
-LANDMARK_SCRIPTS = (*COMMON_SCRIPTS, "landmarks.js")
+POLICY = "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 'none'"
+SCRIPTS = ("meshes.js", "stage.js", "page.js")
+
+
+class Page:
+    """A page of shapes, which notebooks display and :meth:`save` writes.
+
+    Attributes:
+        html: The whole page.
+        height: In pixels, in a notebook.
+
+    Raises:
+        ValueError: A height below 1.
+    """
+
+    def __init__(self, html: str, height: int = 600) -> None:
+        if height < 1:
+            raise ValueError(f"height is a number of pixels, at least 1; got {height}.")
+        self.html = html
+        self.height = height
+
+    def __repr__(self) -> str:
+        return f"<torch_modal.Page of {len(self.html) / 1e6:.1f} MB; its save(path) writes it>"
+
+    def _repr_html_(self) -> str:
+        # The sandbox isolates the page's scripts from the notebook's.
+        return (
+            '<iframe sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy" '
+            f'style="width: 100%; height: {self.height}px; border: 1px solid #dde3e9; border-radius: 8px" '
+            f'srcdoc="{html.escape(self.html)}"></iframe>'
+        )
+
+    def save(self, out: str | Path, overwrite: bool = False) -> Path:
+        """Write the page as one HTML file.
+
+        Args:
+            out: File to write, ``*.html``.
+            overwrite: Replace the file if it exists.
+
+        Returns:
+            The file.
+
+        Raises:
+            ValueError: ``out`` does not end in .html.
+            FileExistsError: The file exists and ``overwrite`` is off.
+        """
+        path = Path(out)
+        check_suffix(path, PAGES)
+        refuse_existing(path, overwrite)
+        write_file(path, self.html.encode("utf-8"))
+        return path
 
 
 def show(
@@ -32,7 +92,7 @@ def show(
     title: str = "torch_modal",
     height: int = 600,
 ) -> Page:
-    """A page that shows sequences of shapes, in a notebook or saved: play, orbit, compare, measure, pick vertices.
+    """A page that shows sequences of shapes, in a notebook or saved: play, orbit, compare, pick and follow vertices.
 
     In the page, shapes between two neighbouring frames are blended linearly. Positions are stored in 65,535 steps along
     the longest side of all shapes together, so they are off by at most 8e-6 of it.
@@ -64,50 +124,26 @@ def show(
         raise ValueError(f"fps must be a positive number, got {fps}.")
     checked, triangles = check_sequences({str(name): frames for name, frames in given.items()}, faces, "sequences")
     shapes = list(checked.values())
-    n_frames = len(shapes[0])
-    ends = [0, n_frames - 1]
-    keyframes = check_indices(ends if keyframe_indices is None else keyframe_indices, n_frames, "keyframe_indices")
-    stamps = np.arange(n_frames, dtype=np.float64) if times is None else _checked_times(times, n_frames)
-    closed = cyclic and n_frames > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes)
-    data = {
-        "times": stamps.tolist(),
-        "has_times": times is not None,
-        "fps": float(fps),
-        "closed": closed,
-        "keyframes": keyframes,
-        **_packed(checked, triangles, view, up),
-    }
-    return Page(document("page.html", SCRIPTS, title, data), height)
-
-
-def write_page(
-    sequences: Mapping[str, Array] | Array,
-    faces: Array,
-    out: str | Path,
-    *,
-    title: str | None = None,
-    overwrite: bool = False,
-    **options: Any,
-) -> Path:
-    """Write a page that shows sequences of shapes, as one HTML file that works without a network.
-
-    Args:
-        sequences: As for :func:`show`.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        out: File to write, ``*.html``.
-        title: Of the page; by default the file's name.
-        overwrite: Replace the file if it exists.
-        options: Further arguments of :func:`show`, such as ``keyframe_indices``.
-
-    Returns:
-        The file.
-
-    Raises:
-        ValueError: An argument cannot be used; the message says why.
-        FileExistsError: The file exists and ``overwrite`` is off.
-    """
-    path = checked_path(out, overwrite)
-    return show(sequences, faces, title=path.stem if title is None else title, **options).save(path, overwrite)
+    n = len(shapes[0])
+    keyframes = check_indices([0, n - 1] if keyframe_indices is None else keyframe_indices, n, "keyframe_indices")
+    stamps = np.arange(n, dtype=np.float64) if times is None else np.asarray(to_numpy(times), dtype=np.float64)  # type: ignore[arg-type]
+    if stamps.shape != (n,) or not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
+        raise ValueError(
+            f"times must be {n} finite numbers, one a frame, each larger than the one before; got "
+            f"{np.array2string(stamps, threshold=8)} of shape {stamps.shape}."
+        )
+    if cyclic and n > 1 and not all(np.array_equal(frames[0], frames[-1]) for frames in shapes):
+        stamps = np.append(stamps, stamps[-1] + (stamps[-1] - stamps[0]) / (n - 1))  # when the first comes again
+    return _page(
+        [pack_group(checked, triangles, view, up)],
+        title,
+        height,
+        n_frames=n,
+        times=stamps.tolist(),
+        has_times=times is not None,
+        fps=float(fps),
+        keyframes=keyframes,
+    )
 
 
 def show_landmarks(
@@ -136,68 +172,66 @@ def show_landmarks(
     """
     if len(meshes) < 2:
         raise ValueError(f"landmarks belong to two meshes or more, got {len(meshes)}.")
-    checked = [
-        (str(name), *check_frames(to_numpy(vertices)[None], faces, f"meshes[{name!r}][0][None]"))
+    checked = {
+        str(name): check_frames(to_numpy(vertices)[None], faces, f"meshes[{name!r}][0][None]")
         for name, (vertices, faces) in meshes.items()
-    ]
+    }
     rows = np.zeros((0, len(checked)), dtype=np.int64) if landmarks is None else to_numpy(landmarks)
     if rows.ndim != 2 or rows.shape[1] != len(checked) or rows.dtype.kind not in "iu":
         raise ValueError(
             f"landmarks must be vertex indices, a column for each of the {len(checked)} meshes, got shape {rows.shape} "
             f"and dtype {rows.dtype}."
         )
-    counts = np.array([shape.shape[1] for _, shape, _ in checked])
+    counts = np.array([shape.shape[1] for shape, _ in checked.values()])
     if ((rows < 0) | (rows >= counts)).any():
         raise ValueError(f"landmarks must index the {counts.tolist()} vertices of the meshes from 0.")
-    data: dict[str, Any] = {
-        "meshes": [_packed({name: shape}, faces) for name, shape, faces in checked],
-        "landmarks": rows.tolist(),
+    groups = [pack_group({name: shape}, faces) for name, (shape, faces) in checked.items()]
+    return _page(groups, title, height, landmarks=rows.tolist())
+
+
+def _page(
+    groups: list[dict[str, Any]],
+    title: str,
+    height: int,
+    *,
+    n_frames: int = 1,
+    times: Sequence[float] = (0.0,),
+    has_times: bool = False,
+    fps: float = 24.0,
+    keyframes: Sequence[int] = (),
+    landmarks: list[list[int]] | None = None,
+) -> Page:
+    """The page of groups of shapes, with the data that page.js reads. Titles and names are escaped."""
+    data = {
+        "groups": groups,
+        "n_frames": n_frames,
+        "times": times,
+        "has_times": has_times,
+        "fps": fps,
+        "keyframes": keyframes,
+        "landmarks": landmarks,
     }
-    return Page(document("landmarks.html", LANDMARK_SCRIPTS, title, data), height)
+    assets = files("torch_modal.view") / "page_assets"
 
+    def asset(name: str) -> str:
+        return (assets / name).read_text(encoding="utf-8")
 
-def _checked_times(times: Sequence[float], n_frames: int) -> FloatArray:
-    stamps: FloatArray = np.asarray(to_numpy(times), dtype=np.float64)  # type: ignore[arg-type]
-    if stamps.shape != (n_frames,) or not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
-        raise ValueError(
-            f"times must be {n_frames} finite numbers, one a frame, each larger than the one before; got "
-            f"{np.array2string(stamps, threshold=8)} of shape {stamps.shape}."
-        )
-    return stamps
-
-
-def _packed(
-    sequences: dict[str, FloatArray],
-    faces: IntArray,
-    view: tuple[float, float] | None = None,
-    up: Literal["y", "z"] | None = None,
-) -> dict[str, Any]:
-    """Shapes, faces and the first view of a page; lengths in steps of the grid."""
-    first = next(iter(sequences.values()))[0]
-    rotation = view_rotation(first, view, up)
-    grid = grid_of(list(sequences.values()))
-    numbers = {name: quantise(frames, grid) for name, frames in sequences.items()}
-    # The box around everything along right, up and front; the camera orbits its middle.
-    low = np.min([_extreme(frames, rotation, np.min) for frames in numbers.values()], axis=0)
-    high = np.max([_extreme(frames, rotation, np.max) for frames in numbers.values()], axis=0)
-    return {
-        "origin": grid.origin.tolist(),
-        "step": grid.step,
-        "n_vertices": len(first),
-        "n_faces": len(faces),
-        "faces": pack_faces(faces),
-        "sequences": [{"name": name, "frames": pack_frames(frames)} for name, frames in numbers.items()],
-        "diagonal": max(float(np.linalg.norm(np.ptp(first, axis=0))) / grid.step, 1.0),
-        "view": {
-            "front": rotation[2].tolist(),
-            "centre": (0.5 * (low + high) @ rotation).tolist(),
-            "half": (0.5 * (high - low)).tolist(),
-            "world_up": [0, 1, 0] if up_axis(first, up) == "y" else [0, 0, 1],
-        },
+    style, library = asset("page.css"), asset("three.min.js")
+    # In a function scope, strict.
+    program = '(() => {\n"use strict";\n' + "\n".join(map(asset, SCRIPTS)) + "})();\n"
+    parts = {
+        "@POLICY@": f"{POLICY}; style-src {_hash(style)}; script-src {_hash(library)} {_hash(program)}",
+        "@GENERATOR@": f"torch_modal {__version__}",
+        "@TITLE@": html.escape(title),
+        "@STYLE@": style,
+        "@DATA@": json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
+        "@LIBRARY@": library,
+        "@PROGRAM@": program,
     }
+    # In one pass: markers inside inserted text stay.
+    return Page(re.sub("|".join(parts), lambda marker: parts[marker.group()], asset("page.html")), height)
 
 
-def _extreme(numbers: Any, rotation: FloatArray, which: Any) -> FloatArray:
-    """Least or largest coordinates of shapes ``(N, V, 3)`` in view directions, a frame at a time to save memory."""
-    found: FloatArray = which([which(shape @ rotation.T, axis=0) for shape in numbers], axis=0)
-    return found
+def _hash(text: str) -> str:
+    """The source expression of an inline script or style in a content security policy."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"

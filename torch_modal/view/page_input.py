@@ -1,9 +1,9 @@
-"""Shapes read back from files: numbered meshes, a folder of them, or an animated GLB that `save_animation` wrote."""
+"""Sequences of shapes from files: numbered meshes, a folder of them, or a GLB that `save_animation` wrote."""
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,24 +18,7 @@ FRAME_SUFFIXES = (".ply", ".obj", ".off")
 GENERATOR = "torch_modal"
 
 
-class Shapes(NamedTuple):
-    """A sequence of shapes of one connectivity, with the metadata of its files."""
-
-    frames: FloatArray
-    """*Shape:* ``(N, V, 3)``."""
-    faces: IntArray
-    """*Shape:* ``(F, 3)``."""
-    keyframe_indices: list[int] | None
-    """Which of the frames are key-frames, where that is known."""
-    fps: float | None
-    """Frames a second, where that is known."""
-    times: list[float] | None
-    """When each frame is shown in seconds, where they are not evenly spaced."""
-    cyclic: bool
-    """Whether the last frame leads on to the first."""
-
-
-def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> Shapes:
+def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> tuple[FloatArray, IntArray, dict[str, Any]]:
     """Read a sequence of shapes.
 
     Args:
@@ -43,7 +26,8 @@ def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> Shapes:
             numbers in their names; or one GLB that :func:`torch_modal.save_animation` wrote, with all its frames.
 
     Returns:
-        The shapes, in the files' coordinates.
+        The shapes in the files' coordinates ``(N, V, 3)``, their faces ``(F, 3)``, and what the files say of them:
+        options of :func:`torch_modal.show`.
 
     Raises:
         FileNotFoundError: A file does not exist.
@@ -53,11 +37,14 @@ def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> Shapes:
     if len(files) == 1 and files[0].is_dir():
         files = _numbered(files[0])
     if len(files) == 1 and files[0].suffix.lower() == ".glb" and files[0].is_file():
-        animation = _read_animation(files[0])
+        asset = open_asset(files[0])
+        assert isinstance(asset, GltfAsset)
+        animation = _animation(files[0], asset)
         if animation is not None:
-            return animation
+            frames, options = animation
+            return frames, asset.faces, options
     keyframes, faces = load_keyframes(files)
-    return Shapes(keyframes.numpy(), faces.numpy(), None, None, None, False)
+    return keyframes.numpy(), faces.numpy(), {}
 
 
 def _numbered(folder: Path) -> list[Path]:
@@ -71,18 +58,17 @@ def _numbered(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: natural(path.name))
 
 
-def _read_animation(path: Path) -> Shapes | None:
-    """The frames of a GLB with morph targets; None if it has none.
+def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]] | None:
+    """The frames of a GLB with morph targets and the options of `show`; None without targets.
 
-    Reads files of `save_animation`: frame 0 and a target for each further frame, which is shown at its time. The
-    meaning of other programs' targets is unknown.
+    Frame 0 is the mesh, each target a further frame, fully shown at its time. The meaning of other programs' targets is
+    unknown.
     """
-    asset = open_asset(path)
-    assert isinstance(asset, GltfAsset)
     document = asset.document
     try:
         frames = asset.morphs()
-        if len(frames) == 1:
+        n = len(frames)
+        if n == 1:
             return None
         if document.root["asset"].get("generator") != GENERATOR or len(document.get("animations")) != 1:
             raise MeshError(
@@ -93,19 +79,23 @@ def _read_animation(path: Path) -> Shapes | None:
         extras = animation["extras"]
         seconds = document.floats(animation["samplers"][0]["input"])[:, 0]
         kept = [int(number) for number in extras["frames"]]
-        places = {number: place for place, number in enumerate(kept)}
-        keyframes = [places[number] for number in extras["keyframes"] if number in places]
-        n, back = len(frames), bool(extras.get("ping_pong"))
+        keyframes = [kept.index(number) for number in extras["keyframes"] if number in kept]
+        back = bool(extras.get("ping_pong"))
         closed = len(seconds) == n + 1 and not back
         if len(kept) != n or len(seconds) != (2 * n - 1 if back else n + closed):
             raise ValueError(f"{n} shapes, {len(kept)} frames, {len(seconds)} times")
+        rate = float(extras["fps"])
     except MeshError:
         raise
     except Exception as error:  # Damaged files may raise any exception; the message names the file.
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: cannot be read as an animation of this package ({reason[:200]})") from error
+    options: dict[str, Any] = {"keyframe_indices": keyframes or None, "cyclic": closed, "fps": rate}
     # Frames left out of a long sequence leave wider steps in time; so does ease.
     times = seconds[:n]
     even = np.allclose(np.diff(times), times[-1] / (n - 1), rtol=1e-4)
-    rate = float(extras["fps"]) if even and kept == list(range(n)) else float((n - 1) / times[-1])
-    return Shapes(frames, asset.faces, keyframes or None, rate, None if even else times.tolist(), closed)
+    if not even or kept != list(range(n)):
+        options["fps"] = float((n - 1) / times[-1])
+    if not even:
+        options["times"] = times.tolist()
+    return frames, options

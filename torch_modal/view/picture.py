@@ -192,7 +192,7 @@ def render_sequence(
             99.5th percentile of what is shown, with an arrow if there is more.
             *Shape of each:* ``(N, V)``.
         color_label: What those numbers are, with their unit.
-        renderer: ``"auto"`` is pyvista where it is installed (extra ``view``), otherwise matplotlib; also, with a
+        renderer: ``"auto"`` is pyvista where it is installed (extra ``pictures``), otherwise matplotlib; also, with a
             warning, where pyvista cannot render.
         overwrite: Replace the file if it exists.
 
@@ -274,10 +274,7 @@ def _colored(
             )
         values[rows.index(row)] = array[chosen].astype(np.float64)
     everything = np.concatenate([v.reshape(-1) for v in values.values()])
-    low, high = (
-        everything.min(),
-        np.percentile(everything, 99.5),
-    )  # a few extreme vertices must not hide the rest
+    low, high = everything.min(), np.percentile(everything, 99.5)  # a few extreme vertices must not hide the rest
     mappable = ScalarMappable(
         Normalize(low, high if high > low else low + 1.0),
         LinearSegmentedColormap.from_list("error", ERROR_COLORS),

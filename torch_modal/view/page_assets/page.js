@@ -1,6 +1,6 @@
-// The state of the page, its controls, and the loop.
+// The page: its state, controls and loop. One group of sequences plays; of several groups, landmarks are picked.
 
-// Of each sequence: the colour of its in-betweens where several are overlaid, and of its curves and trails.
+// The colour of each sequence: of its in-betweens where several are overlaid, and of its trails.
 const LOOKS = [
   { tint: [0.62, 0.71, 0.82], line: "#4a78ab" },
   { tint: [0.88, 0.6, 0.62], line: "#b8474d" },
@@ -9,304 +9,217 @@ const LOOKS = [
   { tint: [0.8, 0.77, 0.56], line: "#8b7d1f" },
 ];
 const GIVEN = [0.91, 0.6, 0.36]; // key-frames, as in the pictures
-const COMPUTED = LOOKS[0].tint;
+const CLICK_PIXELS = 4; // a press that moves further turns the camera
+const SNAP_PIXELS = 3; // the slider meets frames that are as near
+const ENOUGH_LANDMARKS = 5;
+
+const find = (id) => document.getElementById(id);
+
+/** An element with attributes and children; text children are text, never markup. */
+function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+/** Frames, with fractions between them, their times, and their places from 0 to 1 on the time line. */
+class Clock {
+  /** `times` rise; of a closed sequence, the last one is when the first frame comes again. */
+  constructor(times) {
+    this.times = times;
+    this.last = times.length - 1;
+    this.span = times[this.last] - times[0] || 1;
+  }
+
+  timeOf(frame) {
+    const low = Math.min(Math.floor(frame), Math.max(this.last - 1, 0));
+    const high = Math.min(low + 1, this.last);
+    return this.times[low] + (frame - low) * (this.times[high] - this.times[low]);
+  }
+
+  placeOf(frame) {
+    return (this.timeOf(frame) - this.times[0]) / this.span;
+  }
+
+  frameAt(place) {
+    if (this.last === 0) return 0;
+    const time = this.times[0] + Math.min(Math.max(place, 0), 1) * this.span;
+    const low = this.times.slice(1, -1).filter((other) => other <= time).length;
+    return low + (time - this.times[low]) / (this.times[low + 1] - this.times[low]);
+  }
+}
 
 class Viewer {
-  constructor(data, faces, sequences) {
-    Object.assign(this, { data, faces, sequences });
-    this.names = data.sequences.map(({ name }) => name);
-    this.nVertices = data.n_vertices;
-    this.edges = edgesOf(faces);
-    this.measures = measuresOf(faces, this.edges, this.nVertices, data.diagonal);
-    this.clock = new Clock(data.times, data.closed);
-    this.keyframes = data.keyframes;
-    this.frame = 0;
-    this.drawn = 0;
-    this.busy = 0;
-    this.measuring = false;
-    this.playing = false;
+  constructor(data, actors) {
+    Object.assign(this, { data, actors });
+    this.clock = new Clock(data.times);
+    this.closed = data.times.length > data.n_frames;
+    this.picksLandmarks = data.landmarks !== null;
+    this.rows = data.landmarks ?? []; // picked vertices, one of each actor; null where it is still missing
+    this.undone = []; // the rows before each change
+    this.hidden = new Set();
+    this.overlaid = this.playing = false;
     this.forward = true;
-    this.overlaid = false;
-    this.visible = this.names.map(() => true);
-    this.measure = null;
-    this.reference = "keys";
-    this.picks = [];
-    this.most = 1;
-    this.keyMeasures = new Map();
-    this.values = new Float32Array(this.nVertices);
-    this.scratch = new Float32Array(3 * this.nVertices);
+    this.frame = 0;
+    this.drawn = this.busy = 0; // pictures so far, and milliseconds that they took
     this.shapeChanged = this.viewChanged = true;
-    this.stage = new Stage(find("canvas"), data.view, () => (this.viewChanged = true));
-    this.actors = sequences.map(() => this.stage.add(this.nVertices, faces, this.edges));
-    const seek = (frame) => (this.pause(), this.seek(frame));
-    this.timeline = new Timeline(document, this.clock, this.keyframes, seek);
+    this.stage = new Stage(find("canvas"), find("cells"), actors, () => (this.viewChanged = true));
     this.#connect();
+    this.#showWires();
+    this.#showPicks();
     this.layOut();
-    this.stage.resetView();
-    this.#say();
+    this.resetView();
   }
 
-  // ------------------------------------------------------------------------------------------------- shapes
-  /** The shape of a sequence at a frame, which may lie between two, into `out`. */
-  shapeAt(number, frame, out) {
-    const frames = this.sequences[number];
-    const low = Math.floor(frame);
-    return blend(frames[low % frames.length], frames[(low + 1) % frames.length], frame - low, out);
-  }
-
-  /** What the present measure makes of the reference of a sequence at a frame. */
-  #rest(number, frame) {
-    const measure = this.measures[this.measure];
-    if (this.reference === "first") return this.#ofFrame(number, 0);
-    if (this.reference !== "keys") return measure.of(this.shapeAt(Number(this.reference), frame, this.scratch));
-    const { closed } = this.data;
-    const keys = closed && this.keyframes[0] === 0 ? [...this.keyframes, this.clock.nFrames] : this.keyframes;
-    const after = keys.findIndex((key) => key > frame);
-    if (after <= 0) return this.#ofFrame(number, keys.at(after) % this.clock.nFrames); // the first or the last
-    const [from, to] = [keys[after - 1], keys[after]];
-    const places = [from, frame, to].map((key) => this.clock.placeOf(key));
-    const part = (places[1] - places[0]) / (places[2] - places[0]);
-    return measure.mix(this.#ofFrame(number, from), this.#ofFrame(number, to % this.clock.nFrames), part);
-  }
-
-  /** The present measure of a whole frame that serves as a reference, kept. */
-  #ofFrame(number, frame) {
-    const key = `${this.measure} ${number} ${frame}`;
-    if (!this.keyMeasures.has(key)) {
-      this.keyMeasures.set(key, this.measures[this.measure].of(this.sequences[number][frame]));
+  // ------------------------------------------------------------------------------------------------- picking
+  /** A vertex picked in an actor: of sequences, in all of them, or taken back; of landmarks, of the incomplete one. */
+  pick(actor, vertex) {
+    const column = this.actors.indexOf(actor);
+    if (!this.picksLandmarks) {
+      const others = this.rows.filter((row) => row[column] !== vertex);
+      const added = others.length < this.rows.length ? [] : [this.actors.map(() => vertex)];
+      this.setRows([...others, ...added]);
+    } else if (!this.complete.some((row) => row[column] === vertex)) {
+      const incomplete = this.rows.find((row) => row.includes(null)) ?? this.actors.map(() => null);
+      this.setRows([...this.complete, incomplete.with(column, vertex)]);
     }
-    return this.keyMeasures.get(key);
   }
 
-  /** Numbers of all vertices into `out`; the mean of the shape. */
-  #measured(number, points, frame, out) {
-    const measure = this.measures[this.measure];
-    return measure.compare(measure.of(points), this.#rest(number, frame), out);
+  get complete() {
+    return this.rows.filter((row) => !row.includes(null));
   }
 
-  /** Bring everything that is drawn to the present frame. */
-  #updateShapes() {
-    const near = Math.min(...this.keyframes.map((key) => this.#framesAway(key)));
-    const given = Math.max(0, 1 - near);
-    this.actors.forEach((actor, number) => {
-      if (!this.visible[number]) return;
-      const points = this.shapeAt(number, this.frame, actor.position.array);
-      actor.changed(this.faces);
-      const own = this.overlaid ? LOOKS[number % LOOKS.length].tint : COMPUTED;
-      actor.uniforms.tint.value = this.overlaid ? own : own.map((c, i) => c + given * (GIVEN[i] - c));
-      actor.uniforms.painted.value = this.measure ? 1 : 0;
-      if (this.measure) {
-        this.means[number] = this.#measured(number, points, this.frame, this.values);
-        paint(this.values, this.most, this.measures[this.measure].signed, actor.paint.array);
-        actor.paint.needsUpdate = true;
-      }
-      actor.setMarks(this.picks);
+  setRows(rows) {
+    this.undone.push(this.rows);
+    this.rows = rows;
+    this.#showPicks();
+  }
+
+  undo() {
+    this.rows = this.undone.pop() ?? this.rows;
+    this.#showPicks();
+  }
+
+  /** Indices of the picked vertices, or the landmarks as --landmarks reads them. */
+  get text() {
+    if (!this.picksLandmarks) return this.rows.map(([vertex]) => vertex).join(", ");
+    const names = this.actors.map(({ name }) => name.replace(/\s+/g, " "));
+    return [`# ${names.join("  ")}`, ...this.complete.map((row) => row.join("\t")), ""].join("\n");
+  }
+
+  #hint() {
+    if (!this.picksLandmarks) return this.rows.length ? "" : "Click on a shape to pick a vertex";
+    const incomplete = this.rows.find((row) => row.includes(null));
+    const where = incomplete ? this.actors[incomplete.indexOf(null)].name : "any mesh";
+    const enough = this.complete.length < ENOUGH_LANDMARKS ? `; ${ENOUGH_LANDMARKS} make a map safe` : "";
+    return `Landmark ${this.complete.length + 1}: click on ${where}${enough}`;
+  }
+
+  /** The name of a row on its chip, and beside its vertices. */
+  #chip(row, i) {
+    return this.picksLandmarks ? `${i + 1}: ${row.map((vertex) => vertex ?? "?").join(" – ")}` : row[0];
+  }
+
+  #mark(row, i) {
+    return this.picksLandmarks ? i + 1 : row[0];
+  }
+
+  #showPicks() {
+    find("hint").textContent = this.#hint();
+    find("text").value = this.text;
+    find("picks").hidden = !this.rows.length && !this.picksLandmarks;
+    find("copy").disabled = find("save").disabled = !this.complete.length;
+    find("undo").disabled = !this.undone.length;
+    find("chips").replaceChildren(
+      ...this.rows.map((row, i) => {
+        const chip = make("button", { type: "button", title: "Remove" }, this.#chip(row, i));
+        chip.addEventListener("click", () => this.setRows(this.rows.filter((other) => other !== row)));
+        return chip;
+      }),
+    );
+    this.#showTrails();
+    this.shapeChanged = true;
+  }
+
+  #showTrails() {
+    const wanted = find("trails").checked && !this.picksLandmarks ? this.rows : [];
+    this.actors.forEach((actor, column) => {
+      const vertices = wanted.map((row) => row[column]);
+      actor.setTrails(vertices, this.data.keyframes, this.closed, this.#look(column).line);
     });
-    this.timeline.show(this.frame);
-    this.#say();
+    this.viewChanged = true;
   }
 
-  #framesAway(key) {
-    const direct = Math.abs(this.frame - key);
-    return this.data.closed ? Math.min(direct, this.clock.nFrames - direct) : direct;
+  async copy() {
+    try {
+      await navigator.clipboard.writeText(this.text);
+    } catch {
+      find("text").select(); // in frames, and where the page is not trusted with the clipboard
+      document.execCommand("copy");
+    }
+    find("copy").textContent = "Copied";
+    setTimeout(() => (find("copy").textContent = "Copy"), 1200);
   }
 
-  // -------------------------------------------------------------------------------------------------- state
+  save() {
+    const link = make("a", { download: "landmarks.txt" });
+    link.href = URL.createObjectURL(new Blob([this.text], { type: "text/plain" }));
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+  }
+
+  // ------------------------------------------------------------------------------------------------- playing
   seek(frame) {
     this.frame = Math.min(Math.max(frame, 0), this.clock.last);
     this.shapeChanged = true;
   }
 
-  play() {
-    if (this.clock.last === 0) return;
+  play(playing) {
+    this.playing = playing && this.clock.last > 0;
     const ending = find("ending").value;
-    if (ending !== "turn") this.forward = true;
-    if (ending === "stop" && this.frame >= this.clock.last) this.seek(0);
-    this.playing = true;
-    this.#showPlaying();
-  }
-
-  pause() {
-    this.playing = false;
-    this.#showPlaying();
-  }
-
-  #showPlaying() {
+    if (this.playing && ending !== "turn") this.forward = true;
+    if (this.playing && ending === "stop" && this.frame >= this.clock.last) this.seek(0);
     find("play").setAttribute("aria-pressed", this.playing);
     find("play").setAttribute("aria-label", this.playing ? "Pause" : "Play");
   }
 
   #advance(seconds) {
     const length = this.clock.last / this.data.fps; // seconds of the whole at speed 1
-    let place = this.clock.placeOf(this.frame);
-    place += ((this.forward ? 1 : -1) * seconds * Number(find("speed").value)) / length;
+    const step = (seconds * Number(find("speed").value)) / length;
+    let place = this.clock.placeOf(this.frame) + (this.forward ? step : -step);
     const ending = find("ending").value;
     if (ending === "loop") place -= Math.floor(place);
     else if (place > 1 || place < 0) {
-      if (ending === "stop") this.pause();
+      if (ending === "stop") this.play(false);
       else this.forward = place < 0;
-      place = Math.min(Math.max(place, 0), 1);
     }
     this.seek(this.clock.frameAt(place));
   }
 
+  // ------------------------------------------------------------------------------------------------- drawing
+  #look(column) {
+    return LOOKS[column % LOOKS.length];
+  }
+
   layOut() {
-    const shown = [...this.names.keys()].filter((number) => this.visible[number]);
+    const shown = this.actors.filter((actor) => !this.hidden.has(actor));
     this.stage.layOut(shown, this.overlaid);
-    this.actors.forEach((actor, number) => {
-      const order = shown.indexOf(number);
-      actor.setLook(this.overlaid && order > 0 ? 0.45 : 1, order + 1);
-    });
-    find("labels").replaceChildren();
-    for (const port of this.stage.viewports) {
-      port.shown.forEach((number, line) => {
-        const label = make("div", { class: "name", id: `name-${number}` }, this.names[number], make("small"));
-        label.style.setProperty("--color", LOOKS[number % LOOKS.length].line);
-        Object.assign(label.style, { left: `${port.x}px`, top: `${port.y + 22 * line}px` });
-        find("labels").append(label);
+    shown.forEach((actor, order) => actor.setOpacity(this.overlaid && order ? 0.45 : 1, order));
+    for (const cell of this.stage.cells) {
+      const names = cell.actors.map((actor) => {
+        const name = make("div", { class: "name" }, actor.name);
+        name.style.setProperty("--color", this.#look(this.actors.indexOf(actor)).line);
+        return name;
       });
+      cell.names.replaceChildren(...names);
     }
     this.shapeChanged = true;
   }
 
-  setTrails() {
-    const wanted = find("trails").checked ? this.picks : [];
-    this.actors.forEach((actor, number) => {
-      const color = LOOKS[number % LOOKS.length].line;
-      actor.setTrails(this.sequences[number], wanted, this.keyframes, this.data.closed, color);
-    });
+  resetView() {
+    for (const orbit of this.stage.orbits) orbit.reset();
     this.viewChanged = true;
-  }
-
-  setPicks(picks) {
-    this.picks = picks;
-    find("hint").hidden = picks.length > 0;
-    find("picks").hidden = picks.length === 0;
-    find("indices").value = picks.join(", ");
-    find("chips").replaceChildren(
-      ...picks.map((vertex) => {
-        const chip = make("button", { type: "button", title: "Remove" }, String(vertex));
-        chip.addEventListener("click", () => this.setPicks(picks.filter((other) => other !== vertex)));
-        return chip;
-      }),
-    );
-    this.setTrails();
-    this.shapeChanged = true;
-  }
-
-  // ------------------------------------------------------------------------------------------------ measures
-  /** The scale and the curves of the present measure, in parts so that the page stays responsive. */
-  async measureAll() {
-    const run = (this.run = {}); // a later call makes this one stop
-    find("legend").hidden = find("against").hidden = !this.measure;
-    document.body.classList.toggle("measured", Boolean(this.measure));
-    this.means = this.names.map(() => null);
-    this.layOut();
-    this.timeline.draw(null);
-    find("highest").textContent = "";
-    this.measuring = Boolean(this.measure);
-    if (!this.measure) return;
-    const { signed, label } = this.measures[this.measure];
-    const stops = (signed ? TWO_SIDED : SEQUENTIAL).map((rgb) => `rgb(${rgb.map((c) => 255 * c)})`);
-    find("scale").style.background = `linear-gradient(to right, ${stops})`;
-    const values = new Float32Array(this.nVertices);
-    const curves = this.names.map((_, number) => (this.visible[number] ? [] : null));
-    const every = Math.ceil(this.clock.nFrames / 24); // frames whose vertices count for the scale
-    let top = 0;
-    let since = performance.now();
-    for (let frame = 0; frame < this.clock.nFrames; frame++) {
-      for (const [number, curve] of curves.entries()) {
-        if (!curve) continue;
-        curve.push(this.#measured(number, this.sequences[number][frame], frame, values));
-        if (frame % every === 0) top = Math.max(top, percentile(values.map(Math.abs), 0.99));
-      }
-      if (performance.now() - since < 12) continue;
-      await new Promise((resume) => setTimeout(resume));
-      if (this.run !== run) return;
-      since = performance.now();
-    }
-    this.measuring = false;
-    this.setScale(rounded(top));
-    const all = curves.filter(Boolean).flat();
-    const low = signed ? Math.min(0, ...all) : 0;
-    const high = Math.max(0, ...all);
-    const range = signed ? `${low.toFixed(2)} to ${high.toFixed(2)} %` : `up to ${high.toFixed(2)} % in the mean`;
-    find("highest").textContent = `${label}: ${range}`;
-    this.timeline.draw(curves, this.names.map((_, number) => LOOKS[number % LOOKS.length].line), low, high);
-  }
-
-  setScale(most) {
-    this.most = most;
-    find("most").value = most;
-    find("least").textContent = this.measures[this.measure].signed ? `-${most} %` : "0";
-    this.shapeChanged = true;
-  }
-
-  // ------------------------------------------------------------------------------------------------ controls
-  #say() {
-    const whole = Number.isInteger(Number(this.frame.toFixed(2)));
-    const time = this.clock.timeOf(this.frame);
-    const shown = `${this.frame.toFixed(whole ? 0 : 1)} / ${this.clock.nFrames - 1}`;
-    find("readout").textContent = `frame ${shown}` + (this.data.has_times ? `, t = ${Number(time.toFixed(3))}` : "");
-    for (const [number] of this.names.entries()) {
-      const note = document.querySelector(`#name-${number} small`);
-      const mean = this.measure ? this.means[number] : null;
-      if (note) note.textContent = mean === null ? "" : `${mean.toFixed(2)} %`;
-    }
-  }
-
-  #placeMarks() {
-    const marks = this.stage.viewports.flatMap((port) =>
-      this.picks.flatMap((vertex) => (port.shown.length ? [[vertex, port]] : [])),
-    );
-    const labels = find("marks");
-    while (labels.children.length > marks.length) labels.lastChild.remove();
-    while (labels.children.length < marks.length) labels.append(make("span", { class: "mark" }));
-    marks.forEach(([vertex, port], i) => {
-      const { x, y } = this.stage.placeOf(vertex, port.shown[0], port);
-      labels.children[i].textContent = vertex;
-      Object.assign(labels.children[i].style, { left: `${x}px`, top: `${y}px` });
-    });
-  }
-
-  #connect() {
-    this.names.forEach((name, number) => {
-      const chip = make("button", { type: "button", "aria-pressed": "true", title: "Show or hide" }, name);
-      chip.style.setProperty("--color", LOOKS[number % LOOKS.length].line);
-      chip.addEventListener("click", () => {
-        this.visible[number] = !this.visible[number];
-        chip.setAttribute("aria-pressed", this.visible[number]);
-        this.measureAll();
-      });
-      find("sequences").append(chip);
-      if (this.names.length > 1) find("reference").append(make("option", { value: number }, name));
-    });
-    find("sequences").hidden = find("layout").hidden = this.names.length < 2;
-    for (const button of find("layout").children) {
-      button.addEventListener("click", () => {
-        this.overlaid = button.value === "over";
-        for (const other of find("layout").children) other.setAttribute("aria-pressed", other === button);
-        this.layOut();
-      });
-    }
-    const change = (id, act) => find(id).addEventListener("change", (event) => act(event.target));
-    change("measure", ({ value }) => ((this.measure = value || null), this.measureAll()));
-    change("reference", ({ value }) => ((this.reference = value), this.measureAll()));
-    change("most", ({ value }) => this.setScale(Math.max(Number(value), 1e-6) || 1));
-    change("wireframe", () => this.#showWires());
-    change("trails", () => this.setTrails());
-    change("ending", () => (this.forward = true));
-    const click = (id, act) => find(id).addEventListener("click", act);
-    click("reset", () => this.stage.resetView());
-    click("play", () => (this.playing ? this.pause() : this.play()));
-    click("clear", () => this.setPicks([]));
-    click("copy", () => copyFrom(find("indices"), find("copy")));
-    find("ending").value = this.data.closed ? "loop" : "turn";
-    find("against").hidden = true;
-    this.#showWires();
-    this.#connectPicking(find("canvas"));
-    document.addEventListener("keydown", (event) => this.#key(event));
-    new ResizeObserver(() => this.layOut()).observe(find("stage"));
   }
 
   #showWires() {
@@ -314,42 +227,47 @@ class Viewer {
     this.viewChanged = true;
   }
 
-  #connectPicking(canvas) {
-    whenClicked(canvas, (x, y) => {
-      const vertex = this.stage.vertexAt(x, y);
-      if (vertex === null) return;
-      const there = this.picks.includes(vertex);
-      this.setPicks(there ? this.picks.filter((other) => other !== vertex) : [...this.picks, vertex]);
+  /** Bring all that is drawn to the present frame. */
+  #update() {
+    const away = this.data.keyframes.map((key) => Math.abs(this.frame - key));
+    if (this.closed) away.push(...away.map((frames) => this.data.n_frames - frames));
+    const given = Math.max(0, 1 - Math.min(...away));
+    this.actors.forEach((actor, column) => {
+      if (this.hidden.has(actor)) return;
+      actor.setFrame(this.frame);
+      actor.setMarks(this.rows.map((row) => row[column]).filter((vertex) => vertex !== null));
+      const own = LOOKS[0].tint.map((c, i) => c + given * (GIVEN[i] - c));
+      actor.uniforms.tint.value = this.overlaid ? this.#look(column).tint : own;
     });
+    find("time").value = this.clock.placeOf(this.frame);
+    const whole = Number.isInteger(Number(this.frame.toFixed(2)));
+    const time = this.data.has_times ? `, t = ${Number(this.clock.timeOf(this.frame).toFixed(3))}` : "";
+    find("readout").textContent = `frame ${this.frame.toFixed(whole ? 0 : 1)} / ${this.data.n_frames - 1}${time}`;
   }
 
-  #key(event) {
-    const { target, key } = event;
-    const typing = target.matches("select, input[type=number], input[readonly]");
-    if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
-    const stops = event.shiftKey ? this.keyframes : [...Array(this.clock.nFrames).keys()];
-    const acts = {
-      " ": () => (this.playing ? this.pause() : this.play()),
-      ArrowRight: () => this.seek(stops.find((stop) => stop > this.frame + 1e-6) ?? this.frame),
-      ArrowLeft: () => this.seek(stops.findLast((stop) => stop < this.frame - 1e-6) ?? this.frame),
-      Home: () => this.seek(0),
-      End: () => this.seek(this.clock.nFrames - 1),
-      r: () => this.stage.resetView(),
-    };
-    if (!(key in acts) || (key === " " && target.matches("button, input[type=checkbox]"))) return;
-    event.preventDefault();
-    if (key !== " " && key !== "r") this.pause();
-    acts[key]();
+  /** Labels beside the picked vertices, in every cell. */
+  #placeMarks() {
+    for (const cell of this.stage.cells) {
+      const [actor] = cell.actors;
+      const column = this.actors.indexOf(actor);
+      const picked = actor ? this.rows.map((row, i) => [row[column], this.#mark(row, i)]) : [];
+      const labels = picked.filter(([vertex]) => vertex !== null).map(([vertex, text]) => {
+        const label = make("span", { class: "mark" }, text);
+        const { x, y } = cell.placeOf(actor, vertex);
+        Object.assign(label.style, { left: `${x}px`, top: `${y}px` });
+        return label;
+      });
+      cell.marks.replaceChildren(...labels);
+    }
   }
 
-  // ---------------------------------------------------------------------------------------------------- loop
   start() {
     let last = performance.now();
     const turn = (now) => {
       const began = performance.now();
       if (this.playing) this.#advance(Math.min((now - last) / 1000, 0.25));
       last = now;
-      if (this.shapeChanged) this.#updateShapes();
+      if (this.shapeChanged) this.#update();
       if (this.shapeChanged || this.viewChanged) {
         this.stage.draw();
         this.#placeMarks();
@@ -361,53 +279,138 @@ class Viewer {
     };
     requestAnimationFrame(turn);
   }
+
+  /** Nothing moves, and all is drawn. */
+  get idle() {
+    return !(this.playing || this.shapeChanged || this.viewChanged);
+  }
+
+  /** The present position of a vertex, in the coordinates of the caller. */
+  positionOf(vertex, sequence = 0) {
+    const { position, group } = this.actors[sequence];
+    const steps = position.array.slice(3 * vertex, 3 * vertex + 3);
+    return group.origin.map((start, axis) => start + group.step * steps[axis]);
+  }
+
+  /** Where a vertex is seen, in pixels of the window. */
+  placeOf(vertex, sequence = 0) {
+    const actor = this.actors[sequence];
+    const cell = this.stage.cells.find(({ actors }) => actors.includes(actor));
+    const { left, top } = cell.element.getBoundingClientRect();
+    const { x, y } = cell.placeOf(actor, vertex);
+    return { x: left + x, y: top + y };
+  }
+
+  // ------------------------------------------------------------------------------------------------ controls
+  #connect() {
+    const on = (id, event, act) => find(id).addEventListener(event, act);
+    on("play", "click", () => this.play(!this.playing));
+    on("ending", "change", () => (this.forward = true));
+    on("time", "input", () => this.#scrub(Number(find("time").value)));
+    on("reset", "click", () => this.resetView());
+    on("wireframe", "change", () => this.#showWires());
+    on("trails", "change", () => this.#showTrails());
+    on("undo", "click", () => this.undo());
+    on("clear", "click", () => this.setRows([]));
+    on("copy", "click", () => this.copy());
+    on("save", "click", () => this.save());
+    for (const button of find("layout").children) button.addEventListener("click", () => this.#overlay(button));
+    for (const cell of this.stage.cells) this.#connectPicking(cell);
+    this.actors.forEach((actor, column) => {
+      const chip = make("button", { type: "button", "aria-pressed": "true", title: "Show or hide" }, actor.name);
+      chip.style.setProperty("--color", this.#look(column).line);
+      chip.addEventListener("click", () => {
+        if (!this.hidden.delete(actor)) this.hidden.add(actor);
+        chip.setAttribute("aria-pressed", !this.hidden.has(actor));
+        this.layOut();
+      });
+      find("sequences").append(chip);
+    });
+    for (const frame of this.data.keyframes) {
+      const tick = make("button", { type: "button", title: `Key-frame ${frame}`, "aria-label": `Key-frame ${frame}` });
+      tick.style.setProperty("--place", this.clock.placeOf(frame));
+      tick.addEventListener("click", () => (this.play(false), this.seek(frame)));
+      find("keyframes").append(tick);
+    }
+    find("sequences").hidden = find("layout").hidden = this.actors.length < 2 || this.picksLandmarks;
+    find("player").hidden = this.clock.last === 0;
+    find("trails").parentElement.hidden = this.picksLandmarks;
+    find("save").hidden = !this.picksLandmarks;
+    find("ending").value = this.closed ? "loop" : "turn";
+    document.addEventListener("keydown", (event) => this.#key(event));
+    new ResizeObserver(() => this.layOut()).observe(find("stage"));
+  }
+
+  #overlay(button) {
+    this.overlaid = button.value === "over";
+    for (const other of find("layout").children) other.setAttribute("aria-pressed", other === button);
+    this.layOut();
+  }
+
+  #scrub(place) {
+    const frame = this.clock.frameAt(place);
+    const pixels = Math.abs(this.clock.placeOf(Math.round(frame)) - place) * find("time").clientWidth;
+    this.play(false);
+    this.seek(pixels < SNAP_PIXELS ? Math.round(frame) : frame);
+  }
+
+  #connectPicking(cell) {
+    let pressed = null;
+    cell.element.addEventListener("pointerdown", (event) => (pressed = event.isPrimary && !event.button ? event : null));
+    cell.element.addEventListener("pointerup", ({ clientX, clientY }) => {
+      if (!pressed || Math.hypot(clientX - pressed.clientX, clientY - pressed.clientY) > CLICK_PIXELS) return;
+      const { left, top } = cell.element.getBoundingClientRect();
+      const hit = cell.vertexAt(clientX - left, clientY - top);
+      if (hit) this.pick(hit.actor, hit.vertex);
+    });
+  }
+
+  #key(event) {
+    const { target, key } = event;
+    if (target.matches("select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (key === " " && target.matches("button, input[type=checkbox]")) return;
+    const stops = event.shiftKey ? this.data.keyframes : [...Array(this.data.n_frames).keys()];
+    const show = (frame) => (this.play(false), this.seek(frame));
+    const acts = {
+      " ": () => this.play(!this.playing),
+      ArrowRight: () => show(stops.find((stop) => stop > this.frame + 1e-6) ?? this.frame),
+      ArrowLeft: () => show(stops.findLast((stop) => stop < this.frame - 1e-6) ?? this.frame),
+      Home: () => show(0),
+      End: () => show(this.data.n_frames - 1),
+      Backspace: () => this.undo(),
+      r: () => this.resetView(),
+    };
+    if (!(key in acts)) return;
+    event.preventDefault();
+    acts[key]();
+  }
 }
 
-/** A little more than a number, and short to write. */
-function rounded(number) {
-  const unit = 10 ** Math.floor(Math.log10(Math.max(number, 0.01)));
-  return Number(([1, 1.5, 2, 3, 4, 5, 6, 8, 10].find((digit) => digit * unit >= number) * unit).toPrecision(2));
+/** The actors of a group, out of the page's data. */
+async function actorsOf(group, nFrames) {
+  group.faces = await unpackFaces(group.faces, group.n_faces);
+  group.edges = edgesOf(group.faces);
+  group.orbit = new Orbit(group.view);
+  const sequences = group.sequences.map(async ({ name, frames }) => {
+    return new Actor(group, name, await unpackFrames(frames, nFrames, group.n_vertices));
+  });
+  return Promise.all(sequences);
 }
 
 async function main() {
   const data = JSON.parse(find("data").textContent);
-  const faces = await unpackFaces(data.faces, data.n_faces);
-  const unpack = ({ frames }) => unpackFrames(frames, data.times.length, data.n_vertices);
-  const viewer = new Viewer(data, faces, await Promise.all(data.sequences.map(unpack)));
+  const actors = (await Promise.all(data.groups.map((group) => actorsOf(group, data.n_frames)))).flat();
+  const viewer = new Viewer(data, actors);
   find("message").hidden = true;
   viewer.start();
-  requestAnimationFrame(() => setTimeout(() => (window.torchModal.readyAfter = performance.now())));
-  // For scripts around the page; frames may have fractions.
-  window.torchModal = {
-    seek: (frame) => viewer.seek(frame),
-    get frame() {
-      return viewer.frame;
-    },
-    /** Whether all is drawn, and nothing moves. */
-    get idle() {
-      return !(viewer.playing || viewer.measuring || viewer.shapeChanged || viewer.viewChanged);
-    },
-    /** How many pictures have been drawn so far. */
-    get drawn() {
-      return viewer.drawn;
-    },
-    /** Milliseconds that the page's scripts took for them. */
-    get busy() {
-      return viewer.busy;
-    },
-    /** Where a vertex is at the present frame, in the coordinates of the caller. */
-    positionOf(vertex, sequence = 0) {
-      const steps = viewer.actors[sequence].position.array.slice(3 * vertex, 3 * vertex + 3);
-      return data.origin.map((start, axis) => start + data.step * steps[axis]);
-    },
-    /** Where a vertex is seen, in pixels of the window. */
-    placeOf(vertex, sequence = 0) {
-      const port = viewer.stage.viewports.find((candidate) => candidate.shown.includes(sequence));
-      const { left, top } = find("canvas").getBoundingClientRect();
-      const { x, y } = viewer.stage.placeOf(vertex, sequence, port);
-      return { x: left + x, y: top + y };
-    },
-  };
+  window.torchModal = viewer; // for scripts around the page
+  requestAnimationFrame(() => setTimeout(() => (viewer.readyAfter = performance.now())));
 }
 
-main().catch(sayWhy);
+main().catch((error) => {
+  find("message").hidden = false;
+  find("message").textContent = /webgl/i.test(error.message)
+    ? "This page needs WebGL 2, which this browser does not offer or has switched off."
+    : `This page cannot be shown: ${error.message}`;
+  console.error(error);
+});

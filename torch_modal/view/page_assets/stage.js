@@ -1,24 +1,22 @@
-// What is drawn: a mesh with wires, trails and marks for each sequence, in one viewport each or all in one.
+// Drawing: a mesh with wires, trails and marks for each sequence, in cells over one canvas.
 
 const FIELD_OF_VIEW = 26; // degrees, upright
-const TO_SCENE = 1 / 65535; // the longest side of the box around everything is 1 in the scene
+const TO_SCENE = 1 / 65535; // the longest side of the box around the shapes of a group is 1 in the scene
 
-// The lights of the package's pictures: from where, as the viewer sees it, and how bright.
+// The lights of the package's pictures: directions as the viewer sees them, and brightness.
 const SURFACE_SHADER = {
   vertexShader: `
-    attribute vec3 paint;
-    varying vec3 vNormal, vView, vPaint;
+    varying vec3 vNormal, vView;
     void main() {
       vec4 seen = modelViewMatrix * vec4(position, 1.0);
       vNormal = normalMatrix * normal;
       vView = -seen.xyz;
-      vPaint = paint;
       gl_Position = projectionMatrix * seen;
     }`,
   fragmentShader: `
     uniform vec3 tint;
-    uniform float painted, opacity;
-    varying vec3 vNormal, vView, vPaint;
+    uniform float opacity;
+    varying vec3 vNormal, vView;
     float lit(vec3 n, vec3 place, float brightness) { return brightness * max(dot(n, normalize(place)), 0.0); }
     void main() {
       vec3 view = normalize(vView);
@@ -26,10 +24,9 @@ const SURFACE_SHADER = {
       if (!gl_FrontFacing) n = -n; // open meshes show their inside too
       float light = lit(n, vec3(-2.0, 3.0, 4.0), 0.82) + lit(n, vec3(4.0, 1.0, 3.0), 0.30)
                   + lit(n, vec3(0.0, -3.0, 2.0), 0.14);
-      float rim = 0.8 + 0.2 * sqrt(max(dot(n, view), 0.0)); // darker outlines part what overlaps
+      float rim = 0.8 + 0.2 * sqrt(max(dot(n, view), 0.0)); // darker outlines separate what overlaps
       float shine = 0.07 * pow(max(dot(n, normalize(normalize(vec3(-2.0, 3.0, 4.0)) + view)), 0.0), 24.0);
-      vec3 base = mix(tint, vPaint, painted);
-      gl_FragColor = vec4(base * (0.25 + 0.77 * light) * rim + shine, opacity);
+      gl_FragColor = vec4(tint * (0.25 + 0.77 * light) * rim + shine, opacity);
     }`,
 };
 
@@ -52,234 +49,253 @@ const DOT_SHADER = {
     }`,
 };
 
+const PIXEL_RATIO = Math.min(window.devicePixelRatio || 1, 2);
+
 function dotMaterial(size, tint, opacity, depthTest) {
-  const uniforms = { size: { value: size }, tint: { value: tint }, opacity: { value: opacity } };
+  const uniforms = { size: { value: size * PIXEL_RATIO }, tint: { value: tint }, opacity: { value: opacity } };
   return new THREE.ShaderMaterial({ ...DOT_SHADER, uniforms, depthTest, depthWrite: false, transparent: true });
 }
 
 const lineMaterial = (color, opacity, depthTest = true) =>
   new THREE.LineBasicMaterial({ color, opacity, depthTest, depthWrite: false, transparent: true });
 
-/** One sequence: what is shown of it at the present time. */
+/** One sequence. A group holds what its sequences share: faces, edges, and the orbit of the camera. */
 class Actor {
-  constructor(nVertices, faces, edges, centre, ratio) {
+  constructor(group, name, frames) {
+    Object.assign(this, { group, name, frames });
     const indices = (array) => new THREE.BufferAttribute(array, 1);
-    const vectors = () => new THREE.BufferAttribute(new Float32Array(3 * nVertices), 3);
-    this.ratio = ratio;
-    this.group = new THREE.Group();
-    this.group.scale.setScalar(TO_SCENE);
-    this.group.position.set(...centre).multiplyScalar(-TO_SCENE);
-    this.geometry = new THREE.BufferGeometry();
-    this.geometry.setIndex(indices(faces));
+    const vectors = () => new THREE.BufferAttribute(new Float32Array(3 * group.n_vertices), 3);
+    const { centre } = group.view;
     this.position = vectors();
     this.normal = vectors();
-    this.paint = vectors();
-    for (const name of ["position", "normal", "paint"]) this.geometry.setAttribute(name, this[name]);
-    // Holds all shapes: rays are tried against it first, and it is not to be computed anew for each.
-    this.geometry.boundingSphere = new THREE.Sphere(new THREE.Vector3(...centre), 2 / TO_SCENE);
-    this.uniforms = { tint: { value: [1, 1, 1] }, painted: { value: 0 }, opacity: { value: 1 } };
-    const behindWires = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
-    const surface = { ...SURFACE_SHADER, ...behindWires, uniforms: this.uniforms, side: THREE.DoubleSide };
-    this.mesh = new THREE.Mesh(this.geometry, new THREE.ShaderMaterial(surface));
-    // A translucent shape first fills the depth alone, so that only its nearest side is seen through.
-    this.depth = new THREE.Mesh(this.geometry, new THREE.ShaderMaterial({ ...surface, colorWrite: false }));
+    const geometry = new THREE.BufferGeometry();
+    geometry.setIndex(indices(group.faces));
+    geometry.setAttribute("position", this.position);
+    geometry.setAttribute("normal", this.normal);
+    // Holds all shapes: rays are tried against it first, and it need not be computed for each.
+    geometry.boundingSphere = new THREE.Sphere(new THREE.Vector3(...centre), 2 / TO_SCENE);
     const wires = new THREE.BufferGeometry();
     wires.setAttribute("position", this.position);
-    wires.setIndex(indices(edges));
-    wires.boundingSphere = this.geometry.boundingSphere;
+    wires.setIndex(indices(group.edges));
+    this.uniforms = { tint: { value: [1, 1, 1] }, opacity: { value: 1 } };
+    const behindWires = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
+    const surface = { ...SURFACE_SHADER, ...behindWires, uniforms: this.uniforms, side: THREE.DoubleSide };
+    this.mesh = new THREE.Mesh(geometry, new THREE.ShaderMaterial(surface));
+    // A translucent shape first fills the depth alone, so that only its nearest side shows.
+    this.depth = new THREE.Mesh(geometry, new THREE.ShaderMaterial({ ...surface, colorWrite: false }));
     this.wires = new THREE.LineSegments(wires, lineMaterial(0x22303c, 0.32));
+    this.wires.renderOrder = 100;
+    for (const drawn of [this.mesh, this.depth, this.wires]) drawn.frustumCulled = false;
     this.trails = new THREE.Group();
     this.marks = new THREE.Group();
-    this.group.add(this.depth, this.mesh, this.wires, this.trails, this.marks);
-    for (const drawn of [this.mesh, this.depth, this.wires]) drawn.frustumCulled = false;
+    this.root = new THREE.Group();
+    this.root.scale.setScalar(TO_SCENE);
+    this.root.position.set(...centre).multiplyScalar(-TO_SCENE);
+    this.root.add(this.depth, this.mesh, this.wires, this.trails, this.marks);
   }
 
-  /** The shape has been written into `position.array`. */
-  changed(faces) {
-    normalsOf(this.position.array, faces, this.normal.array);
+  /** Show the shape at a frame, which may lie between two. */
+  setFrame(frame) {
+    const low = Math.floor(frame);
+    const part = frame - low;
+    const first = this.frames[low % this.frames.length];
+    const second = this.frames[(low + 1) % this.frames.length];
+    const points = this.position.array;
+    for (let i = 0; i < points.length; i++) points[i] = first[i] + part * (second[i] - first[i]);
+    normalsOf(points, this.group.faces, this.normal.array);
     this.position.needsUpdate = this.normal.needsUpdate = true;
   }
 
-  /** Opaque, or seen through in the given place of the order. */
-  setLook(opacity, order) {
+  /** Opaque, or translucent in the given place of the order. */
+  setOpacity(opacity, order) {
     const clear = opacity < 1;
     this.uniforms.opacity.value = opacity;
-    this.mesh.material.transparent = clear;
     this.depth.visible = clear;
-    this.depth.material.transparent = clear; // sorted among the translucent ones, by the order alone
+    // Both are sorted among the translucent ones, by the order alone.
+    this.mesh.material.transparent = this.depth.material.transparent = clear;
     this.depth.renderOrder = 2 * order;
     this.mesh.renderOrder = 2 * order + 1;
-    this.wires.renderOrder = this.trails.renderOrder = this.marks.renderOrder = 100;
   }
 
-  /** Dots on vertices of the present shape: bright where they are seen, faint where they are hidden. */
+  /** Dots on vertices of the present shape. */
   setMarks(vertices) {
-    this.#refill(this.marks);
-    if (!vertices.length) return;
-    const points = new Float32Array(3 * vertices.length);
-    vertices.forEach((vertex, i) => points.set(this.position.array.subarray(3 * vertex, 3 * vertex + 3), 3 * i));
-    const tint = [0.09, 0.13, 0.18];
-    for (const [opacity, test] of [[0.3, false], [1, true]]) {
-      this.#add(this.marks, THREE.Points, points, dotMaterial(12 * this.ratio, tint, opacity, test));
-    }
+    const points = vertices.flatMap((vertex) => [...this.position.array.subarray(3 * vertex, 3 * vertex + 3)]);
+    this.#clear(this.marks);
+    this.#add(this.marks, THREE.Points, points, (...look) => dotMaterial(12, [0.09, 0.13, 0.18], ...look));
   }
 
   /** The ways of vertices through all frames, with a dot at each key-frame. */
-  setTrails(frames, vertices, keyframes, closed, color) {
-    this.#refill(this.trails);
+  setTrails(vertices, keyframes, closed, color) {
+    this.#clear(this.trails);
+    const frames = closed ? [...this.frames, this.frames[0]] : this.frames;
     for (const vertex of vertices) {
-      const points = new Float32Array(3 * (frames.length + closed));
-      for (let f = 0; f < frames.length + closed; f++) {
-        points.set(frames[f % frames.length].subarray(3 * vertex, 3 * vertex + 3), 3 * f);
-      }
-      const dots = Float32Array.from(keyframes.flatMap((f) => [...points.subarray(3 * f, 3 * f + 3)]));
-      for (const [opacity, test] of [[0.35, false], [1, true]]) {
-        this.#add(this.trails, THREE.Line, points, lineMaterial(color, opacity, test));
-        this.#add(this.trails, THREE.Points, dots, dotMaterial(8 * this.ratio, [0.78, 0.42, 0.16], opacity, test));
-      }
+      const pointsOf = (shapes) => shapes.flatMap((shape) => [...shape.subarray(3 * vertex, 3 * vertex + 3)]);
+      this.#add(this.trails, THREE.Line, pointsOf(frames), (...look) => lineMaterial(color, ...look));
+      const given = pointsOf(keyframes.map((frame) => frames[frame]));
+      this.#add(this.trails, THREE.Points, given, (...look) => dotMaterial(8, [0.78, 0.42, 0.16], ...look));
     }
   }
 
-  #add(group, Kind, points, material) {
-    const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.BufferAttribute(points, 3));
-    const drawn = new Kind(geometry, material);
-    drawn.frustumCulled = false;
-    drawn.renderOrder = 100;
-    group.add(drawn);
+  /** Bright where it is seen, faint where the surface hides it. */
+  #add(to, Kind, points, material) {
+    if (!points.length) return;
+    for (const [opacity, depthTest] of [[0.3, false], [1, true]]) {
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(Float32Array.from(points), 3));
+      const drawn = new Kind(geometry, material(opacity, depthTest));
+      drawn.frustumCulled = false;
+      drawn.renderOrder = 100;
+      to.add(drawn);
+    }
   }
 
-  #refill(group) {
-    for (const drawn of [...group.children]) {
+  #clear(from) {
+    for (const drawn of [...from.children]) {
       drawn.geometry.dispose();
       drawn.material.dispose();
-      group.remove(drawn);
+      from.remove(drawn);
     }
   }
 }
 
-/** The canvas, its camera and its viewports. */
+/** The camera of a group, which the controls of all its cells turn. */
+class Orbit {
+  constructor({ front, half, world_up }) {
+    this.front = front;
+    this.half = half.map((length) => Math.max(length * TO_SCENE, 1e-3));
+    this.camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 100);
+    this.camera.up.set(...world_up);
+    this.target = new THREE.Vector3();
+    this.distance = 1;
+  }
+
+  connect(element, onChange) {
+    const controls = new THREE.OrbitControls(this.camera, element);
+    controls.target = this.target;
+    controls.addEventListener("change", onChange);
+  }
+
+  /** Suit cells of another size; the zoom stays. */
+  fit(width, height) {
+    const away = this.camera.position.clone().sub(this.target);
+    const zoom = away.length() / this.distance;
+    const slope = Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
+    const aspect = width / Math.max(height, 1);
+    this.distance = 1.12 * Math.max(this.half[1] / slope, this.half[0] / (slope * aspect)) + this.half[2];
+    this.camera.aspect = aspect;
+    this.camera.position.copy(this.target).add(away.setLength(zoom * this.distance));
+  }
+
+  reset() {
+    this.target.set(0, 0, 0);
+    this.camera.position.set(...this.front).setLength(this.distance);
+    this.camera.lookAt(this.target);
+  }
+
+  /** Put the clipping planes around all that can be seen. */
+  clip() {
+    this.camera.far = this.camera.position.length() + 2;
+    this.camera.near = this.camera.far / 500;
+    this.camera.updateProjectionMatrix();
+  }
+}
+
+/** A part of the canvas, with the element over it that takes the pointer and holds names and marks. */
+class Cell {
+  constructor(orbit) {
+    this.orbit = orbit;
+    this.actors = []; // shown in it
+    this.names = make("div", { class: "names" });
+    this.marks = make("div", { "aria-hidden": "true" });
+    this.element = make("section", { class: "cell" }, this.names, this.marks);
+  }
+
+  get box() {
+    const { offsetLeft: x, offsetTop: y, offsetWidth: width, offsetHeight: height } = this.element;
+    return { x, y, width, height };
+  }
+
+  /** The actor's vertex nearest to where a ray through a place of the cell hits, and that actor, or null. */
+  vertexAt(x, y) {
+    const { width, height } = this.box;
+    const ray = new THREE.Raycaster();
+    ray.setFromCamera(new THREE.Vector2((2 * x) / width - 1, 1 - (2 * y) / height), this.orbit.camera);
+    const [hit] = ray.intersectObjects(this.actors.map(({ mesh }) => mesh), false);
+    if (!hit) return null;
+    const actor = this.actors.find(({ mesh }) => mesh === hit.object);
+    const place = hit.object.worldToLocal(hit.point.clone());
+    const away = (v) => place.distanceToSquared(new THREE.Vector3().fromBufferAttribute(actor.position, v));
+    const [vertex] = [hit.face.a, hit.face.b, hit.face.c].sort((a, b) => away(a) - away(b));
+    return { actor, vertex };
+  }
+
+  /** Where a vertex of an actor is seen, in pixels of the cell. */
+  placeOf(actor, vertex) {
+    const { width, height } = this.box;
+    const point = new THREE.Vector3().fromBufferAttribute(actor.position, vertex);
+    this.orbit.camera.updateMatrixWorld();
+    actor.root.updateMatrixWorld();
+    point.applyMatrix4(actor.root.matrixWorld).project(this.orbit.camera);
+    return { x: ((point.x + 1) / 2) * width, y: ((1 - point.y) / 2) * height };
+  }
+}
+
+/** The canvas, and a cell for each actor in a grid over it. */
 class Stage {
-  /**
-   * @param view `right`, `up`, `front` and `world_up` are directions, `centre` is in steps of the grid, and `half` the
-   *   half sizes along right, up and front in steps of the grid, of all shapes together.
-   */
-  constructor(canvas, view, onChange) {
-    this.canvas = canvas;
-    this.view = view;
-    this.half = view.half.map((length) => Math.max(length * TO_SCENE, 1e-3));
+  constructor(canvas, grid, actors, onChange) {
+    Object.assign(this, { canvas, grid, actors });
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     // The shaders give the colours of the screen, as the pictures' renderers do; nothing is converted.
     THREE.ColorManagement.enabled = false;
     this.renderer.outputColorSpace = "srgb-linear";
-    this.ratio = Math.min(window.devicePixelRatio || 1, 2);
-    this.renderer.setPixelRatio(this.ratio);
+    this.renderer.setPixelRatio(PIXEL_RATIO);
     this.renderer.setScissorTest(true);
     this.scene = new THREE.Scene();
-    this.camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 100);
-    this.actors = [];
-    this.viewports = []; // {x, y, width, height, shown: [numbers of actors]}, in CSS pixels, y down
-    this.controls = new THREE.OrbitControls(this.camera, canvas);
-    this.controls.addEventListener("change", onChange);
-    this.distance = 1;
-    this.aspect = 1;
-  }
-
-  add(nVertices, faces, edges) {
-    const actor = new Actor(nVertices, faces, edges, this.view.centre, this.ratio);
-    this.actors.push(actor);
-    this.scene.add(actor.group);
-    return actor;
-  }
-
-  /** Divide the canvas among the shown actors; what was zoomed stays so. */
-  layOut(shown, overlaid) {
-    const width = this.canvas.clientWidth;
-    const height = this.canvas.clientHeight;
-    const cells = overlaid ? [shown] : shown.map((number) => [number]);
-    // As many columns as let the shapes be largest.
-    const fits = [];
-    for (let columns = 1; columns <= Math.max(cells.length, 1); columns++) {
-      const rows = Math.ceil(Math.max(cells.length, 1) / columns);
-      const scale = Math.min(width / columns / this.half[0], height / rows / this.half[1]);
-      fits.push({ scale, columns, rows });
+    this.scene.add(...actors.map(({ root }) => root));
+    this.orbits = [...new Set(actors.map(({ group }) => group.orbit))];
+    this.cells = actors.map(({ group }) => new Cell(group.orbit));
+    for (const { element, orbit } of this.cells) {
+      grid.append(element);
+      orbit.connect(element, onChange);
     }
-    const best = fits.reduce((a, b) => (b.scale > 1.02 * a.scale ? b : a));
-    const cell = { width: width / best.columns, height: height / best.rows };
-    this.viewports = cells.map((actors, i) => ({
-      x: (i % best.columns) * cell.width,
-      y: Math.floor(i / best.columns) * cell.height,
-      ...cell,
-      shown: actors,
-    }));
+  }
+
+  /** Divide the canvas among the shown actors, or show them all in one cell. */
+  layOut(shown, overlaid) {
+    this.cells.forEach((cell, i) => {
+      cell.actors = shown.includes(this.actors[i]) ? [this.actors[i]] : [];
+      if (overlaid) cell.actors = this.actors[i] === shown[0] ? shown : [];
+      cell.element.hidden = !cell.actors.length;
+    });
+    const cells = this.cells.filter(({ actors }) => actors.length);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    // As many columns as let the shapes be largest.
+    let best = { scale: 0, columns: 1 };
+    for (let columns = 1; columns <= cells.length; columns++) {
+      const rows = Math.ceil(cells.length / columns);
+      const scales = cells.map(({ orbit: { half } }) => Math.min(width / columns / half[0], height / rows / half[1]));
+      if (Math.min(...scales) > 1.02 * best.scale) best = { scale: Math.min(...scales), columns };
+    }
+    this.grid.style.setProperty("--columns", best.columns);
     this.renderer.setSize(width, height, false);
-    const zoom = this.camera.position.distanceTo(this.controls.target) / this.distance;
-    this.aspect = cell.width / Math.max(cell.height, 1);
-    this.distance = this.#fittingDistance();
-    this.camera.aspect = this.aspect;
-    this.camera.updateProjectionMatrix();
-    const away = this.camera.position.clone().sub(this.controls.target);
-    this.camera.position.copy(this.controls.target).add(away.setLength(zoom * this.distance));
-    this.controls.update();
-  }
-
-  /** From where all shapes just fill a viewport. */
-  #fittingDistance() {
-    const slope = Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
-    return 1.12 * Math.max(this.half[1] / slope, this.half[0] / (slope * this.aspect)) + this.half[2];
-  }
-
-  resetView() {
-    this.controls.target.set(0, 0, 0);
-    this.camera.up.set(...this.view.world_up);
-    this.camera.position.set(...this.view.front).setLength(this.distance);
-    this.controls.update();
+    for (const { orbit, box } of cells) orbit.fit(box.width, box.height);
   }
 
   draw() {
-    const far = this.camera.position.length() + 2;
-    this.camera.near = far / 500;
-    this.camera.far = far;
-    this.camera.updateProjectionMatrix();
-    const height = this.canvas.clientHeight;
-    this.renderer.setScissor(0, 0, this.canvas.clientWidth, height);
-    this.renderer.setViewport(0, 0, this.canvas.clientWidth, height);
+    const { clientWidth, clientHeight } = this.canvas;
+    this.renderer.setScissor(0, 0, clientWidth, clientHeight);
+    this.renderer.setViewport(0, 0, clientWidth, clientHeight);
     this.renderer.setClearColor(0xffffff, 0);
     this.renderer.clear();
-    for (const port of this.viewports) {
-      this.actors.forEach((actor, number) => (actor.group.visible = port.shown.includes(number)));
-      const box = [port.x, height - port.y - port.height, port.width, port.height];
-      this.renderer.setViewport(...box);
-      this.renderer.setScissor(...box);
-      this.renderer.render(this.scene, this.camera);
+    for (const orbit of this.orbits) orbit.clip();
+    for (const cell of this.cells) {
+      if (!cell.actors.length) continue;
+      for (const actor of this.actors) actor.root.visible = cell.actors.includes(actor);
+      const { x, y, width, height } = cell.box;
+      const port = [x, clientHeight - y - height, width, height];
+      this.renderer.setViewport(...port);
+      this.renderer.setScissor(...port);
+      this.renderer.render(this.scene, cell.orbit.camera);
     }
-  }
-
-  /** The vertex nearest to where a ray through a place of the canvas hits, or null. */
-  vertexAt(x, y) {
-    const port = this.viewports.find((p) => x >= p.x && x < p.x + p.width && y >= p.y && y < p.y + p.height);
-    if (!port) return null;
-    const place = new THREE.Vector2((2 * (x - port.x)) / port.width - 1, 1 - (2 * (y - port.y)) / port.height);
-    const ray = new THREE.Raycaster();
-    this.scene.updateMatrixWorld();
-    ray.setFromCamera(place, this.camera);
-    const meshes = port.shown.map((number) => this.actors[number].mesh);
-    const [hit] = ray.intersectObjects(meshes, false);
-    if (!hit) return null;
-    const positions = hit.object.geometry.getAttribute("position");
-    const local = hit.object.worldToLocal(hit.point.clone());
-    const corners = [hit.face.a, hit.face.b, hit.face.c];
-    const away = corners.map((v) => local.distanceToSquared(new THREE.Vector3().fromBufferAttribute(positions, v)));
-    return corners[away.indexOf(Math.min(...away))];
-  }
-
-  /** Where a vertex of an actor is seen in a viewport, in CSS pixels of the canvas. */
-  placeOf(vertex, number, port) {
-    const actor = this.actors[number];
-    const point = new THREE.Vector3().fromBufferAttribute(actor.position, vertex);
-    this.scene.updateMatrixWorld();
-    this.camera.updateMatrixWorld();
-    point.applyMatrix4(actor.group.matrixWorld).project(this.camera);
-    return { x: port.x + ((point.x + 1) / 2) * port.width, y: port.y + ((1 - point.y) / 2) * port.height };
   }
 }

@@ -1,4 +1,4 @@
-// Positions and faces from the page's data: the inverse of page_data.py, where the format is described.
+// Positions and faces from the data of the page (the inverse of page_data.py, which describes the format); edges, normals.
 
 /** The bytes that base64 text stands for. */
 function bytesOfBase64(text) {
@@ -50,4 +50,44 @@ async function unpackFrames(text, nFrames, nVertices) {
     frames.push(shape);
   }
   return frames;
+}
+
+/** Each edge once: a Uint32Array of pairs, the smaller index first. */
+function edgesOf(faces) {
+  const keys = new Float64Array(faces.length);
+  for (let i = 0; i < faces.length; i += 3) {
+    for (let c = 0; c < 3; c++) {
+      const a = faces[i + c];
+      const b = faces[i + ((c + 1) % 3)];
+      keys[i + c] = Math.min(a, b) * 2 ** 26 + Math.max(a, b); // exact up to 2^53
+    }
+  }
+  const unique = keys.sort().filter((key, i) => key !== keys[i - 1]);
+  const edges = new Uint32Array(2 * unique.length);
+  unique.forEach((key, i) => edges.set([Math.floor(key / 2 ** 26), key % 2 ** 26], 2 * i));
+  return edges;
+}
+
+/** Normals of the vertices, weighted by area and not of unit length, into `out`. */
+function normalsOf(points, faces, out) {
+  out.fill(0);
+  for (let f = 0; f < faces.length; f += 3) {
+    const a = 3 * faces[f];
+    const b = 3 * faces[f + 1];
+    const c = 3 * faces[f + 2];
+    const ux = points[b] - points[a];
+    const uy = points[b + 1] - points[a + 1];
+    const uz = points[b + 2] - points[a + 2];
+    const vx = points[c] - points[a];
+    const vy = points[c + 1] - points[a + 1];
+    const vz = points[c + 2] - points[a + 2];
+    const nx = uy * vz - uz * vy;
+    const ny = uz * vx - ux * vz;
+    const nz = ux * vy - uy * vx;
+    for (const corner of [a, b, c]) {
+      out[corner] += nx;
+      out[corner + 1] += ny;
+      out[corner + 2] += nz;
+    }
+  }
 }

@@ -1,0 +1,192 @@
+"""``torch-modal subdivide``: from key-frames to files."""
+
+import argparse
+import warnings
+
+from torch_modal.cli.arguments import (
+    add_common,
+    add_levels,
+    add_meshes,
+    add_modes,
+    add_out,
+    add_picture,
+    add_registration,
+    caching,
+    check_output,
+    is_file,
+    mode_options,
+    number,
+    reporter,
+    times,
+)
+from torch_modal.io.formats import ANIMATION_FORMATS, MESH_FORMATS
+
+
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Arguments of ``subdivide``."""
+    add_meshes(sub, "key-frames, two or more, in their order")
+    animations = ", ".join(ANIMATION_FORMATS)
+    add_out(sub, "FILE_OR_FOLDER", f"the animation alone: {animations}; a folder: numbered frames and animation.glb")
+    add_levels(sub, 0)
+    sub.add_argument(
+        "--frames",
+        type=number(int, 2),
+        metavar="N",
+        help="number of frames of the result (default: those of the levels)",
+    )
+    sub.add_argument("--cyclic", action="store_true", help="the last key-frame leads on to the first")
+    sub.add_argument(
+        "--times",
+        type=times,
+        metavar="T,T,...",
+        help="when the key-frames are, ascending, in any unit; of a cycle, with the time when it begins again",
+    )
+    sub.add_argument(
+        "--no-smooth",
+        dest="smooth",
+        action="store_const",
+        const=False,
+        help="treat each pair of key-frames alone, without what its neighbours in time know",
+    )
+    sub.add_argument(
+        "--contact", action="store_true", help="keep parts from passing through each other (extra contact)"
+    )
+    sub.add_argument(
+        "--proxy",
+        type=number(int, 0),
+        metavar="N",
+        help="a coarser mesh of N vertices moves, and carries the detail; 0: the mesh itself (default: 20000, for "
+        "meshes of more than 100000 vertices)",
+    )
+    sub.add_argument(
+        "--preset",
+        choices=("accurate", "fast", "paper"),
+        default="accurate",
+        help="accurate; fast, without steps on the fine mesh; paper, its Eq. 4 as it stands (default: %(default)s)",
+    )
+    sub.add_argument(
+        "--format",
+        choices=[suffix[1:] for suffix in MESH_FORMATS],
+        help="of the numbered frames (default: that of the first key-frame, with all that its file carries)",
+    )
+    group, positive = sub.add_argument_group("animation"), number(float, 0, above=True)
+    group.add_argument(
+        "--duration",
+        type=positive,
+        metavar="SECONDS",
+        help="of the sequence once (default: 1 for a cycle, 2 for two key-frames, 1 an interval of more)",
+    )
+    group.add_argument(
+        "--fps",
+        type=positive,
+        metavar="X",
+        help="frames a second; with --duration, pictures or samples a second of videos and point caches (default: 24)",
+    )
+    group.add_argument("--ping-pong", action="store_true", help="there and back again")
+    group.add_argument("--ease", action="store_true", help="slow at both ends")
+    add_picture(sub, "also draw the sequence beside linear interpolation")
+    sub.add_argument(
+        "--register", action="store_true", help="the meshes have different connectivity: lay the first onto the others"
+    )
+    add_registration(sub)
+    add_modes(sub)
+    add_common(sub)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Key-frames in, a dense sequence out.
+
+    Fill a sequence of key-frames.
+
+    Each level puts a new shape between all neighbours, so L levels turn every interval
+    into 2**L. The key-frames themselves stay as they are, at their places.
+
+    Examples:
+      one animated file, with a picture beside linear interpolation:
+        torch-modal subdivide open.obj fist.obj --out hand.glb --picture hand.png
+      a cycle of six key-frames as 96 numbered OBJ files and animation.glb in a folder:
+        torch-modal subdivide gait-?.ply --cyclic --levels 4 --out gait --format obj
+      a GIF that goes there and back again:
+        torch-modal subdivide open.obj fist.obj --out hand.gif --ping-pong --ease
+      a point cache for the mesh that is already in Blender:
+        torch-modal subdivide open.obj fist.obj --out hand.mdd --duration 3 --fps 24
+    """
+    if len(args.meshes) < 2:
+        args.fail("subdivide needs two key-frames or more")
+    if args.contact and args.preset == "paper":
+        args.fail("--contact needs one shape for each in-between; --preset paper has two")
+    if (args.landmarks or args.across) and not args.register:
+        args.fail("--landmarks and --across are for --register")
+    if args.cyclic and (args.ping_pong or args.ease):
+        args.fail(
+            f"--{'ping-pong' if args.ping_pong else 'ease'} is for sequences that begin and end; a cycle does not"
+        )
+    single = is_file(args, ANIMATION_FORMATS)
+    animation = args.out if single else args.out / "animation.glb"
+    fmt = args.format or {".gltf": "glb"}.get(args.meshes[0].suffix.lower(), args.meshes[0].suffix.lower()[1:])
+    earlier = [] if single else sorted(args.out.glob(f"frame-*.{fmt}"))
+    check_output([animation, *([args.picture] if args.picture else []), *earlier], args.meshes, args.overwrite)
+
+    import torch_modal as tm
+    from torch_modal.passengers.proxy import Proxy, proxy_size
+    from torch_modal.view.animation import require_packages
+
+    require_packages(animation)
+    n, spread = len(args.meshes), {"cyclic": args.cyclic, "n_frames": args.frames, "times": args.times}
+    places = tm.keyframe_places(n, args.levels, **spread)
+    when = tm.frame_times(n, args.levels, **spread).tolist() + args.times[-1:] * args.cyclic if args.times else None
+    report = reporter(args)
+    registration = {"register": args.register, "landmarks": args.landmarks, "same_subject": not args.across}
+    keyframes, faces = tm.load_keyframes(args.meshes, **registration, **caching(args), report=report)
+    asset = tm.open_asset(args.meshes[0])
+    welded = tm.weld_seams(keyframes, faces)
+    progress = False if args.quiet else None
+    n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
+    carrier = Proxy(welded.keyframes, welded.faces, n_proxy) if n_proxy else None
+    moving = (carrier.keyframes, carrier.faces) if carrier else (welded.keyframes, welded.faces)
+    bases = tm.extract_bases(*moving, args.modes, **mode_options(args))
+    solved = tm.subdivide(
+        *moving,
+        args.levels,
+        bases=bases,
+        **spread,
+        smooth=args.smooth,
+        progress=progress,
+        preset=args.preset,
+        contact=args.contact,
+    )
+    if carrier:
+        report(f"moved by a proxy of {carrier.keyframes.shape[1]} vertices (--proxy 0: by the whole mesh)")
+        solved = carrier.carried(solved, places, welded.keyframes)
+    frames = welded.scatter(solved)
+    keys = [place for place in places if place < len(frames)]
+    frames[keys] = keyframes
+    seams = f", {welded.n_merged} of them copies along seams" if welded.n_merged else ""
+    report(f"{n} key-frames of {keyframes.shape[1]} vertices{seams} -> {len(frames)} frames")
+    if not single:
+        written = tm.save_frames(frames, faces, args.out, fmt, overwrite=args.overwrite, asset=asset)
+        report(f"frames:    {written[0]} to {written[-1].name}")
+        left = sorted(set(earlier) - set(written))
+        if left:  # they look like the end of this sequence
+            message = f"{args.out} also holds {len(left)} frames of an earlier run, from {left[0].name}"
+            warnings.warn(message, stacklevel=2)
+    tm.save_animation(
+        frames,
+        faces,
+        animation,
+        args.fps,
+        keyframe_indices=keys,
+        cyclic=args.cyclic,
+        overwrite=args.overwrite,
+        duration=args.duration,
+        ping_pong=args.ping_pong,
+        ease=args.ease,
+        times=when,
+        asset=asset,
+        progress=progress,
+    )
+    report(f"animation: {animation}")
+    if args.picture:
+        rows = {"torch_modal": frames, "linear": tm.linear_sequence(keyframes, places)}
+        tm.render_sequence(rows, faces, args.picture, keyframe_indices=keys, overwrite=args.overwrite)
+        report(f"picture:   {args.picture}")
