@@ -16,12 +16,11 @@ import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import box, lumped_mass, surface
 from threads import limit_threads
-from torch_modal.backends.torch.alignment import Pair
-from torch_modal.inbetween.samples import ConvergenceWarning, Samples
 
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.modes import extract_bases
@@ -29,6 +28,7 @@ from torch_modal.precompute.stiffness import arap_hessian
 from torch_modal.precompute.tetrahedra import Tetrahedra
 from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
 from torch_modal.registration.load import load_keyframes
+from torch_modal.solve.implicit import ConvergenceWarning
 
 COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
 
@@ -153,25 +153,20 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def modal(
-    rotations: bool = False, local: bool = False, space: str = "joint", **changes: Any
-) -> dict[str, Objective | Solver]:
+def modal(local: bool = False, space: str = "joint", **changes: Any) -> dict[str, Objective | Solver]:
     """Settings of the bare modal solve, to the tolerance; what is named here changes them."""
     of_solver = {name: changes.pop(name) for name in set(changes) & set(Solver.__dataclass_fields__)}
-    objective = Objective(base="rotations" if rotations else "linear", space=space, **changes)
+    objective = Objective(space=space, **changes)
     return {"objective": objective, "solver": Solver(**{"local_steps": 2 * local, **of_solver})}
 
 
-def problem_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
-    """The in-betweens of placed key-frames as the layer's minimisation."""
-    whole = layer.in_between
-    samples = Samples(pair.first, pair.second, None, t, whole.mu_of(t, t.shape), whole.stiffness_of(t, t.shape))
-    return whole.members[0].problem(pair, samples)
-
-
-def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
-    """What the layer's energy knows of them."""
-    return problem_of(layer, pair, t).placement
+def placement_of(core: InBetweenSolver, keyframes: torch.Tensor, weights: torch.Tensor, **given: Any) -> Any:
+    """What the energy of a solver knows of weighted key-frames. *Shape:* ``(B, K, V, 3), (B, K)``."""
+    shapes, _, _ = core.alignment(keyframes, weights)
+    stiffness = [torch.full_like(weights[:, :1], float(term.stiffness)) for term in core.fine.terms]
+    straight = (weights[..., None, None] * shapes).sum(1)
+    base = straight if core.blend is None else core.blend(shapes, weights, straight)
+    return core.space.place(base, RestShapes(shapes, weights, stiffness), given.get("mu", torch.ones(len(weights))))
 
 
 def listen_to_ctrl_c() -> None:

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from precompute import MORE, ROOT, sample
 from scipy.spatial.transform import Rotation
 from threads import limit_threads
-from torch_modal.solve.solver import Status
 from tqdm import tqdm
 from wild import FELL_BACK, WORSE, straight
 
@@ -35,6 +34,7 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.precompute.coarsening import coarsen
 from torch_modal.precompute.filling import MESHERS
+from torch_modal.solve.minimise import Status
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -10,7 +10,6 @@ from conftest import Shapes
 from scipy.optimize import minimize
 from torch import Tensor
 from torch_modal.inbetween.between import Between
-from torch_modal.inbetween.samples import Samples
 
 import torch_modal as tm
 from torch_modal import trees
@@ -25,6 +24,7 @@ from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings
+from torch_modal.inbetween.results import Samples
 from torch_modal.motion import path as path_module
 
 pytest.importorskip("ipctk")
@@ -134,7 +134,7 @@ def test_layer_pushes_fingers_apart(hand: Shapes) -> None:
 def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     x_a, x_b = hand.keyframes
     layer = tm.InBetween(hand.bases, hand.faces, contact=True)
-    member, search = layer.members[0], ContactSearch.__call__
+    member, search = layer.core, ContactSearch.__call__
     found: list[Any] = []
     calls = 0
 
@@ -394,7 +394,7 @@ def test_kernels_and_torch_step_alike(hand: Shapes, smooth: bool) -> None:
     results = []
     for backend in ("torch", "warp"):
         path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
-        member = path.layer.members[0]
+        member = path.core
         samples = path.samples(three.keyframes[None], 0, torch.zeros(2, dtype=torch.int64), t)
         pair = member.placed(samples)
         x = member.frame.bring(member(samples, None).shapes, trees.picked(pair, samples.which), t)
