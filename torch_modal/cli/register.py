@@ -47,8 +47,8 @@ def add_options(sub: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run ``torch-modal register``."""
+    from torch_modal.io.frames import save_mesh
     from torch_modal.io.read import open_asset, read_mesh
-    from torch_modal.io.write import save_mesh
     from torch_modal.registration.landmarks import landmark_table
     from torch_modal.registration.load import ADVICE
     from torch_modal.registration.register import register
