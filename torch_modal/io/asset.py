@@ -73,14 +73,14 @@ class Part(NamedTuple):
     vertices: IntArray
     """The vertex of each point. *Shape:* ``(P,)``."""
     triangles: IntArray
-    """Of points. *Shape:* ``(F, 3)``."""
+    """Indices of points. *Shape:* ``(F, 3)``."""
     material: Material
     texcoords: FloatArray | None = None
     """Origin at the upper left, as in glTF. *Shape:* ``(P, 2)``."""
     colors: FloatArray | None = None
     """Linear RGBA. *Shape:* ``(P, 4)``."""
     normals: FloatArray | None = None
-    """As the file has them. *Shape:* ``(P, 3)``."""
+    """Those of the file. *Shape:* ``(P, 3)``."""
 
 
 class Polygons(NamedTuple):
@@ -91,7 +91,7 @@ class Polygons(NamedTuple):
     corners: IntArray
     """Vertices, one polygon after the other. *Shape:* ``(sum of sizes,)``."""
     texcoords: FloatArray | None = None
-    """Of each corner, origin at the lower left. *Shape:* ``(sum of sizes, 2)``."""
+    """Texture coordinates of the corners, origin at the lower left. *Shape:* ``(sum of sizes, 2)``."""
 
 
 class Asset(ABC):
@@ -111,7 +111,7 @@ class Asset(ABC):
     """Features that :meth:`with_positions` keeps."""
 
     suffix: str
-    """Of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
+    """Ending of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
