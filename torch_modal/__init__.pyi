@@ -39,8 +39,8 @@ from .io.asset import Asset as Asset
 from .io.formats import Animation as Animation
 from .io.formats import animation_format as animation_format
 from .io.formats import mesh_format as mesh_format
+from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
-from .io.write import save_frames as save_frames
 from .keyframes.arrays import weld_seams as weld_seams
 from .keyframes.check import check_keyframes as check_keyframes
 from .layers.blend import Blend as Blend

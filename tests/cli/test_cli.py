@@ -19,7 +19,7 @@ from torch_modal.cli import demo
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
 from torch_modal.io.cache import Cache
-from torch_modal.io.write import save_frames
+from torch_modal.io.frames import save_frames
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute import modes as modes_module
 from torch_modal.precompute import tetwild

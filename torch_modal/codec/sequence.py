@@ -75,7 +75,7 @@ class ModalSequence:
 
     @property
     def cyclic(self) -> bool:
-        """Whether the last key-frame leads on to the first."""
+        """True if the last key-frame leads on to the first."""
         return len(self.keyframe_times) > len(self.keyframes)
 
     @property

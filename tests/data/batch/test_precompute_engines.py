@@ -25,7 +25,7 @@ from torch_modal.data.batch.precompute import Shard, precompute_tree
 from torch_modal.data.batch.record import DONE, UNFINISHED
 from torch_modal.data.batch.set_task import Options
 from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, find_sets, open_set
-from torch_modal.io.write import save_frames
+from torch_modal.io.frames import save_frames
 
 OPTIONS = Options(n_modes=4, mesher="lattice")  # the lattice always gives the same tetrahedra
 ARGUMENTS = ["--modes", "4", "--mesher", "lattice"]

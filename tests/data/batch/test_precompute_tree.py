@@ -16,7 +16,7 @@ from torch_modal.data.batch import set_task, set_worker
 from torch_modal.data.batch.precompute import Shard
 from torch_modal.data.batch.record import Record, inputs_key
 from torch_modal.data.stored import BASES_FILE, LABELS_FILE, find_sets, open_set, write_set
-from torch_modal.io.write import save_frames
+from torch_modal.io.frames import save_frames
 
 REPORT = Shard().report
 
