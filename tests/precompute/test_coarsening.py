@@ -123,7 +123,7 @@ def test_slivers_of_a_straight_tube_are_avoided() -> None:
     """Collapses chosen on the straight tube leave slivers along it, which the other key-frame has not."""
     keyframes, faces = tube(3.0, 32, 120)
     ratio = energy_ratio(coarsen(keyframes, faces, 500), keyframes, faces)
-    alone = energy_ratio(coarsening._collapse_once(keyframes[0], faces, 500), keyframes, faces)
+    alone = energy_ratio(coarsening.collapsed(keyframes[0], faces, 500), keyframes, faces)
     assert alone > 10, "the tube does not show the danger any more"
     assert 0.5 < ratio < 2
 
@@ -165,8 +165,8 @@ def test_pairs_share_the_collapses_of_a_key_frame(
     keyframes, faces = fine
     three = np.stack([keyframes[0], keyframes[1], 1.1 * keyframes[1]])
     seen = []
-    once = coarsening._collapse_once
-    monkeypatch.setattr(coarsening, "_collapse_once", lambda x, *rest: seen.append(x) or once(x, *rest))
+    once = coarsening.collapsed
+    monkeypatch.setattr(coarsening, "collapsed", lambda x, *rest: seen.append(x) or once(x, *rest))
     shared = Collapses(faces)
     for i, j in ((0, 1), (1, 2), (2, 0)):
         alone = coarsen(three[[i, j]], faces, 100)

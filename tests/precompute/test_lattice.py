@@ -16,24 +16,19 @@ from bodies import body
 from scipy.spatial import cKDTree
 from solids import box, lumped_mass, surface
 
-from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling, tetwild
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.filling import Filler
-from torch_modal.precompute.lattice import Lattice, is_too_fine, lattice
-from torch_modal.precompute.modes import extract_bases, extract_modes
-from torch_modal.precompute.proximity import clearances
+from torch_modal.precompute.extract import MESHERS, extract_bases, extract_modes
+from torch_modal.precompute.lattice import Lattice, lattice
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.surface import CanonicalSurface, clearances
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
-    TetrahedralizationError,
     face_connected_pieces,
     solid_volumes,
     tet_volumes,
 )
-from torch_modal.precompute.tetwild import TetrahedraSettings
+from torch_modal.precompute.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -80,7 +75,7 @@ THREADS = """
 import hashlib, sys
 import numpy as np
 import trimesh
-from torch_modal.precompute.modes import extract_bases
+from torch_modal.precompute.extract import extract_bases
 mesh = trimesh.creation.capsule(height=3.0, radius=0.6, count=(24, 24))
 keyframes = np.stack([mesh.vertices, mesh.vertices * [1.0, 1.1, 1.0]])
 total = hashlib.sha256()
@@ -107,12 +102,12 @@ def test_it_is_the_only_default(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) 
     def fail(*args: object, **kwargs: object) -> None:
         raise AssertionError("fTetWild was asked")
 
-    monkeypatch.setattr(tetwild, "tetrahedralize", fail)
+    monkeypatch.setattr(TetWild, "fill", fail)
     vertices, faces = capsule
     for shape in (vertices, vertices * (1.0, 0.02, 1.0)):
         default, named = (extract_modes(shape, faces, 6, cache=False, **way) for way in ({}, {"mesher": "lattice"}))
         np.testing.assert_array_equal(default.modes, named.modes)
-    assert tuple(filling.MESHERS) == ("lattice", "tetwild")
+    assert tuple(MESHERS) == ("lattice", "tetwild")
 
 
 def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
@@ -127,7 +122,7 @@ def test_thin_plates_are_filled(thickness: float) -> None:
     """By tetrahedra in one piece, all over."""
     vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
     whole = CanonicalSurface.of(vertices, faces)
-    filled = Filler(Lattice(), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    filled = Lattice().fill(whole, threading.Event())
     assert face_connected_pieces(filled.tets).max() == 0
     assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
     basis = extract_modes(vertices, faces, 6, cache=False)
@@ -139,8 +134,8 @@ def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     """What fTetWild could still fill, the lattice fills with as many cubes as it may have."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     whole = CanonicalSurface.of(ball.vertices, ball.faces)
-    assert is_too_fine(whole, lattice_module.CUBE * 0.012)
-    filled = Filler(Lattice(0.012), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    filled = lattice(whole, 0.009)
+    assert len(filled.tets) < 40 * lattice_module.MOST_CUBES
     assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
 
 
@@ -158,9 +153,9 @@ def test_thin_limbs_have_small_tetrahedra(name: str) -> None:
     assert len(filled.tets) < 1.2 * lattice_module.MOST_TETRAHEDRA
     exact = trimesh.Trimesh(whole.points, whole.faces)
     assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=0.15)
-    near = clearances(whole)
+    thickness, _ = clearances(whole)
     sizes = np.cbrt(6 * tet_volumes(filled))
-    assert np.median(sizes[filled.vertices[filled.tets].mean(axis=1)[:, 0] > 30]) < near.thickness.min()
+    assert np.median(sizes[filled.vertices[filled.tets].mean(axis=1)[:, 0] > 30]) < thickness.min()
 
 
 def test_lowest_mode_of_a_rod() -> None:
@@ -212,29 +207,10 @@ def test_open_and_half_flipped_surfaces(capsule: Mesh) -> None:
     assert share == pytest.approx(solid_volumes(lattice(whole, 0.05)).sum() / whole.scale**3, rel=0.25)
 
 
-def test_too_fine_a_lattice_is_refused(capsule: Mesh) -> None:
-    with pytest.raises(TetrahedralizationError, match="give a larger edge_length_fac"):
-        lattice(CanonicalSurface.of(*capsule), 0.002)
-
-
-@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("mesher", "auto"), ("settings", "best")])
+@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("mesher", "auto"), ("form", "spokes")])
 def test_unknown_names(capsule: Mesh, name: str, value: str) -> None:
     with pytest.raises(ValueError, match=f"{value}.*give"):
         extract_bases([capsule[0]], capsule[1], 5, **{name: value})
-
-
-def test_settings_reach_the_mesher(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[float] = []
-
-    def note(surface: CanonicalSurface, edge: float, *_: object):
-        seen.append(edge)
-        return lattice(surface, 0.05)
-
-    monkeypatch.setattr(lattice_module, "lattice", note)
-    for settings in ("fast", "fine", TetrahedraSettings(edge_length_fac=0.07)):
-        extract_modes(*capsule, 5, settings=settings, cache=False)
-    assert seen[0] > seen[1]
-    assert seen[2] == lattice_module.CUBE * 0.07
 
 
 @dataclass(frozen=True)
@@ -247,7 +223,7 @@ class Cubes:
     def key(self) -> dict[str, Any]:
         return {"mesher": "cubes", "edge": self.edge}
 
-    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         self.filled.append(len(surface.points))
         return lattice(surface, self.edge)
 

@@ -164,7 +164,7 @@ def cache(args: argparse.Namespace) -> None:
 
 def _precompute_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of `extract_bases`."""
-    return {"method": args.method, "mesher": args.mesher, "settings": args.quality, **caching(args)}
+    return {"method": args.method, "mesher": args.mesher, **caching(args)}
 
 
 def _is_file(args: argparse.Namespace, *suffixes: str) -> bool:

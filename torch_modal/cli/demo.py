@@ -13,7 +13,7 @@ from torch_modal.data.samples import Sample, load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.motion.subdivide import keyframe_places, linear_sequence, subdivide
-from torch_modal.precompute.modes import extract_bases
+from torch_modal.precompute.extract import extract_bases
 from torch_modal.view.animation import save_animation
 from torch_modal.view.picture import render_sequence
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.errors import MeshError, MeshWarning
-from torch_modal.precompute.eigen import EXACT, ModalAnalysisError
-from torch_modal.precompute.modes import extract_modes
+from torch_modal.precompute.eigen import ModalAnalysisError
+from torch_modal.precompute.extract import extract_modes
 from torch_modal.precompute.tetrahedra import TetrahedralizationError
 
 GAP = 1e-3
@@ -72,7 +72,7 @@ def reproducible_modes(
         ValueError: More modes than the shape has.
     """
     available = max(3 * len(faces.unique()) - 6, n_modes)
-    options = {"mesher": "lattice", "tolerance": EXACT, "cache_dir": cache_dir, "cache": cache}
+    options = {"mesher": "lattice", "cache_dir": cache_dir, "cache": cache}
     with warnings.catch_warnings():
         # Rounding makes faces without area of small ones.
         warnings.simplefilter("ignore", MeshWarning)

@@ -19,7 +19,7 @@ from torch_modal.arrays import Array, FloatArray, IntArray
 from torch_modal.extras import require
 from torch_modal.io.write import to_numpy
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.precompute.modes import extract_bases
+from torch_modal.precompute.extract import extract_bases
 from torch_modal.view.live_shapes import LiveShapes
 from torch_modal.view.picture import BETWEEN_COLOR, KEYFRAME_COLOR, up_axis, view_rotation
 
