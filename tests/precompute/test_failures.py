@@ -1,22 +1,18 @@
 """A failure of the mesher is remembered, if it is the mesher's; nobody waits for it twice."""
 
-import re
 import subprocess
 import sys
 import textwrap
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from solids import as_it_is
 
-from torch_modal.io.cache import Cache, cache_content
+from torch_modal.io.cache import cache_content
 from torch_modal.precompute import tetwild
 from torch_modal.precompute.extract import extract_modes
-from torch_modal.precompute.solid import Solid
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
+from torch_modal.precompute.tetrahedra import TetrahedralizationError
 from torch_modal.precompute.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -130,22 +126,6 @@ def test_another_version_of_the_mesher_is_tried(
         assert worker.runs == min(runs + 1, 2)
 
 
-def test_another_version_of_the_mesher_makes_its_own_tetrahedra(
-    capsule: Mesh, capsule_tetrahedra: Tetrahedra, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls = []
-
-    def fill(*args: object) -> Tetrahedra:
-        calls.append(args)
-        return capsule_tetrahedra
-
-    monkeypatch.setattr(TetWild, "fill", fill)
-    for installed in ("0.4.2", "0.4.3", "0.4.2"):
-        monkeypatch.setattr(tetwild, "version", lambda _, installed=installed: installed)
-        Solid.filling(as_it_is(*capsule), TetWild(), Cache.at(tmp_path), threading.Event())
-    assert len(calls) == 2
-
-
 def test_success_after_a_failure_lasts(
     worker: Worker, capsule: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,17 +136,6 @@ def test_success_after_a_failure_lasts(
     modes_of(capsule, tmp_path, timeout=100.0, **COARSE)
     monkeypatch.setattr(tetwild, "WORKER", tmp_path / "gone")
     modes_of(capsule, tmp_path, timeout=0.5, **COARSE)  # the tetrahedra are kept: no failure stands before them
-
-
-def test_a_damaged_entry_is_tried_again(worker: Worker, capsule: Mesh, tmp_path: Path) -> None:
-    worker.does(CRASH)
-    for _ in range(2):
-        with pytest.raises(TetrahedralizationError, match=r"SIGSEGV\)?\. Check the surface[^.]*$"):
-            modes_of(capsule, tmp_path)
-        (entry,) = tmp_path.iterdir()
-        assert re.fullmatch(r"failure-[0-9a-f]{64}\.safetensors", entry.name)
-        entry.write_bytes(entry.read_bytes()[:-3])
-    assert worker.runs == 2
 
 
 def test_the_exit_code_of_the_real_worker(capsule: Mesh, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from solids import box, lumped_mass, surface
 
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.extract import MESHERS, extract_bases, extract_modes
+from torch_modal.precompute.extract import extract_bases, extract_modes
 from torch_modal.precompute.lattice import Lattice, lattice
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface, clearances
@@ -28,7 +28,6 @@ from torch_modal.precompute.tetrahedra import (
     solid_volumes,
     tet_volumes,
 )
-from torch_modal.precompute.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -96,20 +95,6 @@ def test_the_same_in_every_process_with_any_threads() -> None:
     assert len(found) == 1
 
 
-def test_it_is_the_only_default(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A capsule, and one as thin as a plate, which fTetWild used to get."""
-
-    def fail(*args: object, **kwargs: object) -> None:
-        raise AssertionError("fTetWild was asked")
-
-    monkeypatch.setattr(TetWild, "fill", fail)
-    vertices, faces = capsule
-    for shape in (vertices, vertices * (1.0, 0.02, 1.0)):
-        default, named = (extract_modes(shape, faces, 6, cache=False, **way) for way in ({}, {"mesher": "lattice"}))
-        np.testing.assert_array_equal(default.modes, named.modes)
-    assert tuple(MESHERS) == ("lattice", "tetwild")
-
-
 def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
     """A thin box; its flat sides lie along sides of the lattice's cubes."""
     solid = box((*cells, 1), size)
@@ -163,24 +148,6 @@ def test_lowest_mode_of_a_rod() -> None:
     shape = body("rod bent 180")
     found = extract_modes(shape.pose(0.0), shape.faces, 4, mesher="lattice", cache=False).eigenvalues[:2]
     np.testing.assert_allclose(found, (4.730 / 4.0) ** 4 * 2 * 0.04**2 / 4, rtol=0.5)
-
-
-def test_each_side_is_shared_alike(capsule: Mesh) -> None:
-    """Neighbouring cubes cut their common side along the same diagonal: no side belongs to three tetrahedra, and the
-    outer sides are closed."""
-    filled = lattice(CanonicalSurface.of(*capsule), 0.06)
-    sides = np.sort(np.concatenate([filled.tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
-    assert np.unique(sides, axis=0, return_counts=True)[1].max() == 2
-    edges = np.sort(np.concatenate([surface(filled)[:, c] for c in ([0, 1], [1, 2], [2, 0])]), axis=1)
-    assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
-
-
-def test_deterministic(capsule: Mesh) -> None:
-    one, two = (lattice(CanonicalSurface.of(*capsule), 0.05) for _ in range(2))
-    for first, second in zip(one, two, strict=True):
-        np.testing.assert_array_equal(first, second)
-    bases = [extract_modes(*capsule, 10, mesher="lattice", cache=False) for _ in range(2)]
-    np.testing.assert_array_equal(bases[0].modes, bases[1].modes)
 
 
 def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:

@@ -258,24 +258,6 @@ def test_the_cache_knows_the_method(capsule: Mesh, tmp_path: Path, monkeypatch: 
     torch.testing.assert_close(again.modes, shell.modes, rtol=0, atol=0)
 
 
-def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    vertices, faces = strip(cells=(120, 30))
-    poses = np.stack([vertices + [0, 0, 0.1 * i] * np.sin(vertices[:, :1]) for i in range(4)])
-    found = []
-    for cpus in (1, 4):
-        monkeypatch.setattr("torch_modal.precompute.parallel.n_cpus", lambda cpus=cpus: cpus)
-        found.append(extract_bases(poses, faces, 5, method="shell", cache=False, progress=False))
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one.modes, other.modes, rtol=0, atol=0)
-
-
-def test_progress_counts_both_attempts(capsule: Mesh) -> None:
-    counted: list[tuple[int, int]] = []
-    poses = np.stack([strip()[0]] * 3)
-    extract_bases(poses, strip()[1], 3, cache=False, progress=lambda done, total, _: counted.append((done, total)))
-    assert counted[-1] == (3, 3)
-
-
 def test_coincident_vertices_are_one() -> None:
     """An edge without a length has no stiffness: its ends would move against each other."""
     vertices, faces = strip(2.0, 1.0, (20, 10))

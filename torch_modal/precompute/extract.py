@@ -6,6 +6,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -20,11 +21,11 @@ from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lowest_modes
 from torch_modal.precompute.lattice import Lattice
-from torch_modal.precompute.parallel import StoppedError, run_all
+from torch_modal.precompute.parallel import StoppedError, one_blas_thread, run_all
 from torch_modal.precompute.sheet import n_coarse_faces, sheet_body
 from torch_modal.precompute.solid import Solid
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
-from torch_modal.precompute.surface import CanonicalSurface, self_proximity, separation
+from torch_modal.precompute.surface import CanonicalSurface, self_proximity
 from torch_modal.precompute.tetrahedra import Mesher, TetrahedralizationError
 from torch_modal.precompute.tetwild import TetWild
 from torch_modal.progress import Progress, ProgressReport, logger
@@ -36,10 +37,6 @@ MESHERS: dict[str, Callable[[], Mesher]] = {"lattice": Lattice, "tetwild": TetWi
 
 THIN = 0.01
 """Mean thickness, twice the volume over the area, in roots of the area, below which the shell is taken."""
-MAX_SEPARATION = 0.014
-"""Largest separation of parts in contact at which carrying is tried
-(:func:`~torch_modal.precompute.surface.separation`). On the samples and five data sets carrying worked up to 0.0105,
-never from 0.0127 on."""
 VERTICES_AT_ONCE = 30_000
 """Total size of concurrent eigenproblems: about 2 GiB."""
 DEFORMS = 1e-6
@@ -113,8 +110,7 @@ def extract_bases(
             another :class:`~torch_modal.precompute.tetrahedra.Mesher`.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
-        progress: Whether a bar shows key-frame and stage; by default on terminals, with lines of the log elsewhere. Or
-            a function ``(done, total, what)``, which may be called from several threads, one at a time.
+        progress: A bar with key-frame and stage: see :data:`torch_modal.progress.Progress`.
 
     Returns:
         One basis for each key-frame: float64, on the CPU, without gradient.
@@ -176,23 +172,11 @@ def bases_of_checked(
             require_area(shape, triangles)
             surfaces.append(CanonicalSurface.of(shape, triangles))
 
-    with ProgressReport(len(shapes), "vibration modes", progress) as bar:
+    with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
         extraction = _Extraction(
             surfaces, n_modes, form, mesher or Lattice(), cache or Cache.at(None), bar, meanwhile=meanwhile
         )
-        shells = extraction.shells
-
-        def solids() -> list[Arrays]:
-            for index, shape in enumerate(shapes):
-                with _naming_keyframe(index, len(shapes)):
-                    require_solid(shape, triangles)
-            return extraction.solids()
-
-        if method == "auto":
-            found = _first_that_works(solids, shells, extraction)
-        else:
-            found = solids() if method == "solid" else shells()
-
+        found = extraction.by(method)
     if loose := [one for one in found if one["n_zero"][0] > N_RIGID]:
         warnings.warn(
             f"the shape has {max(int(one['n_pieces'][0]) for one in loose)} loose pieces, or parts hung on an edge or "
@@ -214,28 +198,6 @@ def bases_of_checked(
         )
         bases.append(basis)
     return bases
-
-
-def _first_that_works(
-    solids: Callable[[], list[Arrays]], shells: Callable[[], list[Arrays]], extraction: "_Extraction"
-) -> list[Arrays]:
-    """Modes of solids, or of shells where there is a reason; the other ones if the surface makes these fail."""
-    reason = why_shell(extraction.surfaces)
-    if reason:
-        logger.info("modes of the surface itself, not of a solid: %s", reason)
-    first, second = (shells, solids) if reason else (solids, shells)
-    try:
-        return first()
-    except (TetrahedralizationError, ModalAnalysisError) as error:
-        if isinstance(error, TetrahedralizationError) and np.isfinite(error.fails_until):
-            raise  # another attempt may succeed, and the same call should give the same modes
-        extraction.stop.clear()
-        logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
-        extraction.bar.expect(extraction.bar.done)
-        try:
-            return second()
-        except (MeshError, TetrahedralizationError, ModalAnalysisError):
-            raise error from None
 
 
 def why_shell(surfaces: list[CanonicalSurface]) -> str:
@@ -289,13 +251,34 @@ class _Extraction:
     meanwhile: Callable[[], object] | None = None
     stop: threading.Event = field(default_factory=threading.Event)
 
+    def by(self, method: Method) -> list[Arrays]:
+        """Modes by a method; where that was chosen here and fails because of the surface, by the other."""
+        if method != "auto":
+            return self.solids() if method == "solid" else self.shells()
+        reason = why_shell(self.surfaces)
+        if reason:
+            logger.info("modes of the surface itself, not of a solid: %s", reason)
+        first, second = (self.shells, self.solids) if reason else (self.solids, self.shells)
+        try:
+            return first()
+        except (TetrahedralizationError, ModalAnalysisError) as error:
+            if isinstance(error, TetrahedralizationError) and np.isfinite(error.fails_until):
+                raise  # another attempt may succeed, and the same call should give the same modes
+            self.stop.clear()
+            logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
+            self.bar.expect(len(self.surfaces))
+            try:
+                return second()
+            except (MeshError, TetrahedralizationError, ModalAnalysisError):
+                raise error from None
+
     def shells(self) -> list[Arrays]:
         """Modes of all surfaces themselves."""
 
         def compute(index: int) -> Arrays:
-            return self._modes_of(index, lambda: sheet_body(self.surfaces[index], self.n_modes))
+            return self._modes_of(index, partial(sheet_body, self.surfaces[index], self.n_modes))
 
-        return self._all(compute, [{}] * len(self.surfaces), {"form": "shell"}, n_coarse_faces(self.n_modes) // 2)
+        return self._all(compute, {}, {"form": "shell"}, n_coarse_faces(self.n_modes) // 2)
 
     def solids(self) -> list[Arrays]:
         """Modes of all solids inside.
@@ -303,19 +286,18 @@ class _Extraction:
         The key-frame of least self-proximity is meshed, as tetrahedra join parts in contact, and its tetrahedra are
         carried to the others. Those that they cannot follow are meshed, too.
         """
-        first, *others = (int(i) for i in np.argsort([self_proximity(one) for one in self.surfaces], kind="stable"))
-        base = self.surfaces[first]
-        # Key-frames in which parts in contact come apart are meshed in parallel with the first one.
-        alone = [first, *(i for i in others if separation(base, self.surfaces[i]) > MAX_SEPARATION)]
-        meshed = dict(zip(alone, run_all(lambda i: self._mesh(alone[i]), len(alone), self.stop), strict=True))
-        solid = meshed[first]
+        for index, surface in enumerate(self.surfaces):
+            with _naming_keyframe(index, len(self.surfaces)):
+                require_solid(surface.points / surface.scale, surface.faces)
+        first = min(range(len(self.surfaces)), key=lambda index: self_proximity(self.surfaces[index]))
+        rest, solid = self.surfaces[first], self._mesh(first)
         one_at_a_time = threading.Lock()
 
         @functools.cache
         def make_carrier() -> Carrier:
-            return Carrier(solid.tetrahedra, base.points, base.faces, solid.weights())
+            return Carrier(solid.tetrahedra, rest.points, rest.faces, solid.weights())
 
-        def carried(index: int) -> Solid | None:
+        def carry(index: int) -> Solid | None:
             """The first solid in the pose of a key-frame; None if it is too distorted."""
             surface = self.surfaces[index]
             with self._stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
@@ -326,35 +308,31 @@ class _Extraction:
             return None  # a matrix is singular
 
         def compute(index: int) -> Arrays:
-            if index not in meshed and (moved := carried(index)) is not None:
+            if index != first and (carried := carry(index)) is not None:
                 with contextlib.suppress(ModalAnalysisError):  # too distorted
-                    return self._modes_of(index, lambda: moved.body(self.form))
-            own = meshed.get(index) or self._mesh(index)
-            return self._modes_of(index, lambda: own.body(self.form))
+                    return self._modes_of(index, partial(carried.body, self.form))
+            own = solid if index == first else self._mesh(index)
+            return self._modes_of(index, partial(own.body, self.form))
 
-        sources = [meshed.get(index, solid) for index in range(len(self.surfaces))]
-        inputs = [
-            {"rest_points": source.surface.points, **{f"rest_{k}": v for k, v in source.tetrahedra.arrays().items()}}
-            for source in sources
-        ]
-        size = max(len(source.tetrahedra.vertices) for source in sources)
-        return self._all(compute, inputs, {"form": self.form, **self.mesher.key()}, size)
+        inputs = {f"rest_{name}": array for name, array in solid.tetrahedra.arrays().items()}
+        parameters = {"form": self.form, **self.mesher.key()}
+        return self._all(compute, {"rest_points": rest.points, **inputs}, parameters, len(solid.tetrahedra.vertices))
 
     def _all(
-        self, compute: Callable[[int], Arrays], inputs: list[Arrays], parameters: dict[str, Any], n_vertices: int
+        self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int
     ) -> list[Arrays]:
         """Results of all key-frames, from the cache or computed in as many threads as fit into memory.
 
         Args:
             compute: Computes the modes of a key-frame.
-            inputs: Arrays that they depend on beside the surface.
+            inputs: Arrays that they depend on, beside the surface.
             parameters: Numbers and strings that they depend on.
             n_vertices: Size of an eigenproblem.
         """
 
         def modes(index: int) -> Arrays:
             surface = self.surfaces[index]
-            arrays = {"points": surface.points, "faces": surface.faces, **inputs[index]}
+            arrays = {"points": surface.points, "faces": surface.faces, **inputs}
             key = {"n_modes": int(self.n_modes), **parameters}
             found = self.cache.get("modes", arrays, key, lambda: compute(index))
             self.bar.update()
@@ -367,7 +345,7 @@ class _Extraction:
             return Solid.filling(self.surfaces[index], self.mesher, self.cache, self.stop)
 
     def _modes_of(self, index: int, make_body: Callable[[], ElasticBody]) -> Arrays:
-        """Modes of a body, at the points of its surface."""
+        """Modes of a body, at the points of its surface, ``modes (k, U, 3)``."""
         with self._stage(index, "modes"):
             try:
                 return _surface_modes(make_body(), self.surfaces[index], self.n_modes)

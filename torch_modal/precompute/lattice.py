@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.fft import irfftn, next_fast_len, rfftn
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
@@ -136,7 +137,7 @@ class Indicator(NamedTuple):
 
     def at(self, points: FloatArray) -> FloatArray:
         """Trilinear interpolation, with a sharper transition near the surface. *Shape:* ``(P, 3) -> (P,)``."""
-        values = self._by_grid(points)
+        values = map_coordinates(self.values, ((points - self.low) / self.spacing).T, order=1, mode="nearest")
         doubtful = np.flatnonzero(values < SURELY_INSIDE)
         distance, nearest = closest_in(self.samples.tree, points[doubtful], within=NEARBY * self.spacing)
         # Beyond the boundary of an open surface there is no tangent plane.
@@ -146,23 +147,6 @@ class Indicator(NamedTuple):
         height = np.einsum("vi,vi->v", offset, self.samples.normals[nearest])
         values[doubtful] = 0.5 - height / (RAMP * self.spacing)
         return np.clip(values, 0.0, 1.0)
-
-    def _by_grid(self, points: FloatArray) -> FloatArray:
-        # Coordinate by coordinate: half the time of rows of three.
-        strides = np.array(self.values.strides) // self.values.itemsize
-        index, shares = np.zeros(len(points), dtype=np.int64), []
-        for axis in range(3):
-            place = (points[:, axis] - self.low[axis]) / self.spacing
-            base = np.clip(place.astype(np.int64), 0, self.values.shape[axis] - 2)
-            part = np.clip(place - base, 0.0, 1.0)
-            index += base * strides[axis]
-            shares.append((1 - part, part))
-        flat, found = self.values.reshape(-1), np.zeros(len(points))
-        for x, y in itertools.product((0, 1), repeat=2):
-            column = shares[0][x] * shares[1][y]
-            for z in (0, 1):
-                found += column * shares[2][z] * flat[index + int(np.array((x, y, z)) @ strides)]
-        return found
 
 
 def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
@@ -206,13 +190,13 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
         return indicator.at(low + root * places) >= 0.5
 
     most = int(MOST_TETRAHEDRA * max(1.0, USUAL_CUBE * SIZE / largest) ** 3)
-    mesh = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
-    vertices = low + root * mesh.vertices
-    inside = indicator.inside(vertices[mesh.tets])
+    places, tets, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    vertices = low + root * places
+    inside = indicator.inside(vertices[tets])
     kept = inside >= LEAST_INSIDE
-    kept[mesh.owner] = True
-    kept = _bridged(mesh.tets, kept, np.ones(len(kept), dtype=bool))
-    filled = kept_tetrahedra(Tetrahedra(vertices, mesh.tets, np.maximum(inside, LEAST_INSIDE)), kept)
+    kept[owner] = True
+    kept = _bridged(tets, kept, np.ones(len(kept), dtype=bool))
+    filled = kept_tetrahedra(Tetrahedra(vertices, tets, np.maximum(inside, LEAST_INSIDE)), kept)
     return _fitted(without_debris(filled), indicator)
 
 

@@ -32,10 +32,6 @@ N_SAMPLES = 5000
 SEEN_SAMPLES = 10_000
 """Approximate number of samples at which they are measured."""
 MOST_SHRINKINGS = 10
-TOUCHING = 0.015
-"""Distance below which points are in contact, in sizes."""
-CELL = 0.005
-"""Cell size of the subsampling for contact, in sizes."""
 
 
 @dataclass(frozen=True)
@@ -168,30 +164,6 @@ def self_proximity(surface: CanonicalSurface) -> float:
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
-
-
-def separation(rest: CanonicalSurface, posed: CanonicalSurface) -> float:
-    """Separation in one pose of parts in contact in another, in sizes.
-
-    Root mean square over the surface of half the largest growth of a point's distance to its neighbours in space.
-    Tetrahedra of the first pose join both parts, so they cannot follow a separation.
-
-    Args:
-        rest: The surface in the first pose.
-        posed: The surface in the other pose.
-    """
-    cells = np.floor(rest.points / (CELL * SIZE)).astype(np.int64)
-    cells -= cells.min(axis=0)
-    _, chosen, cell = np.unique(np.ravel_multi_index(tuple(cells.T), cells.max(axis=0) + 1), True, True)
-    areas = np.bincount(cell.reshape(-1), vertex_areas(rest.points, rest.faces))
-    # The diagonal, the unit of length here, depends on the pose; the area hardly does.
-    before, after = rest.points[chosen], posed.points[chosen] * np.sqrt(rest.area / posed.area)
-    one, other = cKDTree(before).query_pairs(TOUCHING * SIZE, output_type="ndarray").T
-    growth = np.linalg.norm(after[one] - after[other], axis=1) - np.linalg.norm(before[one] - before[other], axis=1)
-    largest = np.zeros(len(chosen))
-    for point in (one, other):
-        np.maximum.at(largest, point, growth)
-    return float(np.sqrt(np.average((largest / 2) ** 2, weights=areas))) / SIZE
 
 
 def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
