@@ -56,10 +56,11 @@ from .motion.subdivide import subdivide as subdivide
 from .passengers.passengers import Passengers as Passengers
 from .precompute.basis import ModalBasis as ModalBasis
 from .precompute.eigen import ModalAnalysisError as ModalAnalysisError
-from .precompute.modes import extract_bases as extract_bases
-from .precompute.modes import extract_modes as extract_modes
+from .precompute.extract import extract_bases as extract_bases
+from .precompute.extract import extract_modes as extract_modes
+from .precompute.lattice import Lattice as Lattice
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
-from .precompute.tetwild import TetrahedraSettings as TetrahedraSettings
+from .precompute.tetwild import TetWild as TetWild
 from .registration.landmarks import suggest_landmarks as suggest_landmarks
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register

@@ -33,7 +33,7 @@ from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.precompute.coarsening import coarsen
-from torch_modal.precompute.filling import MESHERS
+from torch_modal.precompute.extract import MESHERS
 from torch_modal.solve.minimise import Status
 
 FloatArray = NDArray[np.float64]

@@ -19,7 +19,7 @@ from torch_modal.data.stored import open_set
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.frames import save_frames
-from torch_modal.precompute.shell import THICKNESS
+from torch_modal.precompute.sheet import THICKNESS
 
 pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.keyframes.check.MeshWarning")
 

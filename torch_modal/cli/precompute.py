@@ -98,7 +98,6 @@ def run(args: argparse.Namespace) -> int:
         n_modes=args.modes,
         method=args.method,
         mesher=args.mesher,
-        quality=args.quality,
         cache_dir=args.cache_dir and os.path.abspath(os.path.expanduser(args.cache_dir)),
         timeout=args.timeout,
         retry=args.retry,

@@ -26,8 +26,7 @@ from torch_modal.data.batch.tree import mesh_files
 from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, RECORD_FILE, open_set, why_not_replaceable
 from torch_modal.io.cache import CACHE_VERSION
 from torch_modal.io.files import write_atomically
-from torch_modal.precompute.method import Method
-from torch_modal.precompute.modes import QUALITIES
+from torch_modal.precompute.extract import Method
 from torch_modal.precompute.processes import describe_exit, end_process, last_line
 
 BOOT = """\
@@ -54,7 +53,6 @@ class Options:
     n_modes: int = 30
     method: Method = "auto"
     mesher: str = "lattice"
-    quality: str = "fast"
     cache_dir: str | None = None
     """None: no cache."""
     timeout: float = 600.0
@@ -66,8 +64,7 @@ class Options:
 
     def parameters(self) -> dict[str, Any]:
         """All that the result depends on besides the files."""
-        settings = asdict(QUALITIES[self.quality])
-        made = {"n_modes": self.n_modes, "method": self.method, "mesher": self.mesher, "settings": settings}
+        made = {"n_modes": self.n_modes, "method": self.method, "mesher": self.mesher}
         # No sequence is None: as in records from before there was this option.
         return {**made, "algorithm": CACHE_VERSION, "sequence": self.sequence or None}
 

@@ -25,7 +25,8 @@ from torch_modal.data.motion import Motion
 from torch_modal.data.stored import RECORD_FILE, write_set
 from torch_modal.errors import MeshError
 from torch_modal.io.files import write_atomically
-from torch_modal.precompute.modes import extract_bases
+from torch_modal.precompute.extract import extract_bases
+from torch_modal.precompute.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
 
 GRACE = 30.0
@@ -71,9 +72,8 @@ def compute(job: dict[str, Any]) -> Record:
                 faces,
                 options.n_modes,
                 method=options.method,
-                mesher=options.mesher,  # type: ignore[arg-type]
-                settings=options.quality,
-                timeout=options.timeout / 2,  # leaves time to report its failure, or for a second mesher
+                # Half of the time leaves some to report a failure.
+                mesher=TetWild(timeout=options.timeout / 2) if options.mesher == "tetwild" else options.mesher,
                 cache_dir=options.cache_dir,
                 cache=options.cache_dir is not None,
                 progress=False,
