@@ -165,34 +165,6 @@ def test_import_loads_nothing_heavy() -> None:
     assert printed(code) == ["[]"]
 
 
-def test_nothing_searches_for_garbage_while_names_are_loaded() -> None:
-    """Each search takes a tenth of a second with torch there; afterwards it is as it was before."""
-    code = (
-        "import gc, sys, torch, torch_modal as tm;"
-        "known, searches, during = len(sys.modules), [], [];"
-        "gc.callbacks.append(lambda phase, info: searches.append(len(sys.modules)));"
-        "gc.set_threshold(50);"
-        "tm.subdivide;"
-        "during = [n for n in searches if known < n < len(sys.modules)];"
-        "on = gc.isenabled(); gc.disable(); tm.ShapeDataset;"
-        "print(len(sys.modules) > known + 50, during, on, gc.isenabled())"
-    )
-    assert printed(code) == ["True", "[]", "True", "False"]
-
-
-def test_what_was_loaded_is_old() -> None:
-    """The next search, of what is young, does not go through all of it; what callers have frozen stays so."""
-    code = (
-        "import gc, torch, torch_modal as tm;"
-        "old = len(gc.get_objects(2));"
-        "tm.subdivide;"
-        "young = len(gc.get_objects(0)) + len(gc.get_objects(1));"
-        "print(len(gc.get_objects(2)) > old + 10_000, young < 2_000);"
-        "gc.freeze(); frozen = gc.get_freeze_count(); tm.ShapeDataset; print(gc.get_freeze_count() > 0.9 * frozen)"
-    )
-    assert printed(code) == ["True", "True", "True"]
-
-
 def test_public_names_are_there() -> None:
     import torch_modal
 
