@@ -13,7 +13,7 @@ from conftest import Shapes
 from safetensors.torch import load_file, save_file
 
 import torch_modal as tm
-from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, open_set, write_set
+from torch_modal.data.stored import SET_FILE, open_set, write_set
 from torch_modal.data.table import read_table, write_table
 
 N_IN_NUMBERS = 60
@@ -71,10 +71,10 @@ def made(kind: str, bars: Shapes, folder: Path, monkeypatch: pytest.MonkeyPatch)
         found = [stored.names, stored.times, stored.cyclic, len(stored), stored.n_vertices]
         return [*found, stored.keyframes, stored.faces, *(part for basis in stored.bases for part in parts_of(basis))]
 
-    return Case(folder / "set" / (KEYFRAMES_FILE if kind == "keyframes of a set" else BASES_FILE), load_set)
+    return Case(folder / "set" / SET_FILE, load_set)
 
 
-KINDS = ("basis", "exact", "compact", "table", "keyframes of a set", "bases of a set")
+KINDS = ("basis", "exact", "compact", "table", "set")
 
 
 def everything(case: Case) -> list[Any]:

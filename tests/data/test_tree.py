@@ -1,12 +1,12 @@
-"""What counts as a set of key-frames in a folder tree, in which order, and where its bases go."""
+"""Key-frame sets in a folder tree: their folders, their order."""
 
 import os
 from pathlib import Path
 
 import pytest
 
-from torch_modal.data.batch.record import CRASHED, DONE, Record, inputs_key, read_record
-from torch_modal.data.batch.tree import find_keyframe_sets, mesh_files, natural, places, printable
+from torch_modal.data.precompute_set import inputs_key
+from torch_modal.data.tree import find_keyframe_sets, mesh_files, natural
 
 
 def make(root: Path, *files: str) -> Path:
@@ -20,9 +20,9 @@ def make(root: Path, *files: str) -> Path:
 def test_sets_are_folders_with_two_meshes_or_more(tmp_path: Path) -> None:
     make(tmp_path, "a/1.obj", "a/2.OBJ", "b/c/x.ply", "b/c/y.ply", "b/c/z.ply", "b/c/notes.txt", "b/c/skin.mtl")
     make(tmp_path, "single/one.off", "texts/readme.txt", "a/texture.png", "loose.stl", "mixed/1.glb", "mixed/2.stl")
-    tree = find_keyframe_sets(tmp_path)
-    assert tree.sets == ["a", "b/c", "mixed"]  # that STL is refused is said when the set is worked on
-    assert tree.left_out == {
+    sets, left_out = find_keyframe_sets(tmp_path)
+    assert sets == ["a", "b/c", "mixed"]  # that STL is refused is said when the set is worked on
+    assert left_out == {
         ".": "holds one mesh only, loose.stl; a set needs two or more",
         "single": "holds one mesh only, one.off; a set needs two or more",
     }
@@ -31,15 +31,14 @@ def test_sets_are_folders_with_two_meshes_or_more(tmp_path: Path) -> None:
 def test_hidden_files_folders_and_the_output_are_passed_over(tmp_path: Path) -> None:
     make(tmp_path, "a/1.obj", "a/2.obj", "a/._1.obj", ".trash/1.obj", ".trash/2.obj", "b/1.obj", "b/.2.obj")
     make(tmp_path, "out/c/1.obj", "out/c/2.obj")
-    tree = find_keyframe_sets(tmp_path, skip=tmp_path / "b" / ".." / "out")
-    assert tree.sets == ["a"]
-    assert list(tree.left_out) == ["b"]
+    sets, left_out = find_keyframe_sets(tmp_path, skip=tmp_path / "b" / ".." / "out")
+    assert sets == ["a"] and list(left_out) == ["b"]
     assert [file.name for file in mesh_files(tmp_path / "a")] == ["1.obj", "2.obj"]
 
 
 def test_order_is_natural(tmp_path: Path) -> None:
     make(tmp_path, "s10/k.obj", "s10/l.obj", "s9/frame-10.obj", "s9/frame-9.obj", "s9/Frame-9b.obj", "s9/frame.obj")
-    assert find_keyframe_sets(tmp_path).sets == ["s9", "s10"]
+    assert find_keyframe_sets(tmp_path)[0] == ["s9", "s10"]
     names = [file.name for file in mesh_files(tmp_path / "s9")]
     assert names == ["frame-9.obj", "Frame-9b.obj", "frame-10.obj", "frame.obj"]
     assert sorted(["b", "a/2", "a10", "a/10", "a", "a2"], key=natural) == ["a", "a/2", "a/10", "a2", "a10", "b"]
@@ -51,38 +50,28 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     (tmp_path / "root" / "linked").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     (tmp_path / "root" / "a" / "up").symlink_to(tmp_path / "root", target_is_directory=True)
     (tmp_path / "root" / "a" / "gone.obj").symlink_to(tmp_path / "nowhere.obj")
-    assert find_keyframe_sets(tmp_path / "root").sets == ["a", "linked"]
+    assert find_keyframe_sets(tmp_path / "root")[0] == ["a", "linked"]
     assert len(mesh_files(tmp_path / "root" / "a")) == 2
 
 
-def test_folders_that_cannot_be_read_are_told(tmp_path: Path) -> None:
+def test_folders_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     make(tmp_path, "a/1.obj", "a/2.obj", "locked/1.obj")
     (tmp_path / "locked").chmod(0)
     if not os.access(tmp_path / "locked", os.R_OK):  # root may read anything
-        assert find_keyframe_sets(tmp_path).left_out == {"locked": "cannot be read: Permission denied"}
+        assert find_keyframe_sets(tmp_path)[1] == {"locked": "cannot be read: Permission denied"}
     (tmp_path / "locked").chmod(0o700)
     with pytest.raises(FileNotFoundError):
         find_keyframe_sets(tmp_path / "missing")
 
 
-def test_places_mirror_the_tree(tmp_path: Path) -> None:
-    root = tmp_path / "shapes"
-    assert places(["a", "b/c"], root) == {"a": "a", "b/c": "b/c"}
-    # The output folder has the report in it; a folder with sets below it cannot be replaced as a whole.
-    assert places([".", "a", "a/b/c", "ab"], root) == {".": "shapes", "a": "a/a", "a/b/c": "a/b/c", "ab": "ab"}
-    assert places(["."], Path("/")) == {".": "root"}
-    taken = places([".", "a", "a/a", "a/a_/b", "shapes/b"], root)
-    assert taken == {".": "shapes_", "a": "a/a__", "a/a": "a/a", "a/a_/b": "a/a_/b", "shapes/b": "shapes/b"}
-    assert len(set(taken.values())) == 5
-
-
 def test_key_depends_on_names_and_content(tmp_path: Path) -> None:
-    make(tmp_path, "s/1.obj", "s/2.obj", "s/notes.txt")
+    make(tmp_path, "s/1.obj", "s/2.obj", "s/notes.txt", "s/times.txt")
     first = inputs_key(mesh_files(tmp_path / "s"))
     (tmp_path / "s" / "notes.txt").write_text("says nothing about the shape")
+    (tmp_path / "s" / "times.txt").write_text("nor does this, unless it is a sequence")
     os.utime(tmp_path / "s" / "1.obj", (0, 0))
     assert inputs_key(mesh_files(tmp_path / "s")) == first
-    seen = {first}
+    seen = {first, inputs_key(mesh_files(tmp_path / "s"), sequence=True)}
     for change in (
         lambda: (tmp_path / "s" / "1.obj").write_text("v 0 0 0"),
         lambda: (tmp_path / "s" / "2.obj").rename(tmp_path / "s" / "3.obj"),
@@ -91,28 +80,4 @@ def test_key_depends_on_names_and_content(tmp_path: Path) -> None:
     ):
         change()
         seen.add(inputs_key(mesh_files(tmp_path / "s")))
-    assert len(seen) == 5
-
-
-def test_record_comes_back_and_a_damaged_one_is_none(tmp_path: Path) -> None:
-    record = Record("a\udcff/ü\n", CRASHED, "why", "place", 1.5, 3, 90, ["1.obj"], inputs="ab")
-    file = tmp_path / "record.json"
-    file.write_bytes(record.line())
-    assert read_record(file) == record
-    assert read_record(tmp_path / "missing") is None
-    for damaged in ("", "[]", "{", '{"status": "done"}', '{"set": "a", "status": "done", "colour": 1}'):
-        file.write_text(damaged)
-        assert read_record(file) is None
-
-
-def test_what_changed_names_the_options() -> None:
-    old = Record("a", DONE, inputs="1", parameters={"n_modes": 30, "mesher": "auto"})
-    assert old.what_changed(Record("a", inputs="1", parameters={"mesher": "auto", "n_modes": 30})) == ""
-    new = Record("a", inputs="2", parameters={"mesher": "auto", "n_modes": 40})
-    assert old.what_changed(new) == "its files changed, n_modes changed from 30 to 40"
-
-
-def test_names_that_no_terminal_shows() -> None:
-    assert printable("a/ü") == "a/ü"
-    assert printable("a\nb") == "'a\\nb'"
-    assert printable("\udcff") == "\\udcff"
+    assert len(seen) == 6
