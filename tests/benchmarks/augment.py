@@ -43,9 +43,9 @@ WORKERS, BATCH, ROUNDS = 2, 16, 3
 class RandomLinear(tm.RandomInBetween):
     """What all is compared with: linear interpolation, everything else being the same."""
 
-    def moved(self, pair: Any, t: Tensor) -> Tensor:
-        """Straight."""
-        return torch.lerp(pair.x_a, pair.x_b, t[:, None, None])
+    def shapes(self, batch: tm.ShapeBatch, partners: tm.ShapeBatch, t: Tensor, space: tm.ShapeSpace) -> Tensor:
+        """Linear mixtures."""
+        return torch.lerp(batch.shapes, partners.shapes, t[:, None, None])
 
 
 class Morphomatics(Dataset[dict[str, Any]]):

@@ -13,8 +13,8 @@ from conftest import Shapes
 from safetensors.torch import load_file, save_file
 
 import torch_modal as tm
+from torch_modal.data.in_betweens import read_table, write_table
 from torch_modal.data.stored import SET_FILE, open_set, write_set
-from torch_modal.data.table import read_table, write_table
 
 N_IN_NUMBERS = 60
 """Places among the numbers; beside all bytes of short headers."""
