@@ -2,10 +2,11 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from torch_modal.data.precompute_set import inputs_key
+from torch_modal.data.precompute_set import Options
 from torch_modal.data.tree import find_keyframe_sets, mesh_files, natural
 
 
@@ -64,14 +65,17 @@ def test_folders_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         find_keyframe_sets(tmp_path / "missing")
 
 
-def test_key_depends_on_names_and_content(tmp_path: Path) -> None:
+def test_key_depends_on_names_content_and_options(tmp_path: Path) -> None:
+    def key(**options: Any) -> str:
+        return Options(**options).key(mesh_files(tmp_path / "s"))
+
     make(tmp_path, "s/1.obj", "s/2.obj", "s/notes.txt", "s/times.txt")
-    first = inputs_key(mesh_files(tmp_path / "s"))
+    first = key()
     (tmp_path / "s" / "notes.txt").write_text("says nothing about the shape")
     (tmp_path / "s" / "times.txt").write_text("nor does this, unless it is a sequence")
     os.utime(tmp_path / "s" / "1.obj", (0, 0))
-    assert inputs_key(mesh_files(tmp_path / "s")) == first
-    seen = {first, inputs_key(mesh_files(tmp_path / "s"), sequence=True)}
+    assert key(timeout=5.0, retry=True, overwrite=True, cache_dir="x") == first
+    seen = {first, key(sequence=True), key(n_modes=40), key(quality="fine"), key(method="shell"), key(mesher="tetwild")}
     for change in (
         lambda: (tmp_path / "s" / "1.obj").write_text("v 0 0 0"),
         lambda: (tmp_path / "s" / "2.obj").rename(tmp_path / "s" / "3.obj"),
@@ -79,5 +83,5 @@ def test_key_depends_on_names_and_content(tmp_path: Path) -> None:
         lambda: (tmp_path / "s" / "4.bin").write_text("the vertices of 4.gltf"),
     ):
         change()
-        seen.add(inputs_key(mesh_files(tmp_path / "s")))
-    assert len(seen) == 6
+        seen.add(key())
+    assert len(seen) == 10

@@ -24,7 +24,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from torch_modal.data.stored import SET_FILE, read_note, write_set
 from torch_modal.data.tree import mesh_files
@@ -72,10 +71,24 @@ class Options:
     sequence: bool = False
     """Whether the key-frames of a set are a motion, in the order of their files."""
 
-    def parameters(self) -> dict[str, Any]:
-        """All that the result depends on besides the files."""
-        made = {"n_modes": self.n_modes, "method": self.method, "mesher": self.mesher, "sequence": self.sequence}
-        return {**made, "settings": asdict(QUALITIES[self.quality]), "algorithm": CACHE_VERSION}
+    def key(self, files: Sequence[Path]) -> str:
+        """Digest of all that the bases depend on: options, names and contents of the files, those beside them included.
+
+        Args:
+            files: The meshes of the set.
+
+        Raises:
+            OSError: A file cannot be read.
+        """
+        made = [self.n_modes, self.method, self.mesher, self.sequence, asdict(QUALITIES[self.quality]), CACHE_VERSION]
+        total = hashlib.sha256(json.dumps(made).encode())
+        beside = [files[0].parent / TIMES_FILE] if self.sequence else []
+        if any(file.suffix.lower() == ".gltf" for file in files):
+            beside += sorted(files[0].parent.glob("*.bin"))
+        for file in (*files, *filter(Path.is_file, beside)):
+            for part in (file.name.encode("utf-8", "surrogateescape"), file.read_bytes()):
+                total.update(hashlib.sha256(part).digest())
+        return total.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -88,26 +101,10 @@ class Record:
     """Why it failed, or why it was computed again."""
     warnings: Sequence[str] = ()
     seconds: float = 0.0
-    files: Sequence[str] = ()
-    """Names of the key-frames, in order."""
-    inputs: str = ""
-    """Digest of the files."""
-    parameters: dict[str, Any] | None = None
+    key: str = ""
+    """Digest of the files and options."""
     log: str = ""
     """End of the output of a process that failed."""
-
-    def to_json(self) -> str:
-        """The fields that are not empty."""
-        return json.dumps({name: value for name, value in asdict(self).items() if value})
-
-    def what_changed(self, new: "Record") -> str:
-        """Why a set must be computed again; empty if files and options are the same."""
-        reasons = [] if self.inputs == new.inputs else ["its files changed"]
-        before = self.parameters or {}
-        for name, now in (new.parameters or {}).items():
-            if before.get(name) != now:
-                reasons.append(f"{name} changed from {before.get(name)} to {now}")
-        return ", ".join(reasons)
 
 
 def read_record(folder: Path) -> Record | None:
@@ -116,27 +113,6 @@ def read_record(folder: Path) -> Record | None:
     with contextlib.suppress(OSError, ValueError, TypeError):
         return Record(**json.loads(failure.read_bytes() if failure.is_file() else read_note(folder)))
     return None
-
-
-def inputs_key(files: Sequence[Path], sequence: bool = False) -> str:
-    """SHA-256 of the names and the content of a set's files.
-
-    Args:
-        files: Its meshes, with which go the buffers beside glTF files.
-        sequence: Whether the file of times counts too, if there is one.
-
-    Raises:
-        OSError: A file cannot be read.
-    """
-    folder = files[0].parent
-    beside = [folder / TIMES_FILE] if sequence else []
-    if any(file.suffix.lower() == ".gltf" for file in files):
-        beside += sorted(folder.glob("*.bin"))
-    total = hashlib.sha256()
-    for file in (*files, *filter(Path.is_file, beside)):
-        for part in (file.name.encode("utf-8", "surrogateescape"), file.read_bytes()):
-            total.update(hashlib.sha256(part).digest())
-    return total.hexdigest()
 
 
 # ------------------------------------------------------------------------------------------------- in the command
@@ -162,26 +138,23 @@ def run_set(
         raise FileNotFoundError(f"{socket.gethostname()} has no folder {out}; all machines need the same folders")
     target = out / name
     try:
-        files = mesh_files(source / name)
-        inputs = inputs_key(files, options.sequence)
+        new = Record(key=options.key(mesh_files(source / name)))
     except OSError as error:
         return Record(FAILED, f"its files cannot be read: {error}"), True
-    new = Record(files=[file.name for file in files], inputs=inputs, parameters=options.parameters())
     if obstacle := _obstacle(target, options.overwrite):
         return replace(new, status=FAILED, reason=obstacle), True
     before = read_record(target)
-    if before is not None:
-        why = before.what_changed(new)
-        if not why and before.status == FAILED and options.retry:
-            why = f"tried again after: {before.reason}"
-        if not why:
-            return before, False
-        new = replace(new, reason=why)
+    if before is not None and before.key != new.key:
+        new = replace(new, reason="its files or options changed")
+    elif before is not None and before.status == FAILED and options.retry:
+        new = replace(new, reason=f"tried again after: {before.reason}")
+    elif before is not None:
+        return before, False
 
     started = time.monotonic()
     reason, log = _in_own_process(source / name, target, new, options, stop)
     found = read_record(target)
-    if found is not None and found.status == DONE and not found.what_changed(new):
+    if found is not None and found.status == DONE and found.key == new.key:
         return found, True  # by this process, or by another run meanwhile
     if reason is None:
         return new, True
@@ -189,7 +162,7 @@ def run_set(
     kept = [f"{target} still holds the bases of earlier files or options"] if (target / SET_FILE).exists() else []
     record = replace(new, status=FAILED, reason=reason, seconds=seconds, warnings=kept, log=log)
     with contextlib.suppress(OSError):  # then it is tried again next time
-        write_file(target / FAILURE_FILE, record.to_json().encode())
+        write_file(target / FAILURE_FILE, json.dumps(asdict(record)).encode())
     return record, True
 
 
@@ -300,13 +273,13 @@ def compute(source: Path, target: Path, record: Record, options: Options) -> Non
     started = time.monotonic()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        files = [source / name for name in record.files]
+        files = mesh_files(source)
         stem, n_files = Counter(file.stem for file in files).most_common(1)[0]
         if n_files > 1:
             raise MeshError(f"{n_files} files have the name {stem}; a shape must be there in one format only")
         keyframes, faces = load_keyframes(files)
         times = _times(source / TIMES_FILE, len(files)) if options.sequence else None
-        if inputs_key(files, options.sequence) != record.inputs:
+        if options.key(files) != record.key:
             raise RuntimeError("its files were written to while they were read; start again")
         bases = extract_bases(
             keyframes,
@@ -321,14 +294,11 @@ def compute(source: Path, target: Path, record: Record, options: Options) -> Non
             progress=False,
         )
     texts = (" ".join(str(one.message).split()) for one in caught if issubclass(one.category, UserWarning))
-    done = replace(
-        record,
-        status=DONE,
-        warnings=list(dict.fromkeys(texts)),
-        seconds=round(time.monotonic() - started, 2),
-    )
-    cyclic = times is not None and len(times) == len(files) + 1
-    write_set(target, keyframes, faces, bases, record.files, times=times, cyclic=cyclic, note=done.to_json())
+    seconds = round(time.monotonic() - started, 2)
+    done = replace(record, status=DONE, warnings=list(dict.fromkeys(texts)), seconds=seconds)
+    cyclic, note = times is not None and len(times) == len(files) + 1, json.dumps(asdict(done))
+    names = [file.name for file in files]
+    write_set(target, keyframes, faces, bases, names, times=times, cyclic=cyclic, note=note)
     (target / FAILURE_FILE).unlink(missing_ok=True)
 
 
