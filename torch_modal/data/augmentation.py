@@ -20,7 +20,7 @@ class ShapeBatch(NamedTuple):
     nearest: Tensor | None = None
     """Index of the key-frame whose modes a shape uses; None: the nearest one. On the CPU. *Shape:* ``(B,)``."""
     is_keyframe: Tensor | None = None
-    """Whether a shape equals that key-frame; None: no shape does. On the CPU. *Shape:* ``(B,)``, bool."""
+    """True for shapes that equal that key-frame; None: none does. On the CPU. *Shape:* ``(B,)``, bool."""
     vertex_labels: Tensor | None = None
     """*Shape:* ``(B, V, ...)``."""
     shape_labels: Tensor | None = None
@@ -96,7 +96,7 @@ class ShapeAugmentation(nn.Module):
         self.params: Parameters = {}
 
     uses_keyframes = True
-    """Whether the transform needs key-frames and modes."""
+    """True if the transform needs key-frames and modes."""
     shown: tuple[str, ...] = ()
     """Settings of a subclass that its ``repr`` shows."""
 

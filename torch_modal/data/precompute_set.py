@@ -69,7 +69,7 @@ class Options:
     retry: bool = False
     overwrite: bool = False
     sequence: bool = False
-    """Whether the key-frames of a set are a motion, in the order of their files."""
+    """True if the key-frames of a set are a motion, in the order of their files."""
 
     def key(self, files: Sequence[Path]) -> str:
         """Digest of all that the bases depend on: options, names and contents of the files, those beside them included.
@@ -224,7 +224,7 @@ def _in_own_process(
 
 
 def _wait(process: subprocess.Popen[bytes], end: float, stop: threading.Event | None) -> bool | None:
-    """Whether a process ended before a time; None if it was stopped."""
+    """Wait for a process: True if it ended before a time, False if not, None if it was stopped."""
     while stop is None or not stop.is_set():
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(min(POLL, max(end - time.monotonic(), 0.0)))

@@ -80,7 +80,7 @@ class StoredSet:
 
     @property
     def cyclic(self) -> bool:
-        """Whether the key-frames are a motion whose last leads on to the first."""
+        """True if the key-frames are a motion whose last leads on to the first."""
         return self.times is not None and len(self.times) == len(self) + 1
 
     def __reduce__(self) -> tuple[Any, ...]:
