@@ -545,7 +545,7 @@ def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
 
 def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
     space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
-    assert int(far(space.table(0, 1).double(), hand).sum()) == 0
+    assert int(far(space.in_betweens.table(0, 1).double(), hand).sum()) == 0
 
 
 @pytest.mark.slow
