@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from torch_modal.data.motion import Motion
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.io.cache import CacheWarning
-from torch_modal.io.content import ContentError, code_digest, content_digest
+from torch_modal.io.cache import ContentError, code_digest, content_digest
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.path import Path as MotionPath
@@ -169,26 +170,30 @@ class InBetweens:
 
     def _path(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
         """Shapes between two key-frames: along the motion if they follow each other in it, else of the pair."""
-        # The shapes depend on the neighbours only; a path of all key-frames would be computed for each table.
         span = None if self.motion is None else self.motion.span(i, j)
-        places, times = ([i, j], None) if span is None else span
-        shapes = torch.stack([self.bases[place].reference for place in places]).to(like)
+        bases = [self.bases[i], self.bases[j]] if span is None else list(self.bases)
+        shapes = torch.stack([basis.reference for basis in bases]).to(like)
         if span is None and not self.objective.contact:
             return partial(self._layer(i, j, like).solve, *shapes)
         # A path separates contacts the same way at all times, so that tables are smooth.
-        bases = [self.bases[place] for place in places]
-        path = MotionPath(bases, self.faces, times, objective=self.objective, solver=self.solver).to(like)
-        return partial(path.solve, shapes)
+        given: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
+        if span is None or self.motion is None:
+            return partial(MotionPath(bases, self.faces, **given).to(like).solve, shapes)
+        key, times, cyclic, (start, end) = (like.dtype, like.device), self.motion.times, self.motion.cyclic, span
+        path = self._paths.get(key, lambda: MotionPath(bases, self.faces, times, cyclic, **given).to(like))
+        return lambda t: path.solve(shapes, start + t.double() * (end - start))
 
     def _key(self, i: int, j: int) -> dict[str, str] | None:
         """Digest of all inputs of a table: bases, times, faces, settings and code; None, with a warning, if unknown."""
         span = None if self.motion is None else self.motion.span(i, j)
-        bases = [self.bases[place] for place in (span[0] if span else (i, j))]
+        bases = self.bases if span else [self.bases[place] for place in (i, j)]
         tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
         code = __version__, str(torch.__version__), code_digest()
         settings = self.objective, self.solver
         try:
-            content = content_digest([*code, tensors, self.faces, span and span[1], settings])
+            content = content_digest(
+                [*code, tensors, self.faces, span and (*span, self.motion and self.motion.times), settings]
+            )
         except ContentError as error:
             warnings.warn(
                 f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "

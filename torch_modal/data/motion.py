@@ -42,20 +42,18 @@ class Motion:
             raise ValueError(f"cyclic key-frames are a motion and need their times: range({n_keyframes + 1}) if even")
         return None if times is None else cls(times, n_keyframes, cyclic)
 
-    def span(self, i: int, j: int) -> tuple[list[int], Tensor] | None:
-        """The interval between two successive key-frames, in either direction, with their neighbours.
+    def span(self, i: int, j: int) -> tuple[float, float] | None:
+        """The times of two successive key-frames, in either direction.
 
         Returns:
-            Indices of the three or four key-frames, in the order of time, and their times: 0 at ``i``, 1 at ``j``. None
-            if ``i`` and ``j`` are not successive, or have no neighbours.
+            The times of ``i`` and of ``j``; in a cycle, those before the first and after the last go on. None if they
+            are not successive, or have no neighbours.
         """
         n, back = self.n_keyframes, -1 % self.n_keyframes if self.cyclic else -1
         step = (j - i) % n if self.cyclic else j - i
         if n < 3 or step not in (1, back):
             return None
         first = i if step == 1 else j
-        places = [place for place in range(first - 1, first + 3) if self.cyclic or 0 <= place < n]
         period = self.times[-1] - self.times[0]
-        start, end, *when = (self.times[place % n] + place // n * period for place in (first, first + 1, *places))
-        keyframes, times = [place % n for place in places], (torch.stack(when) - start) / (end - start)
-        return (keyframes, times) if step == 1 else (keyframes[::-1], 1 - times.flip(0))
+        start, end = (float(self.times[place % n] + place // n * period) for place in (first, first + 1))
+        return (start, end) if step == 1 else (end, start)
