@@ -13,7 +13,7 @@ from torch_modal.backends.torch.rests import Rests
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactSearch, refuse_transforms
 from torch_modal.contact.modal import ModalModel
-from torch_modal.contact.separate import Trajectory, separate, through
+from torch_modal.contact.separate import Timeline, separate, through
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.inbetween.between import Batch, Between
 from torch_modal.inbetween.samples import InBetweenResult, Samples
@@ -127,7 +127,7 @@ def push_apart(member: Between, samples: Samples, shapes: Tensor) -> Displacemen
     rotations = placed.placed.rotation.mT @ frame.motion(placed, t).rotation
     limit = AccelerationLimit(seen, rotations, (samples.before is not None, samples.after is not None))
     search = _search(member, pair, 0, len(t))
-    found = separate(start, _steps(member, rests), search, Trajectory(t, limit, model))
+    found = separate(start, _steps(member, rests), search, Timeline(t, limit, model))
     return Displacement(None if found.x is start else found.x - start, t, found.n_before, found.n_crossing)
 
 
