@@ -80,7 +80,7 @@ def tensors_of(value: Any, seen: set[int]) -> Iterator[Tensor]:
     elif isinstance(value, dict | list | tuple):
         for part in list(value.values()) if isinstance(value, dict) else value:
             yield from tensors_of(part, seen)
-    elif type(value).__module__.startswith(("torch_modal", "every_layer")) and hasattr(value, "__dict__"):
+    elif type(value).__module__.startswith(("torch_modal", "every_layer", "terms")) and hasattr(value, "__dict__"):
         yield from tensors_of(vars(value), seen)
 
 
