@@ -139,10 +139,7 @@ class TestValues:
     def test_where_the_blend_is_far_worse_than_straight_lines_they_are_returned(
         self, bars: Shapes, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        layer, start = (
-            InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, max_steps=n))
-            for n in (80, 0)
-        )
+        layer, start = (InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, max_steps=n)) for n in (80, 0))
         blend = type(layer.core.space.blend)
         monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: straight)
         straight = start.solve(*bars.keyframes[1:], 0.4)

@@ -15,8 +15,7 @@ from torch_modal.autograd import Recent
 from torch_modal.data.motion import Motion
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Solver
-from torch_modal.io.cache import CacheWarning
-from torch_modal.io.cache import ContentError, code_digest, content_digest
+from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.path import Path as MotionPath
