@@ -75,7 +75,7 @@ def test_key_depends_on_names_content_and_options(tmp_path: Path) -> None:
     (tmp_path / "s" / "times.txt").write_text("nor does this, unless it is a sequence")
     os.utime(tmp_path / "s" / "1.obj", (0, 0))
     assert key(timeout=5.0, retry=True, overwrite=True, cache_dir="x") == first
-    seen = {first, key(sequence=True), key(n_modes=40), key(quality="fine"), key(method="shell"), key(mesher="tetwild")}
+    seen = {first, key(sequence=True), key(n_modes=40), key(method="shell"), key(mesher="tetwild")}
     for change in (
         lambda: (tmp_path / "s" / "1.obj").write_text("v 0 0 0"),
         lambda: (tmp_path / "s" / "2.obj").rename(tmp_path / "s" / "3.obj"),

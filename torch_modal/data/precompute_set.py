@@ -61,7 +61,6 @@ class Options:
     n_modes: int = 30
     method: Method = "auto"
     mesher: str = "lattice"
-    quality: str = "fast"
     cache_dir: str | None = None
     """None: no cache."""
     timeout: float = 600.0
