@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.backends.torch.fine_steps import FurtherEnergy, relax, step_length
 from torch_modal.backends.warp.function import fused
-from torch_modal.backends.warp.launch import kernels, launch
+from torch_modal.backends.warp.launch import array, kernels, launch
 from torch_modal.backends.warp.shell import ShellPoint, ShellReference, WarpShell
 
 
@@ -96,27 +96,28 @@ class WarpSteps(WarpShell):
             keep: Whether each iteration has memory of its own.
             beside: Further products with directions. *Shape of each:* ``(B, V, 3) -> (B, V, 3)``.
         """
-        module, (b, n) = kernels("steps"), x.shape[:2]
-        kept = x.new_empty(3, n_products if keep else 1, *x.shape)
-        residuals, directions, products = (part.unbind() if keep else [part[0]] * n_products for part in kept)
-        solution, scalars = torch.empty_like(x), x.new_zeros(n_products + 1, b, 3)
-        given = [at.gradient, at.normal, at.moment, at.diagonal, n]
-        launch(module.begin, (b, n), [*given, residuals[0], directions[0], solution, products[0], scalars[0]])
+        module, (b, n), n_kept = kernels("steps"), x.shape[:2], n_products if keep else 1
+        kept, scalars, solution = (
+            x.new_empty(3, n_kept, *x.shape),
+            x.new_zeros(n_products + 1, b, 3),
+            torch.empty_like(x),
+        )
+        # Described once for all launches.
+        normal, fields, numbers, result = (array(each, module.vec3) for each in (at.normal, kept, scalars, solution))
+        inverse, factors = array(at.diagonal, module.symmetric), array(at.factors, module.linearised)
+        stiffness, results = array(to.stiffness, module.real), [fields, numbers, result]
+        launch(module.begin, (b, n), [at.gradient, normal, at.moment, inverse, n_kept, n, *results], device=x.device)
         for k in range(n_products):
-            direction, product = directions[k], products[k]
-            given = [self.constants, direction, at.factors, product, scalars[k]]
-            launch(kernels("shell").product, (b, self.n_edges), given)
+            first = k % n_kept * b * n
+            given = [self.constants, fields, n_kept * b * n + first, factors, fields, 2 * n_kept * b * n + first]
+            launch(kernels("shell").product, (b, self.n_edges), [*given, numbers, k * b], device=x.device)
             for one in beside:
-                pushed = one(direction)
-                product.add_(pushed)
-                scalars[k, :, 2].add_((pushed * direction).sum((1, 2)))
-            last = k == n_products - 1
-            given = [direction, product, at.normal, at.diagonal, to.stiffness, scalars[k], n, residuals[k], solution]
-            following = [None, None] if last else [residuals[k + 1], scalars[k + 1]]
-            launch(module.advance, (b, n), [*given, *following])
-            if not last:
-                given = [residuals[k + 1], at.diagonal, at.normal, scalars[k], n, direction]
-                launch(module.turn, (b, n), [*given, scalars[k + 1], directions[k + 1], products[k + 1]])
+                pushed = one(kept[1, k % n_kept])
+                kept[2, k % n_kept].add_(pushed)
+                scalars[k, :, 2].add_((pushed * kept[1, k % n_kept]).sum((1, 2)))
+            launch(module.advance, (b, n), [normal, inverse, stiffness, k, n_kept, n, *results], device=x.device)
+            if k < n_products - 1:
+                launch(module.turn, (b, n), [normal, inverse, b, k, n_kept, n, *results[:2]], device=x.device)
         return _Iterations(solution, kept, scalars)
 
     def step_back(self, step: "_Taken", to: ShellReference, to_reached: Tensor, to_reference: ShellReference) -> Tensor:
@@ -129,29 +130,26 @@ class WarpSteps(WarpShell):
             to_reference: Is added to.
         """
         x, at, _, (_, kept, scalars) = step
-        module, (b, n) = kernels("steps"), x.shape[:2]
-        residuals, directions, products = (part.unbind() for part in kept)
-        n_products, fields = len(directions), torch.empty_like(kept[0])
-        to_residual, to_direction, to_normal = torch.zeros(3, *x.shape, dtype=x.dtype, device=x.device)
+        module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
+        pushed, to_residual, to_direction, to_normal = torch.empty_like(kept[0]), *x.new_zeros(3, *x.shape)
         to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
-        common = [at.normal, to.stiffness]
-        launch(module.inner, (b, n), [to_reached, directions[-1], n, received[-1]])
+        launch(module.inner, (b, n), [to_reached, kept[1, -1], n, received[-1]])
+        vectors = at.normal, kept, scalars, to_reached, pushed, to_residual, to_direction, to_normal, received
+        normal, fields, numbers, *others = (array(each, module.vec3) for each in vectors)
+        to_end, force, residual, direction, to_volume, to_numbers = others
+        inverse, factors = array(at.diagonal, module.symmetric), array(at.factors, module.linearised)
+        stiffness, blocks = array(to.stiffness, module.real), array(to_diagonal, module.symmetric)
         for k in reversed(range(n_products)):
-            last = k == n_products - 1
-            following = None if last else scalars[k + 1]
-            previous = [None] * 2 if k == 0 else [directions[k - 1], products[k - 1]]
-            given = [to_reached, to_residual, directions[k], products[k], *common, scalars[k], following, n]
-            launch(module.back_to_direction, (b, n), [*given, fields[k], to_direction, received[k]])
-            given = [self.constants, fields[k], at.factors, to_direction, None]
-            launch(kernels("shell").product, (b, self.n_edges), given)
-            given = [directions[k], previous[0], fields[k], *common, scalars[k], received[k], n]
-            launch(module.back_to_normal, (b, n), [*given, to_direction, to_normal])
-            given = [to_reached, to_direction, residuals[k], at.diagonal, *previous, *common]
-            given += [scalars[k - 1] if k else None, scalars[k], following]
-            given += [received[k], None if last else received[k + 1], n, to_residual, to_diagonal]
-            launch(module.back_to_residual, (b, n), [*given, received[k - 1] if k else None])
+            common = [normal, stiffness, k, n_products, n, fields, numbers]
+            given = [*common, to_end, residual, force, direction, to_numbers]
+            launch(module.back_to_direction, (b, n), given, device=x.device)
+            given = [self.constants, force, k * b * n, factors, direction, 0, None, 0]
+            launch(kernels("shell").product, (b, self.n_edges), given, device=x.device)
+            launch(module.back_to_normal, (b, n), [*common, force, direction, to_volume, to_numbers], device=x.device)
+            given = [*common, inverse, to_end, direction, residual, blocks, to_numbers]
+            launch(module.back_to_residual, (b, n), given, device=x.device)
         to_factors = torch.empty_like(at.factors)
-        given = [self.constants, kept[1], fields, at.factors, b, n_products, to_factors]
+        given = [self.constants, fields, force, factors, b, n_products, to_factors]
         launch(module.back_to_factors, (b, self.n_edges), given)
         to_x = to_reached.clone()
         # The right side is the gradient's opposite.

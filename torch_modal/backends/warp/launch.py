@@ -117,25 +117,36 @@ def _device(device: torch.device) -> Any:
 
 
 @cache
-def _entries(kernel: Any) -> list[tuple[Any, tuple[int, ...]]]:
-    """Type and shape of the entries of each argument; nothing for one that is no array."""
-    types = inspect.get_annotations(kernel.func).values()
-    entries = [getattr(one, "dtype", None) for one in types]
+def _entries(kernel: Any) -> list[Any]:
+    """Type of the entries of each argument; None for one that is no array."""
+    return [getattr(one, "dtype", None) for one in inspect.get_annotations(kernel.func).values()]
+
+
+@cache
+def _shape(entry: Any) -> tuple[int, ...]:
+    """Shape of an entry of an array."""
     import warp as wp
 
-    shapes = (() if one is None else wp.zeros(1, dtype=one, device="cpu").numpy().shape[1:] for one in entries)
-    return list(zip(entries, shapes, strict=True))
+    return tuple(wp.zeros(1, dtype=entry, device="cpu").numpy().shape[1:])
 
 
-def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Sequence[Any] = ()) -> None:
+def launch(
+    kernel: Any,
+    dim: tuple[int, ...],
+    given: Sequence[Any],
+    adjoints: Sequence[Any] = (),
+    device: torch.device | None = None,
+) -> None:
     """Run a kernel, or its adjoint, on the tensors' device and torch's stream.
 
     Args:
         kernel: Of :func:`kernels`.
         dim: Number of samples; and of what each has, where a sample may have several threads, whose number is then the
             kernel's last argument. Each takes the first of what is left, then every so many-th. On a CPU there is one.
-        given: Its arguments but for that: :class:`Constants`, contiguous tensors, None for no array, and integers.
+        given: Its arguments but for that: :class:`Constants`, contiguous tensors or :func:`array` of them, None for no
+            array, and integers.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
+        device: That of the tensors; by default that of the first one.
 
     Raises:
         RuntimeError: A tensor is not contiguous, or of another type than the kernel's.
@@ -145,42 +156,38 @@ def launch(kernel: Any, dim: tuple[int, ...], given: Sequence[Any], adjoints: Se
 
     if 0 in dim:
         return
-    device = next(x.device for x in given if isinstance(x, Tensor))
+    if device is None:
+        device = next(x.device for x in given if isinstance(x, Tensor))
     n_threads = dim[0]
     if len(dim) == 2:
         given = [*given, 1 if device.type == "cpu" else dim[1]]
         n_threads *= given[-1]
-    _require_counted(n_threads, f"{n_threads} threads")
+    if n_threads > MOST_ENTRIES:
+        raise ValueError(f"{n_threads} threads are more than a kernel counts, {MOST_ENTRIES}: pass fewer samples")
     given = [x.on(device) if isinstance(x, Constants) else x for x in given]
     entries = _entries(kernel)
-    arguments = [_argument(x, *entry) for x, entry in zip(given, entries, strict=True)]
+    arguments = [array(x, entry) if isinstance(x, Tensor) else x for x, entry in zip(given, entries, strict=True)]
     back: list[Any] = []
     if adjoints:  # structs and numbers, which have no gradients, stand for themselves
         own = zip(given, [*adjoints, *[None] * (len(given) - len(adjoints))], entries, strict=True)
-        back = [_argument(y, *entry) if entry[0] or x is None else x for x, y, entry in own]
-    where = {"device": _device(device)} | ({} if device.type == "cpu" else {"stream": _stream(device)})
-    wp.launch(kernel, n_threads, arguments, adj_inputs=back, adjoint=bool(back), **where)
+        back = [(array(y, entry) if isinstance(y, Tensor) else None) if entry else x for x, y, entry in own]
+    stream = None if device.type == "cpu" else wp.stream_from_torch(torch.cuda.current_stream(device))
+    wp.launch(kernel, n_threads, arguments, (), back, (), _device(device), stream, bool(back))
 
 
-def _stream(device: torch.device) -> Any:
-    """Torch's own, of a GPU."""
+def array(x: Tensor, entry: Any) -> Any:
+    """Warp's description of a tensor. It holds the tensor, and may serve several launches.
+
+    Args:
+        x: The tensor, contiguous.
+        entry: Type of the entries of the array.
+    """
     import warp as wp
 
-    return wp.stream_from_torch(torch.cuda.current_stream(device))
-
-
-def _argument(value: Any, entry: Any, shape: tuple[int, ...]) -> Any:
-    """A tensor as Warp's description of an array; all else as it is."""
-    import warp as wp
-
-    if not isinstance(value, Tensor):
-        return value
-    rows = value.view(-1, *shape)
-    _require_counted(len(rows), f"a tensor of shape {tuple(value.shape)}, {len(rows)} entries")
+    rows = x.view(-1, *_shape(entry))
+    if rows.shape[0] > MOST_ENTRIES:
+        raise ValueError(
+            f"a tensor of shape {tuple(x.shape)} has {rows.shape[0]} entries, and a kernel counts to {MOST_ENTRIES}: "
+            "pass fewer samples at a time"
+        )
     return wp.from_torch(rows, dtype=entry, requires_grad=False, return_ctype=True)
-
-
-def _require_counted(n: int, what: str) -> None:
-    """Raise where a kernel could not count so far."""
-    if n > MOST_ENTRIES:
-        raise ValueError(f"{what}: a kernel counts to {MOST_ENTRIES}; pass fewer samples at a time")

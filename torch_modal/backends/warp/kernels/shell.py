@@ -121,15 +121,17 @@ def merge(
     for k in range(i - s * threads, mesh.record.shape[0], threads):
         at = place(s * mesh.record.shape[0], k)
         w = sums[at]
-        found = rested()
         # Weights below zero may outweigh the others: then there is no minimum, and no weight.
+        weight = real(0.0)
+        length = real(0.0)
         if w[0] > real(0.0):
+            weight = w[0]
             length = w[1] / w[0]
-            found += rested(w[0], length, real(0.0), real(0.0), real(0.0), real(0.0), real(0.0))
             left += w[2] - w[1] * length
+        counts = real(0.0)
         if w[3] > real(0.0):
-            found += rested(real(0.0), real(0.0), w[3], w[4], w[5], w[6], w[7])
-        out[at] = found
+            counts = real(1.0)
+        out[at] = rested(weight, length, counts * w[3], counts * w[4], counts * w[5], counts * w[6], counts * w[7])
     if constant:
         wp.atomic_add(constant, s, HALF * left)
 
@@ -271,42 +273,48 @@ def linearise(
 @wp.kernel(enable_backward=False)
 def product(
     mesh: Mesh,
-    field: wp.array(dtype=vec3),
+    fields: wp.array(dtype=vec3),
+    start: int,
     factors: wp.array(dtype=linearised),
     out: wp.array(dtype=vec3),
+    out_start: int,
     scalars: wp.array(dtype=vec3),
+    first: int,
     threads: int,
 ):
-    """The convex Hessian times a field, and the field times that, the third of the scalars, where there are some."""
+    """The convex Hessian times a field, and the field times that, the third of the scalars, where there are some.
+
+    Fields, results and scalars begin at the given places of their arrays.
+    """
     i = wp.tid()
     s = i // threads
-    v = s * mesh.n_vertices
+    v = start + s * mesh.n_vertices
+    to = out_start + s * mesh.n_vertices
     total = real(0.0)
     for k in range(i - s * threads, mesh.record.shape[0], threads):
         q = mesh.record[place(k, 0)]
         f = factors[place(s * mesh.record.shape[0], k)]
-        q0 = place(v, q[0])
-        q1 = place(v, q[1])
-        origin = field[q0]
-        e = field[q1] - origin
+        q0 = place(to, q[0])
+        q1 = place(to, q[1])
+        origin = fields[place(v, q[0])]
+        e = fields[place(v, q[1])] - origin
         unit = vec3(f[0], f[1], f[2])
         to_j = f[3] * e + (f[4] * wp.dot(unit, e)) * unit
         total += wp.dot(to_j, e)
         if q[2] >= 0:
-            q2 = place(v, q[2])
-            q3 = place(v, q[3])
             ge = vec3(f[5], f[6], f[7])
             ga = vec3(f[8], f[9], f[10])
             gb = vec3(f[11], f[12], f[13])
-            change = wp.dot(ge, e) + wp.dot(ga, field[q2] - origin) + wp.dot(gb, field[q3] - origin)
+            change = wp.dot(ge, e) + wp.dot(ga, fields[place(v, q[2])] - origin)
+            change += wp.dot(gb, fields[place(v, q[3])] - origin)
             moment = f[14] * change
             total += moment * change
             wp.atomic_add(out, q0, -moment * (ge + ga + gb) - to_j)
             wp.atomic_add(out, q1, moment * ge + to_j)
-            wp.atomic_add(out, q2, moment * ga)
-            wp.atomic_add(out, q3, moment * gb)
+            wp.atomic_add(out, place(to, q[2]), moment * ga)
+            wp.atomic_add(out, place(to, q[3]), moment * gb)
         else:
             wp.atomic_add(out, q0, -to_j)
             wp.atomic_add(out, q1, to_j)
     if scalars:
-        wp.atomic_add(scalars, s, vec3(real(0.0), real(0.0), total))
+        wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))

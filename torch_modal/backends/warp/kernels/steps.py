@@ -47,22 +47,32 @@ def form_of(own: vec3, stiffness: real):
     return own[2] + stiffness * own[1] * own[1]
 
 
+@wp.func
+def row(kind: int, k: int, n_kept: int, n_samples: int, s: int, n: int):
+    """Start of a sample's residual (0), direction (1) or product (2) of an iteration; all share one if one is kept."""
+    return ((kind * n_kept + k % n_kept) * n_samples + s) * n
+
+
 @wp.kernel(enable_backward=False)
 def begin(
     gradient: wp.array(dtype=vec3),
     normal: wp.array(dtype=vec3),
     moment: wp.array(dtype=real),
     diagonal: wp.array(dtype=symmetric),
+    n_kept: int,
     n: int,
-    residual: wp.array(dtype=vec3),
-    direction: wp.array(dtype=vec3),
-    solution: wp.array(dtype=vec3),
-    product: wp.array(dtype=vec3),
+    fields: wp.array(dtype=vec3),
     scalars: wp.array(dtype=vec3),
+    solution: wp.array(dtype=vec3),
     threads: int,
 ):
+    """The first residual and direction. The diagonal is inverted in place."""
     i = wp.tid()
     s = i // threads
+    n_samples = moment.shape[0]
+    residual = row(0, 0, n_kept, n_samples, s, n)
+    direction = row(1, 0, n_kept, n_samples, s, n)
+    product = row(2, 0, n_kept, n_samples, s, n)
     push = moment[s]
     found = vec3()
     for k in range(i - s * threads, n, threads):
@@ -71,71 +81,79 @@ def begin(
         inverse = inverted(diagonal[v])
         z = applied(inverse, r)
         diagonal[v] = inverse
-        residual[v] = r
-        direction[v] = z
+        fields[place(residual, k)] = r
+        fields[place(direction, k)] = z
+        fields[place(product, k)] = vec3()
         solution[v] = vec3()
-        product[v] = vec3()
         found += vec3(wp.dot(r, z), wp.dot(normal[v], z), real(0.0))
     wp.atomic_add(scalars, s, found)
 
 
 @wp.kernel(enable_backward=False)
 def advance(
-    direction: wp.array(dtype=vec3),
-    product: wp.array(dtype=vec3),
     normal: wp.array(dtype=vec3),
     inverse: wp.array(dtype=symmetric),
     stiffness: wp.array(dtype=real),
-    scalars: wp.array(dtype=vec3),
+    m: int,
+    n_kept: int,
     n: int,
-    residual: wp.array(dtype=vec3),
+    fields: wp.array(dtype=vec3),
+    scalars: wp.array(dtype=vec3),
     solution: wp.array(dtype=vec3),
-    next_residual: wp.array(dtype=vec3),
-    next_scalars: wp.array(dtype=vec3),
     threads: int,
 ):
-    """The solution after a direction, and the residual there, where there is an array for it."""
+    """The solution after a direction, and the residual there."""
     i = wp.tid()
     s = i // threads
-    push = stiffness[s] * scalars[s][1]
-    step = quotient(scalars[s][0], form_of(scalars[s], stiffness[s]))
+    n_samples = stiffness.shape[0]
+    residual = row(0, m, n_kept, n_samples, s, n)
+    direction = row(1, m, n_kept, n_samples, s, n)
+    product = row(2, m, n_kept, n_samples, s, n)
+    following = row(0, m + 1, n_kept, n_samples, s, n)
+    own = scalars[m * n_samples + s]
+    push = stiffness[s] * own[1]
+    step = quotient(own[0], form_of(own, stiffness[s]))
     size = real(0.0)
+    last = (m + 2) * n_samples == scalars.shape[0]
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        solution[v] = solution[v] + step * direction[v]
-        if next_residual:
-            r = residual[v] - step * (product[v] + push * normal[v])
-            next_residual[v] = r
+        solution[v] = solution[v] + step * fields[place(direction, k)]
+        if not last:
+            r = fields[place(residual, k)] - step * (fields[place(product, k)] + push * normal[v])
+            fields[place(following, k)] = r
             size += wp.dot(r, applied(inverse[v], r))
-    if next_residual:
-        wp.atomic_add(next_scalars, s, vec3(size, real(0.0), real(0.0)))
+    wp.atomic_add(scalars, (m + 1) * n_samples + s, vec3(size, real(0.0), real(0.0)))
 
 
 @wp.kernel(enable_backward=False)
 def turn(
-    residual: wp.array(dtype=vec3),
-    inverse: wp.array(dtype=symmetric),
     normal: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
+    inverse: wp.array(dtype=symmetric),
+    n_samples: int,
+    m: int,
+    n_kept: int,
     n: int,
-    direction: wp.array(dtype=vec3),
-    next_scalars: wp.array(dtype=vec3),
-    next_direction: wp.array(dtype=vec3),
-    product: wp.array(dtype=vec3),
+    fields: wp.array(dtype=vec3),
+    scalars: wp.array(dtype=vec3),
     threads: int,
 ):
     """The next direction; its product is set to zero."""
     i = wp.tid()
     s = i // threads
-    ratio = quotient(next_scalars[s][0], scalars[s][0])
+    residual = row(0, m + 1, n_kept, n_samples, s, n)
+    direction = row(1, m, n_kept, n_samples, s, n)
+    following = row(1, m + 1, n_kept, n_samples, s, n)
+    product = row(2, m + 1, n_kept, n_samples, s, n)
+    to = (m + 1) * n_samples + s
+    ratio = quotient(scalars[to][0], scalars[m * n_samples + s][0])
     swept = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        d = applied(inverse[v], residual[v]) + ratio * direction[v]
-        next_direction[v] = d
-        product[v] = vec3()
+        d = applied(inverse[v], fields[place(residual, k)]) + ratio * fields[place(direction, k)]
+        fields[place(following, k)] = d
+        fields[place(product, k)] = vec3()
         swept += wp.dot(normal[v], d)
-    wp.atomic_add(next_scalars, s, vec3(real(0.0), swept, real(0.0)))
+    wp.atomic_add(scalars, to, vec3(real(0.0), swept, real(0.0)))
 
 
 # ----------------------------------------------------------------------------------------------------- and back again
@@ -152,116 +170,126 @@ def inner(a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), n: int, found: wp.ar
 
 @wp.kernel(enable_backward=False)
 def back_to_direction(
-    to_solution: wp.array(dtype=vec3),
-    to_residual: wp.array(dtype=vec3),
-    direction: wp.array(dtype=vec3),
-    product: wp.array(dtype=vec3),
     normal: wp.array(dtype=vec3),
     stiffness: wp.array(dtype=real),
-    scalars: wp.array(dtype=vec3),
-    next_scalars: wp.array(dtype=vec3),
+    m: int,
+    n_products: int,
     n: int,
-    field: wp.array(dtype=vec3),
+    fields: wp.array(dtype=vec3),
+    scalars: wp.array(dtype=vec3),
+    to_solution: wp.array(dtype=vec3),
+    to_residual: wp.array(dtype=vec3),
+    pushed: wp.array(dtype=vec3),
     to_direction: wp.array(dtype=vec3),
     received: wp.array(dtype=vec3),
     threads: int,
 ):
-    """Gradient of a direction except through the Hessian, and the field to which the Hessian is applied for the rest.
+    """Gradient of a direction except through the Hessian, and the field that the Hessian is applied to for the rest.
 
-    Where there are no next scalars, there is no next direction either. What the length of the step, the ratio to the
-    previous direction and the swept volume receive are three numbers of each iteration.
+    After the last direction there is no next one. What the length of the step, the ratio to the previous direction and
+    the swept volume receive are three numbers of each iteration.
     """
     i = wp.tid()
     s = i // threads
-    push = stiffness[s] * scalars[s][1]
-    form = form_of(scalars[s], stiffness[s])
-    step = quotient(scalars[s][0], form)
-    to_form = -step * quotient(received[s][0], form)
+    n_samples = stiffness.shape[0]
+    at = m * n_samples + s
+    direction = row(1, m, n_products, n_samples, s, n)
+    product = row(2, m, n_products, n_samples, s, n)
+    push = stiffness[s] * scalars[at][1]
+    form = form_of(scalars[at], stiffness[s])
+    step = quotient(scalars[at][0], form)
+    to_form = -step * quotient(received[at][0], form)
     ratio = real(0.0)
-    if next_scalars:
-        ratio = quotient(next_scalars[s][0], scalars[s][0])
+    if m + 1 < n_products:
+        ratio = quotient(scalars[at + n_samples][0], scalars[at][0])
     swept = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        found = step * to_solution[v] + to_form * (product[v] + push * normal[v])
-        f = to_form * direction[v]
-        if next_scalars:
+        found = step * to_solution[v] + to_form * (fields[place(product, k)] + push * normal[v])
+        f = to_form * fields[place(direction, k)]
+        if m + 1 < n_products:
             found += ratio * to_direction[v]
             f -= step * to_residual[v]
-        field[v] = f
+        pushed[place(at * n, k)] = f
         to_direction[v] = found
         swept += wp.dot(normal[v], f)
-    wp.atomic_add(received, s, vec3(real(0.0), real(0.0), swept))
+    wp.atomic_add(received, at, vec3(real(0.0), real(0.0), swept))
 
 
 @wp.kernel(enable_backward=False)
 def back_to_normal(
-    direction: wp.array(dtype=vec3),
-    previous: wp.array(dtype=vec3),
-    field: wp.array(dtype=vec3),
     normal: wp.array(dtype=vec3),
     stiffness: wp.array(dtype=real),
-    scalars: wp.array(dtype=vec3),
-    received: wp.array(dtype=vec3),
+    m: int,
+    n_products: int,
     n: int,
+    fields: wp.array(dtype=vec3),
+    scalars: wp.array(dtype=vec3),
+    pushed: wp.array(dtype=vec3),
     to_direction: wp.array(dtype=vec3),
     to_normal: wp.array(dtype=vec3),
+    received: wp.array(dtype=vec3),
     threads: int,
 ):
     """The volume's part of the Hessian, and the gradient of the ratio to the previous direction, if any."""
     i = wp.tid()
     s = i // threads
-    across = stiffness[s] * scalars[s][1]
-    to_across = stiffness[s] * received[s][2]
+    n_samples = stiffness.shape[0]
+    at = m * n_samples + s
+    direction = row(1, m, n_products, n_samples, s, n)
+    previous = row(1, wp.max(m - 1, 0), n_products, n_samples, s, n)
+    across = stiffness[s] * scalars[at][1]
+    to_across = stiffness[s] * received[at][2]
     along = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
         found = to_direction[v] + to_across * normal[v]
         to_direction[v] = found
-        to_normal[v] = to_normal[v] + across * field[v] + to_across * direction[v]
-        if previous:
-            along += wp.dot(found, previous[v])
-    wp.atomic_add(received, s, vec3(real(0.0), along, real(0.0)))
+        to_normal[v] = to_normal[v] + across * pushed[place(at * n, k)] + to_across * fields[place(direction, k)]
+        along += wp.dot(found, fields[place(previous, k)])
+    if m > 0:
+        wp.atomic_add(received, at, vec3(real(0.0), along, real(0.0)))
 
 
 @wp.kernel(enable_backward=False)
 def back_to_residual(
-    to_solution: wp.array(dtype=vec3),
-    to_direction: wp.array(dtype=vec3),
-    residual: wp.array(dtype=vec3),
-    inverse: wp.array(dtype=symmetric),
-    previous: wp.array(dtype=vec3),
-    previous_product: wp.array(dtype=vec3),
     normal: wp.array(dtype=vec3),
     stiffness: wp.array(dtype=real),
-    previous_scalars: wp.array(dtype=vec3),
-    scalars: wp.array(dtype=vec3),
-    next_scalars: wp.array(dtype=vec3),
-    received: wp.array(dtype=vec3),
-    next_received: wp.array(dtype=vec3),
+    m: int,
+    n_products: int,
     n: int,
+    fields: wp.array(dtype=vec3),
+    scalars: wp.array(dtype=vec3),
+    inverse: wp.array(dtype=symmetric),
+    to_solution: wp.array(dtype=vec3),
+    to_direction: wp.array(dtype=vec3),
     to_residual: wp.array(dtype=vec3),
     to_diagonal: wp.array(dtype=symmetric),
-    previous_received: wp.array(dtype=vec3),
+    received: wp.array(dtype=vec3),
     threads: int,
 ):
     """Gradients of a residual, of the preconditioner, and of the previous step length, if any."""
     i = wp.tid()
     s = i // threads
-    to_size = quotient(received[s][0], form_of(scalars[s], stiffness[s]))
+    n_samples = stiffness.shape[0]
+    at = m * n_samples + s
+    residual = row(0, m, n_products, n_samples, s, n)
+    direction = row(1, wp.max(m - 1, 0), n_products, n_samples, s, n)
+    product = row(2, wp.max(m - 1, 0), n_products, n_samples, s, n)
+    size = scalars[at][0]
+    to_size = quotient(received[at][0], form_of(scalars[at], stiffness[s]))
     push = real(0.0)
-    if previous:
-        to_size += quotient(received[s][1], previous_scalars[s][0])
-        push = stiffness[s] * previous_scalars[s][1]
-    if next_scalars:
-        size = scalars[s][0]
-        to_size -= quotient(next_received[s][1], size) * quotient(next_scalars[s][0], size)
+    if m > 0:
+        to_size += quotient(received[at][1], scalars[at - n_samples][0])
+        push = stiffness[s] * scalars[at - n_samples][1]
+    if m + 1 < n_products:
+        to_size -= quotient(received[at + n_samples][1], size) * quotient(scalars[at + n_samples][0], size)
     along = real(0.0)
     for k in range(i - s * threads, n, threads):
         v = place(s * n, k)
-        m = inverse[v]
-        z = applied(m, residual[v])
-        w = applied(m, to_direction[v])
+        c = inverse[v]
+        z = applied(c, fields[place(residual, k)])
+        w = applied(c, to_direction[v])
         u = w + to_size * z
         found = to_residual[v] + u + to_size * z
         to_residual[v] = found
@@ -274,24 +302,24 @@ def back_to_residual(
             u[1] * z[2] + u[2] * z[1],
             u[2] * z[2] + ridge,
         )
-        if previous:
-            along += wp.dot(to_solution[v], previous[v]) - wp.dot(found, previous_product[v] + push * normal[v])
-    if previous:
-        wp.atomic_add(previous_received, s, vec3(along, real(0.0), real(0.0)))
+        along += wp.dot(to_solution[v], fields[place(direction, k)])
+        along -= wp.dot(found, fields[place(product, k)] + push * normal[v])
+    if m > 0:
+        wp.atomic_add(received, at - n_samples, vec3(along, real(0.0), real(0.0)))
 
 
 @wp.kernel(enable_backward=False)
 def back_to_factors(
     mesh: Mesh,
-    directions: wp.array(dtype=vec3),
     fields: wp.array(dtype=vec3),
+    pushed: wp.array(dtype=vec3),
     factors: wp.array(dtype=linearised),
     n_samples: int,
     n_products: int,
     to_factors: wp.array(dtype=linearised),
     threads: int,
 ):
-    """Gradients of the Hessian's factors from ``field . H direction``, summed over several products."""
+    """Gradients of the Hessian's factors from the pushed fields times ``H`` times the directions."""
     i = wp.tid()
     s = i // threads
     for k in range(i - s * threads, mesh.record.shape[0], threads):
@@ -311,24 +339,21 @@ def back_to_factors(
         to_stiffness = real(0.0)
         for m in range(n_products):
             v = (m * n_samples + s) * mesh.n_vertices
-            q0 = place(v, q[0])
-            q1 = place(v, q[1])
-            origin = directions[q0]
-            start = fields[q0]
-            e = directions[q1] - origin
-            f = fields[q1] - start
+            d = v + n_products * n_samples * mesh.n_vertices
+            origin = fields[place(d, q[0])]
+            start = pushed[place(v, q[0])]
+            e = fields[place(d, q[1])] - origin
+            f = pushed[place(v, q[1])] - start
             rate = wp.dot(unit, e)
             rate_f = wp.dot(unit, f)
             to_unit += rate_f * e + rate * f
             to_across += wp.dot(e, f)
             to_along += rate * rate_f
             if q[2] >= 0:
-                q2 = place(v, q[2])
-                q3 = place(v, q[3])
-                a = directions[q2] - origin
-                b = directions[q3] - origin
-                fa = fields[q2] - start
-                fb = fields[q3] - start
+                a = fields[place(d, q[2])] - origin
+                b = fields[place(d, q[3])] - origin
+                fa = pushed[place(v, q[2])] - start
+                fb = pushed[place(v, q[3])] - start
                 change = wp.dot(ge, e) + wp.dot(ga, a) + wp.dot(gb, b)
                 change_f = wp.dot(ge, f) + wp.dot(ga, fa) + wp.dot(gb, fb)
                 to_e += change_f * e + change * f
