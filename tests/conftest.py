@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,23 +15,22 @@ import scipy.sparse as sp
 import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from solids import box, lumped_mass, surface
+from solids import as_it_is, box, element_hessian, lumped_mass, surface
 from threads import limit_threads
-from torch_modal.backends.torch.alignment import Pair
-from torch_modal.inbetween.samples import ConvergenceWarning, Samples
 
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.modes import extract_bases
-from torch_modal.precompute.stiffness import arap_hessian
+from torch_modal.precompute.extract import extract_bases
 from torch_modal.precompute.tetrahedra import Tetrahedra
-from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
+from torch_modal.solve.implicit import ConvergenceWarning
 
-COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
+COARSE = TetWild(edge_length_fac=0.08, epsilon=5e-3)
 
 limit_threads()  # small problems, and often several processes at once: threads would wait for each other
 
@@ -66,7 +66,7 @@ def capsule() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="session")
 def capsule_tetrahedra(capsule: tuple[np.ndarray, np.ndarray]) -> Tetrahedra:
     """The capsule filled by the real mesher, once per run: few enough vertices for dense linear algebra."""
-    return tetrahedralize(*capsule, COARSE)
+    return COARSE.fill(as_it_is(*capsule), threading.Event())
 
 
 class Shapes(NamedTuple):
@@ -94,7 +94,7 @@ def bent_bar(cells: tuple[int, int, int], n_modes: int) -> Shapes:
     bases = []
     for pose in poses:
         solid = Tetrahedra(pose, bar.tets)
-        modes = lowest_modes(arap_hessian(solid, "element"), sp.diags(lumped_mass(solid)), pose, n_modes)
+        modes = lowest_modes(element_hessian(solid), sp.diags(lumped_mass(solid)), pose, n_modes)
         at_surface = modes.modes.T.reshape(n_modes, -1, 3)[:, used]
         numbers = (pose[used], modes.eigenvalues, at_surface.copy(), modes.rigid_eigenvalues)
         bases.append(ModalBasis(*map(torch.from_numpy, numbers)))
@@ -153,25 +153,20 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def modal(
-    rotations: bool = False, local: bool = False, space: str = "joint", **changes: Any
-) -> dict[str, Objective | Solver]:
+def modal(local: bool = False, space: str = "joint", **changes: Any) -> dict[str, Objective | Solver]:
     """Settings of the bare modal solve, to the tolerance; what is named here changes them."""
     of_solver = {name: changes.pop(name) for name in set(changes) & set(Solver.__dataclass_fields__)}
-    objective = Objective(base="rotations" if rotations else "linear", space=space, **changes)
+    objective = Objective(space=space, **changes)
     return {"objective": objective, "solver": Solver(**{"local_steps": 2 * local, **of_solver})}
 
 
-def problem_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
-    """The in-betweens of placed key-frames as the layer's minimisation."""
-    whole = layer.in_between
-    samples = Samples(pair.first, pair.second, None, t, whole.mu_of(t, t.shape), whole.stiffness_of(t, t.shape))
-    return whole.members[0].problem(pair, samples)
-
-
-def placement_of(layer: MidShape, pair: Pair, t: torch.Tensor) -> Any:
-    """What the layer's energy knows of them."""
-    return problem_of(layer, pair, t).placement
+def placement_of(core: InBetweenSolver, keyframes: torch.Tensor, weights: torch.Tensor, **given: Any) -> Any:
+    """What the energy of a solver knows of weighted key-frames. *Shape:* ``(B, K, V, 3), (B, K)``."""
+    shapes, _, _ = core.alignment(keyframes, weights)
+    stiffness = [torch.full_like(weights[:, :1], float(term.stiffness)) for term in core.fine.terms]
+    straight = (weights[..., None, None] * shapes).sum(1)
+    base = straight if core.blend is None else core.blend(shapes, weights, straight)
+    return core.space.place(base, RestShapes(shapes, weights, stiffness), given.get("mu", torch.ones(len(weights))))
 
 
 def listen_to_ctrl_c() -> None:

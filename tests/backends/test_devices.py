@@ -17,13 +17,13 @@ from torch import Tensor, nn
 from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.overrides import TorchFunctionMode
 from torch_modal.backends.torch.alignment import Pair
-from torch_modal.inbetween.samples import Samples
 
 import torch_modal as tm
 from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
 from torch_modal.contact.active import ContactEnergy, Contacts
 from torch_modal.energy.energy import Energy
 from torch_modal.geometry.rigid import RigidMotion
+from torch_modal.inbetween.results import Samples
 from torch_modal.inbetween.settings import PRESETS
 
 DOUBLE = torch.float64
@@ -158,7 +158,7 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
         if "contact" in kind:
             pytest.importorskip("ipctk")
         layer = tm.InBetween(bases, faces, preset, solver=solver, contact="contact" in kind or None)
-    parts = [part for part in getattr(layer.members[0].space.energy, "parts", []) if hasattr(part, "_kept")]
+    parts = [part for part in getattr(layer.core.space.energy, "parts", []) if hasattr(part, "_kept")]
     tables = [part.tables for part in parts]  # made at the first use, of numbers
     with gpu() as mode, torch.no_grad():
         on_gpu(layer, mode)
@@ -166,7 +166,7 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
             on_gpu(own, mode)
             part._kept = part.columns, own
         t = blank(2)
-        assert_member_runs(layer.members[0], blank(2, 30, 3), t, layer.stiffness_of(t, t.shape))
+        assert_member_runs(layer.core, blank(2, 30, 3), t, layer.stiffness_of(t, t.shape))
 
 
 def test_contacts() -> None:

@@ -329,7 +329,7 @@ class TestLayers:
     def test_in_between(self, bars: Shapes, dtype: torch.dtype) -> None:
         x_a, x_b = bars.keyframes[:2].to(dtype)
         made = [tm.InBetween(bars.bases[:2], bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]
-        assert [type(layer.members[0].fine) for layer in made] == [WarpFineEnergy, FineEnergy]
+        assert [type(layer.core.fine) for layer in made] == [WarpFineEnergy, FineEnergy]
         found, truth = (layer.to(dtype)(x_a, x_b, torch.tensor([0.3, 0.5], dtype=dtype)) for layer in made)
         assert found.dtype == dtype
         torch.testing.assert_close(found, truth, rtol=0, atol=1e-7 if dtype == torch.float64 else 1e-4)
@@ -384,7 +384,7 @@ class TestLayers:
         for kind in ("warp", "torch"):
             solver = tm.Solver(backend=kind, polish=1)  # type: ignore[arg-type]
             path = tm.Path(bars.bases[:n], bars.faces, objective=objective, solver=solver)
-            assert isinstance(path.layer.members[0].fine, WarpFineEnergy) == (kind == "warp")
+            assert isinstance(path.core.fine, WarpFineEnergy) == (kind == "warp")
             keyframes = bars.keyframes[:n].clone().requires_grad_()
             shape = path(keyframes, t)
             with torch.no_grad():
@@ -397,7 +397,7 @@ class TestLayers:
         from torch._subclasses import FakeTensorMode
 
         layer = tm.InBetween(small_bars.bases[:2], small_bars.faces)
-        member = layer.members[0]
+        member = layer.core
         with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
             x = mode.from_tensor(small_bars.keyframes[:1])
             assert (
@@ -433,7 +433,7 @@ class TestBackend:
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else there(name))
         backend._works.cache_clear()
         try:
-            assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).members[0].fine) is FineEnergy
+            assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).core.fine) is FineEnergy
             with pytest.raises(MissingPackageError, match="pip install warp-lang"):
                 tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
         finally:

@@ -54,7 +54,6 @@ import numpy as np
 import torch
 from tables import geometric_mean, number
 from threads import limit_threads
-from torch_modal.solve.solver import Status
 from tqdm import tqdm
 from wild_bodies import bent_and_twisted
 from wild_making import BODIES, WildBody
@@ -62,7 +61,8 @@ from wild_making import BODIES, WildBody
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.precompute.method import METHODS, Method
+from torch_modal.precompute.extract import METHODS, Method
+from torch_modal.solve.minimise import Status
 
 N_MODES = 30
 PRESETS = ("accurate", "fast", "paper")

@@ -9,7 +9,6 @@ import torch
 from conftest import Shapes, modal
 from terms import Area, Pull, Spring
 from torch import Tensor, nn
-from torch_modal.inbetween.levels import coarse_values
 
 import torch_modal as tm
 from torch_modal.backends.torch.fine_steps import relax
@@ -19,6 +18,7 @@ from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 from torch_modal.energy.volume import Volume
+from torch_modal.inbetween.multilevel import coarse_values
 
 DOUBLE = torch.float64
 
@@ -91,7 +91,7 @@ def test_a_term_of_ones_own_against_central_differences(kind: str, local_steps: 
 
     def layer_of(stiffness: Any) -> tm.InBetween:
         term = Area(stiffness) if kind == "area" else Spring([7], point, stiffness)
-        chosen: Any = modal(coarse_faces=200, tolerance=1e-13, rotations=True)
+        chosen: Any = modal(coarse_faces=200, tolerance=1e-13)
         objective = replace(chosen["objective"], terms=(term,))
         return tm.InBetween(
             bars.bases[1:], bars.faces, objective=objective, solver=replace(chosen["solver"], local_steps=local_steps)
@@ -160,7 +160,7 @@ def test_a_soft_part_takes_the_deformation(bars: Shapes) -> None:
     mesh = Mesh.of(bars.faces, len(x_a))
     alpha = torch.where(bars.keyframes[0][mesh.edges].mean(1)[:, 0] > 0, 5.0, 500.0).double()
     blind, knowing = (tm.InBetween(bars.bases[1:], bars.faces, **modal(alpha=a, gamma=0.0)) for a in (500.0, alpha))
-    shell, scale = tm.ShellEnergy(bars.faces, alpha=alpha, gamma=0.0), blind.members[0].frame.scale
+    shell, scale = tm.ShellEnergy(bars.faces, alpha=alpha, gamma=0.0), blind.core.alignment.scale
     found = [sum(shell(scale * layer(x_a, x_b, 0.5), scale * end) for end in (x_a, x_b)) for layer in (blind, knowing)]
     assert float(found[1]) < 0.999 * float(found[0])
     # The part that is soft gives way: its edges change more than before.

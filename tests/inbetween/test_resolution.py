@@ -6,11 +6,11 @@ import torch
 import trimesh
 from bodies import body
 from conftest import Shapes
-from torch_modal.inbetween.resolution import ENOUGH_FACES, spread, stretching
 
 import torch_modal as tm
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
+from torch_modal.inbetween.coarse import ENOUGH_FACES, spread, stretching
 from torch_modal.precompute.coarsening import FACES_OF_PIECE, coarsen
 
 
@@ -30,7 +30,7 @@ def test_fast_resolves_thin_limbs(name: str, most: float) -> None:
     with torch.no_grad():
         found = layer(first, last, 0.5)
     assert error(found) < most * error((first + last) / 2)
-    n_faces = len(layer.members[0].frame.coarse.faces)
+    n_faces = len(layer.core.space.levels.coarse.faces)
     assert n_faces <= (ENOUGH_FACES if name.startswith("wire") else 300), "more than a body of one thickness needs"
 
 

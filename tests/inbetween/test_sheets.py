@@ -11,14 +11,14 @@ import torch
 from shapes import edge_error, edge_lengths
 from sheets import cylinder, folded, rectangle, rolled
 from torch import Tensor
-from torch_modal.inbetween.resolution import resolving
-from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.energy.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
+from torch_modal.inbetween.coarse import resolving
 from torch_modal.precompute.coarsening import Collapses, coarsen
+from torch_modal.solve.minimise import Status
 
 BACKENDS = ["torch", "warp"]
 Direction = Callable[[np.ndarray], np.ndarray]

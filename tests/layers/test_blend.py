@@ -11,7 +11,6 @@ from shapes import apart
 from terms import Spring
 from torch import Tensor
 from torch_modal.inbetween.among import WeightedSamples
-from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
@@ -22,6 +21,7 @@ from torch_modal.geometry.triangle_frames import sides
 from torch_modal.geometry.vectors import cross
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
+from torch_modal.solve.minimise import Status
 
 DOUBLE = torch.float64
 pytestmark = pytest.mark.usefixtures("converged")
@@ -34,7 +34,7 @@ def pulls(*values: float) -> Tensor:
 
 @pytest.fixture(scope="module")
 def layer(bars: Shapes) -> Blend:
-    return Blend(bars.bases, bars.faces, **modal(coarse_faces=200, rotations=True, local=True))
+    return Blend(bars.bases, bars.faces, **modal(coarse_faces=200, local=True))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ class TestTwo:
         blend = Blend(bars.bases[1:], bars.faces, objective=settings.objective, solver=solver)
         layer, w = blend.layer, pulls(0.7, 0.3)[None]
         samples = WeightedSamples(bars.keyframes[None, 1:], w, layer.stiffness_of(w[:, 0], torch.Size([1])))
-        found = layer.members[0].weighted(samples, None)
+        found = layer.core.weighted(samples, None)
         assert apart(found.shapes[0], blend(bars.keyframes[1:], w[0])) < 1e-9
 
 
@@ -127,12 +127,12 @@ class TestInvariances:
         angle = (w * angles).sum()
         expected = x @ torch.linalg.matrix_exp(angle * torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 0.0]]).double()).mT
         found = layer(x @ turns.mT + torch.arange(4)[:, None, None], w)
-        area_centre = layer.layer.members[0].frame.weights @ x / layer.layer.members[0].frame.weights.sum()
+        area_centre = layer.core.alignment.weights @ x / layer.core.alignment.weights.sum()
         moves = torch.arange(4) + 0.0
         centre = (w[:, None] * (area_centre @ turns.mT + moves[:, None])).sum(0)
         expected = expected - expected.mean(0)
         assert apart(found - found.mean(0), expected) < 1e-9
-        centres = layer.layer.members[0].frame.weights @ found / layer.layer.members[0].frame.weights.sum()
+        centres = layer.core.alignment.weights @ found / layer.core.alignment.weights.sum()
         torch.testing.assert_close(centres, centre, rtol=0, atol=1e-9)
 
     def test_weights_a_little_below_zero_go_on(self, layer: Blend, poses: Tensor) -> None:
@@ -207,7 +207,7 @@ class TestResults:
     def test_it_is_near_the_optimum(self, bars: Shapes, poses: Tensor, layer: Blend) -> None:
         """Of the energy on the fine mesh, against that of a long descent of all vertices, and of the linear blend."""
         polished = Blend(bars.bases, bars.faces, solver=tm.Solver(polish=30))
-        shell, frame, w = tm.ShellEnergy(bars.faces), layer.layer.members[0].frame, pulls(0.4, 0.3, 0.3)
+        shell, frame, w = tm.ShellEnergy(bars.faces), layer.core.alignment, pulls(0.4, 0.3, 0.3)
 
         def energy(x: Tensor) -> float:
             each = (shell(frame.scale * x, frame.scale * pose) for pose in bars.keyframes)
@@ -260,7 +260,7 @@ class TestResults:
     def test_what_is_worse_than_its_start_falls_back(
         self, bars: Shapes, layer: Blend, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        member = layer.layer.members[0]
+        member = layer.core
         monkeypatch.setattr(member, "refined", lambda x, rests: 1.5 * x)
         with pytest.warns(tm.ConvergenceWarning, match="came out worse"):
             x = layer(bars.keyframes, pulls(0.5, 0.2, 0.3))
@@ -276,7 +276,7 @@ class TestResults:
         assert bool(result.shapes[0].isfinite().all()) and bool(result.shapes[1].isnan().all())
 
     def test_of_two_neither(self, bars: Shapes, poses: Tensor) -> None:
-        two = Blend(bars.bases[:2], bars.faces, **modal(coarse_faces=200, rotations=True, local=True))
+        two = Blend(bars.bases[:2], bars.faces, **modal(coarse_faces=200, local=True))
         x = torch.stack([poses[0] * torch.nan, poses[1]])
         result = two.solve(x, pulls(0, 1))
         assert torch.equal(result.shapes, poses[1]) and result.solution.status == Status.CONVERGED

@@ -238,7 +238,7 @@ def test_the_mean_of_rotations_that_are_far_apart(run: Any) -> None:
 @either
 def test_poses_of_key_frames_that_are_far_from_each_other(bars: Shapes, run: Any) -> None:
     """Likewise: the last rounds alone."""
-    frame = tm.Blend(bars.bases, bars.faces, "fast").layer.members[0].frame
+    frame = tm.Blend(bars.bases, bars.faces, "fast").core.alignment
     keyframes = bars.keyframes[None] + 0.8 * like(bars.keyframes[None])
     given = keyframes, numbers(0.3, 0.5, 0.2)[None]
 

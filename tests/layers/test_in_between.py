@@ -16,18 +16,18 @@ from conftest import Shapes, bent_bar, modal, random_rotation
 from shapes import diagonal
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
-from torch_modal.inbetween.samples import ConvergenceError, ConvergenceWarning
-from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.minimise import Status
 
 DOUBLE = torch.float64
 pytestmark = pytest.mark.usefixtures("converged")
@@ -139,11 +139,8 @@ class TestValues:
     def test_where_the_blend_is_far_worse_than_straight_lines_they_are_returned(
         self, bars: Shapes, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        layer, start = (
-            InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, rotations=True, max_steps=n))
-            for n in (80, 0)
-        )
-        blend = type(layer.members[0].space.blend)
+        layer, start = (InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, max_steps=n)) for n in (80, 0))
+        blend = type(layer.core.space.blend)
         monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: straight)
         straight = start.solve(*bars.keyframes[1:], 0.4)
         monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: 3 * straight)
@@ -152,8 +149,8 @@ class TestValues:
         torch.testing.assert_close(found.shapes, straight.shapes, rtol=0, atol=1e-9)
 
     def test_a_blend_that_is_not_finite_is_straight(self, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-        layer = InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, rotations=True))
-        poisson = type(layer.members[0].space.blend.poisson)
+        layer = InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200))
+        poisson = type(layer.core.space.blend.poisson)
         monkeypatch.setattr(poisson, "forward", lambda self, edges, near: torch.nan * near)
         found = layer.solve(*bars.keyframes[1:], 0.4)
         assert found.shapes.isfinite().all() and found.solution.converged
@@ -424,9 +421,9 @@ class TestSingleSamples:
 
 OPTIONS = {
     "modes": modal(),
-    "rotations": modal(rotations=True),
+    "rotations": modal(),
     "local": modal(local=True),
-    "polish": modal(rotations=True, polish=1),
+    "polish": modal(polish=1),
     "paired": modal(space="paired"),
 }
 
@@ -485,7 +482,7 @@ class TestTorch:
 
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
     def test_low_precision_computes_in_float32(self, bars: Shapes, dtype: torch.dtype) -> None:
-        layer = InBetween(bars.bases[:2], bars.faces, **modal(coarse_faces=200, rotations=True, local=True))
+        layer = InBetween(bars.bases[:2], bars.faces, **modal(coarse_faces=200, local=True))
         x_a, x_b = bars.keyframes[:2]
         truth = layer(x_a, x_b, 0.5)
         low = copy.deepcopy(layer).to(dtype)
@@ -504,7 +501,7 @@ class TestTorch:
     def test_products_of_float32_are_exact_inside(self, bars: Shapes) -> None:
         """Whatever is set outside, and it is set again afterwards."""
         layer, seen = InBetween(bars.bases[:2], bars.faces).float(), []
-        layer.members[0].register_forward_pre_hook(lambda *_: seen.append(torch.get_float32_matmul_precision()))
+        layer.core.register_forward_pre_hook(lambda *_: seen.append(torch.get_float32_matmul_precision()))
         try:
             torch.set_float32_matmul_precision("medium")
             layer(*bars.keyframes[:2].float(), 0.5)

@@ -8,8 +8,6 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
-from torch_modal.solve.adjoint import ConvergenceWarning
-from torch_modal.solve.solver import Status
 
 import torch_modal as tm
 from torch_modal.backends.torch.distortion import Distortion, _weights
@@ -17,6 +15,8 @@ from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.warp.backend import WarpBackend
 from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.settings import PRESETS
+from torch_modal.solve.implicit import ConvergenceWarning
+from torch_modal.solve.minimise import Status
 
 BACKENDS = [pytest.param("warp", marks=pytest.mark.skipif(not WarpBackend.works(), reason="no Warp")), "torch"]
 
@@ -63,7 +63,7 @@ class TestFallBack:
     @pytest.mark.parametrize("backend", BACKENDS)
     def test_the_start_is_returned_and_the_status_says_so(self, bars: Shapes, backend: str, monkeypatch: Any) -> None:
         layer = tm.InBetween(bars.bases[1:], bars.faces, **preset("fast", backend=backend))
-        space, x_a, x_b = layer.members[0].space, *bars.keyframes[1:]
+        space, x_a, x_b = layer.core.space, *bars.keyframes[1:]
         spoiled = type(space).lift
 
         def lift(self: Any, a: Tensor, problem: Any) -> Tensor:
@@ -89,15 +89,15 @@ class TestFallBack:
 
     def test_what_has_no_in_between_stays_so(self, bars: Shapes, monkeypatch: Any) -> None:
         layer = tm.InBetween(bars.bases[1:], bars.faces, **preset("fast"))
-        spoiled = type(layer.members[0].space).lift
-        monkeypatch.setattr(type(layer.members[0].space), "lift", lambda *given: 10 * torch.sin(37 * spoiled(*given)))
+        spoiled = type(layer.core.space).lift
+        monkeypatch.setattr(type(layer.core.space), "lift", lambda *given: 10 * torch.sin(37 * spoiled(*given)))
         result = layer.solve(bars.keyframes[1], bars.keyframes[2] * torch.nan, 0.5)
         assert result.solution.status == Status.INVALID and result.shapes.isnan().all()
 
     @pytest.mark.parametrize("backend", BACKENDS)
     def test_gradients_are_those_of_what_is_returned(self, small_bars: Shapes, backend: str, monkeypatch: Any) -> None:
         layer = tm.InBetween(small_bars.bases[1:], small_bars.faces, **preset("fast", backend=backend))
-        space, (x_a, x_b) = layer.members[0].space, small_bars.keyframes[1:]
+        space, (x_a, x_b) = layer.core.space, small_bars.keyframes[1:]
         spoiled = type(space).lift
         monkeypatch.setattr(type(space), "lift", lambda *given: 10 * torch.sin(37 * spoiled(*given)))
         leaf = x_a.clone().requires_grad_()

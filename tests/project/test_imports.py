@@ -84,7 +84,7 @@ def floor(module: str) -> int:
 
 def test_every_module_has_its_floor() -> None:
     assert {module.split(".")[0] for module in MODULES} == set(FLOORS)
-    assert "precompute.modes" in own("motion.subdivide"), "imports are not seen"
+    assert "precompute.extract" in own("motion.subdivide"), "imports are not seen"
     assert "geometry.connectivity" in own("inbetween.frame"), (
         "from torch_modal.geometry import connectivity is not seen"
     )
@@ -105,13 +105,13 @@ def test_no_imports_go_round() -> None:
 
 
 def test_precompute_is_without_torch() -> None:
-    """Besides the basis: ``modes.py`` alone makes tensors, for ``basis.py``."""
+    """Besides the basis: ``extract.py`` alone makes tensors, for ``basis.py``."""
     with_torch = {
         name
         for name in MODULES
         if name.startswith("precompute.") and "torch" in {found.split(".")[0] for found in imported(name)}
     }
-    assert with_torch == {"precompute.basis", "precompute.modes"}
+    assert with_torch == {"precompute.basis", "precompute.extract"}
 
 
 def test_layers_are_torch_only() -> None:

@@ -9,15 +9,15 @@ from conftest import Shapes, modal, placement_of
 from scipy.optimize import least_squares
 from torch import Tensor
 from torch.func import jacfwd
-from torch_modal.inbetween.samples import ConvergenceError, report
 from torch_modal.solve.quasi_newton import descend
-from torch_modal.solve.solver import Solution, Status, minimise
 
 from torch_modal.energy.modal_energy import Derivatives, Placement
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import periodic_square
+from torch_modal.inbetween.results import ConvergenceError, report
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.minimise import Solution, Status, minimise
 
 
 class LeastSquares:

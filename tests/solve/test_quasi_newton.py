@@ -9,11 +9,11 @@ from test_gauss_newton import Circle, LeastSquares, Rosenbrock, problem, start
 from test_gauss_newton import layer as layer  # a fixture
 from torch import Tensor
 from torch_modal.solve.quasi_newton import descend
-from torch_modal.solve.solver import Status, minimise
 
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.solve import quasi_newton
 from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.minimise import Status, minimise
 
 
 def test_same_minimum_as_newtons_method(layer: MidShape, bars: Shapes) -> None:

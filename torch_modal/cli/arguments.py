@@ -100,12 +100,6 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
         help="what fills surfaces for solids: a lattice of cubes (deterministic, takes every surface), or fTetWild "
         "(default: %(default)s)",
     )
-    sub.add_argument(
-        "--quality",
-        choices=("fast", "fine"),
-        default="fast",
-        help="how fine the tetrahedra are (default: %(default)s)",
-    )
 
 
 def add_registration(sub: argparse.ArgumentParser) -> None:

@@ -21,7 +21,7 @@ from torch_modal.layers.mid_shape import MidShape
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.modes import bases_of_checked
+from torch_modal.precompute.extract import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
 
 MAX_LEVELS = 12

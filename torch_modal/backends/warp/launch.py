@@ -19,7 +19,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_modal.extras import uncollected
 from torch_modal.progress import ProgressReport
 
 Module = Literal[
@@ -45,11 +44,9 @@ MOST_ENTRIES = 2**31 - 1
 @cache
 def kernels(name: Module) -> Any:
     """A module of the kernels, compiled by the first who asks on a machine, and kept by Warp."""
-    with uncollected():
-        import warp as wp
+    import warp as wp
 
-        module = importlib.import_module(f"{PACKAGE}.{name}")
-
+    module = importlib.import_module(f"{PACKAGE}.{name}")
     _load(wp, module.__name__)
     return module
 
