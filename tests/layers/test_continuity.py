@@ -83,13 +83,6 @@ class TestOneFunction:
             assert apart(layer(*hand.keyframes, t), layer(*(hand.keyframes + noise), t)) < 1e-6
 
     @torch.no_grad()
-    def test_what_other_bases_there_are_changes_nothing(self, creature: Shapes, preset: Any) -> None:
-        whole = tm.InBetween(creature.bases, creature.faces, preset)
-        pair = tm.InBetween(creature.bases[1:], creature.faces, preset)
-        ends = creature.keyframes[1:]
-        assert apart(whole(*ends, 0.37, pair=1), pair(*ends, 0.37)) < 1e-9
-
-    @torch.no_grad()
     def test_reversed(self, creature: Shapes, preset: Any) -> None:
         x_a, x_b = creature.keyframes[:2]
         forth = tm.InBetween(creature.bases[:2], creature.faces, preset)

@@ -26,7 +26,7 @@ from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve import implicit
 from torch_modal.solve.minimise import Status
 
 DOUBLE = torch.float64
@@ -89,18 +89,6 @@ class TestValues:
         expected = turned(0.3)
         torch.testing.assert_close(between - between.mean(0), expected - expected.mean(0), rtol=0, atol=1e-9)
 
-    def test_pairs_are_chosen_per_sample(self, bars: Shapes) -> None:
-        both = InBetween(bars.bases, bars.faces, **modal(coarse_faces=200))
-        assert both.pairs == [(0, 1), (1, 2)]
-        pair = torch.tensor([1, 0, 1])
-        x_a, x_b = bars.keyframes[pair][:, None], bars.keyframes[pair + 1][:, None]
-        x = both(x_a, x_b, times(0.2, 0.7), pair[:, None])
-        for i, p in enumerate(pair.tolist()):
-            alone = both(bars.keyframes[p], bars.keyframes[p + 1], times(0.2, 0.7), p)
-            torch.testing.assert_close(x[i], alone, rtol=0, atol=1e-9)
-        back = InBetween(bars.bases, bars.faces, pairs=[(2, 0)], **modal(coarse_faces=200))
-        assert back(bars.keyframes[2], bars.keyframes[0], 0.5).shape == bars.keyframes.shape[1:]
-
     def test_local_interpolation_lowers_the_energy_and_keeps_the_conventions(self, bars: Shapes) -> None:
         layers = [
             InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, local=n > 0, polish=n // 2))
@@ -120,37 +108,21 @@ class TestValues:
         single = copy.deepcopy(layers[1]).float()(x_a.float(), x_b.float(), at.float())
         assert float((single - together).abs().max()) < 1e-3 * diagonal(x_a)
 
-    def test_a_blend_by_rotations_leaves_less_to_do(self, bars: Shapes) -> None:
-        x_a, x_b = bars.keyframes[1:]
-        shell, scale = ShellEnergy(bars.faces), 100 / diagonal(x_a)
-
-        def energy(x: Tensor) -> float:
-            return float(sum(shell(scale * x, scale * end) for end in (x_a, x_b)))
-
-        without, layer = (
-            InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, rotations=r)) for r in (False, True)
-        )
-        assert energy(layer(x_a, x_b, 0.5)) < energy(without(x_a, x_b, 0.5))
-        x = layer(x_a, x_b, times(0.0, 0.5, 1.0))
-        assert torch.equal(x[0], x_a)
-        assert torch.equal(x[2], x_b)
-        torch.testing.assert_close(layer(x_a, x_a + 1, 0.5), x_a + 0.5, rtol=0, atol=1e-9)
-
     def test_where_the_blend_is_far_worse_than_straight_lines_they_are_returned(
         self, bars: Shapes, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         layer, start = (InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200, max_steps=n)) for n in (80, 0))
-        blend = type(layer.core.space.blend)
-        monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: straight)
+        blend = type(layer.core.blend)
+        monkeypatch.setattr(blend, "forward", lambda self, shapes, weights, straight: straight)
         straight = start.solve(*bars.keyframes[1:], 0.4)
-        monkeypatch.setattr(blend, "forward", lambda self, x, y, t, straight: 3 * straight)
+        monkeypatch.setattr(blend, "forward", lambda self, shapes, weights, straight: 3 * straight)
         found = layer.solve(*bars.keyframes[1:], 0.4)
         assert found.solution.status == Status.FELL_BACK
         torch.testing.assert_close(found.shapes, straight.shapes, rtol=0, atol=1e-9)
 
     def test_a_blend_that_is_not_finite_is_straight(self, bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
         layer = InBetween(bars.bases[1:], bars.faces, **modal(coarse_faces=200))
-        poisson = type(layer.core.space.blend.poisson)
+        poisson = type(layer.core.blend.poisson)
         monkeypatch.setattr(poisson, "forward", lambda self, edges, near: torch.nan * near)
         found = layer.solve(*bars.keyframes[1:], 0.4)
         assert found.shapes.isfinite().all() and found.solution.converged
@@ -180,13 +152,11 @@ class TestGradients:
 
         return value
 
-    def inputs(
-        self, shapes: Shapes, space: str, generator: torch.Generator, roughness: float = 0.1
-    ) -> dict[str, Tensor]:
+    def inputs(self, shapes: Shapes, space: str, generator: torch.Generator) -> dict[str, Tensor]:
         x_a, x_b = shapes.keyframes[1:]
         # Stretched, squeezed and roughened: lengths that no shape can have at once leave a large residual.
         x_b = x_b * torch.tensor([1.5, 0.7, 1.2], dtype=DOUBLE)
-        x_b = x_b + roughness * torch.randn(x_b.shape, generator=generator, dtype=DOUBLE)
+        x_b = x_b + 0.1 * torch.randn(x_b.shape, generator=generator, dtype=DOUBLE)
         x_b = x_b @ random_rotation(generator).mT + 1
         values = {"mu": 3.0, "alpha": 400.0, "beta": 20.0, "gamma": 5e4, "t": 0.5 if space == "paired" else 0.37}
         inputs = {name: torch.tensor(value, dtype=DOUBLE) for name, value in values.items()}
@@ -210,20 +180,18 @@ class TestGradients:
             )
             assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5), name
 
-    @pytest.mark.parametrize("fine", [{"local": True, "polish": 1}, {"rotations": True}], ids=["steps", "rotations"])
-    def test_through_what_happens_on_the_fine_mesh(
-        self, large: Shapes, generator: torch.Generator, fine: dict[str, Any]
-    ) -> None:
-        """Local interpolation, polish and the blend by local rotations are part of what is differentiated."""
+    def test_through_what_happens_on_the_fine_mesh(self, large: Shapes, generator: torch.Generator) -> None:
+        """Local steps and polish are part of what is differentiated."""
         weights = torch.randn(large.keyframes.shape[1:], generator=generator, dtype=DOUBLE)
-        # The blend is not taken between rough shapes: straight lines are better there.
-        inputs = self.inputs(large, "joint", generator, roughness=0.01 if "rotations" in fine else 0.1)
+        inputs = self.inputs(large, "joint", generator)
         del inputs["mu"]
 
-        def value(options: dict[str, Any] = fine, **inputs: Tensor) -> Tensor:
+        def value(fine: bool = True, **inputs: Tensor) -> Tensor:
             constants = {name: inputs[name] for name in ("alpha", "beta", "gamma")}
             layer = InBetween(
-                large.bases[1:], large.faces, **modal(coarse_faces=200, tolerance=1e-13, **constants, **options)
+                large.bases[1:],
+                large.faces,
+                **modal(local=fine, polish=int(fine), coarse_faces=200, tolerance=1e-13, **constants),
             )
             return (layer(inputs["x_a"], inputs["x_b"], inputs["t"]) * weights).sum()
 
@@ -236,7 +204,7 @@ class TestGradients:
             step = 1e-6 if x.dim() else DIFFERENCE_STEPS[name]
             expected = central_difference(lambda y, name=name: value(**{**inputs, name: y}), x, direction, step)
             assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5), name
-        (without,) = torch.autograd.grad(value({}, **leaves), leaves["x_a"])
+        (without,) = torch.autograd.grad(value(False, **leaves), leaves["x_a"])
         assert float((without - gradients[0]).norm()) > 1e-2 * float(without.norm())
 
     def test_the_gauss_newton_hessian_would_not_do(
@@ -259,11 +227,9 @@ class TestGradients:
         (wrong,) = torch.autograd.grad(y, x_a)
         assert float((wrong - exact).norm() / exact.norm()) > 1e-2
 
-    @pytest.mark.parametrize(("space", "rotations"), [("joint", False), ("joint", True), ("paired", False)])
-    def test_gradcheck_and_gradgradcheck(self, small_bars: Shapes, space: str, rotations: bool) -> None:
-        layer = InBetween(
-            small_bars.bases[1:], small_bars.faces, **modal(space=space, tolerance=1e-14, rotations=rotations)
-        )
+    @pytest.mark.parametrize("space", ["joint", "paired"])
+    def test_gradcheck_and_gradgradcheck(self, small_bars: Shapes, space: str) -> None:
+        layer = InBetween(small_bars.bases[1:], small_bars.faces, **modal(space=space, tolerance=1e-14))
         x_a, x_b = (x.clone().requires_grad_() for x in small_bars.keyframes[1:])
         t = torch.tensor([0.5], dtype=DOUBLE) if space == "paired" else times(0.3, 0.6).requires_grad_()
         with warnings.catch_warnings():
@@ -421,7 +387,6 @@ class TestSingleSamples:
 
 OPTIONS = {
     "modes": modal(),
-    "rotations": modal(),
     "local": modal(local=True),
     "polish": modal(polish=1),
     "paired": modal(space="paired"),
@@ -517,7 +482,7 @@ class TestTorch:
         shapes = layer(x_a, bars.keyframes[1], 0.5)
         (truth,) = torch.autograd.grad(shapes.sum(), x_a, retain_graph=True)
         keep = torch.tensor([1.0, 0.0], dtype=DOUBLE)[:, None, None]
-        monkeypatch.setattr(GaussNewtonStep, "ridged", lambda self, hessian: keep * hessian)
+        monkeypatch.setattr(implicit, "ridged", lambda hessian: keep * hessian)
         with pytest.warns(ConvergenceWarning, match="the Hessian of 1 in-betweens is singular"):
             (found,) = torch.autograd.grad(shapes.sum(), x_a)
         torch.testing.assert_close(found[0], truth[0], rtol=1e-6, atol=1e-8)
@@ -541,8 +506,6 @@ class TestTorch:
         (lambda layer, a, b: layer(a.numpy(), b, 0.5), "x_a is a ndarray; pass a tensor"),
         (lambda layer, a, b: layer(a.expand(2, -1, -1), b.expand(3, -1, -1), 0.5), "does not broadcast"),
         (lambda layer, a, b: layer(a.expand(3, -1, -1), b, torch.rand(4)), r"t of shape \(4,\) .* x_a\[:, None\]"),
-        (lambda layer, a, b: layer(a, b, 0.5, 3), r"pair is one of 0 to 0, .*; got 3"),
-        (lambda layer, a, b: layer(a, b, 0.5, torch.tensor([5, 7])), "pair holds whole numbers from 0 to 0"),
         *((lambda layer, a, b, t=t: layer(a, b, times(0.5, t)), r"t lies in \[0, 1\]") for t in (-0.1, 1.5, math.nan)),
     ],
 )
@@ -561,7 +524,6 @@ def test_what_a_call_refuses(call: Any, message: str, layer: InBetween, bars: Sh
         (lambda: modal(coarse_faces=3), "coarse_faces is a whole number, 4 or more"),
         (lambda: modal(polish=-1), "polish is a whole number"),
         (lambda: modal(polish=1.5), "polish is a whole number"),
-        (lambda: {"pairs": [(0, 9)]}, "indices of 2 bases"),
         (lambda: {"preset": "best"}, "preset is one of 'accurate', 'fast', 'paper'; got 'best'"),
     ],
 )
@@ -574,7 +536,9 @@ def test_bases_that_do_not_fit(bars: Shapes, small_bars: Shapes) -> None:
     for bases, message in (
         ([bars.bases[0], small_bars.bases[0]], r"meshes of \[30, 164\] vertices"),
         (small_bars.bases[:2], "vertices that do not exist"),
-        (bars.bases[:1], "needs two bases, got 1"),
+        (bars.bases, "between two bases, got 3; Path and Blend take more"),
+        (bars.keyframes[0], r"key-frames are floating-point of shape \(K, V, 3\); got \(164, 3\)"),
+        (bars.keyframes[:2].long(), "got .* of torch.int64"),
     ):
         with pytest.raises(ValueError, match=message):
             InBetween(bases, bars.faces)

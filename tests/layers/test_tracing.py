@@ -50,7 +50,7 @@ def test_steps_of_one_sample(small_bars: Shapes) -> None:
     ("name", "call"),
     [
         ("InBetween", lambda layer, x: layer(x[0], x[1], TIMES[:0])),
-        ("InBetween", lambda layer, x: layer(x[:0], x[:0], 0.5, torch.zeros(0, dtype=torch.int64))),
+        ("InBetween", lambda layer, x: layer(x[:0], x[:0], 0.5)),
         ("Blend", lambda layer, x: layer(x, THIRDS.expand(0, 3))),
         ("Path", lambda layer, x: layer(x, TIMES[:0])),
         ("Path, pairs", lambda layer, x: layer(x, TIMES[:0])),

@@ -64,7 +64,22 @@ def basis_buffers(bases: Bases) -> list[BasisBuffers]:
     ]
 
 
-class InBetweenLayer(nn.Module):
+class PreciseModule(nn.Module):
+    """A module that stays in float32 or float64, whatever it is cast to, and outlives inference mode."""
+
+    @lasting
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "PreciseModule":
+        """Never below float32."""
+
+        def kept(tensor: Tensor) -> Tensor:
+            out = fn(tensor)
+            low = out.is_floating_point() and torch.finfo(out.dtype).bits < 32
+            return tensor.to(out.device, torch.float32) if low else out
+
+        return super()._apply(kept, recurse)
+
+
+class InBetweenLayer(PreciseModule):
     """A layer that solves in-betweens of the modal spaces of all its bases.
 
     Args:
@@ -105,17 +120,6 @@ class InBetweenLayer(nn.Module):
         given = torch.stack(references), modes, Mesh(connectivity), list(self.terms), self.objective, self.solver
         kind = ContactSolver if self.objective.contact else InBetweenSolver
         self.core = kind(*given).to(like)
-
-    @lasting
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "InBetweenLayer":
-        """Never below float32."""
-
-        def kept(tensor: Tensor) -> Tensor:
-            out = fn(tensor)
-            low = out.is_floating_point() and torch.finfo(out.dtype).bits < 32
-            return tensor.to(out.device, torch.float32) if low else out
-
-        return super()._apply(kept, recurse)
 
     @property
     def dtype(self) -> torch.dtype:

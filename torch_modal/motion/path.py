@@ -21,7 +21,7 @@ from torch_modal.inbetween.results import InBetweenResult, unminimised, warn_of_
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import as_faces, checked_times
 from torch_modal.keyframes.check import checked_surface
-from torch_modal.layers.base import Bases, BasisBuffers, basis_buffers
+from torch_modal.layers.base import Bases, BasisBuffers, PreciseModule, basis_buffers
 from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.cubics import Scheme, located, wrapped
@@ -36,7 +36,7 @@ N_SEARCHED = 31
 SAME_TIME = 2e-15
 
 
-class Path(nn.Module):
+class Path(PreciseModule):
     """Shapes at any time of a motion through key-frames.
 
     With three key-frames or more, the rotations and sizes of triangles and the rigid motion follow splines
