@@ -160,13 +160,21 @@ def modal(local: bool = False, space: str = "joint", **changes: Any) -> dict[str
     return {"objective": objective, "solver": Solver(**{"local_steps": 2 * local, **of_solver})}
 
 
-def placement_of(core: InBetweenSolver, keyframes: torch.Tensor, weights: torch.Tensor, **given: Any) -> Any:
-    """What the energy of a solver knows of weighted key-frames. *Shape:* ``(B, K, V, 3), (B, K)``."""
+def placement_of(core: InBetweenSolver, keyframes: torch.Tensor, weights: torch.Tensor, linear: bool = False) -> Any:
+    """What the modal energy of a solver knows of weighted key-frames. *Shape:* ``(B, K, V, 3), (B, K)``.
+
+    Args:
+        core: The solver.
+        keyframes: In the caller's coordinates.
+        weights: They add up to one.
+        linear: True for the weighted sum of the key-frames in the place of their blend by local rotations.
+    """
     shapes, _, _ = core.alignment(keyframes, weights)
     stiffness = [torch.full_like(weights[:, :1], float(term.stiffness)) for term in core.fine.terms]
-    straight = (weights[..., None, None] * shapes).sum(1)
-    base = straight if core.blend is None else core.blend(shapes, weights, straight)
-    return core.space.place(base, RestShapes(shapes, weights, stiffness), given.get("mu", torch.ones(len(weights))))
+    base = (weights[..., None, None] * shapes).sum(1)
+    if core.blend is not None and not linear:
+        base = core.blend(shapes, weights, base)
+    return core.space.place(base, RestShapes(shapes, weights, stiffness), torch.ones_like(weights[:, 0]))
 
 
 def listen_to_ctrl_c() -> None:

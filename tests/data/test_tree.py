@@ -84,4 +84,4 @@ def test_key_depends_on_names_content_and_options(tmp_path: Path) -> None:
     ):
         change()
         seen.add(key())
-    assert len(seen) == 10
+    assert len(seen) == 9

@@ -33,7 +33,7 @@ class Case:
 
     kind: type[ShellEnergy] = ShellEnergy
 
-    def __init__(self, faces: Tensor, x: Tensor, extra: bool, seed: int = 0, **stiffness: float) -> None:
+    def __init__(self, faces: Tensor, x: Tensor, seed: int = 0, **stiffness: float) -> None:
         generator = torch.Generator().manual_seed(seed)
 
         def random(*shape: int) -> Tensor:
@@ -50,13 +50,11 @@ class Case:
         factors = [both[:, None] * stiffness for stiffness in self.shell.stiffness]
         rests = [self.shell.rest(r) for r in self.rests]
         reference = self.shell.energy.among(rests, torch.stack(self.pulls, -1) / both[:, None], factors)
-        self.extra = random(BATCH, *x.shape) if extra else None
-        self.placement = self.modal.place(base, reference, self.extra)
-        self.a = 0.02 * size * random(BATCH, N + extra)
+        self.placement = self.modal.place(base, reference)
+        self.a = 0.02 * size * random(BATCH, N)
 
     def shape_by_hand(self, a: Tensor) -> Tensor:
-        x = self.base + torch.einsum("bn,nvc->bvc", a[:, :N], self.columns)
-        return x if self.extra is None else x + a[:, N, None, None] * self.extra
+        return self.base + torch.einsum("bn,nvc->bvc", a, self.columns)
 
     def energy_by_hand(self, a: Tensor) -> Tensor:
         x = self.shape_by_hand(a)
@@ -101,9 +99,8 @@ def surface_of(request: pytest.FixtureRequest, small_bars: Shapes) -> tuple[Tens
     return faces, x
 
 
-@pytest.mark.parametrize("extra", [False, True])
-def test_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) -> None:
-    case = Case(*surface_of, extra)
+def test_agrees_with_autograd(surface_of: tuple[Tensor, Tensor]) -> None:
+    case = Case(*surface_of)
     rows = case.modal.rows(case.a, case.placement)[..., : case.base.shape[1]]
     torch.testing.assert_close(rows.movedim(0, -1), case.shape_by_hand(case.a))
     torch.testing.assert_close(case.modal.value(case.a, case.placement), case.energy_by_hand(case.a))
@@ -118,25 +115,22 @@ def test_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) ->
     assert torch.linalg.eigvalsh(got.gauss_newton).amin() > 0
     truth = case.hessian_by_autograd()
     assert relative(got.gauss_newton, truth) > 1e-2, "at rest there would be nothing to see"
-    assert got.second_order is not None
-    assert relative(got.gauss_newton + got.second_order, truth) < 1e-11
+    assert relative(got.hessian, truth) < 1e-11
 
 
 class SmoothCase(Case):
     kind = SmoothShell
 
 
-@pytest.mark.parametrize("extra", [False, True])
-def test_a_periodic_function_of_angles_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) -> None:
+def test_a_periodic_function_of_angles_agrees_with_autograd(surface_of: tuple[Tensor, Tensor]) -> None:
     """Gauss-Newton's Hessian takes the largest curvature of the function; both terms together are the true one."""
-    case = SmoothCase(*surface_of, extra)
+    case = SmoothCase(*surface_of)
     torch.testing.assert_close(case.modal.value(case.a, case.placement), case.energy_by_hand(case.a))
     gradient = torch.autograd.functional.jacobian(lambda a: case.energy_by_hand(a).sum(), case.a)
     got, truth = case.derivatives(), case.hessian_by_autograd()
     assert relative(got.gradient, gradient) < 1e-12
     assert torch.linalg.eigvalsh(got.gauss_newton).amin() > 0
-    assert got.second_order is not None
-    assert relative(got.gauss_newton + got.second_order, truth) < 1e-11
+    assert relative(got.hessian, truth) < 1e-11
     along = torch.randn(case.a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     leaves = [leaf.clone().requires_grad_() for leaf in trees.leaves(case.placement)]
     slope = (case.modal.derivatives(case.a, trees.filled(case.placement, leaves), False).gradient * along).sum()
@@ -146,7 +140,7 @@ def test_a_periodic_function_of_angles_agrees_with_autograd(surface_of: tuple[Te
 
 
 def test_the_anchor_is_part_of_the_energy(small_bars: Shapes) -> None:
-    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, False)
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
     anchored, place = SumOfEnergies(case.modal, anchor=7.0), [case.placement]
     gain = 3.5 * case.a.square().sum(-1)
     torch.testing.assert_close(anchored.value(case.a, place), case.energy_by_hand(case.a) + gain)
@@ -157,43 +151,41 @@ def test_the_anchor_is_part_of_the_energy(small_bars: Shapes) -> None:
     torch.testing.assert_close((value, gradient), (anchored.value(case.a, place), held.gradient))
 
 
-@pytest.mark.parametrize("extra", [False, True])
-def test_pull_back_agrees_with_autograd(surface_of: tuple[Tensor, Tensor], extra: bool) -> None:
-    case = Case(*surface_of, extra)
+def test_pull_back_agrees_with_autograd(surface_of: tuple[Tensor, Tensor]) -> None:
+    case = Case(*surface_of)
     along = torch.randn(case.a.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     leaves = [leaf.clone().requires_grad_() for leaf in trees.leaves(case.placement)]
     tracked = trees.filled(case.placement, leaves)
     slope = (case.modal.derivatives(case.a, tracked, second_order=False).gradient * along).sum()
     truth = torch.autograd.grad(slope, leaves, allow_unused=True, materialize_grads=True)
     found = trees.leaves(case.modal.pull_back(case.a, along, case.placement))
-    assert len(found) == len(truth) == 8 + extra
+    assert len(found) == len(truth) == 8
     for value, wanted in zip(found, truth, strict=True):
         assert float((value - wanted).norm()) <= 1e-11 * float(wanted.norm())
 
 
 def require_true_hessian(case: Case) -> None:
     got = case.derivatives()
-    assert got.second_order is not None
     gradient = torch.autograd.functional.jacobian(lambda a: case.energy_by_hand(a).sum(), case.a)
     assert relative(got.gradient, gradient) < 1e-12
-    assert relative(got.gauss_newton + got.second_order, case.hessian_by_autograd()) < 1e-11
+    assert relative(got.hessian, case.hessian_by_autograd()) < 1e-11
 
 
 @pytest.mark.parametrize("cut", [0, 6])
 @pytest.mark.parametrize("stiffness", [(500.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 1000.0)])
 def test_each_term_alone(stiffness: tuple[float, float, float], cut: int, small_bars: Shapes) -> None:
     names = dict(zip(("alpha", "beta", "gamma"), stiffness, strict=True))
-    require_true_hessian(Case(small_bars.faces[cut:], small_bars.keyframes[1] * 20, True, **names))
+    require_true_hessian(Case(small_bars.faces[cut:], small_bars.keyframes[1] * 20, **names))
 
 
 @pytest.mark.parametrize("stiffness", [{"gamma": 0.0}, {"alpha": 0.0, "beta": 0.0}], ids=["area", "volume"])
 @pytest.mark.parametrize("faces", [FINS, MOEBIUS], ids=["three faces at an edge", "moebius strip"])
 def test_no_consistent_winding(faces: list[list[int]], stiffness: dict[str, float]) -> None:
-    require_true_hessian(Case(*odd_surface(faces), True, **stiffness))
+    require_true_hessian(Case(*odd_surface(faces), **stiffness))
 
 
 def test_second_order_is_optional_and_comes_in_chunks(small_bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, True)
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
     whole, first_order = case.derivatives(), case.derivatives(second_order=False)
     assert first_order.second_order is None
     assert torch.equal(whole.gauss_newton, first_order.gauss_newton)
@@ -203,7 +195,7 @@ def test_second_order_is_optional_and_comes_in_chunks(small_bars: Shapes, monkey
 
 
 def test_cardinality_value_takes_more_leading_dimensions(small_bars: Shapes) -> None:
-    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, True)
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
     many = case.a + 0.01 * torch.arange(4, dtype=torch.float64)[:, None, None]
     energies = case.modal.value(many, case.placement)
     assert energies.shape == (4, BATCH)
@@ -213,7 +205,7 @@ def test_cardinality_value_takes_more_leading_dimensions(small_bars: Shapes) -> 
 
 @pytest.mark.parametrize("second_order", [False, True])
 def test_collapsed_triangles_give_finite_derivatives(second_order: bool, small_bars: Shapes) -> None:
-    case = Case(small_bars.faces, small_bars.keyframes[1] * 20, False)
+    case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
     base = case.placement.base.clone()
     base[0, :, small_bars.faces[0, 0]] = base[0, :, small_bars.faces[0, 1]]
     base[1, :, small_bars.faces[0]] = base[1, :, small_bars.faces[0, :1]]

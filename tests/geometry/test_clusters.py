@@ -14,7 +14,7 @@ from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.rigid import best_rotation
-from torch_modal.inbetween.blend import Blends
+from torch_modal.motion.spline import Spline
 
 TURNS = 3
 
@@ -92,9 +92,8 @@ def test_gradients(mesh: Connectivity, kind: type[LocalRotations]) -> None:
     assert torch.autograd.gradcheck(lambda *given: rotations(*pair(*given)), given, fast_mode=True)
 
 
-def test_other_pairs_have_clusters_of_their_own(mesh: Connectivity) -> None:
-    shapes = torch.stack([strip(0), strip(0.5), strip(TURNS)])
-    blends = Blends(mesh, shapes, (0, 1), TorchBackend())
-    assert blends.first.rotations.clusters is None
-    assert blends.of(1, 2).rotations.clusters is not None
-    assert Blends(mesh, shapes, (0, 2), TorchBackend()).of(0, 1).rotations.clusters is None
+def test_intervals_of_a_motion_have_clusters_of_their_own(mesh: Connectivity) -> None:
+    shapes, times = torch.stack([strip(0), strip(0.5), strip(TURNS)]), torch.arange(3).double()
+    for order, wanted in (([0, 1, 2], [False, True]), ([2, 0, 1], [True, False])):
+        spline = Spline(mesh, shapes[order], times, None, TorchBackend())
+        assert [rotations.clusters is not None for rotations in spline.rotations] == wanted

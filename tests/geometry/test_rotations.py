@@ -4,9 +4,8 @@ import math
 
 import pytest
 import torch
-from conftest import Shapes, modal, problem_of
+from conftest import Shapes, modal, placement_of
 from torch import Tensor
-from torch_modal.geometry.hermite import Spacing
 
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
@@ -15,8 +14,9 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.rotations import exp
-from torch_modal.inbetween.blend import Blends, RotationBlend
+from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.layers.mid_shape import MidShape
+from torch_modal.motion.spline import Spline
 
 T = torch.tensor([0.0, 0.3, 0.5, 1.0], dtype=torch.float64)
 
@@ -144,17 +144,17 @@ def test_the_corner_that_faces_begin_with_changes_nothing(name: str, kind: str, 
     sample = load_sample(name)
     x, faces = torch.cat([sample.keyframes, sample.truth])[:3].contiguous(), sample.faces
     first = torch.randint(3, (len(faces), 1), generator=generator)
-    half, hours = T[2:3], Spacing(*(torch.ones(1, dtype=torch.float64) for _ in range(3)))
+    half, times, backend = T[2:3], torch.arange(3, dtype=torch.float64), choose(kind)
     shapes = []
     for corners in (faces, faces.gather(1, (first + torch.arange(3)) % 3)):
-        blend = RotationBlend(Connectivity(corners.numpy()), x, choose(kind))
-        trajectory = blend.rotations.trajectory(x[2:], x[:1], x[1:2], None, hours)
+        mesh = Connectivity(corners.numpy())
+        blend, spline = RotationBlend(mesh, x, backend), Spline(mesh, x, times, None, backend)
         shapes.append(
             torch.cat(
                 [
                     blended(blend, x[:1], x[1:2], half),
                     blend(x[None], torch.tensor([[0.5, 0.2, 0.3]], dtype=torch.float64), x[:1]),
-                    blend.along(trajectory, torch.tensor([0]), x[:1], half),
+                    spline(spline.knots(x[None]), 1, torch.tensor([0]), half) / spline.alignment.scale,
                 ]
             )
         )
@@ -182,29 +182,25 @@ def test_blend_is_the_shape_of_these_edges(degrees: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["torch", "warp"])
-def test_pairs_share_a_blend_where_no_tree_would_tell_another_sense(
+def test_intervals_share_rotations_where_no_tree_would_tell_another_sense(
     kind: str, small_bars: Shapes, generator: torch.Generator
 ) -> None:
     if kind == "warp":
         pytest.importorskip("warp")
-    backend = choose(kind)
     # Torn to pieces: neighbours turn any way, so that it matters which of them are compared.
     x = small_bars.keyframes
     torn = x[:1] + 0.5 * torch.randn(x[:1].shape, dtype=x.dtype, generator=generator)
     mesh, shapes = Connectivity(small_bars.faces.numpy()), torch.cat([x, torn])
-    blends = Blends(mesh, shapes, (0, 1), backend)
-    shared, own = blends.of(0, 1), blends.of(2, 3)
-    assert blends.of(1, 2) is shared and blends.of(2, 0) is shared
-    assert own is not shared and own.poisson is shared.poisson
-    alone = RotationBlend(mesh, shapes[2:], backend)
-    assert torch.equal(own.rotations.ancestors, alone.rotations.ancestors)
-    assert not torch.equal(own.rotations.ancestors, shared.rotations.ancestors)
+    shared, also, own = Spline(mesh, shapes, torch.arange(4.0).double(), None, choose(kind)).rotations
+    assert also is shared and own is not shared
+    assert torch.equal(own.ancestors, LocalRotations(mesh, shapes[2:]).ancestors)
+    assert not torch.equal(own.ancestors, shared.ancestors)
 
 
 def test_a_tree_of_another_pair_tells_the_way_round() -> None:
     (x, faces), half, whole = ribbon(0.0), ribbon(math.radians(130))[0], ribbon(math.radians(300))[0]
     mesh = Connectivity(faces.numpy())
-    blend = Blends(mesh, torch.stack([x, half, whole]), (0, 1), TorchBackend()).of(0, 2)
+    blend = RotationBlend(mesh, torch.stack([x, half, whole]), TorchBackend())
     found = blended(blend, x[None], whole[None], T[2:3])[0]
     torch.testing.assert_close(edges(found, mesh), edges(ribbon(math.radians(150))[0], mesh), rtol=0, atol=1e-9)
 
@@ -243,11 +239,13 @@ def test_derivatives(degrees: float, generator: torch.Generator) -> None:
 def test_starts_near_the_end_on_a_hand(ends: tuple[int, int], bound: float, hands: Shapes) -> None:
     """Linear interpolation has 11.8, 3.7 and 6.6 times its energy; fingers turn by up to 300 degrees."""
     pair = hands.pick(*ends)
-    layer = MidShape(pair.bases, pair.faces, **modal())
-    frame = layer.space.frame
-    t = torch.tensor([0.5], dtype=torch.float64)
-    problem = problem_of(layer, frame.place(*pair.keyframes[:, None]), t)
-    energies = [float(layer.step.energy.value(a, problem.placement)) for a in (problem.start, 0 * problem.start)]
+    layer, half = MidShape(pair.bases, pair.faces, **modal()), torch.full((1, 2), 0.5, dtype=torch.float64)
+    core = layer.in_between.core
+    zeros = half.new_zeros(1, core.space.energy.n_amplitudes)
+    energies = [
+        float(core.space.energy.value(zeros, placement_of(core, pair.keyframes[None], half, linear)))
+        for linear in (False, True)
+    ]
     least = float(layer.solve(*pair.keyframes).solution.energy)
     assert energies[0] < bound * least
     assert energies[1] > 3 * least

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from torch_modal.inbetween.comparison import no_worse
+from torch_modal.inbetween.comparison import blended
 
 INF, NAN = torch.inf, torch.nan
 
@@ -15,21 +15,21 @@ INF, NAN = torch.inf, torch.nan
 )
 def test_a_shape_gives_way_from_a_tenth_more_distortion_to_a_fifth(own: float, part: float) -> None:
     x, start = torch.zeros(1, 4, 3).double(), torch.ones(1, 4, 3).double()
-    found, replaced = no_worse(x, [start], torch.tensor([[own], [1.0]]).double(), torch.zeros(1).double())
+    found, replaced = blended(x, [start], torch.tensor([[own], [1.0]]).double(), torch.zeros(1).double())
     assert float(found[0, 0, 0]) == pytest.approx(part, abs=1e-6) and replaced.tolist() == [part == 1]
 
 
 def test_the_best_of_the_starts_is_taken() -> None:
     x, starts = torch.zeros(3, 4, 3), [torch.full((3, 4, 3), value) for value in (1.0, 2.0)]
     distortion = torch.tensor([[9.0, 9.0, 1.0], [1.0, 3.0, 1.0], [2.0, 2.0, 1.0]])
-    found, worse = no_worse(x, starts, distortion, torch.zeros(3))
+    found, worse = blended(x, starts, distortion, torch.zeros(3))
     assert worse.tolist() == [True, True, False] and found[:, 0, 0].tolist() == [1.0, 2.0, 0.0]
 
 
 def test_gradient_of_the_blend(generator: torch.Generator) -> None:
-    def blended(x: Tensor) -> Tensor:
+    def given_way(x: Tensor) -> Tensor:
         own = 1 + 0.2 * torch.sigmoid(x.sum((1, 2)))
         distortion = torch.stack([own, torch.ones_like(own)])
-        return no_worse(x, [torch.ones_like(x)], distortion, torch.zeros_like(own))[0]
+        return blended(x, [torch.ones_like(x)], distortion, torch.zeros_like(own))[0]
 
-    assert gradcheck(blended, torch.randn(2, 4, 3, dtype=torch.float64, generator=generator).requires_grad_())
+    assert gradcheck(given_way, torch.randn(2, 4, 3, dtype=torch.float64, generator=generator).requires_grad_())

@@ -143,7 +143,7 @@ def caching(args: argparse.Namespace) -> dict[str, Any]:
 
 def mode_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of `extract_bases` besides the number of modes."""
-    return {"method": args.method, "mesher": args.mesher, "settings": args.quality, **caching(args)}
+    return {"method": args.method, "mesher": args.mesher, **caching(args)}
 
 
 def reporter(args: argparse.Namespace) -> Callable[[str], None]:

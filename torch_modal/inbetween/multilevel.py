@@ -42,7 +42,7 @@ class MultilevelEnergy(nn.Module):
                 sampled = own_terms[0].sampled
                 parts.append(CoarseEnergy(Energy(fine.mesh if sampled else mesh, own_terms, sampled)))
         self.parts: Any = nn.ModuleList(parts)
-        self._coarse, self._fine = (coarse,), (fine,)
+        self.coarse, self._fine = coarse, (fine,)
 
     def modal(self, basis: SubspaceBasis, anchor: float = 0.0) -> SumOfEnergies:
         """All of them in the amplitudes of a subspace, anchored at zeros."""
@@ -58,7 +58,7 @@ class MultilevelEnergy(nn.Module):
             rests: The rest shapes on the fine mesh.
             soften: True for less bending stiffness at needles of the base.
         """
-        restrict = self._coarse[0].restrict
+        restrict = self.coarse.restrict
         bases = self._seen(base, restrict(base))
         shapes = self._seen(rests.shapes, restrict(rests.shapes))
         placed = []
@@ -82,7 +82,7 @@ class MultilevelEnergy(nn.Module):
         own = [values[i] for i in members]
         if energy.sampled:
             return own
-        fine, coarse = self._fine[0].energy.parts, self._coarse[0]
+        fine, coarse = self._fine[0].energy.parts, self.coarse
         parts = zip(own, members, energy.parts, strict=True)
         return [coarse_values(value, fine[i], part, coarse.clusters, coarse.n_vertices) for value, i, part in parts]
 

@@ -89,10 +89,10 @@ class InBetweenLayer(nn.Module):
         self.bases = nn.ModuleList(bases)
         self.faces = torch.from_numpy(as_faces(faces))
         self._build()
-        self.register_load_state_dict_post_hook(lambda layer, _: layer._build())
+        self.register_load_state_dict_post_hook(InBetweenLayer._build)
 
     @lasting
-    def _build(self) -> None:
+    def _build(self, _: Any = None) -> None:
         """Build everything that follows from the bases, in float64 on the CPU, then of their dtype and device."""
         like = self.bases[0].reference
         references, modes = (

@@ -7,6 +7,7 @@ stretch.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -91,10 +92,10 @@ class ModalDecoder(nn.Module):
             self.spline.poisson.centres(displaced) * self.spline.alignment.scale if several else displaced[..., :0]
         )
         self.register_buffer("moves", centres.permute(1, 2, 0).flatten(1).contiguous())
-        self.register_load_state_dict_post_hook(lambda decoder, _: decoder._build())
+        self.register_load_state_dict_post_hook(ModalDecoder._build)
 
     @lasting
-    def _build(self) -> None:
+    def _build(self, _: Any = None) -> None:
         """Build everything that follows from the key-frames, their times and the reference."""
         keyframes = self.keyframes
         used = self.reference[self.faces.unique()]

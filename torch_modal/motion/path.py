@@ -114,10 +114,10 @@ class Path(nn.Module):
         elif self.objective.terms or self.contact:
             self.layers.append(Blend(own, self.faces, **given))
         self._build()
-        self.register_load_state_dict_post_hook(lambda path, _: path._build())
+        self.register_load_state_dict_post_hook(Path._build)
 
     @lasting
-    def _build(self) -> None:
+    def _build(self, _: Any = None) -> None:
         """Build the spline of the bases' references, on their device and in their dtype."""
         like = self.bases[0].reference
         references = torch.stack([basis.reference.double().cpu() for basis in self.bases])
