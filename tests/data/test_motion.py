@@ -36,25 +36,12 @@ def test_neighbours_in_time() -> None:
     assert Motion(range(2), 2).neighbours.tolist() == [[1, 1], [0, 0]]
 
 
-def test_ways_between_neighbours() -> None:
+def test_spans_of_successive_key_frames() -> None:
     motion = Motion((0, 1, 3, 4), 4)
-    for (i, j), keyframes, times in (
-        ((0, 1), [0, 1, 2], [0, 1, 3]),
-        ((1, 2), [0, 1, 2, 3], [-0.5, 0, 1, 1.5]),
-        ((2, 1), [3, 2, 1, 0], [-0.5, 0, 1, 1.5]),
-        ((2, 3), [1, 2, 3], [-2, 0, 1]),
-    ):
-        span = motion.span(i, j)
-        assert span is not None and span[0] == keyframes and span[1].tolist() == times
+    assert [motion.span(*pair) for pair in ((0, 1), (1, 2), (2, 1), (2, 3))] == [(0, 1), (1, 3), (3, 1), (3, 4)]
     assert motion.span(0, 2) is None and motion.span(0, 3) is None and motion.span(1, 1) is None
     cycle = Motion((0, 1, 3, 5), 3, cyclic=True)
-    for (i, j), keyframes, times in (
-        ((2, 0), [1, 2, 0, 1], [-1, 0, 1, 1.5]),
-        ((0, 2), [1, 0, 2, 1], [-0.5, 0, 1, 2]),
-        ((0, 1), [2, 0, 1, 2], [-2, 0, 1, 3]),
-    ):
-        span = cycle.span(i, j)
-        assert span is not None and span[0] == keyframes and span[1].tolist() == times
+    assert [cycle.span(*pair) for pair in ((2, 0), (0, 2), (0, 1))] == [(3, 5), (5, 3), (0, 1)]
     # Two have nobody to be smooth with, whichever way they go round.
     assert Motion(range(2), 2).span(0, 1) is None and Motion(range(3), 2, cyclic=True).span(0, 1) is None
 
@@ -86,8 +73,7 @@ def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Sh
         with torch.no_grad():
             expected = path(shapes.keyframes, torch.lerp(*torch.tensor(when[i : i + 2], dtype=F64), u))
         found = space.in_betweens.of_keyframes(i, j, u)
-        # Weights of vertices are means over the neighbours here, over all key-frames there.
-        assert largest(found - expected) < 2e-3
+        assert largest(found - expected) < 1e-12
         assert largest(pairs.in_betweens.of_keyframes(i, j, u) - expected) > 2e-2
         assert torch.equal(found[[0, -1]], shapes.keyframes[[i, j]])
         torch.testing.assert_close(space.in_betweens.of_keyframes(j, i, 1 - u), found, rtol=0, atol=1e-6)
@@ -98,7 +84,7 @@ def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Sh
     assert torch.equal(found, pairs.in_betweens.of_shapes(x[:1], x[1:], half, 0, 1))
 
 
-def test_tables_hold_the_path_and_follow_from_times_and_neighbours(bar_motion: Shapes, tmp_path: Path) -> None:
+def test_tables_hold_the_path_and_follow_from_times_and_key_frames(bar_motion: Shapes, tmp_path: Path) -> None:
     t = torch.linspace(0, 1, 23, dtype=F64)
     solved = space_of(bar_motion, times=None).in_betweens.of_keyframes(1, 2, t)
     read = space_of(bar_motion, folder=tmp_path).in_betweens.of_keyframes(1, 2, t)
@@ -108,14 +94,13 @@ def test_tables_hold_the_path_and_follow_from_times_and_neighbours(bar_motion: S
     file = tmp_path / "between-1-2.safetensors"
     kept, when = tmp_path / "kept", file.stat().st_mtime_ns
     shutil.copy2(file, kept)
-    # Twice as slow is the same way, and what is beyond the neighbours has no say.
-    space_of(bar_motion, folder=tmp_path, keyframe_times=[2 * t for t in TIMES[:4]] + [20.0]).in_betweens.table(1, 2)
+    space_of(bar_motion, folder=tmp_path).in_betweens.table(1, 2)
     assert file.stat().st_mtime_ns == when
     first = bar_motion.bases[0]
     modes = first.modes + 0.1 * torch.sin(first.reference)
     other = tm.ModalBasis(first.reference, first.eigenvalues, modes, first.rigid_eigenvalues)
     changed = bar_motion._replace(bases=[other, *bar_motion.bases[1:]])
-    for shapes, times in ((bar_motion, None), (bar_motion, (0.0, 0.6, 2.0, 3.0, 4.5)), (changed, TIMES)):
+    for shapes, times in ((bar_motion, None), (bar_motion, (0.0, 0.5, 2.0, 3.0, 4.6)), (changed, TIMES)):
         shutil.copy2(kept, file)
         space_of(shapes, folder=tmp_path, keyframe_times=times).in_betweens.table(1, 2)
         assert file.stat().st_mtime_ns != when
@@ -171,6 +156,6 @@ def test_a_dataset_draws_from_the_path_of_a_stored_motion(bar_motion: Shapes, tm
         return (samples[:, None] - middles).flatten(2).abs().amax(2)
 
     found = distances()
-    assert largest(found.amin(1)) < 2e-3
+    assert largest(found.amin(1)) < 1e-12
     assert set(found.argmin(1).tolist()) == {0, 1, 2, 3}
     assert float(distances(keyframe_times=None).amin(1).min()) > 1e-2

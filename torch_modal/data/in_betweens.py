@@ -169,18 +169,22 @@ class InBetweens:
 
     def _path(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
         """Shapes between two key-frames: along the motion if they follow each other in it, else of the pair."""
-        span = None if self.motion is None else self.motion.span(i, j)
+        motion, span = self.motion, None if self.motion is None else self.motion.span(i, j)
         bases = [self.bases[i], self.bases[j]] if span is None else list(self.bases)
         shapes = torch.stack([basis.reference for basis in bases]).to(like)
         if span is None and not self.objective.contact:
             return partial(self._layer(i, j, like).solve, *shapes)
         # A path separates contacts the same way at all times, so that tables are smooth.
         given: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
-        if span is None or self.motion is None:
+        if span is None or motion is None:
             return partial(MotionPath(bases, self.faces, **given).to(like).solve, shapes)
-        key, times, cyclic, (start, end) = (like.dtype, like.device), self.motion.times, self.motion.cyclic, span
-        path = self._paths.get(key, lambda: MotionPath(bases, self.faces, times, cyclic, **given).to(like))
-        return lambda t: path.solve(shapes, start + t.double() * (end - start))
+
+        def made() -> MotionPath:
+            return MotionPath(bases, self.faces, motion.times, motion.cyclic, **given).to(like)
+
+        path = self._paths.get((like.dtype, like.device), made)
+        start, end = torch.tensor(span, dtype=torch.float64, device=like.device)
+        return lambda t: path.solve(shapes, torch.lerp(start, end, t.double()))  # exact at both ends
 
     def _key(self, i: int, j: int) -> dict[str, str] | None:
         """Digest of all inputs of a table: bases, times, faces, settings and code; None, with a warning, if unknown."""
@@ -188,11 +192,9 @@ class InBetweens:
         bases = self.bases if span else [self.bases[place] for place in (i, j)]
         tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
         code = __version__, str(torch.__version__), code_digest()
-        settings = self.objective, self.solver
+        when = self.motion and span and (span, self.motion.times)
         try:
-            content = content_digest(
-                [*code, tensors, self.faces, span and (*span, self.motion and self.motion.times), settings]
-            )
+            content = content_digest([*code, tensors, self.faces, when, self.objective, self.solver])
         except ContentError as error:
             warnings.warn(
                 f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
