@@ -10,7 +10,6 @@ from conftest import Shapes, random_rotation
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.layers import modal_decoder
 
 
 @pytest.fixture(scope="module")
@@ -126,24 +125,6 @@ def test_leading_dimensions_and_dtypes(decoder: tm.ModalDecoder, bars: Shapes) -
         decoder(torch.zeros(2, 8).double(), 0.5, torch.zeros(2, 5).double())
     with pytest.raises(ValueError, match=r"0 and 3; got 3\.5"):
         decoder(a, 3.5)
-
-
-def test_few_intervals_are_kept(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A long motion has many, and each holds a factorised system."""
-    basis, times = bars.bases[0], torch.tensor([0.0, 1.0, 3.0, 4.0]).double()
-
-    def make() -> tm.ModalDecoder:
-        return tm.ModalDecoder(bars.keyframes, bars.faces, times, basis.reference, basis.modes).requires_grad_(False)
-
-    many = make()
-    a, t = torch.ones(6, 8).double(), torch.tensor([3.5, 0.2, 1.5, 0.7, 3.1, 2.0]).double()
-    wanted = many(a, t)
-    monkeypatch.setattr(modal_decoder, "KEPT", 0)
-    few = make()
-    for _ in range(2):
-        assert torch.equal(few(a, t), wanted)
-    assert len(many._blends) == 3
-    assert len(few._blends) == len(few._known) == 2
 
 
 # --------------------------------------------------------------------------------------------------------------- encode
