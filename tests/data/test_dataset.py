@@ -11,9 +11,9 @@ import torch
 from conftest import Shapes
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader, default_collate
-from torch_modal.data.in_betweens import FORMAT, VERSION, write_table
 
 import torch_modal as tm
+from torch_modal.data.in_betweens import FORMAT, VERSION, write_table
 from torch_modal.energy.bend import Bend
 from torch_modal.io.cache import CacheWarning
 from torch_modal.io.tensors import TensorFile
