@@ -127,6 +127,9 @@ class LocalRotations(nn.Module):
         turns = _turn_between(start, own)
         if self.clusters is None:
             signs = self.sign(turns.detach().movedim(0, -1), own.doubled_areas.detach())
+            # A triangle that is a point has no frame and a quaternion of 0.5: with the other sign it would make a whole
+            # turn, whose axis has no derivative.
+            signs = torch.where(turns.detach().square().sum(0) < 0.5, 1.0, signs)
             turns = (signs * turns).unflatten(1, weights.shape)
             turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
