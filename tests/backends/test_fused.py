@@ -113,8 +113,9 @@ def test_local_steps(case: Case) -> None:
     found, truth = case.by_warp(*case.given), case.by_torch(*case.given)
     assert float((truth - case.given[0]).abs().max()) > 1e-2
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-8 * CANONICAL_SIZE)
-    truth = gradients(case.by_torch, case.given)
-    assert_alike(gradients(case.by_warp, case.given), truth, 1e-6)
+    assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
+    if case.fused.closed:
+        assert_alike(gradients(case.by_warp, case.given, True), gradients(case.by_torch, case.given, True), 1e-7)
 
 
 def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None:
@@ -145,19 +146,6 @@ def test_gradient_where_the_steps_start(small_bars: Shapes) -> None:
     given = [start, case.given[1], case.given[1].clone(), *case.given[3:]]
     for run in (case.by_warp, case.by_torch):
         assert all(float(own.abs().max()) < 10 for own in gradients(run, given))
-
-
-def test_gradients_of_gradients(small_bars: Shapes) -> None:
-    case = Case(small_bars, small_bars.faces, 0.3)
-    assert_alike(gradients(case.by_warp, case.given, True), gradients(case.by_torch, case.given, True), 1e-7)
-
-
-def test_vmap(small_bars: Shapes) -> None:
-    case = Case(small_bars, small_bars.faces, 0.3)
-    moved = torch.stack([case.given[0], 1.01 * case.given[0]])
-    found = vmap(lambda x: case.by_warp(x, *case.given[1:]))(moved)
-    truth = torch.stack([case.by_warp(x, *case.given[1:]) for x in moved])
-    torch.testing.assert_close(found, truth, rtol=0, atol=1e-12 * CANONICAL_SIZE)
 
 
 class TestModal:
@@ -336,15 +324,6 @@ class TestLayers:
         found, truth = (layer.to(dtype)(x_a, x_b, torch.tensor([0.3, 0.5], dtype=dtype)) for layer in made)
         assert found.dtype == dtype
         torch.testing.assert_close(found, truth, rtol=0, atol=1e-7 if dtype == torch.float64 else 1e-4)
-
-    def test_local_steps_after_the_papers_space(self, bars: Shapes) -> None:
-        solvers = [tm.Solver(backend=kind) for kind in ("warp", "torch")]
-        found, truth, without = (
-            tm.InBetween(bars.bases[:2], bars.faces, "paper", solver=solver)(*bars.keyframes[:2], 0.5)
-            for solver in [*solvers, tm.Solver(local_steps=0)]
-        )
-        torch.testing.assert_close(found, truth, rtol=0, atol=1e-7)
-        assert float((found - without).abs().max()) > 1e-3
 
     def test_path(self, bars: Shapes) -> None:
         paths = [tm.Path(bars.bases, bars.faces, solver=tm.Solver(backend=kind)) for kind in ("warp", "torch")]

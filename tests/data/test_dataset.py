@@ -11,9 +11,9 @@ import torch
 from conftest import Shapes
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader, default_collate
-from torch_modal.data.in_betweens import FORMAT, VERSION, write_table
 
 import torch_modal as tm
+from torch_modal.data.in_betweens import FORMAT, VERSION, write_table
 from torch_modal.energy.bend import Bend
 from torch_modal.io.cache import CacheWarning
 from torch_modal.io.tensors import TensorFile
@@ -90,10 +90,9 @@ def test_samples_are_the_transforms(root: Path, bars: Shapes) -> None:
     for i in range(3):
         assert torch.equal(still[i]["vertices"], bars.keyframes[i])
     middle = tm.ShapeDataset(root, tm.RandomInBetween(t=(0.5, 0.5), p=1.0), samples_per_set=12, dtype=torch.float64)
-    layer = tm.InBetween(bars.bases, bars.faces, "fast", pairs=[(0, 1), (1, 2), (0, 2)])
     truths = {
-        pair: layer(bars.keyframes[pair[0]], bars.keyframes[pair[1]], 0.5, i)
-        for i, pair in enumerate([(0, 1), (1, 2), (0, 2)])
+        (i, j): tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, "fast")(*bars.keyframes[[i, j]], 0.5)
+        for i, j in ((0, 1), (1, 2), (0, 2))
     }
     seen = set()
     for i in range(12):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes, processes, wait_until
-from safetensors.torch import load_file, save_file
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
@@ -23,7 +22,7 @@ from torch_modal.io.frames import save_frames
 # In place of the process that computes a set: the set's name says what becomes of it. The package itself starts it,
 # keeps its time and reads its result.
 FAKE = """
-import json, os, signal, subprocess, sys, time
+import hashlib, json, os, signal, subprocess, sys, time
 job = json.loads(sys.stdin.readline())
 name, record = os.path.basename(job["target"]), job["record"]
 with open(os.environ["FAKE_LOG"], "a") as log:
@@ -46,12 +45,19 @@ if "refuse" in name:
 record.update(status="done", seconds=0.1, warnings=["a bit open"] if "open" in name else [])
 data = open(os.environ["FAKE_SET"], "rb").read()
 end = 8 + int.from_bytes(data[:8], "little")
-header = json.loads(data[8:end])
-header["__metadata__"]["note"] = json.dumps(record)
+header, body = json.loads(data[8:end]), bytearray(data[end:])
+entry = json.loads(header["__metadata__"]["torch_modal"])
+entry = json.dumps({**entry, "note": json.dumps(record)}, sort_keys=True)
+header["__metadata__"]["torch_modal"] = entry
+names = sorted(name for name in header if name not in ("__metadata__", "digests"))
+first, last = header["digests"]["data_offsets"]
+digest = hashlib.sha256(json.dumps([entry, names]).encode() + body[first + 32 : last]).digest()
+body[first : first + 32] = digest
 head = json.dumps(header).encode()
+head += b" " * (-len(head) % 8)
 os.makedirs(job["target"], exist_ok=True)
 file = os.path.join(job["target"], "set.safetensors")
-open(file + ".tmp", "wb").write(len(head).to_bytes(8, "little") + head + data[end:])
+open(file + ".tmp", "wb").write(len(head).to_bytes(8, "little") + head + body)
 os.replace(file + ".tmp", file)
 if os.path.exists(job["target"] + "/precompute-failure.json"):
     os.unlink(job["target"] + "/precompute-failure.json")
@@ -101,14 +107,11 @@ def bench(tmp_path: Path, bars: Shapes, capsys: pytest.CaptureFixture[str], monk
     made = Bench(tmp_path, capsys)
     (tmp_path / "worker.py").write_text(FAKE)
     write_set(tmp_path / "stored", *bars, ["1.obj", "2.obj", "3.obj"])
-    stored = load_file(file := tmp_path / "stored" / SET_FILE)
-    del stored["digests"]  # so that the fake process may write a note
-    save_file(stored, file, {"format": "torch_modal.set", "version": "2", "names": "[0, 1, 2]", "times": "null"})
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr(precompute_set, "COMMAND", [sys.executable, str(tmp_path / "worker.py")])
     monkeypatch.setattr(precompute_set.tempfile, "tempdir", str(tmp_path / "scratch"))
     monkeypatch.setenv("FAKE_LOG", str(made.log))
-    monkeypatch.setenv("FAKE_SET", str(file))
+    monkeypatch.setenv("FAKE_SET", str(tmp_path / "stored" / SET_FILE))
     return made
 
 

@@ -8,13 +8,16 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
+from scipy.interpolate import CubicSpline
 from shapes import diagonal, edge_error, largest
 from terms import Area
 from torch import Tensor, nn
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.geometry import hermite
+from torch_modal.motion import cubics as splines
+from torch_modal.motion import subdivide as sequence
+from torch_modal.motion.cubics import Cubics, Squared, cubics, offset
 from torch_modal.motion.path import Path
 
 DOUBLE = torch.float64
@@ -38,49 +41,40 @@ def path(motion: Shapes) -> Path:
 # --------------------------------------------------------------------------------------------------- cubic motion
 
 
-def test_half_way_it_is_the_four_point_scheme(generator: torch.Generator) -> None:
-    a, b, c, d = 0.1 * torch.randn(4, 50, dtype=DOUBLE, generator=generator) + times(0, 1, 2, 3)[:, None]
-    even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
-    bend = hermite.tangent_offset(c - b, b - a, d - c, even)
-    half = b + 0.5 * (c - b) + hermite.beyond(bend, times(0.5))
-    torch.testing.assert_close(half, 9 / 16 * (b + c) - 1 / 16 * (a + d))
+def along(found: Cubics, i: int, u: Tensor) -> Tensor:
+    """The way along one interval. *Shape:* ``(T,) -> (T, ...)``."""
+    step, first, last = (part[i] for part in found)
+    u = u.view(-1, *[1] * step.dim())
+    return u * step + offset(first, last, u)
 
 
-def test_a_parabola_is_followed_whatever_the_spacing() -> None:
-    def at(t: Tensor) -> Tensor:
-        return 3 + 2 * t + 0.5 * t * t
-
-    knots, u = times(0.0, 0.7, 1.9, 2.4), torch.linspace(0, 1, 9, dtype=DOUBLE)
-    steps, h = at(knots).diff(), hermite.Spacing(*knots.diff())
-    bend = hermite.tangent_offset(steps[1], steps[0], steps[2], h)
-    found = at(knots[1]) + u * steps[1] + hermite.beyond(bend, u)
-    torch.testing.assert_close(found, at(knots[1] + u * h.own))
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_where_nothing_is_limited_it_is_the_spline_of_scipy(cyclic: bool, generator: torch.Generator) -> None:
+    knots, u = times(0.0, 0.7, 1.9, 2.4, 3.6, 4.1), torch.linspace(0, 1, 9, dtype=DOUBLE)
+    x = knots[:, None] + 0.1 * torch.randn(6, 50, dtype=DOUBLE, generator=generator)
+    if cyclic:  # round a large circle
+        angle = 2 * math.pi * knots / knots[-1]
+        x = torch.stack([angle.cos(), angle.sin()], 1)
+        x[-1] = x[0]
+    found = cubics(x.diff(dim=0), knots.diff(), cyclic, lambda v: v.square().sum(-1, keepdim=True))
+    truth = CubicSpline(knots.numpy(), x.numpy(), bc_type="periodic" if cyclic else "natural")
+    for i in range(5):
+        wanted = torch.from_numpy(truth(torch.lerp(knots[i], knots[i + 1], u).numpy()))
+        torch.testing.assert_close(x[i] + along(found, i, u), wanted, rtol=0, atol=1e-12)
 
 
 def test_what_stops_does_not_overshoot() -> None:
     """Key-frames on a line, unevenly spaced, and one that rests: the motion between never turns back."""
-    places = times(0.0, 0.1, 5.0, 5.0, 5.2, 9.0)
-    even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
-    u = torch.linspace(0, 1, 33, dtype=DOUBLE)
-    for i in range(1, 4):
-        steps = places.diff()
-        bend = hermite.tangent_offset(steps[i], steps[i - 1], steps[i + 1], even)
-        trajectory = places[i] + u * steps[i] + hermite.beyond(bend, u)
-        assert bool((trajectory.diff() >= -1e-12).all())
-    rest = hermite.tangent_offset(places.diff()[2], places.diff()[1], places.diff()[3], even)
-    assert largest(hermite.beyond(rest, u)) == 0
+    places, u = times(0.0, 0.1, 5.0, 5.0, 5.2, 9.0), torch.linspace(0, 1, 33, dtype=DOUBLE)
+    found = cubics(places.diff(), torch.ones(5, dtype=DOUBLE), False)
+    for i in range(5):
+        assert bool((along(found, i, u).diff() >= -1e-12).all())
+    assert largest(along(found, 2, u)) == 0
 
 
-def test_ends_are_natural() -> None:
-    """No second derivative where there is no neighbour, and a straight line with none at all."""
-    step, after = times(1.0), times(1.6)
-    even = hermite.Spacing(*torch.ones(3, dtype=DOUBLE))
-    u = torch.tensor(0.0, dtype=DOUBLE, requires_grad=True)
-    value = hermite.beyond(hermite.tangent_offset(step, None, after, even), u).sum()
-    (first,) = torch.autograd.grad(value, u, create_graph=True)
-    assert float(torch.autograd.grad(first, u)[0]) == pytest.approx(0, abs=1e-12)
-    alone = hermite.tangent_offset(step, None, None, even)
-    assert largest(alone.first) == largest(alone.last) == 0
+def test_one_step_alone_is_straight() -> None:
+    found = cubics(times(1.0), times(2.0), False)
+    assert largest(found.first) == largest(found.last) == 0
 
 
 # ------------------------------------------------------------------------------------------------------------- laws
@@ -108,10 +102,10 @@ def test_cardinality(
 
 def test_pairs_alone_are_the_layers(motion: Shapes) -> None:
     path = Path(motion.bases, motion.faces, smooth=False)
-    layer = path.layer
     found = path(motion.keyframes, times(0.3, 2.6))
     for x, i, u in ((found[0], 0, 0.3), (found[1], 2, 0.6)):
-        torch.testing.assert_close(x, layer(*motion.keyframes[i : i + 2], u, i), rtol=0, atol=1e-9)
+        layer = tm.InBetween(motion.bases[i : i + 2], motion.faces)
+        torch.testing.assert_close(x, layer(*motion.keyframes[i : i + 2], u), rtol=0, atol=1e-9)
     two = motion.pick(0, 1)
     smooth, straight = (Path(two.bases, two.faces, smooth=s)(two.keyframes, 0.4) for s in (True, False))
     assert torch.equal(smooth, straight), "two key-frames have no neighbours"
@@ -126,8 +120,8 @@ def test_a_rigid_motion_is_smooth_too(bars: Shapes) -> None:
         c, s = math.cos(0.8 * t), math.sin(0.8 * t)
         return (x - centre) @ torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=DOUBLE) + centre + t
 
-    path = Path([bars.bases[0]] * 4, bars.faces)
     keyframes = torch.stack([posed(i) for i in range(4)])
+    path = Path(keyframes, bars.faces)
     found = path(keyframes, times(0.25, 1.5, 2.9))
     for y, t in zip(found, (0.25, 1.5, 2.9), strict=True):
         wanted = posed(t)
@@ -137,16 +131,16 @@ def test_a_rigid_motion_is_smooth_too(bars: Shapes) -> None:
 
 def test_reversed_in_time(motion: Shapes) -> None:
     when = times(0.0, 0.5, 2.0, 2.5, 4.0)
-    there = Path(motion.bases, motion.faces, when)
-    back = Path(motion.bases[::-1], motion.faces, 4.0 - when.flip(0))
+    there = Path(motion.keyframes, motion.faces, when)
+    back = Path(motion.keyframes.flip(0), motion.faces, 4.0 - when.flip(0))
     at = times(0.2, 1.1, 2.2, 3.3)
     torch.testing.assert_close(back(motion.keyframes.flip(0), 4.0 - at), there(motion.keyframes, at), rtol=0, atol=1e-9)
 
 
 def test_a_cycle_may_begin_anywhere(motion: Shapes) -> None:
     own = motion.pick(0, 1, 2, 3)
-    cycle = Path(own.bases, own.faces, cyclic=True)
-    rolled = Path(own.bases[1:] + own.bases[:1], own.faces, cyclic=True)
+    cycle = Path(own.keyframes, own.faces, cyclic=True)
+    rolled = Path(own.keyframes.roll(-1, 0), own.faces, cyclic=True)
     at = times(0.3, 1.6, 2.5, 3.9)
     found = cycle(own.keyframes, at)
     torch.testing.assert_close(rolled(own.keyframes.roll(-1, 0), at - 1), found, rtol=0, atol=1e-9)
@@ -165,21 +159,58 @@ def test_velocities_are_continuous(path: Path, motion: Shapes) -> None:
     assert jump(path) < 0.02 * jump(pair)
 
 
+def second_derivatives(path: Path, keyframes: Tensor, h: float = 1e-3) -> Tensor:
+    """Just before and just after the second of three key-frames. *Shape:* ``(2, V, 3)``."""
+    x = path(keyframes, 1 + h * torch.arange(-3, 4, dtype=DOUBLE))
+    return torch.stack([2 * x[3] - 5 * y[0] + 4 * y[1] - y[2] for y in (x[:3].flip(0), x[4:])]) / h**2
+
+
+def test_accelerations_are_continuous(bars: Shapes) -> None:
+    """But for the little by which the triangles' axes differ."""
+    straight, half = bars.keyframes[0], Path(bars.keyframes[:2], bars.faces, [0, 1])(bars.keyframes[:2], 0.4)
+    x = torch.stack([straight, half, bars.keyframes[1]])
+    before, after = second_derivatives(Path(x, bars.faces), x)
+    assert largest(before) > 0.1 and largest(after - before) < 1e-2 * largest(before)
+
+
 def test_velocities_are_continuous_where_edges_change(bars: Shapes) -> None:
     """Both sides of a key-frame fit vertices to edges by the same weights."""
     x, key, h = bars.keyframes.clone(), times(1.0), 1e-5
     x[1] *= 1 + 0.5 * torch.sin(3 * x[1][:, :1])
-    bases = [dataclasses.replace(basis, reference=shape) for basis, shape in zip(bars.bases, x, strict=True)]
     jumps = [
         largest((trajectory(x, key + h) + trajectory(x, key - h) - 2 * x[1]) / h)
-        for trajectory in (Path(bases, bars.faces, smooth=smooth) for smooth in (True, False))
+        for trajectory in (Path(x, bars.faces, smooth=smooth) for smooth in (True, False))
     ]
     assert jumps[0] < 1e-4 * jumps[1]
 
 
+def test_no_modes_are_needed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sequence, "bases_of_checked", lambda *_, **__: pytest.fail("modes are extracted"))
+    x, faces = bars.keyframes, bars.faces
+    path, at = Path(x, faces), times(0.0, 0.3, 1.0, 1.6, 2.0)
+    found = path(x, at)
+    assert torch.equal(found[::2], x)
+    torch.testing.assert_close(found, Path(bars.bases, faces)(x, at), rtol=0, atol=1e-12)
+    frames = tm.subdivide(x, faces, 2, progress=False)
+    torch.testing.assert_close(frames, path(x, torch.linspace(0, 2, 9, dtype=DOUBLE)), rtol=0, atol=1e-12)
+    pairs = tm.subdivide(x, faces, 1, n_modes=0, smooth=False, progress=False)
+    for i in (0, 1):
+        truth = tm.MidShape(x[i : i + 2], faces)(x[i], x[i + 1])
+        torch.testing.assert_close(pairs[2 * i + 1], truth, rtol=0, atol=1e-12)
+        torch.testing.assert_close(Path(x, faces, smooth=False)(x, i + 0.5), truth, rtol=0, atol=1e-9)
+
+
+def test_it_computes_in_float32_at_least(bars: Shapes) -> None:
+    path = Path(bars.keyframes, bars.faces).half()
+    found = path(bars.keyframes.half(), times(0.5, 1.5))
+    assert path.dtype == torch.float32 and found.dtype == torch.float16
+    truth = Path(bars.keyframes, bars.faces)(bars.keyframes, times(0.5, 1.5))
+    assert largest(found.double() - truth) < 1e-2
+
+
 def test_what_rests_between_equal_keyframes_does_not_move(bars: Shapes) -> None:
     still = bars.pick(0, 1, 1, 2)
-    path = Path(still.bases, still.faces)
+    path = Path(still.keyframes, still.faces)
     found = path(still.keyframes, torch.linspace(1, 2, 9, dtype=DOUBLE))
     assert largest(found - still.keyframes[1]) < 5e-3 * diagonal(still.keyframes[0])
     assert largest(found - still.keyframes[1]) < 1e-9
@@ -188,7 +219,7 @@ def test_what_rests_between_equal_keyframes_does_not_move(bars: Shapes) -> None:
 def test_a_stop_is_not_passed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bar bends, stops, and goes back at uneven times; without the limit it would run on."""
     own = bars.pick(0, 2, 1, 1, 0)
-    path = Path(own.bases, own.faces, [0.0, 0.9, 1.2, 2.0, 2.3])
+    path = Path(own.keyframes, own.faces, [0.0, 0.9, 1.2, 2.0, 2.3])
     stop = own.keyframes[2]
 
     def overshoot() -> float:
@@ -201,7 +232,7 @@ def test_a_stop_is_not_passed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> 
         return worst / diagonal(stop)
 
     assert overshoot() < 5e-3
-    monkeypatch.setattr(hermite, "_velocity", lambda v, w, h, k, _: (k * v + h * w) / (h + k))
+    monkeypatch.setattr(splines, "limited", lambda velocities, *_: velocities)
     assert overshoot() > 5e-3
 
 
@@ -230,7 +261,7 @@ def test_subdivide_is_the_path_at_even_times(motion: Shapes) -> None:
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_gradients_against_central_differences(motion: Shapes, smooth: bool) -> None:
-    """To the key-frames that a time depends on, and to the time."""
+    """To the key-frames, all of which a spline depends on, and to the time."""
     path = Path(motion.bases, motion.faces, smooth=smooth, solver=tm.Solver(tolerance=1e-13))
     weights = torch.randn(2, *motion.keyframes.shape[1:], dtype=DOUBLE, generator=torch.Generator().manual_seed(1))
     inputs = {"keyframes": motion.keyframes + 0.01 * weights[0], "t": times(1.3, 3.6)}
@@ -248,11 +279,10 @@ def test_gradients_against_central_differences(motion: Shapes, smooth: bool) -> 
             ends = [value(**{**inputs, name: inputs[name] + s * step * along}) for s in (-2, -1, 1, 2)]
         slope = float((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step))
         assert float((gradients[name] * along).sum()) == pytest.approx(slope, rel=1e-5)
-    # At 3.6 the last four key-frames have a say, or the last two.
     single = inputs["keyframes"].clone().requires_grad_()
     (own,) = torch.autograd.grad((path(single, 3.6) * weights[0]).sum(), single)
     felt = own.flatten(1).abs().amax(1) > 1e-9
-    assert felt.tolist() == [False, False, smooth, True, True]
+    assert felt.tolist() == [smooth, smooth, smooth, True, True]
 
 
 def test_gradients_reach_a_term(motion: Shapes) -> None:
@@ -284,7 +314,7 @@ def test_gradients_reach_a_term(motion: Shapes) -> None:
     ("call", "message"),
     [
         *((lambda path, x, at=at: path(x, at), "between the times of .*, 0 and 4") for at in (-0.1, 4.2, math.nan)),
-        (lambda path, x: path(x[:4], 0.5), r"shape \(\.\.\., 5, V, 3\); got \(4, 164, 3\)"),
+        (lambda path, x: path(x[:4], 0.5), r"shape \(\.\.\., 5, 164, 3\); got \(4, 164, 3\)"),
         (lambda path, x: path(x.expand(2, -1, -1, -1), torch.rand(3)), "does not broadcast against motions"),
         (lambda path, x: path.insert(2.0), "already"),
     ],
@@ -321,16 +351,15 @@ def test_too_few_key_frames_and_pairs_alone(motion: Shapes) -> None:
 def errors(path: Path, keyframes: Tensor, at: Tensor, truth: Tensor) -> tuple[float, float]:
     """Mean distance of vertices, and mean relative error of edge lengths."""
     x = path(keyframes, at)
-    return float((x - truth).norm(dim=-1).mean()), edge_error(x, truth, path.layer.faces)
+    return float((x - truth).norm(dim=-1).mean()), edge_error(x, truth, path.faces)
 
 
-def test_the_sample_creature(cache_folder: object) -> None:
+def test_the_sample_creature() -> None:
     """Six key-frames of a gallop, the truth half-way between them."""
     sample = load_sample("creature")
-    bases = tm.extract_bases(sample.keyframes, sample.faces, 20, mesher="lattice", progress=False)
     at = torch.tensor(sample.true_times, dtype=DOUBLE)
     (near, edges), (far, worse) = (
-        errors(Path(bases, sample.faces, cyclic=True, smooth=s), sample.keyframes, at, sample.truth)
+        errors(Path(sample.keyframes, sample.faces, cyclic=True, smooth=s), sample.keyframes, at, sample.truth)
         for s in (True, False)
     )
     assert near < 0.4 * far
@@ -363,30 +392,37 @@ def test_second_differences_on_the_hand(hands: Shapes) -> None:
 # ----------------------------------------------------------------------------------------------------------- editing
 
 
-@pytest.mark.parametrize(("cyclic", "smooth", "touched"), [(False, True, 3), (True, True, 4), (False, False, 2)])
-def test_a_change_is_local(bars: Shapes, cyclic: bool, smooth: bool, touched: int) -> None:
-    own = bars.pick(0, 1, 2, 1, 0, 2)
-    path = Path(own.bases, own.faces, cyclic=cyclic, smooth=smooth)
-    editor = tm.PathEditor(path, own.keyframes, steps=3)
-    before = editor.shapes()
-    torch.testing.assert_close(before, path(own.keyframes, editor.times()), rtol=0, atol=1e-9)
-    other = own.keyframes.clone()
-    other[1] += 0.1
-    computed: list[int] = []
+def edited(shapes: Shapes, i: int, **options: Any) -> int:
+    """How many intervals are computed again after a key-frame has changed."""
+    path = Path(shapes.keyframes, shapes.faces, **options)
+    editor = tm.PathEditor(path, shapes.keyframes, steps=3)
+    before, other, computed = editor.shapes(), shapes.keyframes.clone(), []
+    torch.testing.assert_close(before, path(shapes.keyframes, editor.times()), rtol=0, atol=1e-9)
+    other[i] += 0.1
     path.register_forward_pre_hook(lambda *_: computed.append(1))
-    editor.replace(1, other[1])
-    after = editor.shapes()
-    assert len(computed) == touched
-    torch.testing.assert_close(after, path(other, editor.times()), rtol=0, atol=1e-9)
-    assert torch.equal(editor.shapes(), after)
-    assert torch.equal(own.keyframes[1] + 0.1, other[1]), "the caller's key-frames stay"
+    editor.replace(i, other[i])
+    after, n = editor.shapes(), len(computed)
+    assert torch.equal(editor.shapes(), after) and len(computed) == n
+    torch.testing.assert_close(after, path(other, editor.times()), rtol=0, atol=1e-5)
+    assert torch.equal(shapes.keyframes[i] + 0.1, other[i]), "the caller's key-frames stay"
+    return n
+
+
+def test_a_change_of_a_pair_is_local(bars: Shapes) -> None:
+    assert edited(bars.pick(0, 1, 2, 1, 0, 2), 1, smooth=False) == 2
+    assert edited(bars.pick(0, 1, 2, 1, 0, 2), 0, smooth=False) == 1
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_a_change_of_a_spline_fades(small_bars: Shapes, cyclic: bool) -> None:
+    """It reaches all of it, a quarter as far at each key-frame; what nobody sees is not computed again."""
+    assert 8 <= edited(small_bars.pick(*[0, 1, 2, 1] * 10), 1, cyclic=cyclic) <= 25
 
 
 def test_a_pinned_in_between_becomes_a_keyframe(motion: Shapes, path: Path) -> None:
     editor = tm.PathEditor(path, motion.keyframes, steps=2)
     passing = path(motion.keyframes, 2.3)
     assert editor.insert(2.3) == 3
-    assert editor.path.layer is path.layer
     assert editor.path.times.tolist() == [0, 1, 2, 2.3, 3, 4]
     torch.testing.assert_close(editor.shapes()[6], passing, rtol=0, atol=1e-12)
     moved = passing + 0.05
@@ -493,8 +529,10 @@ def test_an_inserted_key_frame_borrows_the_modes_around_it(motion: Shapes) -> No
     x, path = motion.keyframes, Path(motion.bases, motion.faces, smooth=False)
     pinned = path(x, 1.3) + 0.05
     found = path.insert(1.3)(torch.cat([x[:2], pinned[None], x[2:]]), times(1.15, 1.65))
-    for shape, ends in zip(found, ((x[1], pinned), (pinned, x[2])), strict=True):
-        torch.testing.assert_close(shape, path.layer(*ends, 0.5, 1), rtol=0, atol=1e-9)
+    borrowed = dataclasses.replace(motion.bases[1], reference=path(x, 1.3))
+    for shape, ends, other in zip(found, ((x[1], pinned), (pinned, x[2])), (1, 2), strict=True):
+        bases = [motion.bases[1], borrowed] if other == 1 else [borrowed, motion.bases[2]]
+        torch.testing.assert_close(shape, tm.InBetween(bases, motion.faces)(*ends, 0.5), rtol=0, atol=1e-9)
 
 
 def test_each_motion_has_its_own_times(path: Path, motion: Shapes) -> None:
@@ -505,7 +543,11 @@ def test_each_motion_has_its_own_times(path: Path, motion: Shapes) -> None:
 
 def test_a_path_scheme_outlasts_an_insert(motion: Shapes) -> None:
     """One in which every key-frame is a rest."""
-    path = Path(motion.bases, motion.faces, smooth=lambda before, *_: torch.zeros_like(before))
+
+    def still(speeds: Tensor, durations: Tensor, cyclic: bool, squared: Squared) -> Tensor:
+        return torch.cat([torch.zeros_like(speeds), torch.zeros_like(speeds[:1])])
+
+    path = Path(motion.bases, motion.faces, smooth=still)
     keyframes = torch.cat([motion.keyframes[:2], path(motion.keyframes, 1.5)[None], motion.keyframes[2:]])
     near = path.insert(1.5)(keyframes, times(1.5, 1.5 + 1e-3, 2.0, 2.0 + 1e-3))
     assert largest(near[1::2] - near[::2]) < 1e-4

@@ -220,5 +220,5 @@ class _Relaxed:
         return (relax(self.shell.energy, x, reference, self.n_steps, self.n_products),)
 
     @staticmethod
-    def _reference(*to: Tensor) -> ShellReference:
-        return ShellReference(*to, torch.zeros_like(to[-1]))
+    def _reference(elements: Tensor, stiffness: Tensor, volume: Tensor) -> ShellReference:
+        return ShellReference(elements, stiffness, volume, torch.zeros_like(volume))

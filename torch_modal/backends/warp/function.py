@@ -1,6 +1,6 @@
 """Functions of tensors by kernels, for all that autograd and ``torch.func`` do."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import torch
@@ -16,13 +16,16 @@ class Operation(Protocol):
     n_differentiable: int
     """How many of the results have gradients; they come first."""
 
-    def run(self, kept: list[Any] | None, *given: Tensor) -> tuple[Tensor, ...]:
-        """The results; what :meth:`back` needs is added to the list, if there is one."""
+    @property
+    def run(self) -> Callable[..., tuple[Tensor, ...]]:
+        """The results, of a list and the tensors; what :attr:`back` needs is added to the list, unless it is None."""
 
-    def back(self, kept: list[Any], grads: Sequence[Tensor], *given: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients in the arguments from those in the results; ``kept`` is empty where nothing was kept."""
+    @property
+    def back(self) -> Callable[..., tuple[Tensor | None, ...]]:
+        """Gradients in the tensors from the list, those in the results, and the tensors; the list may be empty."""
 
-    def by_torch(self, *given: Tensor) -> tuple[Tensor, ...]:
+    @property
+    def by_torch(self) -> Callable[..., tuple[Tensor, ...]]:
         """The same results by torch: for forward mode, second derivatives, and tensors without data."""
 
 

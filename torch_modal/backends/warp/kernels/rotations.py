@@ -4,7 +4,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from torch_modal.backends.warp.kernels.elements import HALF, TINIEST, TINY, length_of, place, real, vec3, vec4
+from torch_modal.backends.warp.kernels.elements import (
+    HALF,
+    SIXTH,
+    TINIEST,
+    TINY,
+    length_of,
+    place,
+    real,
+    vec3,
+    vec4,
+)
 from torch_modal.geometry import rotations, triangle_frames
 
 packed_trajectory = wp.types.vector(length=30, dtype=real)
@@ -200,13 +210,22 @@ def rotated(real_part: real, axis: vec3, v: vec3):
 
 @wp.func
 def sinc(squared_angle: real):
-    # Of the square: with all derivatives at zero.
-    found = real(1.0) - squared_angle / real(6.0) * (
-        real(1.0) - squared_angle / real(20.0) * (real(1.0) - squared_angle / real(42.0))
-    )
-    if squared_angle >= SMALL:
-        angle = wp.sqrt(squared_angle)
+    """Of the square: with all derivatives at zero, by a series."""
+    z = squared_angle
+    found = real(1.0) - SIXTH * z * (real(1.0) - z / real(20.0) * (real(1.0) - z / real(42.0)))
+    if z >= SMALL:
+        angle = wp.sqrt(z)
         found = wp.sin(angle) / angle
+    return found
+
+
+@wp.func
+def cosine(squared_angle: real):
+    """Likewise."""
+    z = squared_angle
+    found = real(1.0) - HALF * z * (real(1.0) - z / real(12.0) * (real(1.0) - z / real(30.0)))
+    if z >= SMALL:
+        found = wp.cos(wp.sqrt(z))
     return found
 
 
@@ -246,49 +265,8 @@ def add_sides(total: wp.array(dtype=vec4), edge: int, e: wp.vec3i, g: vec3, area
 def about(half: vec3):
     """The quaternion that turns about an axis by twice its length."""
     z = wp.dot(half, half)
-    # Both are functions of the square: up to a whole turn, interpolated at Chebyshev's nodes to 2e-19.
-    w = z * z
-    even = real(1.0) + w * (
-        real(0.041666666666666644)
-        + w
-        * (
-            real(2.4801587301543947e-05)
-            + w * (real(2.087675689868704e-09) + w * (real(4.7794436302050165e-14) + w * (real(4.086623381139723e-19))))
-        )
-    )
-    odd = real(-0.5) + w * (
-        real(-0.001388888888888844)
-        + w
-        * (
-            real(-2.7557319221516713e-07)
-            + w
-            * (real(-1.1470743476144586e-11) + w * (real(-1.561566465023175e-16) + w * (real(-7.978335129390308e-22))))
-        )
-    )
-    cosine = even + z * odd
-    even = real(1.0) + w * (
-        real(0.008333333333333333)
-        + w
-        * (
-            real(2.755731922396843e-06)
-            + w
-            * (real(1.6059043800914716e-10) + w * (real(2.8114436905160995e-15) + w * (real(1.947767908073262e-20))))
-        )
-    )
-    odd = real(-0.16666666666666666) + w * (
-        real(-0.0001984126984126966)
-        + w
-        * (
-            real(-2.505210838444744e-08)
-            + w
-            * (real(-7.647162877752289e-13) + w * (real(-8.219210144599324e-18) + w * (real(-3.4993887391279544e-23))))
-        )
-    )
-    sine = even + z * odd
-    if z > real(10.0):
-        cosine = wp.cos(wp.sqrt(z))
-        sine = sinc(z)
-    return vec4(cosine, sine * half[0], sine * half[1], sine * half[2])
+    sine = sinc(z)
+    return vec4(cosine(z), sine * half[0], sine * half[1], sine * half[2])
 
 
 @wp.func
