@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_modal.backends.torch.fine_steps import FurtherEnergy, relax, step_length
 from torch_modal.backends.warp.function import fused
-from torch_modal.backends.warp.launch import array, kernels, launch
+from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellPoint, ShellReference, WarpShell
 
 
@@ -102,22 +102,19 @@ class WarpSteps(WarpShell):
             x.new_zeros(n_products + 1, b, 3),
             torch.empty_like(x),
         )
-        # Described once for all launches.
-        normal, fields, numbers, result = (array(each, module.vec3) for each in (at.normal, kept, scalars, solution))
-        inverse, factors = array(at.diagonal, module.symmetric), array(at.factors, module.linearised)
-        stiffness, results = array(to.stiffness, module.real), [fields, numbers, result]
-        launch(module.begin, (b, n), [at.gradient, normal, at.moment, inverse, n_kept, n, *results], device=x.device)
+        inverse, factors, results = at.diagonal, at.factors, [kept, scalars, solution]
+        launch(module.begin, (b, n), [at.gradient, at.normal, at.moment, inverse, n_kept, n, *results])
         for k in range(n_products):
             first = k % n_kept * b * n
-            given = [self.constants, fields, n_kept * b * n + first, factors, fields, 2 * n_kept * b * n + first]
-            launch(kernels("shell").product, (b, self.n_edges), [*given, numbers, k * b], device=x.device)
+            given = [self.constants, kept, n_kept * b * n + first, factors, kept, 2 * n_kept * b * n + first]
+            launch(kernels("shell").product, (b, self.n_edges), [*given, scalars, k * b])
             for one in beside:
                 pushed = one(kept[1, k % n_kept])
                 kept[2, k % n_kept].add_(pushed)
                 scalars[k, :, 2].add_((pushed * kept[1, k % n_kept]).sum((1, 2)))
-            launch(module.advance, (b, n), [normal, inverse, stiffness, k, n_kept, n, *results], device=x.device)
+            launch(module.advance, (b, n), [at.normal, inverse, to.stiffness, k, n_kept, n, *results])
             if k < n_products - 1:
-                launch(module.turn, (b, n), [normal, inverse, b, k, n_kept, n, *results[:2]], device=x.device)
+                launch(module.turn, (b, n), [at.normal, inverse, b, k, n_kept, n, *results[:2]])
         return _Iterations(solution, kept, scalars)
 
     def step_back(self, step: "_Taken", to: ShellReference, to_reached: Tensor, to_reference: ShellReference) -> Tensor:
@@ -131,29 +128,24 @@ class WarpSteps(WarpShell):
         """
         x, at, _, (_, kept, scalars) = step
         module, (b, n), n_products = kernels("steps"), x.shape[:2], kept.shape[1]
-        pushed, to_residual, to_direction, to_normal = torch.empty_like(kept[0]), *x.new_zeros(3, *x.shape)
+        force, (residual, direction, to_volume) = torch.empty_like(kept[0]), x.new_zeros(3, *x.shape)
         to_diagonal, received = torch.zeros_like(at.diagonal), x.new_zeros(n_products, b, 3)
         launch(module.inner, (b, n), [to_reached, kept[1, -1], n, received[-1]])
-        vectors = at.normal, kept, scalars, to_reached, pushed, to_residual, to_direction, to_normal, received
-        normal, fields, numbers, *others = (array(each, module.vec3) for each in vectors)
-        to_end, force, residual, direction, to_volume, to_numbers = others
-        inverse, factors = array(at.diagonal, module.symmetric), array(at.factors, module.linearised)
-        stiffness, blocks = array(to.stiffness, module.real), array(to_diagonal, module.symmetric)
         for k in reversed(range(n_products)):
-            common = [normal, stiffness, k, n_products, n, fields, numbers]
-            given = [*common, to_end, residual, force, direction, to_numbers]
-            launch(module.back_to_direction, (b, n), given, device=x.device)
-            given = [self.constants, force, k * b * n, factors, direction, 0, None, 0]
-            launch(kernels("shell").product, (b, self.n_edges), given, device=x.device)
-            launch(module.back_to_normal, (b, n), [*common, force, direction, to_volume, to_numbers], device=x.device)
-            given = [*common, inverse, to_end, direction, residual, blocks, to_numbers]
-            launch(module.back_to_residual, (b, n), given, device=x.device)
+            common = [at.normal, to.stiffness, k, n_products, n, kept, scalars]
+            given = [*common, to_reached, residual, force, direction, received]
+            launch(module.back_to_direction, (b, n), given)
+            given = [self.constants, force, k * b * n, at.factors, direction, 0, None, 0]
+            launch(kernels("shell").product, (b, self.n_edges), given)
+            launch(module.back_to_normal, (b, n), [*common, force, direction, to_volume, received])
+            given = [*common, at.diagonal, to_reached, direction, residual, to_diagonal, received]
+            launch(module.back_to_residual, (b, n), given)
         to_factors = torch.empty_like(at.factors)
-        given = [self.constants, fields, force, factors, b, n_products, to_factors]
+        given = [self.constants, kept, force, at.factors, b, n_products, to_factors]
         launch(module.back_to_factors, (b, self.n_edges), given)
         to_x = to_reached.clone()
         # The right side is the gradient's opposite.
-        self.from_point(x, at, to, -to_residual, to_x, to_reference, (to_diagonal, to_factors), to_normal)
+        self.from_point(x, at, to, -residual, to_x, to_reference, (to_diagonal, to_factors), to_volume)
         to_reference.stiffness.add_((scalars[:-1, :, 1] * received[..., 2]).sum(0))
         return to_x
 

@@ -5,6 +5,7 @@ import inspect
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -116,17 +117,14 @@ def _device(device: torch.device) -> Any:
 
 
 @cache
-def _entries(kernel: Any) -> list[Any]:
-    """Type of the entries of each argument; None for one that is no array."""
-    return [getattr(one, "dtype", None) for one in inspect.get_annotations(kernel.func).values()]
-
-
-@cache
-def _shape(entry: Any) -> tuple[int, ...]:
-    """Shape of an entry of an array."""
+def _entries(kernel: Any) -> list[tuple[int, torch.dtype] | None]:
+    """Numbers per entry, and their type, of each argument that is an array; None for others."""
     import warp as wp
 
-    return tuple(wp.zeros(1, dtype=entry, device="cpu").numpy().shape[1:])
+    entries = [getattr(one, "dtype", None) for one in inspect.get_annotations(kernel.func).values()]
+    numbers = [getattr(entry, "_wp_scalar_type_", entry) for entry in entries]
+    pairs = zip(entries, numbers, strict=True)
+    return [None if e is None else (getattr(e, "_length_", 1), wp.dtype_to_torch(own)) for e, own in pairs]
 
 
 def launch(
@@ -142,8 +140,7 @@ def launch(
         kernel: Of :func:`kernels`.
         dim: Number of samples; and of what each has, where a sample may have several threads, whose number is then the
             kernel's last argument. Each takes the first of what is left, then every so many-th. On a CPU there is one.
-        given: Its arguments but for that: :class:`Constants`, contiguous tensors or :func:`array` of them, None for no
-            array, and integers.
+        given: Its arguments but for that: :class:`Constants`, contiguous tensors, None for no array, and integers.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
         device: That of the tensors; by default that of the first one.
 
@@ -164,29 +161,74 @@ def launch(
     if n_threads > MOST_ENTRIES:
         raise ValueError(f"{n_threads} threads are more than a kernel counts, {MOST_ENTRIES}: pass fewer samples")
     given = [x.on(device) if isinstance(x, Constants) else x for x in given]
-    entries = _entries(kernel)
-    arguments = [array(x, entry) if isinstance(x, Tensor) else x for x, entry in zip(given, entries, strict=True)]
-    back: list[Any] = []
-    if adjoints:  # structs and numbers, which have no gradients, stand for themselves
-        own = zip(given, [*adjoints, *[None] * (len(given) - len(adjoints))], entries, strict=True)
-        back = [(array(y, entry) if isinstance(y, Tensor) else None) if entry else x for x, y, entry in own]
-    stream = None if device.type == "cpu" else wp.stream_from_torch(torch.cuda.current_stream(device))
-    wp.launch(kernel, n_threads, arguments, (), back, (), _device(device), stream, bool(back))
+    key = kernel, device, len(adjoints) > 0
+    if key not in _COMMANDS.known:
+        _COMMANDS.known[key] = _Command(*key, given)
+    _COMMANDS.known[key](n_threads, given, adjoints)
 
 
-def array(x: Tensor, entry: Any) -> Any:
-    """Warp's description of a tensor. It holds the tensor, and may serve several launches.
+class _Command:
+    """A launch that Warp has recorded, repeated with other arguments in a fraction of the time of a new one.
 
-    Args:
-        x: The tensor, contiguous.
-        entry: Type of the entries of the array.
+    Tensors are written into its descriptions of arrays, which do not hold them.
     """
-    import warp as wp
 
-    rows = x.view(-1, *_shape(entry))
-    if rows.shape[0] > MOST_ENTRIES:
+    def __init__(self, kernel: Any, device: torch.device, back: bool, given: Sequence[Any]) -> None:
+        import warp as wp
+
+        self.device, self.entries, self.last = device, _entries(kernel), list(given)
+        described = type(wp.from_torch(torch.zeros(1), return_ctype=True))
+
+        def nothing() -> list[Any]:
+            pairs = zip(self.entries, given, strict=True)
+            return [described(0, 0, 1, (0,), (e[0] * e[1].itemsize,)) if e else x for e, x in pairs]
+
+        adjoints = nothing() if back else []
+        own = _device(device)
+        self.recorded = wp.launch(
+            kernel, 1, inputs=nothing(), adj_inputs=adjoints, device=own, adjoint=back, record_cmd=True
+        )
+        n = len(self.entries)
+        self.arrays, self.adjoints = self.recorded.params[1 : 1 + n], self.recorded.params[1 + n :]
+
+    def __call__(self, n_threads: int, given: Sequence[Any], adjoints: Sequence[Any]) -> None:
+        import warp as wp
+
+        for i, (entry, x) in enumerate(zip(self.entries, given, strict=True)):
+            if entry is not None:
+                _describe(self.arrays[i], x, *entry)
+            elif x is not self.last[i]:
+                self.recorded.set_param_at_index(i, x)
+                self.last[i] = x
+        for described, entry, x in zip(self.adjoints, self.entries, adjoints):  # those that follow have none
+            if entry is not None:
+                _describe(described, x, *entry)
+        self.recorded.set_dim(n_threads)
+        on_cpu = self.device.type == "cpu"
+        self.recorded.launch(None if on_cpu else wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+
+
+def _describe(array: Any, x: Tensor | None, width: int, dtype: torch.dtype) -> None:
+    """Write a tensor into Warp's description of an array, of vectors of a width."""
+    if x is None:
+        array.data = array.shape[0] = 0
+        return
+    if x.dtype is not dtype or not x.is_contiguous():
+        raise RuntimeError(f"a kernel needs a contiguous tensor of {dtype}; got {x.dtype}, strides {x.stride()}")
+    length = x.numel() // width
+    if length > MOST_ENTRIES:
         raise ValueError(
-            f"a tensor of shape {tuple(x.shape)} has {rows.shape[0]} entries, and a kernel counts to {MOST_ENTRIES}: "
+            f"a tensor of shape {tuple(x.shape)} has {length} entries, and a kernel counts to {MOST_ENTRIES}: "
             "pass fewer samples at a time"
         )
-    return wp.from_torch(rows, dtype=entry, requires_grad=False, return_ctype=True)
+    array.data, array.shape[0] = x.data_ptr(), length
+
+
+class _Commands(threading.local):
+    """The commands of a thread."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[Any, torch.device, bool], _Command] = {}
+
+
+_COMMANDS = _Commands()
