@@ -19,6 +19,8 @@ class WarpRotations(LocalRotations):
     Edge vectors between two shapes and on trajectories come from kernels; of more shapes, the signs of rotations do.
     """
 
+    shares: Tensor
+
     def __init__(self, mesh: Connectivity, references: Tensor) -> None:
         super().__init__(mesh, references)
         parent = self.ancestors[0]
@@ -34,13 +36,14 @@ class WarpRotations(LocalRotations):
             "parent": parent,
             "piece": self.piece,
         }
-        numbers = {"signs": self.side_signs.view(3, -1).T, "shares": shares.view(3, -1).T}
+        #: Parts of the sides in their edge vectors, with their senses. *Shape:* ``(F, 3)``.
+        self.register_buffer("shares", shares.view(3, -1).T.contiguous(), persistent=False)
         #: The surface as the first argument of kernels.
         self.constants = Constants(
             "rotations",
             "surface",
             **{name: x.int().contiguous() for name, x in integers.items()},
-            **{name: x.double().contiguous() for name, x in numbers.items()},
+            signs=self.side_signs.view(3, -1).T.double().contiguous(),
             n_vertices=references.shape[1],
             n_edges=self.n_edges,
             n_pieces=self.n_pieces,
@@ -96,7 +99,7 @@ class _Turned:
         own, edges = self.rotations, shapes.new_zeros(len(shapes), self.rotations.n_edges, 3)
         quaternions, areas, packed = own.turned(shapes)
         sign = own.sign(quaternions, areas)
-        given = [own.constants, quaternions, sign, packed, weights, edges]
+        given = [own.constants, quaternions, sign, packed, weights, own.shares.double(), edges]
         launch(kernels("rotations").part_turned, (len(shapes), len(own.faces)), given)
         if kept is not None:
             kept.append(sign)
@@ -109,7 +112,7 @@ class _Turned:
         own = self.rotations
         sign = kept[0] if kept else own.sign(*own.turned(shapes)[:2])
         found = torch.zeros_like(shapes), torch.zeros_like(weights)
-        given = [own.constants, shapes, weights, sign, grads[0], *found]
+        given = [own.constants, shapes, weights, sign, own.shares.double(), grads[0], *found]
         launch(kernels("rotations_adjoint").from_turned, (len(shapes), len(own.faces)), given)
         return found
 

@@ -35,8 +35,6 @@ class Surface:
     """Edges of the sides of each triangle."""
     signs: wp.array(dtype=vec3)
     """Senses of the sides."""
-    shares: wp.array(dtype=vec3)
-    """Senses times the part that the side has in its edge vector."""
     order: wp.array(dtype=wp.int32)
     """Triangles, parents before children."""
     parent: wp.array(dtype=wp.int32)
@@ -51,7 +49,6 @@ def surface(
     faces: Tensor,
     sides: Tensor,
     signs: Tensor,
-    shares: Tensor,
     order: Tensor,
     parent: Tensor,
     piece: Tensor,
@@ -62,7 +59,6 @@ def surface(
     made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
     made.sides = wp.array(sides.numpy(), dtype=wp.vec3i, device=device)
     made.signs = wp.array(signs.numpy(), dtype=vec3, device=device)
-    made.shares = wp.array(shares.numpy(), dtype=vec3, device=device)
     made.order = wp.array(order.numpy(), dtype=wp.int32, device=device)
     made.parent = wp.array(parent.numpy(), dtype=wp.int32, device=device)
     made.piece = wp.array(piece.numpy(), dtype=wp.int32, device=device)
@@ -311,10 +307,14 @@ def part_turned(
     sign: wp.array(dtype=real),
     packed: wp.array(dtype=packed_turn),
     weights: wp.array(dtype=wp.vec2d),
+    shares: wp.array(dtype=vec3),
     edges: wp.array(dtype=vec3),
     threads: int,
 ):
-    """Edge vectors between two shapes from the sides of all triangles, of turns whose signs are known."""
+    """Edge vectors between two shapes from the sides of all triangles, of turns whose signs are known.
+
+    A side has a share of its edge vector, with its sense.
+    """
     i = wp.tid()
     s = i // threads
     w = weights[s]
@@ -331,7 +331,7 @@ def part_turned(
         first = x * one + y * two
         second = HALF * first + HEIGHT * (y * one + z * two)
         of = surface.sides[place(k, 0)]
-        share = surface.shares[place(k, 0)]
+        share = shares[place(k, 0)]
         wp.atomic_add(edges, place(to, of[0]), share[0] * first)
         wp.atomic_add(edges, place(to, of[1]), share[1] * (second - first))
         wp.atomic_add(edges, place(to, of[2]), -share[2] * second)

@@ -91,6 +91,7 @@ def from_turned(
     shapes: wp.array(dtype=vec3),
     weights: wp.array(dtype=wp.vec2d),
     sign: wp.array(dtype=real),
+    shares: wp.array(dtype=vec3),
     to_edges: wp.array(dtype=vec3),
     to_shapes: wp.array(dtype=vec3),
     to_weights: wp.array(dtype=wp.vec2d),
@@ -117,7 +118,7 @@ def from_turned(
         two = HALF * one + HEIGHT * turned(part, y * a.e1 + z * a.e2)
         # From the edges: of the sides ``one``, ``two - one`` and ``-two``.
         of = surface.sides[place(k, 0)]
-        share = surface.shares[place(k, 0)]
+        share = shares[place(k, 0)]
         across = share[1] * to_edges[place(edge, of[1])]
         to_one = share[0] * to_edges[place(edge, of[0])] - across
         to_two = across - share[2] * to_edges[place(edge, of[2])]
