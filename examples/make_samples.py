@@ -28,7 +28,7 @@ from _sculpt import (
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from torch_modal.io.write import save_mesh
+from torch_modal.io.frames import save_mesh
 
 # -------------------------------------------------------------------------------------------- creature, shape
 # About 2 units long, Y up, facing +X; its right side is +Z. Left limbs are mirror images of the right ones.

@@ -21,7 +21,7 @@ from _animals import animal, galloping, tips
 from scipy.spatial import cKDTree
 
 import torch_modal as tm
-from torch_modal.io.write import save_mesh
+from torch_modal.io.frames import save_mesh
 
 TIMES = {"slender": 0.0, "stout": 4.5}
 """Of their strides, in frames: stretched, and about to push off with the hind legs."""

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import scipy.sparse as sp
 import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from solids import box, lumped_mass, surface
+from solids import as_it_is, box, element_hessian, lumped_mass, surface
 from threads import limit_threads
 
 from torch_modal.backends.torch.energies import RestShapes
@@ -23,14 +24,13 @@ from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.modes import extract_bases
-from torch_modal.precompute.stiffness import arap_hessian
+from torch_modal.precompute.extract import extract_bases
 from torch_modal.precompute.tetrahedra import Tetrahedra
-from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
 from torch_modal.solve.implicit import ConvergenceWarning
 
-COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
+COARSE = TetWild(edge_length_fac=0.08, epsilon=5e-3)
 
 limit_threads()  # small problems, and often several processes at once: threads would wait for each other
 
@@ -66,7 +66,7 @@ def capsule() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="session")
 def capsule_tetrahedra(capsule: tuple[np.ndarray, np.ndarray]) -> Tetrahedra:
     """The capsule filled by the real mesher, once per run: few enough vertices for dense linear algebra."""
-    return tetrahedralize(*capsule, COARSE)
+    return COARSE.fill(as_it_is(*capsule), threading.Event())
 
 
 class Shapes(NamedTuple):
@@ -94,7 +94,7 @@ def bent_bar(cells: tuple[int, int, int], n_modes: int) -> Shapes:
     bases = []
     for pose in poses:
         solid = Tetrahedra(pose, bar.tets)
-        modes = lowest_modes(arap_hessian(solid, "element"), sp.diags(lumped_mass(solid)), pose, n_modes)
+        modes = lowest_modes(element_hessian(solid), sp.diags(lumped_mass(solid)), pose, n_modes)
         at_surface = modes.modes.T.reshape(n_modes, -1, 3)[:, used]
         numbers = (pose[used], modes.eigenvalues, at_surface.copy(), modes.rigid_eigenvalues)
         bases.append(ModalBasis(*map(torch.from_numpy, numbers)))

@@ -84,7 +84,7 @@ def main(name: str) -> None:
     (vertices, faces), n_modes, _ = CASES[name]
     warnings.simplefilter("ignore")
     try:
-        bases = tm.extract_bases(np.stack([vertices, vertices * 1.1]), faces, n_modes, cache=False, timeout=60.0)
+        bases = tm.extract_bases(np.stack([vertices, vertices * 1.1]), faces, n_modes, cache=False)
     except (ValueError, RuntimeError) as error:
         print(f"error: {type(error).__name__}: {error}")
         return

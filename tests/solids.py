@@ -6,8 +6,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from torch_modal.precompute.embedding import find_neighbours, fit_weights
-from torch_modal.precompute.stiffness import mass_matrix
-from torch_modal.precompute.tetrahedra import Tetrahedra
+from torch_modal.precompute.stiffness import hat_gradients, mass_matrix
+from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
 
 
 def box(cells: tuple[int, int, int], size: tuple[float, float, float], jitter: float = 0.0) -> Tetrahedra:
@@ -39,7 +40,25 @@ def together(*solids: Tetrahedra) -> Tetrahedra:
 
 def embed_surface(points: np.ndarray, solid: Tetrahedra, normals: np.ndarray | None = None) -> sp.csr_matrix:
     """Weights of the surface in the pose in which its neighbours are found. *Shape:* ``(V, N)``."""
-    return fit_weights(points, solid.vertices, find_neighbours(points, solid, normals))
+    return fit_weights(points, solid.vertices, *find_neighbours(points, solid, normals))
+
+
+def element_hessian(solid: Tetrahedra) -> sp.csc_matrix:
+    """Hessian of ``sum_t vol_t |sym grad u|²``, linear elements without smoothing. *Shape:* ``(3N, 3N)``."""
+    g = hat_gradients(solid)
+    blocks = np.einsum("tbi,taj->tabij", g, g) + np.einsum("tak,tbk->tab", g, g)[..., None, None] * np.eye(3)
+    blocks *= solid_volumes(solid)[:, None, None, None, None]
+    unknowns = 3 * solid.tets[:, :, None] + np.arange(3)
+    rows = np.broadcast_to(unknowns[:, :, None, :, None], blocks.shape)
+    columns = np.broadcast_to(unknowns[:, None, :, None, :], blocks.shape)
+    n = 3 * len(solid.vertices)
+    k = sp.coo_matrix((blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(n, n)).tocsc()
+    return sp.csc_matrix((k + k.T) / 2)
+
+
+def as_it_is(points: np.ndarray, faces: np.ndarray) -> CanonicalSurface:
+    """The surface in its own coordinates."""
+    return CanonicalSurface(points, faces, np.arange(len(points)), 1.0, np.eye(3))
 
 
 def lumped_mass(solid: Tetrahedra) -> np.ndarray:

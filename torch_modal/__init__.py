@@ -3,16 +3,8 @@
 The public names stand in ``__init__.pyi``; each is loaded when it is first used (PEP 562).
 """
 
-from typing import Any
-
 import lazy_loader
 
-from torch_modal.extras import uncollected
 from torch_modal.version import __version__ as __version__
 
-_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-
-def __getattr__(name: str) -> Any:
-    with uncollected():
-        return _load(name)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -39,8 +39,8 @@ from .io.asset import Asset as Asset
 from .io.formats import Animation as Animation
 from .io.formats import animation_format as animation_format
 from .io.formats import mesh_format as mesh_format
+from .io.frames import save_frames as save_frames
 from .io.read import open_asset as open_asset
-from .io.write import save_frames as save_frames
 from .keyframes.arrays import weld_seams as weld_seams
 from .keyframes.check import check_keyframes as check_keyframes
 from .layers.blend import Blend as Blend
@@ -56,10 +56,11 @@ from .motion.subdivide import subdivide as subdivide
 from .passengers.passengers import Passengers as Passengers
 from .precompute.basis import ModalBasis as ModalBasis
 from .precompute.eigen import ModalAnalysisError as ModalAnalysisError
-from .precompute.modes import extract_bases as extract_bases
-from .precompute.modes import extract_modes as extract_modes
+from .precompute.extract import extract_bases as extract_bases
+from .precompute.extract import extract_modes as extract_modes
+from .precompute.lattice import Lattice as Lattice
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
-from .precompute.tetwild import TetrahedraSettings as TetrahedraSettings
+from .precompute.tetwild import TetWild as TetWild
 from .registration.landmarks import suggest_landmarks as suggest_landmarks
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register

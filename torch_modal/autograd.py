@@ -114,6 +114,9 @@ class Recent:
         self.limit = limit
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Recent, (self.limit,)  # copies and pickles are empty
+
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """The object of a key; computed if it is not in the cache, by :func:`made_outside`."""
         if key not in self._kept:

@@ -1,33 +1,11 @@
 """Lazy imports of optional packages."""
 
-import gc
 import importlib
 import importlib.util
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from typing import Any
 
 from torch_modal.errors import MissingPackageError
-
-
-@contextmanager
-def uncollected() -> Iterator[None]:
-    """Suspend garbage collection during an import, which creates hardly any garbage.
-
-    A collection traverses all objects of torch in a tenth of a second, once or twice per large import. New objects move
-    to the oldest generation, so that later collections of young objects skip them.
-    """
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            # Python 3.12 starts with a few hundred frozen objects. More were frozen by others and stay frozen.
-            if gc.get_freeze_count() < 1000:
-                gc.freeze()
-                gc.unfreeze()
-            gc.enable()
 
 
 def require(module: str, extra: str, what: str) -> Any:

@@ -5,6 +5,7 @@ is ready: of the paper's own solve (Eq. 4), and of what this package does by def
 one core; the paper's are of an Intel Core i7-3370 of 3.4 GHz.
 """
 
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +16,6 @@ from _bipeds import KINDS, biped
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.io.cache import Cache
-from torch_modal.precompute.filling import Filler
-from torch_modal.precompute.lattice import Lattice
 from torch_modal.precompute.surface import CanonicalSurface
 
 N_MODES = 50
@@ -50,8 +48,7 @@ def main(out: Path, overwrite: bool = True, names: Sequence[str] = tuple(PAPER))
     for name in names:
         x, faces = key_poses(name)
         surface = CanonicalSurface.of(x[0].numpy(), faces.numpy())
-        filler = Filler(Lattice(), 600.0, Cache.at(None, enabled=False))
-        n = len(filler.body(surface).tetrahedra.vertices)
+        n = len(tm.Lattice().fill(surface, threading.Event()).vertices)
         start = time.process_time()
         bases = tm.extract_bases(x, faces, N_MODES, mesher="lattice", cache=False, progress=False)
         prepare = time.process_time() - start

@@ -1,5 +1,6 @@
 """How much of the mode space of a fine reference other settings hold; a part of precompute.py."""
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -10,28 +11,24 @@ import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 from quadratic import at_points, quadratic_modes
-from solids import embed_surface, lumped_mass
+from solids import element_hessian, embed_surface, lumped_mass
 
 import torch_modal as tm
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.embedding import closest_tetrahedra
-from torch_modal.precompute.lattice import USUAL_EDGE, lattice
-from torch_modal.precompute.modes import QUALITIES
-from torch_modal.precompute.stiffness import HessianForm, arap_hessian, hat_gradients, mass_matrix
+from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Tetrahedra
-from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.tetrahedra import Mesher, Tetrahedra
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 N_MODES = 30
 ASKED = 0.95
-FULL = TetrahedraSettings(edge_length_fac=0.03, epsilon=2e-3, stop_energy=10.0, max_surface_faces=10**8)
-LINEAR_REFERENCE = TetrahedraSettings(edge_length_fac=0.0125, epsilon=5e-4, stop_energy=10.0, max_surface_faces=10**8)
-QUADRATIC_REFERENCE = TetrahedraSettings(edge_length_fac=0.022, epsilon=5e-4, stop_energy=10.0, max_surface_faces=10**8)
+EXACT = {"stop_energy": 10.0, "max_surface_faces": 10**8, "timeout": 3600.0}
+FULL = tm.TetWild(0.03, 2e-3, **EXACT)
+LINEAR_REFERENCE, QUADRATIC_REFERENCE = tm.TetWild(0.0125, 5e-4, **EXACT), tm.TetWild(0.022, 5e-4, **EXACT)
 
 HEAD = """
 | mesh | setting | vertices | meshing, s | captured, quadratic reference | captured, linear reference | shell energy |
@@ -67,17 +64,18 @@ class Judge:
         self.quadratic = self._reference(QUADRATIC_REFERENCE, self._quadratic)
         self._roughness = self._shell_energies(self.linear)
 
-    def _reference(self, settings: TetrahedraSettings, solve: Callable[[Tetrahedra], FloatArray]) -> FloatArray:
+    def _reference(self, settings: tm.TetWild, solve: Callable[[Tetrahedra], FloatArray]) -> FloatArray:
         def compute() -> Arrays:
-            points, faces = self.surface.points, self.surface.faces
-            return {"modes": solve(tetrahedralize(points, faces, settings, timeout=3600))}
+            return {"modes": solve(settings.fill(self.surface, threading.Event()))}
 
         content = {"points": self.surface.points, "faces": self.surface.faces}
         return self._kept.get("reference", content, {**asdict(settings), "modes": N_MODES}, compute)["modes"]
 
     def _linear(self, tetrahedra: Tetrahedra) -> FloatArray:
         """As fine as one can wait for, with the plainest method."""
-        return self.at_surface(self.embedding(tetrahedra), solid_modes(tetrahedra, "element", lumped=True))
+        mass = sp.diags(lumped_mass(tetrahedra))
+        modes = lowest_modes(element_hessian(tetrahedra), mass, tetrahedra.vertices, N_MODES).modes
+        return self.at_surface(self.embedding(tetrahedra), modes)
 
     def _quadratic(self, tetrahedra: Tetrahedra) -> FloatArray:
         """Hardly too stiff: the better truth."""
@@ -87,18 +85,6 @@ class Judge:
     def embedding(self, tetrahedra: Tetrahedra) -> sp.csr_matrix:
         """The one that the package uses."""
         return embed_surface(self.surface.points, tetrahedra, self.surface.normals)
-
-    def clamped_embedding(self, tetrahedra: Tetrahedra) -> sp.csr_matrix:
-        """The usual one: barycentric coordinates in the closest tetrahedron, negative ones set to zero."""
-        points = self.surface.points
-        tets = closest_tetrahedra(points, tetrahedra)
-        corners = tetrahedra.tets[tets]
-        offset = points - tetrahedra.vertices[corners].mean(axis=1)
-        weights = np.clip(0.25 + np.einsum("vi,vai->va", offset, hat_gradients(tetrahedra)[tets]), 0, None)
-        weights /= weights.sum(axis=1, keepdims=True)
-        rows = np.repeat(np.arange(len(corners)), 4)
-        shape = (len(corners), len(tetrahedra.vertices))
-        return sp.csr_matrix((weights.reshape(-1), (rows, corners.reshape(-1))), shape=shape)
 
     def at_surface(self, weights: sp.csr_matrix, modes: FloatArray) -> FloatArray:
         """Modes of a solid at the points of the surface. *Shape:* ``(3U, k)``."""
@@ -122,40 +108,26 @@ class Judge:
         return np.array([float(self._shell(rest + torch.from_numpy(u.reshape(-1, 3)), rest)) for u in moved])
 
 
-def solid_modes(tetrahedra: Tetrahedra, form: HessianForm = "edge", lumped: bool = False) -> FloatArray:
+def solid_modes(tetrahedra: Tetrahedra) -> FloatArray:
     """The lowest modes, as the package computes them by default."""
-    mass = sp.diags(lumped_mass(tetrahedra)) if lumped else mass_matrix(tetrahedra)
-    return lowest_modes(arap_hessian(tetrahedra, form), mass, tetrahedra.vertices, N_MODES).modes
+    return lowest_modes(arap_hessian(tetrahedra), mass_matrix(tetrahedra), tetrahedra.vertices, N_MODES).modes
 
 
 def rows(judge: Judge, runs: int) -> list[tuple[str, list[Found]]]:
-    """Modes by every setting; several times for the default, as fTetWild is not deterministic."""
-    points, faces = judge.surface.points, judge.surface.faces
+    """Modes by every mesher; several times for fTetWild, which is not deterministic."""
 
-    def solved(fill: Callable[[], Tetrahedra]) -> tuple[Tetrahedra, Found]:
+    def solved(mesher: Mesher) -> Found:
         start = time.perf_counter()
-        tetrahedra = fill()
+        tetrahedra = mesher.fill(judge.surface, threading.Event())
         seconds = time.perf_counter() - start
         modes = judge.at_surface(judge.embedding(tetrahedra), solid_modes(tetrahedra))
-        return tetrahedra, Found(modes, seconds, len(tetrahedra.vertices))
+        return Found(modes, seconds, len(tetrahedra.vertices))
 
-    fast, fine = QUALITIES["fast"], QUALITIES["fine"]
-    made = [solved(lambda: tetrahedralize(points, faces, fast)) for _ in range(runs)]
-    found = [("**fast** (default; decimated)", [one for _, one in made])]
-    usual, clamped = [], []
-    for tetrahedra, one in made:
-        modes = judge.at_surface(judge.clamped_embedding(tetrahedra), solid_modes(tetrahedra))
-        clamped.append(Found(modes, one.seconds, one.n_vertices))
-        modes = judge.at_surface(judge.embedding(tetrahedra), solid_modes(tetrahedra, "element", lumped=True))
-        usual.append(Found(modes, one.seconds, one.n_vertices))
-    found.append(("fast, clamped barycentric", clamped))
-    found.append(("fast, element form and lumped mass", usual))
-    found.append(
-        ("full: not decimated, 3 %, `stop_energy=10`", [solved(lambda: tetrahedralize(points, faces, FULL))[1]])
-    )
-    found.append(("fine", [solved(lambda: tetrahedralize(points, faces, fine))[1]]))
-    found.append(("lattice", [solved(lambda: lattice(judge.surface, USUAL_EDGE))[1]]))
-    return found
+    return [
+        ("fTetWild", [solved(tm.TetWild()) for _ in range(runs)]),
+        ("fTetWild, not decimated, 3 %, `stop_energy=10`", [solved(FULL)]),
+        ("lattice", [solved(tm.Lattice())]),
+    ]
 
 
 def table(meshes: Sequence[tuple[str, FloatArray, IntArray]], runs: int, keep: Path | None) -> None:

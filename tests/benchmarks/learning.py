@@ -91,7 +91,7 @@ class Task:
             each = share // len(self.pairs)
             for i, j in self.pairs:
                 t = torch.rand(each, generator=generator)
-                shapes.append(space.keyframe_in_between(i, j, t.double()).double())
+                shapes.append(space.in_betweens.of_keyframes(i, j, t.double()).double())
                 weights.append(torch.zeros(each, n).index_copy(1, torch.tensor([i, j]), torch.stack([1 - t, t], 1)))
         if "samples" in arm:
             shapes.append(space.sample(share, generator).double())

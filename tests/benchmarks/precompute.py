@@ -18,12 +18,10 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from capture import table
-from eigensolvers import eigensolvers
 from numpy.typing import NDArray
 from threads import limit_threads
 
@@ -34,8 +32,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ROOT = Path(__file__).parents[2]
 BARE = {"edge_length_fac": 0.03, "epsilon": 2e-3}
-N_MODES = 30
-PARTS = ("speed", "threads", "memory", "carrying", "eigensolvers", "capture")
+PARTS = ("speed", "threads", "memory", "capture")
 MORE = {"hand": "mh-hand-path", "woman": "mh-woman"}
 
 
@@ -105,17 +102,11 @@ def speed(name: str, keyframes: FloatArray, faces: IntArray) -> None:
     reference = bare_call(keyframes[0], faces)
     what = f"{len(keyframes)} bases of 50 modes, {name}, {keyframes.shape[1]} vertices"
     print(f"{name}, one bare pytetwild call: {reference.wall:.1f} s, {reference.processor:.1f} cpu")
-    ways: list[tuple[str, float | None, dict[str, Any]]] = [
-        ("carried", 0.7, {"mesher": "tetwild"}),
-        ("lattice (default)", 0.4, {}),
-        ("own tetrahedra for each", None, {"mesher": "tetwild", "carry": False}),
-    ]
-    for way, bound, chosen in ways:
-        cost = measured(lambda chosen=chosen: tm.extract_bases(keyframes, faces, 50, cache=False, **chosen))
-        asked = "" if bound is None else f" [at most {bound}]"
+    for mesher, bound in (("tetwild", 0.7), ("lattice", 0.4)):
+        cost = measured(lambda mesher=mesher: tm.extract_bases(keyframes, faces, 50, cache=False, mesher=mesher))
         print(
-            f"{what}, {way}: {cost.wall:.1f} s, {cost.processor:.1f} cpu; against the bare call: "
-            f"{cost.wall / reference.wall:.2f} wall{asked}, {cost.processor / reference.processor:.2f} cpu",
+            f"{what}, {mesher}: {cost.wall:.1f} s, {cost.processor:.1f} cpu; against the bare call: "
+            f"{cost.wall / reference.wall:.2f} wall [at most {bound}], {cost.processor / reference.processor:.2f} cpu",
             flush=True,
         )
 
@@ -158,39 +149,6 @@ def memory(keyframes: FloatArray, faces: IntArray) -> None:
     )
 
 
-def energy(mid: torch.Tensor, ends: list[torch.Tensor], faces: torch.Tensor) -> float:
-    """Mean shell energy of the way to both ends, over all vertices, at a diagonal of 100."""
-    scale = 100 / float((ends[0].amax(dim=0) - ends[0].amin(dim=0)).norm())
-    shell = tm.ShellEnergy(faces)
-    return sum(float(shell(mid * scale, end * scale)) for end in ends) / 2
-
-
-def carrying(sets: dict[str, tuple[FloatArray, IntArray, list[tuple[int, int]]]]) -> None:
-    """Mid-shape energies with carried tetrahedra, and with a lattice, against own tetrahedra."""
-    for name, (keyframes, faces, spans) in sets.items():
-        used = sorted({index for span in spans for index in span})
-        made = {
-            way: tm.extract_bases(keyframes[used], faces, N_MODES, cache=False, **chosen)
-            for way, chosen in (
-                ("own", {"mesher": "tetwild", "carry": False}),
-                ("carried", {"mesher": "tetwild"}),
-                ("lattice", {}),
-            )
-        }
-        x, f = torch.from_numpy(keyframes[used]), torch.from_numpy(faces)
-        for a, b in spans:
-            i, j = used.index(a), used.index(b)
-            values = {
-                way: energy(tm.MidShape([bases[i], bases[j]], f)(x[i], x[j]), [x[i], x[j]], f)
-                for way, bases in made.items()
-            }
-            ratios = {way: values[way] / values["own"] for way in values}
-            print(
-                f"mid-shape energy against own tetrahedra, {name} {a}/{b}: carried {ratios['carried']:.3f} "
-                f"[at most 1.02], lattice {ratios['lattice']:.3f}"
-            )
-
-
 def main() -> None:
     """Run the parts asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -216,21 +174,6 @@ def main() -> None:
         threads(arguments.samples / "creature", arguments.mesher)
     if "memory" in arguments.parts:
         memory(*creature)
-    if "carrying" in arguments.parts:
-        sets = {
-            "creature": (*creature, [(i, i + 1) for i in range(5)]),
-            "sculpted hand": (*sample(arguments.samples / "hand"), [(0, 1)]),
-        }
-        if arguments.data.is_dir():
-            sets["hand"] = (*sample(arguments.data / MORE["hand"], "0*"), [(0, 8), (0, 4), (4, 8)])
-            sets["woman"] = (*sample(arguments.data / MORE["woman"], "0*"), [(0, 1), (0, 2), (1, 2)])
-        carrying(sets)
-    if "eigensolvers" in arguments.parts:
-        eigensolvers("creature", creature[0][0], creature[1])
-        if arguments.data.is_dir():
-            for name in MORE:
-                keyframes, faces = sample(arguments.data / MORE[name], "0*")
-                eigensolvers(name, keyframes[0], faces)
     if "capture" in arguments.parts:
         meshes = [("creature", creature[0][0], creature[1])]
         if arguments.data.is_dir():

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from cases import DATA
 from numpy.typing import NDArray
-from precompute import MORE, ROOT, sample
 from scipy.spatial.transform import Rotation
 from threads import limit_threads
 from tqdm import tqdm
@@ -33,7 +33,7 @@ from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.precompute.coarsening import coarsen
-from torch_modal.precompute.filling import MESHERS
+from torch_modal.precompute.extract import MESHERS
 from torch_modal.solve.minimise import Status
 
 FloatArray = NDArray[np.float64]
@@ -47,14 +47,18 @@ WORST = 0.01
 
 def sources(data: Path) -> dict[str, tuple[FloatArray, IntArray]]:
     """Key-frames of all shapes at hand."""
-    samples = ROOT / "torch_modal" / "samples"
-    found = {name: sample(samples / name) for name in ("creature", "hand")}
+    samples = Path(tm.__file__).parent / "samples"
+    files = {name: sorted((samples / name).glob("key-*.ply")) for name in ("creature", "hand")}
+    found = {}
     if data.is_dir():
-        found |= {f"large {name}": sample(data / MORE[name], "0*") for name in MORE}
-        found |= {name: sample(data / name, "*") for name in ("mh-hand", "ict-face", "hyper-cube")}
+        for name in ("mh-hand-path", "mh-woman", "mh-hand", "ict-face", "hyper-cube"):
+            files[name] = sorted((data / name).glob("*.obj"))
         for file in sorted((data / "animals").glob("*.npz")):
             stored = np.load(file)
             found[file.stem] = stored["frames"].astype(np.float64), stored["faces"].astype(np.int64)
+    for name, own in files.items():
+        keyframes, faces = tm.load_keyframes(own)
+        found[name] = keyframes.numpy(), faces.numpy()
     return found
 
 
@@ -98,7 +102,7 @@ def main() -> int:
     parser.add_argument("--mesher", choices=MESHERS, help="in the place of the default")
     parser.add_argument("--preset", choices=[name for name in PRESETS if name != "paper"], default="accurate")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="more, if it is there")
+    parser.add_argument("--data", type=Path, default=DATA, help="more, if it is there")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     random = np.random.default_rng(arguments.seed)

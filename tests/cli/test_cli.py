@@ -19,12 +19,11 @@ from torch_modal.cli import demo
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
 from torch_modal.io.cache import Cache
-from torch_modal.io.write import save_frames
+from torch_modal.io.frames import save_frames
 from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute import modes as modes_module
-from torch_modal.precompute import tetwild
+from torch_modal.precompute.extract import MESHERS
 from torch_modal.precompute.tetrahedra import TetrahedralizationError
-from torch_modal.precompute.tetwild import TetrahedraSettings
+from torch_modal.precompute.tetwild import TetWild
 
 FAST = ["--modes", "6", "--levels", "1", "--preset", "fast"]
 
@@ -43,8 +42,7 @@ def meshes(capsule: tuple[np.ndarray, np.ndarray], tmp_path_factory: pytest.Temp
 @pytest.fixture(autouse=True)
 def coarse_tetrahedra(monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the mesher's time; nothing here depends on how fine the tetrahedra are."""
-    coarse = TetrahedraSettings(edge_length_fac=0.05, epsilon=3e-3)
-    monkeypatch.setitem(modes_module.QUALITIES, "fast", coarse)
+    monkeypatch.setitem(MESHERS, "tetwild", lambda: TetWild(edge_length_fac=0.05, epsilon=3e-3))
 
 
 @pytest.fixture
@@ -54,7 +52,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*_: object, **__: object) -> None:
         raise AssertionError("the mesher was started")
 
-    monkeypatch.setattr(tetwild, "tetrahedralize", started)
+    monkeypatch.setattr(TetWild, "fill", started)
     monkeypatch.setattr(lattice_module, "lattice", started)
 
 
@@ -220,7 +218,7 @@ def test_failed_mesher_is_one_line_and_a_bug_is_not(
     def crash(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(tetwild, "tetrahedralize", crash)
+    monkeypatch.setattr(TetWild, "fill", crash)
     error: Exception = TetrahedralizationError("cannot fill\nthis")
     assert fails(capsys, *argv) == "cannot fill this"
     error = TypeError("a bug")

@@ -18,7 +18,7 @@ from torch_modal.contact import modal, separate
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
 from torch_modal.contact.detect import _nearest_faces
-from torch_modal.contact.separate import Trajectory, through
+from torch_modal.contact.separate import Timeline, through
 from torch_modal.data.samples import load_sample, sample_files
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
@@ -291,12 +291,12 @@ def test_rounding_does_not_choose_among_faces_around_the_nearest_point() -> None
         assert f[chosen].tolist() == [2, 5]
 
 
-def unlimited(n: int, n_vertices: int, most: float = 10.0) -> Trajectory:
+def unlimited(n: int, n_vertices: int, most: float = 10.0) -> Timeline:
     """A trajectory at rest, with a limit of accelerations between frames."""
     limit = AccelerationLimit(
         torch.zeros(n + 2, n_vertices, 3), torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1), (False, False), most
     )
-    return Trajectory(torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1], limit, None)
+    return Timeline(torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1], limit, None)
 
 
 def test_a_displacement_fades_out_where_it_makes_shapes_worse() -> None:
@@ -529,7 +529,7 @@ def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
 
 def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
     space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
-    assert int(far(space.table(0, 1).double(), hand).sum()) == 0
+    assert int(far(space.in_betweens.table(0, 1).double(), hand).sum()) == 0
 
 
 @pytest.mark.slow

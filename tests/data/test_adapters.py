@@ -76,19 +76,20 @@ def number_vertices(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
 
 
 # ------------------------------------------------------------------------------------------------ PyTorch Geometric
-def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
+@pytest.mark.parametrize("n", [1, 3])
+def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace], n: int) -> None:
+    """A graph, and a batch of graphs, are transformed as their shapes would be; what came stays."""
     geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
     from torch_geometric.transforms import Compose, FaceToEdge
 
     from torch_modal.data.pyg import RandomShape
 
-    data = geometric.data.Data(
-        pos=bars.keyframes[0],
-        face=bars.faces.T.contiguous(),
-        normal=torch.zeros(164, 3, dtype=F64),
-        x=torch.arange(164),
-        y=torch.tensor([[1.0, 0, 0]]),
-    )
+    face, normal = bars.faces.T.contiguous(), torch.zeros(164, 3, dtype=F64)
+    graphs = [
+        geometric.data.Data(pos=x, face=face, normal=normal, x=torch.arange(164), y=torch.eye(3)[i : i + 1])
+        for i, x in enumerate(bars.keyframes[:n])
+    ]
+    data = geometric.data.Batch.from_data_list(graphs) if n > 1 else graphs[0]
 
     def make() -> tm.AugmentationSequential:
         return tm.AugmentationSequential(
@@ -100,25 +101,34 @@ def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> No
 
     transform = RandomShape(make(), y=torch.eye(3))
     found = Compose([transform, FaceToEdge(remove_faces=False)])(data)
-    assert torch.equal(data.pos, bars.keyframes[0]), "the graph that came has changed"
+    assert torch.equal(data.pos, bars.keyframes[:n].flatten(0, 1)), "the graph that came has changed"
     assert found.edge_index.shape[0] == 2
-    assert torch.equal(found.x, data.x)
-    assert torch.equal(found.face, data.face)
-    pool = tm.ShapeBatch.of_keyframes(spaces[0], data.pos)
-    expected = make()(bars.keyframes[:1], pool=pool)
-    torch.testing.assert_close(found.pos, expected[0])
-    torch.testing.assert_close(found.normal, tm.vertex_normals(expected, bars.faces)[0])
-    t = transform.augmentation.params[0]["t"]
-    assert found.y.shape == (1, 3)
-    assert float(found.y[0, 0]) == pytest.approx(1 - float(t), abs=1e-6)
+    assert torch.equal(found.x, data.x) and torch.equal(found.face, data.face)
+    expected = make()(bars.keyframes[:n], pool=tm.ShapeBatch.of_keyframes(spaces[0], data.pos))
+    torch.testing.assert_close(found.pos, expected.flatten(0, 1))
+    torch.testing.assert_close(found.normal, tm.vertex_normals(expected, bars.faces).flatten(0, 1))
+    assert found.y.shape == (n, 3)
+    torch.testing.assert_close(found.y.diagonal(), 1 - transform.augmentation.params[0]["t"].float())
     assert "RandomInBetween" in repr(transform)
 
     alone = RandomShape(tm.RandomModalDeformation(p=1.0), space=spaces[0])
     moved = alone(data)
     assert torch.equal(moved.y, data.y)
     assert not torch.equal(moved.pos, data.pos)
-    with pytest.raises(ValueError, match=r"shape \(164, 3\); got \(30, 3\)"):
-        alone(geometric.data.Data(pos=torch.zeros(30, 3)))
+
+
+def test_graphs_that_do_not_fit(spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
+    geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
+    from torch_modal.data.pyg import RandomShape
+
+    transform = RandomShape(tm.RandomModalDeformation(), space=spaces[0])
+    one, *uneven = (geometric.data.Data(pos=torch.zeros(n, 3, dtype=F64)) for n in (30, 100, 228))
+    for data, message in (
+        (one, r"1 graphs of this space has the shape \(164, 3\).*; got \(30, 3\)"),
+        (geometric.data.Batch.from_data_list(uneven), r"2 graphs of this space has the shape \(328, 3\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            transform(data)
     with pytest.raises(ValueError, match="needs key-frames"):
         RandomShape(tm.RandomModalDeformation())
 
@@ -140,40 +150,3 @@ def test_graphs_from_the_dataset(bars: Shapes, tmp_path: Path) -> None:
 
 def graph_labels(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
     return {**number_vertices(stored), "shape_labels": torch.arange(len(stored))}
-
-
-def test_batches_of_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
-    """A batch is transformed as its shapes would be."""
-    geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
-    from torch_modal.data.pyg import RandomShape
-
-    graphs = [
-        geometric.data.Data(
-            pos=x, face=bars.faces.T.contiguous(), normal=torch.zeros(164, 3, dtype=F64), y=torch.eye(3)[i : i + 1]
-        )
-        for i, x in enumerate(bars.keyframes)
-    ]
-    batch = geometric.data.Batch.from_data_list(graphs)
-
-    def make() -> tm.AugmentationSequential:
-        return tm.AugmentationSequential(
-            tm.RandomInBetween(p=1.0, blend_labels=True), generator=torch.Generator().manual_seed(2), space=spaces[0]
-        )
-
-    transform = RandomShape(make(), y=torch.eye(3))
-    found = transform(batch)
-    pool = tm.ShapeBatch.of_keyframes(spaces[0], batch.pos)
-    expected = make()(bars.keyframes, pool=pool)
-    torch.testing.assert_close(found.pos, expected.flatten(0, 1))
-    torch.testing.assert_close(found.normal, tm.vertex_normals(expected, bars.faces).flatten(0, 1))
-    assert torch.equal(batch.pos, bars.keyframes.flatten(0, 1)), "the batch that came has changed"
-    torch.testing.assert_close(found.y.sum(1), torch.ones(3))
-    t = transform.augmentation.params[0]["t"].float()
-    torch.testing.assert_close(found.y.diagonal(), 1 - t)
-    apart = found.to_data_list()
-    assert len(apart) == 3 and torch.equal(apart[1].pos, found.pos[164:328])
-    uneven = geometric.data.Batch.from_data_list(
-        [geometric.data.Data(pos=torch.zeros(n, 3, dtype=F64)) for n in (100, 228)]
-    )
-    with pytest.raises(ValueError, match=r"2 graphs of this space has the shape \(328, 3\)"):
-        RandomShape(make())(uneven)

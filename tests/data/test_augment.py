@@ -13,8 +13,8 @@ from conftest import Shapes, random_rotation
 
 import torch_modal as tm
 from torch_modal.data.deformation import deform, linear_strain
+from torch_modal.data.in_betweens import interpolate
 from torch_modal.data.samples import load_sample
-from torch_modal.data.table import interpolate
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.rigid import best_fit
 
@@ -202,8 +202,8 @@ def test_key_frames_of_a_pool_are_interpolated_from_a_table(bars: Shapes, space:
     exact = tm.ShapeSpace(bars.bases, bars.faces, dtype=F64, times=None)
     t = torch.tensor([0.0, 0.03, 0.3, 0.51, 0.77, 0.99, 1.0], dtype=F64)
     for i, j in ((0, 1), (2, 0)):
-        solved = exact.keyframe_in_between(i, j, t)
-        read = space.keyframe_in_between(i, j, t)
+        solved = exact.in_betweens.of_keyframes(i, j, t)
+        read = space.in_betweens.of_keyframes(i, j, t)
         linear = torch.lerp(bars.keyframes[i], bars.keyframes[j], t[:, None, None])
         assert float((read - solved).norm(dim=-1).max()) < 0.02 * float((linear - solved).norm(dim=-1).max())
         assert float((read - solved).norm(dim=-1).max()) < 2e-4 * 4  # of a bar of length 4
@@ -214,7 +214,7 @@ def test_key_frames_of_a_pool_are_interpolated_from_a_table(bars: Shapes, space:
     batch = augment.transform(pool.rows(torch.tensor([2, 2])), params := augment.forward_parameters(2), None, pool)
     for row in range(2):
         partner = (2 + 1 + int(2 * params["partner"][row])) % 3
-        expected = space.keyframe_in_between(2, partner, params["t"][row : row + 1])[0]
+        expected = space.in_betweens.of_keyframes(2, partner, params["t"][row : row + 1])[0]
         assert torch.equal(batch.shapes[row], expected)
 
 
@@ -253,7 +253,9 @@ def test_nearest_key_frame_is_found_through_rigid_motions(bars: Shapes, space: t
 def test_in_betweens_are_the_same_from_either_end(bars: Shapes, space: tm.ShapeSpace) -> None:
     x, y = 1.01 * bars.keyframes[:1], bars.keyframes[2:] + 0.01
     t = torch.tensor([0.2], dtype=F64)
-    torch.testing.assert_close(space.in_between(y, x, 1 - t, 2, 0), space.in_between(x, y, t, 0, 2))
+    torch.testing.assert_close(
+        space.in_betweens.of_shapes(y, x, 1 - t, 2, 0), space.in_betweens.of_shapes(x, y, t, 0, 2)
+    )
 
 
 def test_times_and_partners_are_uniform(space: tm.ShapeSpace) -> None:
@@ -339,8 +341,7 @@ def test_the_strain_of_a_sheet_is_that_of_its_sides() -> None:
     mode = torch.zeros_like(x)
     mode[:, 2] = 0.5 * x[:, 0] ** 2
     basis = tm.ModalBasis(x, torch.ones(1, dtype=F64), mode[None], torch.zeros(6, dtype=F64))
-    reference = tm.ShapeSpace(basis, faces).reference(0, x)
-    curvature = float(reference.modes.view(3, -1)[2].max()) / 0.5  # of a strain of one
+    curvature = float(tm.ShapeSpace(basis, faces).mode_scales(0))  # of a strain of one
     assert curvature * size(x.numpy(), faces.numpy()) == pytest.approx(1 / 0.005, rel=0.3)
 
 
@@ -354,8 +355,7 @@ def test_strain_is_bounded_and_the_bound_reached(bars: Shapes, space: tm.ShapeSp
         assert float(largest.min()) > 0.75 * bound
 
 
-def test_what_a_space_keeps_is_made_once_and_is_its_own(bars: Shapes, space: tm.ShapeSpace) -> None:
-    assert space.reconstruction() is space.reconstruction("cpu")
+def test_key_frames_are_copies(bars: Shapes, space: tm.ShapeSpace) -> None:
     like = torch.empty(0, dtype=torch.float32)
     given = space.keyframes(like)
     assert given.dtype == torch.float32
@@ -366,12 +366,10 @@ def test_what_a_space_keeps_is_made_once_and_is_its_own(bars: Shapes, space: tm.
 def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     """The straight bar along its softest mode: strains stay those of the linear estimate, which itself shears."""
     x = bars.keyframes[:1]
-    reference = space.reference(0, x)
-    amplitudes = torch.zeros(1, 8, dtype=F64)
-    amplitudes[0, 0] = 1.0
-    amplitudes = amplitudes * (0.5 / linear_strain(amplitudes, reference, space.edges))
-    bent = deform(x, amplitudes, reference, space.reconstruction())
-    straight = x + (amplitudes @ reference.modes).reshape(3, -1).mT
+    displacement = bars.bases[0].modes[0].mT[:, None]
+    displacement = displacement * (0.5 / linear_strain(displacement, x[0], space.edges))
+    bent = deform(x, displacement, x[0], space.reconstruction())
+    straight = x + displacement[:, 0].mT
     initial = volume(x, bars.faces)
     assert float(volume(straight, bars.faces) / initial) > 1.35
     assert float(volume(bent, bars.faces) / initial) == pytest.approx(1, abs=0.025)
@@ -383,7 +381,7 @@ def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     angle = torch.arccos(((turns[0].T @ turns[1]).trace() - 1) / 2)
     assert float(angle) > 1.5
     # And small ones are the modes themselves, up to the rigid motion that they are aligned by.
-    small = deform(x, 1e-4 * amplitudes, reference, space.reconstruction())
+    small = deform(x, 1e-4 * displacement, x[0], space.reconstruction())
     rigid = bars.bases[0].rigid_modes.flatten(1)
     difference = ((small - x) * 1e4 - (straight - x)).flatten()
     difference = difference - rigid.T @ (rigid @ difference)
@@ -414,10 +412,9 @@ def test_modes_that_do_not_deform_are_left_out(bars: Shapes) -> None:
         torch.cat([drift, basis.modes]),
         basis.rigid_eigenvalues,
     )
-    modes = tm.ShapeSpace(loose, bars.faces).reference(0, basis.reference).modes
-    expected = tm.ShapeSpace(basis, bars.faces).reference(0, basis.reference).modes
-    assert not bool(modes[0].any())
-    torch.testing.assert_close(modes[1:], expected)
+    found, expected = (tm.ShapeSpace(each, bars.faces).mode_scales(0) for each in (loose, basis))
+    assert found[0] == 0
+    torch.testing.assert_close(found[1:], expected)
 
 
 # ---------------------------------------------------------------------------------------------------- rigid motion

@@ -1,5 +1,6 @@
 """Files of numbers in which single bytes were changed: each load gives the same numbers, or a ValueError."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 from conftest import Shapes
+from safetensors.torch import load_file, save_file
 
 import torch_modal as tm
 from torch_modal.codec.sequence import STORED
-from torch_modal.data.stored import BASES_FILE, KEYFRAMES_FILE, open_set, write_set
-from torch_modal.data.table import read_table, write_table
+from torch_modal.data.in_betweens import read_table, write_table
+from torch_modal.data.stored import SET_FILE, open_set, write_set
 
 N_IN_NUMBERS = 60
 """Places among the numbers; beside all bytes of short headers."""
@@ -38,8 +40,8 @@ def made(kind: str, bars: Shapes, folder: Path) -> Case:
         path = folder / "a.safetensors"
         bars.bases[0].truncate(2).save(path)
         return Case(path, lambda: parts_of(tm.ModalBasis.load(path)))
-    if kind == "motion":
-        path = folder / "a.safetensors"
+    if kind == "sequence":
+        path = folder / "a.tms"
         frames = torch.lerp(bars.keyframes[0], bars.keyframes[1], torch.linspace(0, 1, 5).double()[:, None, None])
         tm.encode(frames, bars.faces, [0, 4], 4, times=[0, 1, 2, 3, 5]).save(path)
 
@@ -60,10 +62,10 @@ def made(kind: str, bars: Shapes, folder: Path) -> Case:
         found = [stored.names, stored.times, stored.cyclic, len(stored), stored.n_vertices]
         return [*found, stored.keyframes, stored.faces, *(part for basis in stored.bases for part in parts_of(basis))]
 
-    return Case(folder / "set" / (KEYFRAMES_FILE if kind == "keyframes of a set" else BASES_FILE), load_set)
+    return Case(folder / "set" / SET_FILE, load_set)
 
 
-KINDS = ("basis", "motion", "table", "keyframes of a set", "bases of a set")
+KINDS = ("basis", "sequence", "table", "set")
 
 
 def everything(case: Case) -> list[Any]:
@@ -100,3 +102,18 @@ def test_a_changed_byte_is_an_error_or_changes_nothing(kind: str, small_bars: Sh
             continue
         assert all(map(same, after, before)), f"byte {place} of {len(data)} ({start} of the header)"
     assert found_out > N_IN_NUMBERS
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_without_digests_are_damaged(kind: str, small_bars: Shapes, tmp_path: Path) -> None:
+    case = made(kind, small_bars, tmp_path)
+    data = case.path.read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    tensors = load_file(case.path)
+    assert tensors.pop("digests").dtype == torch.uint8
+    save_file(tensors, case.path, header["__metadata__"])
+    if case.refuses:
+        with pytest.raises(ValueError, match="is damaged"):
+            case.load()
+    else:
+        assert case.load() == [None]

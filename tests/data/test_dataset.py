@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torch.utils.data import DataLoader, default_collate
 
 import torch_modal as tm
-from torch_modal.data.table import FORMAT, VERSION, write_table
+from torch_modal.data.in_betweens import FORMAT, VERSION, write_table
 from torch_modal.energy.bend import Bend
 from torch_modal.io.cache import CacheWarning
 from torch_modal.io.tensors import TensorFile
@@ -90,10 +90,9 @@ def test_samples_are_the_transforms(root: Path, bars: Shapes) -> None:
     for i in range(3):
         assert torch.equal(still[i]["vertices"], bars.keyframes[i])
     middle = tm.ShapeDataset(root, tm.RandomInBetween(t=(0.5, 0.5), p=1.0), samples_per_set=12, dtype=torch.float64)
-    layer = tm.InBetween(bars.bases, bars.faces, "fast", pairs=[(0, 1), (1, 2), (0, 2)])
     truths = {
-        pair: layer(bars.keyframes[pair[0]], bars.keyframes[pair[1]], 0.5, i)
-        for i, pair in enumerate([(0, 1), (1, 2), (0, 2)])
+        (i, j): tm.InBetween([bars.bases[i], bars.bases[j]], bars.faces, "fast")(*bars.keyframes[[i, j]], 0.5)
+        for i, j in ((0, 1), (1, 2), (0, 2))
     }
     seen = set()
     for i in range(12):
@@ -214,7 +213,7 @@ def test_labels_from_the_folder(bars: Shapes, tmp_path: Path) -> None:
         assert data[k]["shape_labels"] == 4 + k
         assert data[k]["vertex_labels"].unique().tolist() == [k]
     save_file({"vertex_labels": torch.zeros(163)}, tmp_path / "set" / "labels.safetensors")
-    with pytest.raises(ValueError, match=r"vertex_labels of 3 key-frames.*got \(163,\)"):
+    with pytest.raises(ValueError, match=r"set: vertex_labels begin with the shape \(3, 164\).*got \(163,\)"):
         tm.ShapeDataset(tmp_path)[0]
 
 
@@ -233,7 +232,7 @@ def test_tables_are_kept_in_the_folders(bars: Shapes, tmp_path: Path) -> None:
     assert [path.stat().st_mtime_ns for path in tables] != times
     # A folder's tables of other shapes are not taken for one's own.
     moved = bars.pick(1, 0, 2)
-    shapes = tm.ShapeSpace(moved.bases, moved.faces, folder=tmp_path / "set").table(0, 1)
+    shapes = tm.ShapeSpace(moved.bases, moved.faces, folder=tmp_path / "set").in_betweens.table(0, 1)
     assert torch.equal(shapes[0], bars.keyframes[1].float())
     # Where nothing can be written, nothing is.
     for path in tables:
@@ -250,7 +249,7 @@ def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
     path = tmp_path / "between-0-1.safetensors"
 
     def table(bases: list[tm.ModalBasis] = bars.bases, faces: torch.Tensor = bars.faces, **options: Any) -> Any:
-        return tm.ShapeSpace(bases, faces, folder=tmp_path, **options).table(0, 1)
+        return tm.ShapeSpace(bases, faces, folder=tmp_path, **options).in_betweens.table(0, 1)
 
     right = table()
     key = TensorFile(path, FORMAT, VERSION).metadata
@@ -280,7 +279,7 @@ def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
         path.unlink()
         assert torch.equal(table(**change), found)
     plant()
-    monkeypatch.setattr("torch_modal.data.space.__version__", "0.0.1")
+    monkeypatch.setattr("torch_modal.data.in_betweens.__version__", "0.0.1")
     assert torch.equal(table(), right)
 
 
@@ -297,10 +296,10 @@ def test_tables_of_a_users_own_term_are_not_stored(bars: Shapes, tmp_path: Path)
     objective = tm.Objective(coarse_faces=300, terms=(Area(2.0),))
     space = tm.ShapeSpace(bars.bases, bars.faces, objective=objective, folder=tmp_path)
     with pytest.warns(CacheWarning, match="are not stored.*Area"):
-        space.table(0, 1)
+        space.in_betweens.table(0, 1)
     assert not list(tmp_path.iterdir())
     with pytest.raises(ValueError, match="times=None"):
-        tm.ShapeSpace(bars.bases, bars.faces, times=None).table(0, 1)
+        tm.ShapeSpace(bars.bases, bars.faces, times=None).in_betweens.table(0, 1)
 
 
 def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> None:
@@ -314,7 +313,7 @@ def test_what_does_not_converge_is_warned_of(bars: Shapes, tmp_path: Path) -> No
     assert not list(tmp_path.rglob("between-*"))
     space = tm.ShapeSpace(bars.bases, bars.faces, solver=hasty, times=None)
     with pytest.warns(tm.ConvergenceWarning, match=r"1 of 1 in-betweens near the key-frames 0 and 1"):
-        space.keyframe_in_between(1, 0, torch.tensor([0.5], dtype=torch.float64))
+        space.in_betweens.of_keyframes(1, 0, torch.tensor([0.5], dtype=torch.float64))
     x = bars.keyframes + 0.01 * torch.sin(bars.keyframes)
     with pytest.warns(tm.ConvergenceWarning, match="OUT_OF_STEPS"):
         between(x, space=space)

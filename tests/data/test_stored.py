@@ -1,6 +1,5 @@
 """Key-frame sets on disk: whole or absent, mapped into memory, the same after reading."""
 
-import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,16 +11,7 @@ from safetensors.torch import save_file
 
 from torch_modal.data.dataset import stored_labels
 from torch_modal.data.space import ShapeSpace
-from torch_modal.data.stored import (
-    BASES_FILE,
-    KEYFRAMES_FILE,
-    LABELS_FILE,
-    RECORD_FILE,
-    StoredSet,
-    find_sets,
-    open_set,
-    write_set,
-)
+from torch_modal.data.stored import LABELS_FILE, SET_FILE, StoredSet, find_sets, open_set, read_note, write_set
 from torch_modal.precompute.basis import ModalBasis
 
 NAMES = ("straight.obj", "bent.obj", "twisted.obj")
@@ -96,37 +86,21 @@ def test_pickle_carries_the_path_alone(folder: Path) -> None:
 
 
 def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> None:
-    write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
-    assert torch.equal(open_set(folder).keyframes, 2 * small_bars.keyframes)
-    assert sorted(path.name for path in folder.parent.iterdir()) == ["bars"]
-    (folder / "between-0-1.safetensors").write_bytes(b"")  # made from a set, and out of date with it
-    write_set(folder, *small_bars, NAMES)
-    assert sorted(path.name for path in folder.iterdir()) == [BASES_FILE, KEYFRAMES_FILE]
-
-
-def test_files_of_the_user_stay_when_a_set_is_replaced(small_bars: Shapes, folder: Path) -> None:
     save_file({"vertex_labels": torch.arange(30)}, folder / LABELS_FILE)
     (folder / "notes.txt").write_text("mine")
-    (folder / RECORD_FILE).write_text("of the set that was there")
-    write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES, beside={"x": b"y"})
+    (folder / "between-0-1.safetensors").write_bytes(b"")  # made from a set, and out of date with it
+    write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES, note="new")
     assert torch.equal(open_set(folder).keyframes, 2 * small_bars.keyframes)
+    assert open_set(folder).note == read_note(folder) == "new"
     assert torch.equal(stored_labels(open_set(folder))["vertex_labels"], torch.arange(30))
-    assert (folder / "notes.txt").read_text() == "mine" and (folder / "x").read_bytes() == b"y"
-    assert not (folder / RECORD_FILE).exists()
-    write_set(folder.parent / "new", *small_bars, NAMES)
-    for place, what in ((folder.parent, "holds the folder bars"), (folder / "notes.txt", "is no folder")):
-        with pytest.raises(FileExistsError, match=what):
-            write_set(place, *small_bars, NAMES)
-    (folder.parent / "other").mkdir()
-    (folder.parent / "other" / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match=r"holds notes\.txt and no stored key-frame set"):
-        write_set(folder.parent / "other", *small_bars, NAMES)
-    assert [path.name for path in (folder.parent / "other").iterdir()] == ["notes.txt"]
+    assert (folder / "notes.txt").read_text() == "mine"
+    assert sorted(path.name for path in folder.iterdir()) == [LABELS_FILE, "notes.txt", SET_FILE]
+    with pytest.raises(OSError, match=r"notes\.txt"):
+        write_set(folder / "notes.txt", *small_bars, NAMES)
 
 
 def test_several_may_write_one_set_at_once(small_bars: Shapes, folder: Path) -> None:
-    """The last one's set stays, whole, with the labels; nobody fails, and no temporary folder is left."""
-    (folder / LABELS_FILE).write_text("mine")
+    """The last one's set stays, whole; nobody fails, and no temporary file is left."""
 
     def write(scale: int) -> None:
         for _ in range(30):
@@ -137,44 +111,25 @@ def test_several_may_write_one_set_at_once(small_bars: Shapes, folder: Path) -> 
     scale = float(open_set(folder).keyframes.abs().max() / small_bars.keyframes.abs().max())
     assert scale in (1.0, 2.0, 3.0, 4.0)
     assert len(open_set(folder).bases) == 3
-    assert (folder / LABELS_FILE).read_text() == "mine"
-    assert sorted(path.name for path in folder.parent.iterdir()) == ["bars"]
-
-
-def test_leftovers_are_removed_when_nobody_can_be_writing_them(small_bars: Shapes, folder: Path) -> None:
-    names = [".bars.77-0123abcd.tmp", ".bars.78-0123abcd.tmp", ".bars.mine.tmp", ".other.77-0123abcd.tmp"]
-    for name in names:
-        (folder.parent / name).mkdir()
-        if "77" in name:
-            os.utime(folder.parent / name, (0, 0))
-    write_set(folder, *small_bars, NAMES)
-    assert sorted(path.name for path in folder.parent.iterdir()) == sorted(["bars", *names[1:]])
+    assert [path.name for path in folder.iterdir()] == [SET_FILE]
 
 
 def test_a_failure_leaves_nothing_behind(small_bars: Shapes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = {path: path.read_bytes() for path in folder.iterdir()}
-    write, calls = Path.write_bytes, []
+    before = (folder / SET_FILE).read_bytes()
 
     def full_disk(path: Path, data: bytes) -> int:
-        calls.append(path.name)
-        if len(calls) == 2:
-            raise OSError("No space left on device")
-        return write(path, data)
+        raise OSError("No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(OSError, match="No space"):
         write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
-    assert len(calls) == 2
-    assert {path: path.read_bytes() for path in folder.iterdir()} == before
-    assert [path.name for path in folder.parent.iterdir()] == ["bars"]
+    assert [(path.name, path.read_bytes()) for path in folder.iterdir()] == [(SET_FILE, before)]
 
 
 def test_finds_sets_in_order(small_bars: Shapes, folder: Path) -> None:
     root = folder.parents[1]
     write_set(root / "a", *small_bars, NAMES)
-    write_set(root / "deep" / ".bars.17.tmp", *small_bars, NAMES)
-    (root / "half").mkdir()
-    (root / "half" / KEYFRAMES_FILE).write_bytes(b"")
+    write_set(root / "deep" / ".hidden", *small_bars, NAMES)
     assert find_sets(root) == [root / "a", root / "deep" / "bars"]
     assert find_sets(str(folder)) == [folder]
     with pytest.raises(FileNotFoundError, match="no folder"):
@@ -196,15 +151,23 @@ def test_refuses_parts_that_do_not_fit(small_bars: Shapes, bars: Shapes, tmp_pat
 
 
 def test_refuses_what_is_no_set(small_bars: Shapes, folder: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=KEYFRAMES_FILE):
+    with pytest.raises(FileNotFoundError, match=SET_FILE):
         open_set(folder.parent)
-    whole = (folder / BASES_FILE).read_bytes()
-    (folder / BASES_FILE).write_bytes(whole[:-1])
+    path = folder / SET_FILE
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
     with pytest.raises(ValueError, match="damaged"):
         open_set(folder)
-    small_bars.bases[0].save(folder / BASES_FILE)
-    with pytest.raises(ValueError, match=r"lacks the tensors 0\.reference"):
-        open_set(folder)
-    (folder / BASES_FILE).write_bytes((folder / KEYFRAMES_FILE).read_bytes())
-    with pytest.raises(ValueError, match=r"torch_modal\.set"):
+    small_bars.bases[0].save(path)
+    with pytest.raises(ValueError, match=r"not 'torch_modal\.set'"):
         StoredSet(folder)
+    shapes = {"keyframes": small_bars.keyframes.contiguous(), "faces": small_bars.faces.contiguous()}
+    good = {"format": "torch_modal.set", "version": "2", "names": "[]", "times": "null"}
+    for tensors, metadata, message in (
+        (shapes, good, r"lacks the tensors 0\.reference"),
+        ({**shapes, "faces": small_bars.faces[0]}, good, r"needs keyframes \(K, V, 3\) and faces"),
+        (shapes, {**good, "version": "3"}, "version '3'"),
+    ):
+        save_file(tensors, path, metadata)
+        with pytest.raises(ValueError, match=message):
+            read_note(folder)

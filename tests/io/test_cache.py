@@ -33,7 +33,11 @@ from torch_modal.io.cache import (
 )
 
 POINTS = np.arange(6.0).reshape(2, 3)
-RESULT = {"values": np.linspace(0, 1, 50), "index": np.arange(8).reshape(2, 4)}
+RESULT = {
+    "values": np.linspace(0, 1, 50),
+    "index": np.arange(8).reshape(2, 4).T,
+    "one": np.broadcast_to(0.5, 1),  # with a stride of 0
+}
 
 
 class Counted:

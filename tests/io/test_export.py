@@ -15,8 +15,8 @@ import torch
 import trimesh
 
 from torch_modal.io import glb
+from torch_modal.io.frames import save_frames
 from torch_modal.io.read import open_asset
-from torch_modal.io.write import save_frames
 from torch_modal.view.animation import save_animation
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -328,7 +328,9 @@ def test_normals_have_unit_length_everywhere(tmp_path):
 
 
 def test_the_import_is_light():
-    code = "import sys, torch_modal.io.write, torch_modal.view.animation, torch_modal.view.picture; print(*sys.modules)"
+    code = (
+        "import sys, torch_modal.io.frames, torch_modal.view.animation, torch_modal.view.picture; print(*sys.modules)"
+    )
     root = str(Path(glb.__file__).parents[1])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert not {"pyvista", "vtkmodules", "matplotlib", "pygltflib"} & set(done.stdout.split())

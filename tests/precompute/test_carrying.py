@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 import torch
 from bodies import bend
-from solids import box, embed_surface, surface
+from solids import as_it_is, box, embed_surface, surface
 
-from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling, modes, solving, tetwild
-from torch_modal.precompute.carrying import Carried, Carrier, nearest_rotations, vertex_rotations
+from torch_modal.precompute import carrying
+from torch_modal.precompute.carrying import Carrier, nearest_rotations, vertex_rotations
 from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
-from torch_modal.precompute.filling import Body, Filler, Filling, meshing_order
-from torch_modal.precompute.proximity import clearances, self_proximity, separation
-from torch_modal.precompute.solving import Solid, Solved
+from torch_modal.precompute.embedding import find_neighbours
+from torch_modal.precompute.extract import extract_bases
+from torch_modal.precompute.solid import Solid
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.surface import CanonicalSurface, clearances, self_proximity
 from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
 from torch_modal.precompute.tetwild import TetWild
 
@@ -38,29 +37,24 @@ def carrier() -> Carrier:
 
 
 def test_rigid_motions_and_scale_are_carried_exactly(carrier: Carrier) -> None:
-    result = carrier.carry(POINTS @ TURN.T * 7.0 + 3.0)
-    np.testing.assert_allclose(result.tetrahedra.vertices, BAR.vertices @ TURN.T * 7.0 + 3.0, atol=1e-10)
-    assert max(result.fit_rms, result.fit_max) < 1e-10
-    assert result.inverted == 0
+    found = carrier.carry(POINTS @ TURN.T * 7.0 + 3.0)
+    np.testing.assert_allclose(found, BAR.vertices @ TURN.T * 7.0 + 3.0, atol=1e-10)
 
 
 def test_a_bent_bar_is_filled_as_it_bends(carrier: Carrier) -> None:
     """Bent by 270 degrees, further than any interpolation of positions or of single rotations can follow."""
     angle = 1.5 * np.pi
-    result = carrier.carry(bent(POINTS, angle))
-    truth = bent(BAR.vertices, angle)
-    assert np.linalg.norm(result.tetrahedra.vertices - truth, axis=1).max() < 0.1
-    assert result.inverted == 0
-    assert result.is_good
-    assert (tet_volumes(result.tetrahedra) > 0).all()
+    found = carrier.carry(bent(POINTS, angle))
+    assert found is not None
+    assert np.linalg.norm(found - bent(BAR.vertices, angle), axis=1).max() < 0.1
+    assert (tet_volumes(Tetrahedra(found, BAR.tets)) > 0).all()
 
 
 def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) -> None:
     points = bent(POINTS, np.pi)
-    bar = CanonicalSurface(POINTS, COMPACT, USED, 1.0, np.eye(3))
-    carried = Filling(
-        Body(bar, BAR), CanonicalSurface(points, COMPACT, USED, 1.0, np.eye(3)), carrier.carry(points).tetrahedra
-    )
+    bar = as_it_is(POINTS, COMPACT)
+    solid = Solid(bar, BAR, *find_neighbours(bar.points, BAR, bar.normals))
+    carried = solid.carried(as_it_is(points, COMPACT), carrier.carry(points))
     truth = Tetrahedra(bent(BAR.vertices, np.pi), BAR.tets)
     found = lowest_modes(arap_hessian(carried.tetrahedra), carried.mass(), carried.tetrahedra.vertices, 8)
     wanted = lowest_modes(arap_hessian(truth), mass_matrix(truth), truth.vertices, 8)
@@ -70,20 +64,8 @@ def test_modes_of_the_carried_bar_are_those_of_the_bent_one(carrier: Carrier) ->
 
 
 def test_what_cannot_be_followed_is_seen(carrier: Carrier) -> None:
-    mirrored = carrier.carry(POINTS * (1.0, 1.0, -1.0))
-    assert mirrored.inverted > 0.5
-    assert not mirrored.is_good
-    crumpled = carrier.carry(POINTS + np.random.default_rng(0).normal(size=POINTS.shape))
-    assert crumpled.fit_rms > 5e-3
-    assert not crumpled.is_good
-
-
-@pytest.mark.parametrize(
-    ("measures", "good"),
-    [((0.004, 0.09, 0.03), True), ((0.006, 0.0, 0.0), False), ((0.0, 0.11, 0.0), False), ((0.0, 0.0, 0.05), False)],
-)
-def test_borders_of_the_checks(measures: tuple[float, float, float], good: bool) -> None:
-    assert Carried(BAR, *measures).is_good is good
+    assert carrier.carry(POINTS * (1.0, 1.0, -1.0)) is None  # mirrored
+    assert carrier.carry(POINTS + np.random.default_rng(0).normal(size=POINTS.shape)) is None  # crumpled
 
 
 def test_local_rotations_of_a_turn() -> None:
@@ -118,17 +100,17 @@ def test_clearances_of_a_plate_and_of_a_gap() -> None:
         np.concatenate([one, one + np.array([0, 0, 0.7])]),
         np.concatenate([compact.reshape(-1, 3), compact.reshape(-1, 3) + len(one)]),
     )
-    near = clearances(whole)
+    thickness, gap = clearances(whole)
     middle = whole.points[whole.faces].mean(axis=1)
     flat = (np.ptp(whole.points[whole.faces][..., 2], axis=1) == 0) & (np.abs(middle[:, :2]) < [30.0, 12.0]).all(axis=1)
-    np.testing.assert_allclose(near.thickness[flat], 0.4 * whole.scale, rtol=0.02)
+    np.testing.assert_allclose(thickness[flat], 0.4 * whole.scale, rtol=0.02)
     facing = flat & (np.abs(middle[:, 2]) < 0.2 * whole.scale)
-    np.testing.assert_allclose(near.gap[facing], 0.3 * whole.scale, rtol=0.02)
-    assert np.isinf(near.gap[flat & ~facing]).all()
+    np.testing.assert_allclose(gap[facing], 0.3 * whole.scale, rtol=0.02)
+    assert np.isinf(gap[flat & ~facing]).all()
     # Corners of a box are no thin parts.
     cube = box((20, 20, 20), (1.0, 1.0, 1.0))
     used, compact = np.unique(surface(cube), return_inverse=True)
-    assert np.isinf(clearances(CanonicalSurface.of(cube.vertices[used], compact.reshape(-1, 3))).thickness).all()
+    assert np.isinf(clearances(CanonicalSurface.of(cube.vertices[used], compact.reshape(-1, 3)))[0]).all()
 
 
 def horseshoe(angle: float) -> np.ndarray:
@@ -143,21 +125,6 @@ def test_self_proximity_grows_as_the_ends_meet() -> None:
     closeness = [self_proximity(s) for s in surfaces]
     assert closeness[2] == 0
     assert closeness[0] > closeness[1]
-    assert meshing_order(surfaces)[-1] == 0
-
-
-def test_parting_is_of_what_touched_and_came_apart() -> None:
-    fine = box((48, 6, 6), (16.0, 1.0, 1.0))
-    faces = np.unique(surface(fine), return_inverse=True)[1].reshape(-1, 3)
-    closed, ajar, opened = (CanonicalSurface.of(horseshoe(angle), faces) for angle in (1.995 * np.pi, 1.9 * np.pi, 0.5))
-    # Both ends, of 1 by 1 and of 66 in all, part by most of the length of 16, and half of that is counted for each.
-    apart = np.linalg.norm(opened.points[0] - opened.points[-1]) * closed.scale / opened.scale
-    expected = apart / 2 * np.sqrt(2 / 66) / 100
-    assert separation(closed, opened) == pytest.approx(expected, rel=0.4)
-    assert separation(closed, ajar) < 0.3 * separation(closed, opened)
-    assert separation(opened, closed) < 0.001
-    turned = CanonicalSurface.of(horseshoe(1.995 * np.pi) @ TURN.T * 7.0 + 3.0, faces)
-    assert separation(closed, turned) < 1e-9
 
 
 # --------------------------------------------------------------------------------------- a set of key-frames
@@ -168,70 +135,26 @@ def meshed(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """A mesher that knows the bar; it keeps the surfaces that it was asked to fill."""
     asked: list[np.ndarray] = []
 
-    def fill(points: np.ndarray, *args: object, **kwargs: object) -> Tetrahedra:
-        asked.append(points)
+    def fill(mesher: TetWild, surface: CanonicalSurface, stop: object) -> Tetrahedra:
+        asked.append(surface.points)
         low, high = BAR.vertices.min(axis=0), BAR.vertices.max(axis=0)
         return Tetrahedra((BAR.vertices - (low + high) / 2) * (100 / np.linalg.norm(high - low)), BAR.tets)
 
-    monkeypatch.setattr(tetwild, "tetrahedralize", fill)
+    monkeypatch.setattr(TetWild, "fill", fill)
     return asked
 
 
 def test_the_mesher_runs_once_for_a_set(meshed: list[np.ndarray]) -> None:
     poses = np.stack([bent(POINTS, 1.0), POINTS, bent(POINTS, 2.0)])
-    bases = modes.extract_bases(poses[[1, 0, 2]], COMPACT, 5, mesher="tetwild", cache=False)
+    bases = extract_bases(poses[[1, 0, 2]], COMPACT, 5, mesher="tetwild", cache=False)
     assert len(meshed) == 1
     for basis, pose in zip(bases, poses[[1, 0, 2]], strict=True):
         np.testing.assert_array_equal(basis.reference, pose)
-    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, mesher="tetwild", carry=False, cache=False)
-    assert len(meshed) == 3
-
-
-def test_a_keyframe_that_cannot_be_carried_to_has_its_own(
-    meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torch_modal.precompute.carrying.MAX_FIT", -1.0)
-    modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, mesher="tetwild", cache=False)
-    assert len(meshed) == 2
-
-
-def test_what_is_known_to_tear_is_not_carried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ring whose ends touch, and come apart: both poses are meshed; the other way round they are not."""
-    poses = np.stack([bent(POINTS, 1.995 * np.pi), bent(POINTS, 0.5)])
-    filled: list[Filling] = []
-
-    def solve(n_vertices: int, body: Solid, n_modes: int, *_: object) -> Solved:
-        filled.append(body.filling)
-        return Solved(np.zeros(n_modes), np.zeros((n_modes, n_vertices, 3)), np.zeros(6), 6)
-
-    monkeypatch.setattr(solving, "solve", solve)
-    monkeypatch.setattr(solving, "meshing_order", lambda surfaces: list(range(len(surfaces))))
-    monkeypatch.setattr(Filler, "body", lambda self, posed: Body(posed, BAR))
-    tried = []
-    monkeypatch.setattr(Filler, "carried", lambda self, body, posed: tried.append(posed))
-    modes.extract_bases(poses, COMPACT, 5, mesher="lattice", cache=False)
-    assert tried == []
-    assert all(filling.body.surface is filling.surface for filling in filled)
-    modes.extract_bases(poses[::-1].copy(), COMPACT, 5, mesher="lattice", cache=False)
-    assert len(tried) == 1
-
-
-def test_carried_tetrahedra_come_from_the_cache(
-    meshed: list[np.ndarray], tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    filler = Filler(TetWild(), 1.0, Cache.at(tmp_path))
-    surfaces = [CanonicalSurface.of(pose, COMPACT) for pose in (POINTS, bent(POINTS, 1.0))]
-    first = filler.carried(filler.body(surfaces[0]), surfaces[1])
-    monkeypatch.setattr(filling, "Carrier", None)
-    again = filler.carried(filler.body(surfaces[0]), surfaces[1])
-    assert len(meshed) == 1
-    assert first is not None and again is not None
-    np.testing.assert_array_equal(first.tetrahedra.vertices, again.tetrahedra.vertices)
 
 
 def test_equal_poses_have_equal_modes(meshed: list[np.ndarray]) -> None:
     """The same key-frame twice, the second turned: the same modes, turned."""
-    first, second = modes.extract_bases(np.stack([POINTS, POINTS @ TURN.T]), COMPACT, 6, mesher="tetwild", cache=False)
+    first, second = extract_bases(np.stack([POINTS, POINTS @ TURN.T]), COMPACT, 6, mesher="tetwild", cache=False)
     torch.testing.assert_close(first.eigenvalues, second.eigenvalues, rtol=1e-6, atol=0)
     a = (first.modes @ torch.from_numpy(TURN).T).flatten(1)
     b = second.modes.flatten(1)
@@ -239,32 +162,29 @@ def test_equal_poses_have_equal_modes(meshed: list[np.ndarray]) -> None:
     assert overlap.min() > 0.999
 
 
-def test_a_singular_matrix_is_not_carried(meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What SciPy raises then counts as not carried: each key-frame has tetrahedra of its own."""
+@pytest.mark.parametrize("reason", ["no fit", "singular matrix", "no modes"])
+def test_a_keyframe_that_cannot_be_carried_to_has_its_own(
+    reason: str, meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Progress counts it once."""
 
-    def singular(*_: object) -> None:
+    def fail(*_: object) -> None:
         raise RuntimeError("Factor is exactly singular")
 
-    monkeypatch.setattr("torch_modal.precompute.carrying.factorize", singular)
-    bases = modes.extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, mesher="tetwild", cache=False)
-    assert len(meshed) == 2
-    assert all(torch.isfinite(basis.modes).all() for basis in bases)
-
-
-def test_carried_tetrahedra_that_are_too_distorted_for_modes(
-    meshed: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The key-frame has its own then, and progress counts it once."""
-    solve, counted = solving.solve, []
-
-    def fails_if_carried(n_vertices: int, body: Solid, *others: object) -> Solved:
-        if body.surface is not body.filling.body.surface:
+    def fails_if_carried(solid: Solid, form: str) -> object:
+        if solid.meshed is not None:
             raise ModalAnalysisError("the stiffness is indefinite")
-        return solve(n_vertices, body, *others)
+        return body(solid, form)
 
-    monkeypatch.setattr(solving, "solve", fails_if_carried)
-    poses = np.stack([POINTS, POINTS + 1.0])
+    body, counted = Solid.body, []
+    if reason == "no fit":
+        monkeypatch.setattr(carrying, "MAX_FIT", -1.0)
+    elif reason == "singular matrix":
+        monkeypatch.setattr(carrying, "factorize", fail)
+    else:
+        monkeypatch.setattr(Solid, "body", fails_if_carried)
     monkeypatch.setattr("torch_modal.progress.ProgressReport.update", lambda self: counted.append(1))
-    modes.extract_bases(poses, COMPACT, 5, mesher="tetwild", cache=False)
+    bases = extract_bases(np.stack([POINTS, POINTS + 1.0]), COMPACT, 5, mesher="tetwild", cache=False)
     assert len(meshed) == 2
-    assert len(counted) == 4
+    assert len(counted) == 2
+    assert all(torch.isfinite(basis.modes).all() for basis in bases)

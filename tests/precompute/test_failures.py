@@ -1,6 +1,5 @@
 """A failure of the mesher is remembered, if it is the mesher's; nobody waits for it twice."""
 
-import re
 import subprocess
 import sys
 import textwrap
@@ -10,15 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_modal.io.cache import Cache, cache_content, clear_cache
-from torch_modal.precompute import filling, tetrahedra, tetwild
-from torch_modal.precompute.modes import extract_modes
-from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.io.cache import cache_content
+from torch_modal.precompute import tetwild
+from torch_modal.precompute.extract import extract_modes
 from torch_modal.precompute.tetrahedra import TetrahedralizationError
-from torch_modal.precompute.tetwild import TetrahedraSettings
+from torch_modal.precompute.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
-COARSE = TetrahedraSettings(edge_length_fac=0.08, epsilon=5e-3)
+COARSE = {"edge_length_fac": 0.08, "epsilon": 5e-3}
 
 
 class Worker:
@@ -44,8 +42,8 @@ def worker(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyP
     return made
 
 
-def modes_of(mesh: Mesh, folder: Path, **chosen: object) -> object:
-    return extract_modes(*mesh, 4, cache_dir=str(folder), **{"mesher": "tetwild", "method": "solid", **chosen})  # type: ignore[arg-type]
+def modes_of(mesh: Mesh, folder: Path, **settings: float) -> object:
+    return extract_modes(*mesh, 4, cache_dir=str(folder), method="solid", mesher=TetWild(**settings))  # type: ignore[arg-type]
 
 
 CRASH = "os.kill(os.getpid(), signal.SIGSEGV)"
@@ -62,30 +60,6 @@ def test_a_crash_is_remembered(worker: Worker, capsule: Mesh, tmp_path: Path, co
     assert worker.runs == 1
     assert str(second.value).startswith(str(first.value))
     assert f"to try again, clear the cache in {tmp_path} (torch-modal cache --clear)" in str(second.value)
-
-
-def test_what_makes_it_another_call(worker: Worker, capsule: Mesh, tmp_path: Path) -> None:
-    worker.does(CRASH)
-    vertices, faces = capsule
-    for runs, (mesh, chosen) in enumerate(
-        [
-            ((vertices, faces), {}),
-            ((vertices * (1, 1, 1.01), faces), {}),
-            ((vertices, faces), {"settings": COARSE}),
-        ]
-    ):
-        for _ in range(2):
-            with pytest.raises(TetrahedralizationError, match="SIGSEGV"):
-                modes_of(mesh, tmp_path, **chosen)
-            assert worker.runs == runs + 1
-    assert clear_cache(tmp_path).n_entries == 3
-    with pytest.raises(TetrahedralizationError, match="SIGSEGV"):
-        modes_of(capsule, tmp_path)
-    assert worker.runs == 4
-    for _ in range(2):
-        with pytest.raises(TetrahedralizationError, match="SIGSEGV"):
-            modes_of(capsule, tmp_path, cache=False)
-    assert worker.runs == 6
 
 
 def test_a_timeout_is_remembered_up_to_its_length(worker: Worker, capsule: Mesh, tmp_path: Path) -> None:
@@ -134,10 +108,10 @@ def test_too_little_memory_is_not_remembered(worker: Worker, capsule: Mesh, tmp_
     run = f"import runpy\nsys.path.insert(0, '')\nsys.argv[0] = {real!r}\nrunpy.run_path({real!r}, run_name='__main__')"
     worker.does(limited.format(180 * 2**20) + run)
     with pytest.raises(TetrahedralizationError, match=r"SIGABRT|exit code 1"):
-        modes_of(capsule, tmp_path, settings=COARSE)
+        modes_of(capsule, tmp_path, **COARSE)
     assert cache_content(tmp_path).n_entries == 0
     worker.does(run)
-    modes_of(capsule, tmp_path, settings=COARSE)
+    modes_of(capsule, tmp_path, **COARSE)
     assert worker.runs == 2
 
 
@@ -152,44 +126,16 @@ def test_another_version_of_the_mesher_is_tried(
         assert worker.runs == min(runs + 1, 2)
 
 
-def test_another_version_of_the_mesher_makes_its_own_tetrahedra(
-    capsule: Mesh, capsule_tetrahedra: tetrahedra.Tetrahedra, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls = []
-
-    def mesher(*args: object, **kwargs: object) -> tetrahedra.Tetrahedra:
-        calls.append(args)
-        return capsule_tetrahedra
-
-    monkeypatch.setattr(tetwild, "tetrahedralize", mesher)
-    surface = CanonicalSurface(*capsule, np.arange(len(capsule[0])), 1.0, np.eye(3))
-    for installed in ("0.4.2", "0.4.3", "0.4.2"):
-        monkeypatch.setattr(tetwild, "version", lambda _, installed=installed: installed)
-        filling.Filler(tetwild.TetWild(COARSE), 1.0, Cache.at(tmp_path)).body(surface)
-    assert len(calls) == 2
-
-
 def test_success_after_a_failure_lasts(
     worker: Worker, capsule: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     worker.does("time.sleep(60)")
     with pytest.raises(TetrahedralizationError, match="timeout"):
-        modes_of(capsule, tmp_path, timeout=0.5, settings=COARSE)
+        modes_of(capsule, tmp_path, timeout=0.5, **COARSE)
     monkeypatch.undo()
-    modes_of(capsule, tmp_path, timeout=100.0, settings=COARSE)
+    modes_of(capsule, tmp_path, timeout=100.0, **COARSE)
     monkeypatch.setattr(tetwild, "WORKER", tmp_path / "gone")
-    modes_of(capsule, tmp_path, timeout=0.5, settings=COARSE)  # the tetrahedra are kept: no failure stands before them
-
-
-def test_a_damaged_entry_is_tried_again(worker: Worker, capsule: Mesh, tmp_path: Path) -> None:
-    worker.does(CRASH)
-    for _ in range(2):
-        with pytest.raises(TetrahedralizationError, match=r"SIGSEGV\)?\. Check the surface[^.]*$"):
-            modes_of(capsule, tmp_path)
-        (entry,) = tmp_path.iterdir()
-        assert re.fullmatch(r"failure-[0-9a-f]{64}\.safetensors", entry.name)
-        entry.write_bytes(entry.read_bytes()[:-3])
-    assert worker.runs == 2
+    modes_of(capsule, tmp_path, timeout=0.5, **COARSE)  # the tetrahedra are kept: no failure stands before them
 
 
 def test_the_exit_code_of_the_real_worker(capsule: Mesh, tmp_path: Path) -> None:

@@ -16,24 +16,18 @@ from bodies import body
 from scipy.spatial import cKDTree
 from solids import box, lumped_mass, surface
 
-from torch_modal.io.cache import Cache
-from torch_modal.precompute import filling, tetwild
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.filling import Filler
-from torch_modal.precompute.lattice import Lattice, is_too_fine, lattice
-from torch_modal.precompute.modes import extract_bases, extract_modes
-from torch_modal.precompute.proximity import clearances
+from torch_modal.precompute.extract import extract_bases, extract_modes
+from torch_modal.precompute.lattice import Lattice, lattice
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.surface import CanonicalSurface, clearances
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
-    TetrahedralizationError,
     face_connected_pieces,
     solid_volumes,
     tet_volumes,
 )
-from torch_modal.precompute.tetwild import TetrahedraSettings
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -80,7 +74,7 @@ THREADS = """
 import hashlib, sys
 import numpy as np
 import trimesh
-from torch_modal.precompute.modes import extract_bases
+from torch_modal.precompute.extract import extract_bases
 mesh = trimesh.creation.capsule(height=3.0, radius=0.6, count=(24, 24))
 keyframes = np.stack([mesh.vertices, mesh.vertices * [1.0, 1.1, 1.0]])
 total = hashlib.sha256()
@@ -101,20 +95,6 @@ def test_the_same_in_every_process_with_any_threads() -> None:
     assert len(found) == 1
 
 
-def test_it_is_the_only_default(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A capsule, and one as thin as a plate, which fTetWild used to get."""
-
-    def fail(*args: object, **kwargs: object) -> None:
-        raise AssertionError("fTetWild was asked")
-
-    monkeypatch.setattr(tetwild, "tetrahedralize", fail)
-    vertices, faces = capsule
-    for shape in (vertices, vertices * (1.0, 0.02, 1.0)):
-        default, named = (extract_modes(shape, faces, 6, cache=False, **way) for way in ({}, {"mesher": "lattice"}))
-        np.testing.assert_array_equal(default.modes, named.modes)
-    assert tuple(filling.MESHERS) == ("lattice", "tetwild")
-
-
 def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
     """A thin box; its flat sides lie along sides of the lattice's cubes."""
     solid = box((*cells, 1), size)
@@ -127,7 +107,7 @@ def test_thin_plates_are_filled(thickness: float) -> None:
     """By tetrahedra in one piece, all over."""
     vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
     whole = CanonicalSurface.of(vertices, faces)
-    filled = Filler(Lattice(), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    filled = Lattice().fill(whole, threading.Event())
     assert face_connected_pieces(filled.tets).max() == 0
     assert cKDTree(filled.vertices).query(whole.points)[0].max() < 4.0
     basis = extract_modes(vertices, faces, 6, cache=False)
@@ -139,8 +119,8 @@ def test_too_fine_cubes_become_larger(capsule: Mesh) -> None:
     """What fTetWild could still fill, the lattice fills with as many cubes as it may have."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     whole = CanonicalSurface.of(ball.vertices, ball.faces)
-    assert is_too_fine(whole, lattice_module.CUBE * 0.012)
-    filled = Filler(Lattice(0.012), 1.0, Cache.at(None, enabled=False)).body(whole).tetrahedra
+    filled = lattice(whole, 0.009)
+    assert len(filled.tets) < 40 * lattice_module.MOST_CUBES
     assert solid_volumes(filled).sum() == pytest.approx(trimesh.Trimesh(whole.points, whole.faces).volume, rel=0.02)
 
 
@@ -158,9 +138,9 @@ def test_thin_limbs_have_small_tetrahedra(name: str) -> None:
     assert len(filled.tets) < 1.2 * lattice_module.MOST_TETRAHEDRA
     exact = trimesh.Trimesh(whole.points, whole.faces)
     assert solid_volumes(filled).sum() == pytest.approx(exact.volume, rel=0.15)
-    near = clearances(whole)
+    thickness, _ = clearances(whole)
     sizes = np.cbrt(6 * tet_volumes(filled))
-    assert np.median(sizes[filled.vertices[filled.tets].mean(axis=1)[:, 0] > 30]) < near.thickness.min()
+    assert np.median(sizes[filled.vertices[filled.tets].mean(axis=1)[:, 0] > 30]) < thickness.min()
 
 
 def test_lowest_mode_of_a_rod() -> None:
@@ -168,24 +148,6 @@ def test_lowest_mode_of_a_rod() -> None:
     shape = body("rod bent 180")
     found = extract_modes(shape.pose(0.0), shape.faces, 4, mesher="lattice", cache=False).eigenvalues[:2]
     np.testing.assert_allclose(found, (4.730 / 4.0) ** 4 * 2 * 0.04**2 / 4, rtol=0.5)
-
-
-def test_each_side_is_shared_alike(capsule: Mesh) -> None:
-    """Neighbouring cubes cut their common side along the same diagonal: no side belongs to three tetrahedra, and the
-    outer sides are closed."""
-    filled = lattice(CanonicalSurface.of(*capsule), 0.06)
-    sides = np.sort(np.concatenate([filled.tets[:, c] for c in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])]), axis=1)
-    assert np.unique(sides, axis=0, return_counts=True)[1].max() == 2
-    edges = np.sort(np.concatenate([surface(filled)[:, c] for c in ([0, 1], [1, 2], [2, 0])]), axis=1)
-    assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
-
-
-def test_deterministic(capsule: Mesh) -> None:
-    one, two = (lattice(CanonicalSurface.of(*capsule), 0.05) for _ in range(2))
-    for first, second in zip(one, two, strict=True):
-        np.testing.assert_array_equal(first, second)
-    bases = [extract_modes(*capsule, 10, mesher="lattice", cache=False) for _ in range(2)]
-    np.testing.assert_array_equal(bases[0].modes, bases[1].modes)
 
 
 def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:
@@ -212,29 +174,10 @@ def test_open_and_half_flipped_surfaces(capsule: Mesh) -> None:
     assert share == pytest.approx(solid_volumes(lattice(whole, 0.05)).sum() / whole.scale**3, rel=0.25)
 
 
-def test_too_fine_a_lattice_is_refused(capsule: Mesh) -> None:
-    with pytest.raises(TetrahedralizationError, match="give a larger edge_length_fac"):
-        lattice(CanonicalSurface.of(*capsule), 0.002)
-
-
-@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("mesher", "auto"), ("settings", "best")])
+@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("mesher", "auto"), ("form", "spokes")])
 def test_unknown_names(capsule: Mesh, name: str, value: str) -> None:
     with pytest.raises(ValueError, match=f"{value}.*give"):
         extract_bases([capsule[0]], capsule[1], 5, **{name: value})
-
-
-def test_settings_reach_the_mesher(capsule: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[float] = []
-
-    def note(surface: CanonicalSurface, edge: float, *_: object):
-        seen.append(edge)
-        return lattice(surface, 0.05)
-
-    monkeypatch.setattr(lattice_module, "lattice", note)
-    for settings in ("fast", "fine", TetrahedraSettings(edge_length_fac=0.07)):
-        extract_modes(*capsule, 5, settings=settings, cache=False)
-    assert seen[0] > seen[1]
-    assert seen[2] == lattice_module.CUBE * 0.07
 
 
 @dataclass(frozen=True)
@@ -247,7 +190,7 @@ class Cubes:
     def key(self) -> dict[str, Any]:
         return {"mesher": "cubes", "edge": self.edge}
 
-    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         self.filled.append(len(surface.points))
         return lattice(surface, self.edge)
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from torch_modal.precompute import eigen, parallel, solving
-from torch_modal.precompute.modes import extract_modes
-from torch_modal.precompute.parallel import Budget, StoppedError, n_cpus, one_blas_thread, run_all
+from torch_modal.precompute import eigen, extract, parallel
+from torch_modal.precompute.extract import extract_modes
+from torch_modal.precompute.parallel import StoppedError, one_blas_thread, run_all
 
 
 @pytest.fixture(params=[1, 3])
@@ -30,9 +30,11 @@ def test_results_are_in_order(cpus: int) -> None:
     assert run_all(work, 0, threading.Event()) == []
 
 
-def test_as_many_at_once_as_processors(cpus: int) -> None:
+@pytest.mark.parametrize("bound", [None, 0, 2])
+def test_as_many_at_once_as_processors(cpus: int, bound: int | None) -> None:
     running, most, lock = 0, 0, threading.Lock()
-    together = threading.Barrier(cpus)
+    allowed = cpus if bound is None else min(cpus, max(bound, 1))
+    together = threading.Barrier(allowed)
 
     def work(index: int) -> None:
         nonlocal running, most
@@ -43,8 +45,8 @@ def test_as_many_at_once_as_processors(cpus: int) -> None:
         with lock:
             running -= 1
 
-    run_all(work, 2 * cpus, threading.Event())
-    assert most == cpus
+    run_all(work, 2 * cpus, threading.Event(), bound)
+    assert most == allowed
 
 
 def test_who_has_nothing_else_to_do_does_that(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,10 +63,10 @@ def test_who_has_nothing_else_to_do_does_that(monkeypatch: pytest.MonkeyPatch) -
         did.append("meanwhile")
         done.set()
 
-    assert run_all(work, 3, threading.Event(), meanwhile) == [0, 1, 2]
+    assert run_all(work, 3, threading.Event(), meanwhile=meanwhile) == [0, 1, 2]
     assert "meanwhile" in did
     with pytest.raises(ZeroDivisionError):
-        run_all(lambda index: index, 3, threading.Event(), lambda: 1 // 0)
+        run_all(lambda index: index, 3, threading.Event(), meanwhile=lambda: 1 // 0)
 
 
 def test_ctrl_c_while_work_is_handed_out_ends_what_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,28 +112,6 @@ def test_the_first_error_ends_the_others(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not any(thread.name.startswith("torch_modal") for thread in threading.enumerate())
 
 
-def test_a_budget_is_shared() -> None:
-    budget, used, most, lock = Budget(10), 0, 0, threading.Lock()
-
-    def work(amount: int) -> None:
-        nonlocal used, most
-        with budget.part(amount):
-            with lock:
-                used += min(amount, 10)
-                most = max(most, used)
-            time.sleep(0.02)
-            with lock:
-                used -= min(amount, 10)
-
-    threads = [threading.Thread(target=work, args=(amount,)) for amount in (4, 4, 4, 100, 3, 3, 3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(timeout=30)
-    assert used == 0
-    assert 8 <= most <= 10
-
-
 def blas_threads() -> set[int]:
     return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
 
@@ -173,11 +153,7 @@ def test_modes_are_computed_with_one(capsule: tuple[np.ndarray, np.ndarray], mon
         seen.append(blas_threads())
         return eigen.lowest_modes(*args)
 
-    monkeypatch.setattr(solving, "lowest_modes", lowest_modes)
+    monkeypatch.setattr(extract, "lowest_modes", lowest_modes)
     extract_modes(*capsule, 5, mesher="lattice", cache=False)
     assert seen == [{1}]
     assert blas_threads() == {2}
-
-
-def test_number_of_processors() -> None:
-    assert n_cpus() >= 1

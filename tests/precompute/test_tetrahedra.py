@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import COARSE
-from solids import box, together
+from solids import as_it_is, box, together
 
 from torch_modal.precompute import tetwild
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, tet_volumes, without_debris
-from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
+from torch_modal.precompute.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -35,12 +36,14 @@ def test_fills_the_capsule(capsule: Mesh, capsule_tetrahedra: Tetrahedra) -> Non
 def test_inside_out_unreferenced_tiny_and_from_a_thread(capsule: Mesh) -> None:
     vertices, faces = capsule
     scattered = np.concatenate([[[1e3, 0, 0]], vertices]) * 1e-6  # vertex 0 is in no face
+    surface = CanonicalSurface.of(scattered, faces[:, ::-1] + 1)
     found: list[Tetrahedra] = []
     handler = signal.getsignal(signal.SIGINT)
-    thread = threading.Thread(target=lambda: found.append(tetrahedralize(scattered, faces[:, ::-1] + 1, COARSE)))
+    thread = threading.Thread(target=lambda: found.append(COARSE.fill(surface, threading.Event())))
     thread.start()
     thread.join()
-    assert tet_volumes(found[0]).sum() == pytest.approx(1e-18 * trimesh.Trimesh(vertices, faces).volume, rel=0.05)
+    volume = (1e-6 * surface.scale) ** 3 * trimesh.Trimesh(vertices, faces).volume
+    assert tet_volumes(found[0]).sum() == pytest.approx(volume, rel=0.05)
     assert signal.getsignal(signal.SIGINT) is handler
 
 
@@ -49,9 +52,10 @@ def test_mesher_stays_out_of_this_process(tmp_path: Path) -> None:
         import signal, sys
         import trimesh
         handler = signal.getsignal(signal.SIGINT)
-        from torch_modal.precompute.tetwild import TetrahedraSettings, tetrahedralize
+        from torch_modal.precompute.extract import extract_modes
+        from torch_modal.precompute.tetwild import TetWild
         ball = trimesh.creation.icosphere(subdivisions=1)
-        assert len(tetrahedralize(ball.vertices, ball.faces, TetrahedraSettings(edge_length_fac=0.3)).tets)
+        extract_modes(ball.vertices, ball.faces, 4, mesher=TetWild(edge_length_fac=0.3), cache=False)
         assert "pytetwild" not in sys.modules
         assert signal.getsignal(signal.SIGINT) is handler
     """
@@ -103,7 +107,7 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_failure_says_which_mesh_and_why(worker, capsule: Mesh, code: str, says: str) -> None:
     worker(code)
     with pytest.raises(TetrahedralizationError, match=says) as caught:
-        tetrahedralize(*capsule)
+        TetWild().fill(as_it_is(*capsule), threading.Event())
     assert f"a mesh of {len(capsule[0])} vertices and {len(capsule[1])} faces" in str(caught.value)
 
 
@@ -125,7 +129,7 @@ def test_timeout_kills_the_worker_and_its_children(worker, capsule: Mesh, tmp_pa
     """)
     start = time.monotonic()
     with pytest.raises(TetrahedralizationError, match="no result after the timeout of 1 s"):
-        tetrahedralize(*capsule, timeout=1.0)
+        TetWild(timeout=1.0).fill(as_it_is(*capsule), threading.Event())
     assert time.monotonic() - start < 10
     time.sleep(0.1)
     assert not any(_is_running(int(pid)) for pid in (tmp_path / "pids").read_text().split())
@@ -142,10 +146,11 @@ def test_ctrl_c_ends_the_worker(tmp_path: Path) -> None:
         import pathlib, signal, trimesh
         signal.signal(signal.SIGINT, signal.default_int_handler)
         from torch_modal.precompute import tetwild
+        from torch_modal.precompute.extract import extract_modes
         tetwild.WORKER = pathlib.Path({str(tmp_path / "worker.py")!r})
         ball = trimesh.creation.icosphere(subdivisions=1)
         try:
-            tetwild.tetrahedralize(ball.vertices, ball.faces)
+            extract_modes(ball.vertices, ball.faces, 4, mesher="tetwild", cache=False)
         except KeyboardInterrupt:
             print("interrupted")
     """
@@ -200,8 +205,8 @@ def test_debris_is_dropped_and_pieces_are_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("epsilon", 0.0), ("edge_length_fac", -1.0), ("stop_energy", float("nan"))]
+    ("name", "value"), [("epsilon", 0.0), ("edge_length_fac", -1.0), ("stop_energy", float("nan")), ("timeout", -1.0)]
 )
 def test_settings_out_of_range(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
-        TetrahedraSettings(**{name: value})
+        TetWild(**{name: value})

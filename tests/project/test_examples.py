@@ -89,6 +89,7 @@ def test_few_shot_comes_nearer_than_mixtures_of_vertices(tmp_path: Path) -> None
     assert (tmp_path / "few-shot.png").stat().st_size > 100_000
 
 
+@pytest.mark.slow
 def test_morph_animals_goes_from_one_body_to_another(tmp_path: Path) -> None:
     """The short form, on coarse meshes: legs that swing keep their lengths, which linear interpolation cuts short."""
     found, frames, faces, _ = load_example("morph_animals").main(tmp_path, levels=1, cell=0.042, n_modes=8)

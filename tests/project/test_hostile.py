@@ -57,6 +57,23 @@ for basis in tm.extract_bases(np.stack([v, v * (1, 1, 1.2)]), f, 10, mesher="tet
 """
 
 
+FINE = CALL.replace('"tetwild"', "tm.TetWild(0.02, 1e-3, 10.0, 10_000)")
+EACH = """
+import torch_modal as tm
+from torch_modal.precompute import carrying
+carrying.MAX_FIT = -1  # no tetrahedra are carried
+
+class OneByLattice:
+    calls = 0
+    def key(self):
+        return {"mesher": "one by lattice"}
+    def fill(self, surface, stop):
+        self.calls += 1
+        mesher = tm.Lattice() if self.calls == 1 else tm.TetWild(0.02, 1e-3, 10.0, 10_000)
+        return mesher.fill(surface, stop)
+""" + CALL.replace("[v, v", "[v, v * (1, 1, 1.1), v").replace('"tetwild"', "OneByLattice()")
+
+
 def start(cache: Path, code: str = CALL) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-c", code],
@@ -86,7 +103,7 @@ def running(tmp_path: Path) -> Iterator[tuple["subprocess.Popen[str]", int]]:
     """A process in the middle of meshing, and its worker."""
     if not Path("/proc/self/stat").exists():
         pytest.skip("workers are found through /proc, which this system does not have")
-    process = start(tmp_path / "cache", CALL.replace("1.2)]), f, 10", "1.2)]), f, 10, settings='fine'"))
+    process = start(tmp_path / "cache", FINE)
     try:
         end = time.monotonic() + 60
         while not (workers := workers_of(process.pid)):
@@ -125,7 +142,7 @@ def test_ctrl_c_in_the_middle_leaves_nothing_behind(
 def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
     if not Path("/proc/self/stat").exists():
         pytest.skip("workers are found through /proc, which this system does not have")
-    process = start(tmp_path / "cache", CALL.replace("1.2)]), f, 10", "1.2)]), f, 10, settings='fine', carry=False"))
+    process = start(tmp_path / "cache", EACH)
     try:
         end = time.monotonic() + 60
         while len(workers := workers_of(process.pid)) < min(2, n_cpus()):
@@ -138,7 +155,7 @@ def test_ctrl_c_ends_all_of_several_workers(tmp_path: Path) -> None:
         process.communicate()
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
-    assert cache_content(tmp_path / "cache").n_entries == 0, errors
+    assert cache_content(tmp_path / "cache").n_entries <= 2, errors  # those of the first key-frame
 
 
 @pytest.mark.slow

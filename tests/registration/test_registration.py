@@ -12,7 +12,7 @@ from torch_modal import extras
 from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
 from torch_modal.extras import require
-from torch_modal.io.write import save_mesh
+from torch_modal.io.frames import save_mesh
 from torch_modal.registration import register as register_module
 from torch_modal.registration.fit import ElasticSurface, PointTargets
 from torch_modal.registration.landmarks import landmark_table, read_landmarks

@@ -100,12 +100,6 @@ def add_modes(sub: argparse.ArgumentParser) -> None:
         help="what fills surfaces for solids: a lattice of cubes (deterministic, takes every surface), or fTetWild "
         "(default: %(default)s)",
     )
-    sub.add_argument(
-        "--quality",
-        choices=("fast", "fine"),
-        default="fast",
-        help="how fine the tetrahedra are (default: %(default)s)",
-    )
 
 
 def add_registration(sub: argparse.ArgumentParser) -> None:
@@ -149,7 +143,7 @@ def caching(args: argparse.Namespace) -> dict[str, Any]:
 
 def mode_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of `extract_bases` besides the number of modes."""
-    return {"method": args.method, "mesher": args.mesher, "settings": args.quality, **caching(args)}
+    return {"method": args.method, "mesher": args.mesher, **caching(args)}
 
 
 def reporter(args: argparse.Namespace) -> Callable[[str], None]:

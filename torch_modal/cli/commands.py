@@ -58,7 +58,7 @@ def register(args: argparse.Namespace) -> None:
     check_output([args.out], args.meshes, args.overwrite)
 
     import torch_modal as tm
-    from torch_modal.io.write import save_mesh
+    from torch_modal.io.frames import save_mesh
     from torch_modal.registration.landmarks import landmark_table
     from torch_modal.registration.load import ADVICE
 

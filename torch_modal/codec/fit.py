@@ -18,11 +18,11 @@ SHORTER = 0.4
 RIDGE = 1e-4
 """Over the mean diagonal of the normal equations: amplitudes that hardly move the vertices stay near zero."""
 DIFFERENCE = 1e-3
-"""Of amplitudes, in the finite differences of the Jacobian."""
+"""Difference of amplitudes, for the Jacobian."""
 MAX_TURN = 0.3
 """Change of edges, over their lengths, from which on the Jacobian is recomputed; about a rotation in radians."""
 QUANTILE = 0.95
-"""Of the edges' changes, which is compared with that limit."""
+"""Quantile of the edges' changes that is compared with that limit."""
 
 
 class FittedFrames(NamedTuple):
@@ -90,7 +90,7 @@ class _Linearisation:
         self.factor = torch.linalg.cholesky(normal + self.ridge * torch.eye(k).double())
 
     def holds(self, x: Tensor) -> bool:
-        """Whether a shape is so near that the derivatives serve it. *Shape:* ``(V, 3)``."""
+        """True if a shape is so near that the derivatives serve it. *Shape:* ``(V, 3)``."""
         i, j = self._ends
         own, other = (shape[j] - shape[i] for shape in (self.x, _best_fit(x, self.x).apply(x)))
         length = own.norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)

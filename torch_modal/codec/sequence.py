@@ -15,7 +15,7 @@ from torch_modal.codec.selection import ERROR, Selection, checked_motion
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.motion.decoder import ModalDecoder
-from torch_modal.precompute.modes import extract_modes
+from torch_modal.precompute.extract import extract_modes
 from torch_modal.progress import Progress, ProgressReport
 
 FORMAT = "torch_modal.sequence"
@@ -75,7 +75,7 @@ class ModalSequence:
 
     @property
     def cyclic(self) -> bool:
-        """Whether the last key-frame leads on to the first."""
+        """True if the last key-frame leads on to the first."""
         return len(self.keyframe_times) > len(self.keyframes)
 
     @property

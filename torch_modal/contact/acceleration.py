@@ -17,7 +17,7 @@ LEAST_LIMIT = 30.0
 ROUNDS = 200
 """Most iterations of :meth:`AccelerationLimit.nearest`."""
 TOLERANCE = 0.01
-"""Relative excess over the bound at which the iteration stops."""
+"""Relative tolerance of the bound at which the iteration stops."""
 RELAXATION = 1.7
 PENALTY = 0.5
 

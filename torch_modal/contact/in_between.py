@@ -10,7 +10,7 @@ from torch_modal.backends.torch.energies import Beside, RestShapes
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactSearch, refuse_transforms
 from torch_modal.contact.modal import ModalModel
-from torch_modal.contact.separate import Trajectory, separate, through
+from torch_modal.contact.separate import Timeline, separate, through
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.joint import JointSpace
@@ -118,8 +118,8 @@ def push_apart(
         return ModalModel(space.basis.fine, core.alignment.weights, found.gradient.to(u), stiffness.to(u))
 
     search = contact_search(core, ends[0], len(u))
-    trajectory = Trajectory(u, limit, model if isinstance(core.space, JointSpace) else None)
-    found = separate(x, _steps(core, rests), search, trajectory)
+    timeline = Timeline(u, limit, model if isinstance(core.space, JointSpace) else None)
+    found = separate(x, _steps(core, rests), search, timeline)
     field = None if found.x is x else found.x - x
     return Displacement(field, u, found.n_crossing, contact_search(core, ends[0], 1))
 

@@ -39,7 +39,7 @@ FADE = 0.0625
 """Duration over which the displacement is faded out beside a shape that it makes worse, at first."""
 
 
-class Trajectory(NamedTuple):
+class Timeline(NamedTuple):
     """Shapes at T even times between two ends, which have no displacement."""
 
     t: Tensor
@@ -65,7 +65,7 @@ def separate(
     start: Tensor,
     relax: Callable[[Tensor, Tensor, Beside], Tensor],
     search: ContactSearch,
-    trajectory: Trajectory | None = None,
+    timeline: Timeline | None = None,
 ) -> Separated:
     """Separate the parts of T shapes that pass through each other; the shapes as they are, where none do.
 
@@ -77,7 +77,7 @@ def separate(
         relax: Takes a Newton step of all vertices of some of the shapes, given those, their indices and energies beside
             the elastic one. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
-        trajectory: Times, limit and modes of several shapes; None for one shape alone.
+        timeline: Times, limit and modes of several shapes; None for one shape alone.
     """
     n, device = len(start), start.device
     every, nothing = torch.arange(n, device=device), torch.zeros(n, dtype=torch.int64, device=device)
@@ -85,18 +85,20 @@ def separate(
     if not bool(search.count(start[stride - 1 :: stride]).any()):
         return Separated(start, nothing, nothing)
     active, n_before = search(start, every)
+    if not len(active.shapes):
+        return Separated(start, n_before, n_before)
     search.watch(active, AROUND)
-    chosen = every if trajectory is None else _chosen(trajectory.t, search)
+    chosen = every if timeline is None else _chosen(timeline.t, search)
     x = start
-    if trajectory is not None and trajectory.model is not None:
+    if timeline is not None and timeline.model is not None:
         contact = ContactEnergy(active.rows(chosen), search.areas, start)
-        spline = through(trajectory.t[chosen], trajectory.t)
-        bend = (trajectory.limit.differences[:n] @ spline.double()).to(start)
-        moved = modal_displacement(trajectory.model(chosen), start[chosen], contact, bend)
+        spline = through(timeline.t[chosen], timeline.t)
+        bend = (timeline.limit.differences[:n] @ spline.double()).to(start)
+        moved = modal_displacement(timeline.model(chosen), start[chosen], contact, bend)
         x = start + torch.tensordot(spline, moved, 1)
-    x, n_crossing = _settled(start, x, relax, search, trajectory, active, chosen, n_before)
-    if trajectory is not None:
-        x, n_crossing = _never_worse(start, x - start, search, trajectory, n_before)
+    x, n_crossing = _settled(start, x, relax, search, timeline, active, chosen, n_before)
+    if timeline is not None and x is not start:
+        x, n_crossing = _never_worse(start, x - start, search, timeline, n_before)
     return Separated(x, n_before, n_crossing)
 
 
@@ -116,41 +118,42 @@ def _settled(
     x: Tensor,
     relax: Callable[[Tensor, Tensor, Beside], Tensor],
     search: ContactSearch,
-    trajectory: Trajectory | None,
+    timeline: Timeline | None,
     active: Contacts,
     chosen: Tensor,
     n_before: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Alternate the steps of each shape with the bound on all; the round with the fewest far pairs.
+    """Alternate the steps of each shape with the bound on all, and use the round with the fewest far pairs.
 
     Args:
         start: Without contact. *Shape:* ``(T, V, 3)``.
         x: Where the rounds begin. *Shape:* ``(T, V, 3)``.
         relax: As for :func:`separate`.
         search: Likewise.
-        trajectory: Likewise.
+        timeline: Likewise.
         active: Contacts of all shapes.
         chosen: Shapes that take steps. *Shape:* ``(S,)``.
         n_before: Far pairs of ``start``. *Shape:* ``(T,)``.
 
     Returns:
-        The shapes, and their numbers of far pairs. *Shape:* ``(T, V, 3), (T,)``.
+        The shapes, ``start`` where no round has fewer pairs, and their numbers of far pairs.
+        *Shape:* ``(T, V, 3), (T,)``.
     """
     every, n_far, best, n_best = torch.arange(len(x), device=x.device), n_before, start, n_before
-    most = MOST_MOVED * search.depth(start[0]) if trajectory is None else math.inf
+    most = MOST_MOVED * search.depth(start[0]) if timeline is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
     alone, dual, springs = x, torch.zeros_like(x), torch.zeros_like(x[0, :, 0])
     for k in range(1, ROUNDS[1] + 1):
         energies = _energies(active.rows(chosen), Pull((x - dual)[chosen].detach(), springs), search.areas)
         alone = x.index_copy(0, chosen, relax(alone[chosen], chosen, energies))
-        if trajectory is None:
+        if timeline is None:
             x = alone
         else:
             wanted = (alone + dual - start)[chosen]
             if len(chosen) < len(x):
-                wanted = torch.tensordot(through(trajectory.t[chosen], trajectory.t), wanted, 1)
-            moved, limited = trajectory.limit.nearest(wanted)
-            x = start + moved
+                wanted = torch.tensordot(through(timeline.t[chosen], timeline.t), wanted, 1)
+            field, limited = timeline.limit.nearest(wanted)
+            x = start + field
             dual = dual.index_add(0, chosen, (alone - x)[chosen])
             springs[limited] = PULL * search.areas[limited]
         some = every if k == ROUNDS[0] else torch.unique(torch.cat([active.shapes, torch.nonzero(n_far).flatten()]))
@@ -158,7 +161,8 @@ def _settled(
         active, n_far = found.beside(active), n_far.index_copy(0, some, counts)
         if k < ROUNDS[0]:
             continue
-        if int(n_far.sum()) <= int(n_best.sum()) and float((x - start).detach().norm(dim=-1).max()) <= most:
+        moved, n_left = float((x - start).detach().norm(dim=-1).max()), int(n_far.sum())
+        if moved <= most and n_left <= int(n_best.sum()) and n_left < int(n_before.sum()):
             best, n_best = x, n_far
         if not bool(n_far.any()):
             break
@@ -180,7 +184,7 @@ def _energies(active: Contacts, pull: Pull, areas: Tensor) -> Beside:
 
 
 def _never_worse(
-    start: Tensor, field: Tensor, search: ContactSearch, trajectory: Trajectory, n_before: Tensor
+    start: Tensor, field: Tensor, search: ContactSearch, timeline: Timeline, n_before: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Fade the displacement out around shapes in which it adds far pairs.
 
@@ -191,13 +195,13 @@ def _never_worse(
         start: Without contact. *Shape:* ``(T, V, 3)``.
         field: The displacement. *Shape:* ``(T, V, 3)``.
         search: As for :func:`separate`.
-        trajectory: Likewise.
+        timeline: Likewise.
         n_before: Far pairs of ``start``. *Shape:* ``(T,)``.
 
     Returns:
         The shapes, and their numbers of far pairs. *Shape:* ``(T, V, 3), (T,)``.
     """
-    t, found, reach, bad = trajectory.t, field, FADE, torch.zeros_like(n_before, dtype=torch.bool)
+    t, found, reach, bad = timeline.t, field, FADE, torch.zeros_like(n_before, dtype=torch.bool)
     while reach <= 1:
         n_far = search.count(start + found)
         worse = n_far > n_before
@@ -207,7 +211,7 @@ def _never_worse(
             reach = 2 * reach
         bad = bad | worse
         distance = ((t[:, None] - t[bad]).abs().amin(1) / reach).clamp_max(1)
-        found, _ = trajectory.limit.nearest(field * (distance**2 * (3 - 2 * distance))[:, None, None])
+        found, _ = timeline.limit.nearest(field * (distance**2 * (3 - 2 * distance))[:, None, None])
     return start, n_before
 
 

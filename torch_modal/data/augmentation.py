@@ -1,13 +1,12 @@
 """The base class of random transforms of shapes, with the conventions of kornia's augmentations."""
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.autograd import full_precision, lasting, require_numbers
+from torch_modal.autograd import full_precision, require_numbers
 from torch_modal.data.space import ShapeSpace
 
 Parameters = dict[str, Tensor]
@@ -20,24 +19,12 @@ class ShapeBatch(NamedTuple):
     """*Shape:* ``(B, V, 3)``."""
     nearest: Tensor | None = None
     """Index of the key-frame whose modes a shape uses; None: the nearest one. On the CPU. *Shape:* ``(B,)``."""
-    given: Tensor | None = None
-    """Whether a shape equals that key-frame; None: no shape does. On the CPU. *Shape:* ``(B,)``, bool."""
+    is_keyframe: Tensor | None = None
+    """True for shapes that equal that key-frame; None: none does. On the CPU. *Shape:* ``(B,)``, bool."""
     vertex_labels: Tensor | None = None
     """*Shape:* ``(B, V, ...)``."""
     shape_labels: Tensor | None = None
     """*Shape:* ``(B, ...)``."""
-
-    def rows(self, index: Tensor) -> "ShapeBatch":
-        """Some of the shapes."""
-        return ShapeBatch._make(None if part is None else part[index.to(part.device)] for part in self)
-
-    def put(self, index: Tensor, other: "ShapeBatch") -> "ShapeBatch":
-        """A copy with some of the shapes replaced."""
-        parts = (
-            mine if mine is None or its is None else mine.index_copy(0, index.to(mine.device), its)
-            for mine, its in zip(self, other, strict=True)
-        )
-        return ShapeBatch._make(parts)
 
     @classmethod
     def of_keyframes(
@@ -55,37 +42,28 @@ class ShapeBatch(NamedTuple):
             vertex_labels: *Shape:* ``(K, V, ...)``.
             shape_labels: *Shape:* ``(K, ...)``.
         """
-        number = torch.arange(len(space))
-        given = torch.ones(len(space), dtype=torch.bool)
-        return cls(space.keyframes(like), number, given, vertex_labels, shape_labels)
+        every = torch.arange(len(space))
+        return cls(space.keyframes(like), every, every >= 0, vertex_labels, shape_labels)
 
-    def scaled(self, factor: float) -> "ShapeBatch":
-        """A copy with the shapes multiplied by a number."""
-        return self if factor == 1 else self._replace(shapes=factor * self.shapes)
+    def rows(self, index: Tensor) -> "ShapeBatch":
+        """Some of the shapes."""
+        return ShapeBatch._make(None if part is None else part[index.to(part.device)] for part in self)
 
-    def located(self, space: ShapeSpace) -> "ShapeBatch":
-        """A copy with the nearest key-frame of each shape."""
-        nearest = space.nearest(self.shapes) if self.nearest is None else self.nearest
-        given = torch.zeros(len(nearest), dtype=torch.bool) if self.given is None else self.given
-        return self._replace(nearest=nearest, given=given)
-
-
-class Pool(NamedTuple):
-    """The shapes that partners are drawn from."""
-
-    batch: ShapeBatch
-    """With their nearest key-frames."""
-    own: Tensor | None
-    """Index in the pool of each shape, or of its nearest key-frame. On the CPU. *Shape:* ``(B,)``."""
-    neighbours: Tensor | None = None
-    """Key-frames before and after each in time, if the pool is a motion. *Shape:* ``(K, 2)``."""
+    def put(self, index: Tensor, other: "ShapeBatch") -> "ShapeBatch":
+        """A copy with some of the shapes replaced."""
+        parts = (
+            mine if mine is None or its is None else mine.index_copy(0, index.to(mine.device), its)
+            for mine, its in zip(self, other, strict=True)
+        )
+        return ShapeBatch._make(parts)
 
 
 class ShapeAugmentation(nn.Module):
     """A random transform of shapes of one connectivity, batched, differentiable in the shapes.
 
     Parameters are drawn for each sample on the device of the generator, independent of the shapes' device and dtype.
-    :attr:`params` has those of the last call; a call with ``params`` repeats them.
+    :attr:`params` has those of the last call, ``batch_prob`` (which shapes were transformed) among them; a call with
+    ``params`` repeats them.
 
     Args:
         p: Probability that a shape is transformed.
@@ -115,42 +93,39 @@ class ShapeAugmentation(nn.Module):
         self.keepdim = keepdim
         self.generator = generator
         self.space = space
-        self._params: Parameters = {}
+        self.params: Parameters = {}
 
     uses_keyframes = True
-    """Whether the transform uses the nearest key-frame of a shape."""
+    """True if the transform needs key-frames and modes."""
     shown: tuple[str, ...] = ()
     """Settings of a subclass that its ``repr`` shows."""
-
-    @property
-    def params(self) -> Parameters:
-        """Parameters of the last call, ``batch_prob`` (which shapes were transformed) among them."""
-        return self._params
 
     def extra_repr(self) -> str:
         """Settings, as kornia shows them."""
         return ", ".join(f"{name}={getattr(self, name)}" for name in (*self.shown, "p", "same_on_batch", "keepdim"))
 
     # ------------------------------------------------------------------------------------------------ for subclasses
-    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
-        """Draw parameters for ``n`` shapes. *Shape of each:* ``(n, ...)``."""
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """Draw parameters for ``n`` shapes. *Shape of each:* ``(n, ...)``.
+
+        A parameter ``partner`` in [0, 1) draws a second shape for each.
+        """
         raise NotImplementedError
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: "Pool"
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Transform all shapes of a batch.
 
         Args:
-            batch: The shapes, with their nearest key-frames if there is a space, in its units.
+            batch: The shapes, with their nearest key-frames if there is a space.
             params: Their parameters, on their device.
-            space: Key-frames and modes, of a size that float32 can square (:meth:`ShapeSpace.in_units`).
-            pool: The shapes that partners are drawn from.
+            space: The :class:`ShapeSpace`; None if there is none and the transform needs none.
+            partners: The second shapes, if there is a parameter ``partner``.
         """
         raise NotImplementedError
 
     # -------------------------------------------------------------------------------------------------------- calls
-    @full_precision
     def forward_parameters(
         self,
         n: int,
@@ -165,17 +140,18 @@ class ShapeAugmentation(nn.Module):
             space: Key-frames and modes; by default the module's.
             generator: By default the module's.
             same_on_batch: By default the module's.
+
+        Raises:
+            ValueError: There is no space, and the transform needs one.
         """
-        space = self.space if space is None else space
+        space = self._space(space)
         generator = self.generator if generator is None else generator
         same = self.same_on_batch if same_on_batch is None else same_on_batch
         drawn = 1 if same and n else n
-        draw = partial(self._drawn, drawn, space, generator)
-        params = lasting(draw)() if torch.is_inference_mode_enabled() else draw()
+        with torch.inference_mode(False):  # a later call, with gradients, may repeat them
+            chosen = uniform(drawn, generator) < self.p
+            params = {"batch_prob": chosen, **self.generate_parameters(drawn, space, generator)}
         return {name: value.expand(n, *value.shape[1:]) for name, value in params.items()}
-
-    def _drawn(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
-        return {"batch_prob": uniform(n, generator) < self.p, **self.generate_parameters(n, space, generator)}
 
     @full_precision
     def transform(
@@ -195,32 +171,34 @@ class ShapeAugmentation(nn.Module):
                 from these; by default they are drawn from the batch.
 
         Raises:
-            ValueError: The rows of ``params`` or ``pool`` do not fit.
+            ValueError: There is no space, or the rows of ``params`` or ``pool`` do not fit.
         """
-        space = self.space if space is None else space
+        space = self._space(space)
         if self.uses_keyframes or torch.compiler.is_exporting():
             require_numbers(type(self).__name__, batch.shapes)
-        own = self._own_rows(batch.shapes, params)
+        n, dtype, device = len(batch.shapes), batch.shapes.dtype, batch.shapes.device
+        wrong = {name: tuple(value.shape) for name, value in params.items() if len(value) != n}
+        if wrong:
+            raise ValueError(f"{n} shapes need parameters with {n} rows; got {wrong}")
         chosen = torch.nonzero(params["batch_prob"].cpu()).flatten()
         if not len(chosen):
             return batch
-        own = {name: value[chosen.to(value.device)] for name, value in own.items()}
-        if space is None or not self.uses_keyframes:
-            return batch.put(chosen, self.apply_transform(batch.rows(chosen), own, space, Pool(batch, chosen)))
-        unit, space = space.unit, space.in_units()
-        batch = batch.scaled(1 / unit).located(space)
-        mine = batch.rows(chosen)
-        if pool is None:
-            others = Pool(batch, chosen)
-        elif len(pool.shapes) == len(space):
-            others = Pool(
-                pool.scaled(1 / unit).located(space),
-                mine.nearest,
-                None if space.motion is None else space.motion.neighbours,
-            )
-        else:
-            raise ValueError(f"a pool holds the {len(space)} key-frames of the space; got {len(pool.shapes)} shapes")
-        return batch.put(chosen, self.apply_transform(mine, own, space, others)).scaled(unit)
+        if self.uses_keyframes:
+            batch = _located(batch, space, torch.promote_types(dtype, space.least_dtype))
+        mine, partners = batch.rows(chosen), None
+        if "partner" in params:
+            partners = _partners(params["partner"].cpu()[chosen], batch, chosen, space, pool)
+            if partners is None:
+                return batch._replace(shapes=batch.shapes.to(dtype))
+        own = {}
+        for name, value in params.items():
+            kind = mine.shapes.dtype if value.is_floating_point() else None
+            own[name] = value[chosen.to(value.device)].to(device, kind)
+        found = self.apply_transform(mine, own, space, partners)
+        if batch.is_keyframe is not None:
+            found = found._replace(is_keyframe=torch.zeros(len(chosen), dtype=torch.bool))
+        batch = batch.put(chosen, found)
+        return batch._replace(shapes=batch.shapes.to(dtype))
 
     def forward(
         self,
@@ -236,42 +214,68 @@ class ShapeAugmentation(nn.Module):
             shapes: Vertex positions. *Shape:* ``(B, V, 3)`` or ``(V, 3)``.
             params: Parameters of an earlier call, to repeat it.
             space: Key-frames and modes; by default the module's.
-            pool: The key-frames of the space (:meth:`ShapeBatch.of_keyframes`), if partners are drawn from these; by
-                default they are drawn from the batch.
+            pool: As for :meth:`transform`.
 
         Returns:
             *Shape:* ``(B, V, 3)``; ``(V, 3)`` for one shape if ``keepdim`` is set.
 
         Raises:
-            ValueError: The shapes, or the rows of ``params``, do not fit.
+            ValueError: The shapes do not fit; or as for :meth:`transform`.
         """
-        space = self.space if space is None else space
+        space = self._space(space)
         check_shapes(shapes, space)
         single = shapes.dim() == 2
         batch = ShapeBatch(shapes[None] if single else shapes)
-        self._params = self.forward_parameters(len(batch.shapes), space) if params is None else params
-        out = self.transform(batch, self._params, space, pool).shapes
+        self.params = self.forward_parameters(len(batch.shapes), space) if params is None else params
+        out = self.transform(batch, self.params, space, pool).shapes
         return out[0] if single and self.keepdim else out
 
-    @staticmethod
-    def _own_rows(shapes: Tensor, params: Parameters) -> Parameters:
-        """Parameters on the device and in the dtype of the shapes."""
-        n = len(shapes)
-        wrong = {name: tuple(value.shape) for name, value in params.items() if len(value) != n}
-        if wrong:
-            raise ValueError(f"{n} shapes need parameters with {n} rows; got {wrong}")
-        return {
-            name: value.to(shapes.device, shapes.dtype if value.is_floating_point() else None)
-            for name, value in params.items()
-        }
-
-    def _space(self, space: ShapeSpace | None) -> ShapeSpace:
-        if space is None:
+    def _space(self, space: ShapeSpace | None) -> Any:
+        space = self.space if space is None else space
+        if space is None and self.uses_keyframes:
             raise ValueError(
                 f"{type(self).__name__} needs key-frames and modes: pass space=ShapeSpace(bases, faces) when it is "
                 "made or called"
             )
         return space
+
+
+def _located(batch: ShapeBatch, space: ShapeSpace, dtype: torch.dtype) -> ShapeBatch:
+    """A batch in a dtype, with the nearest key-frame of each shape."""
+    shapes = batch.shapes.to(dtype)
+    nearest = space.nearest(shapes) if batch.nearest is None else batch.nearest
+    none = torch.zeros(len(shapes), dtype=torch.bool)
+    return batch._replace(
+        shapes=shapes, nearest=nearest, is_keyframe=none if batch.is_keyframe is None else batch.is_keyframe
+    )
+
+
+def _partners(
+    draw: Tensor, batch: ShapeBatch, chosen: Tensor, space: ShapeSpace, pool: ShapeBatch | None
+) -> ShapeBatch | None:
+    """A second shape for each of the chosen ones; None if there is no other.
+
+    Args:
+        draw: Its place among the other shapes, in [0, 1); of key-frames in a motion, that before (below 0.5) or after.
+            *Shape:* ``(n,)``.
+        batch: All shapes.
+        chosen: *Shape:* ``(n,)``.
+        space: The space.
+        pool: Its key-frames, if partners are drawn from these.
+    """
+    size = len(batch.shapes) if pool is None else len(pool.shapes)
+    if pool is not None and size != len(space):
+        raise ValueError(f"a pool holds the {len(space)} key-frames of the space; got {size} shapes")
+    if size < 2:
+        return None
+    if pool is not None:
+        assert batch.nearest is not None
+        pool, own = _located(pool, space, batch.shapes.dtype), batch.nearest[chosen]
+        if space.motion is not None:
+            return pool.rows(space.motion.neighbours[own, (draw >= 0.5).long()])
+    else:
+        pool, own = batch, chosen
+    return pool.rows((own + (draw * (size - 1)).long().clamp(0, size - 2) + 1) % size)
 
 
 def check_shapes(shapes: Tensor, space: ShapeSpace | None) -> None:
@@ -306,13 +310,11 @@ def check_range(name: str, given: tuple[float, float], lowest: float, highest: f
 
 def uniform(n: int, generator: torch.Generator | None, *size: int) -> Tensor:
     """Uniform numbers in [0, 1), float64. *Shape:* ``(n, ...)``."""
-    return torch.rand(n, *size, dtype=torch.float64, generator=generator, device=_device(generator))
+    device = "cpu" if generator is None else generator.device
+    return torch.rand(n, *size, dtype=torch.float64, generator=generator, device=device)
 
 
 def normal(n: int, generator: torch.Generator | None, *size: int) -> Tensor:
     """Standard normal numbers, float64. *Shape:* ``(n, ...)``."""
-    return torch.randn(n, *size, dtype=torch.float64, generator=generator, device=_device(generator))
-
-
-def _device(generator: torch.Generator | None) -> torch.device:
-    return torch.device("cpu") if generator is None else generator.device
+    device = "cpu" if generator is None else generator.device
+    return torch.randn(n, *size, dtype=torch.float64, generator=generator, device=device)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from torch_modal.autograd import Recent, one_thread
-from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch
+from torch_modal.data.augmentation import ShapeAugmentation, ShapeBatch
 from torch_modal.data.random_in_between import RandomInBetween
-from torch_modal.data.sequential import AugmentationSequential
+from torch_modal.data.sequential import AugmentationSequential, check_labels
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets, open_set
 from torch_modal.geometry.vectors import vertex_normals
@@ -26,14 +26,6 @@ def stored_labels(stored: StoredSet) -> Labels:
     """The contents of ``labels.safetensors`` in a set's folder, if there is one."""
     path = stored.folder / LABELS_FILE
     return load_file(path) if path.is_file() else {}
-
-
-class _Opened(NamedTuple):
-    """A set in use."""
-
-    space: ShapeSpace
-    pool: ShapeBatch
-    """The key-frames, with labels."""
 
 
 class ShapeDataset(Dataset[Sample]):
@@ -95,14 +87,10 @@ class ShapeDataset(Dataset[Sample]):
         self.dtype = dtype
         self.with_faces = faces
         self.with_normals = normals
-        self.open_sets = open_sets
         self.options = options
         # In shared memory: workers that outlive an epoch see the next one.
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
         self._opened = Recent(open_sets)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_opened": Recent(self.open_sets)}
 
     def __len__(self) -> int:
         """Samples in an epoch."""
@@ -119,11 +107,11 @@ class ShapeDataset(Dataset[Sample]):
 
     def space(self, number: int) -> ShapeSpace:
         """Key-frames and modes of a set."""
-        return self._open(number).space
+        return self._open(number)[0]
 
     def faces(self, number: int) -> Tensor:
         """Faces of a set. *Shape:* ``(F, 3)``."""
-        return self._open(number).space.faces
+        return self.space(number).faces
 
     def __getitem__(self, index: int) -> Sample:
         """One sample."""
@@ -148,19 +136,17 @@ class ShapeDataset(Dataset[Sample]):
         turn = self.epoch * self.samples_per_set
         start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
         drawn = [self.transform.forward_parameters(1, space, self._generator(index)) for index in indices]
-        params = [_joined(each) for each in zip(*drawn, strict=True)]
+        params = [
+            {name: torch.cat([row[name] for row in rows]) for name in rows[0]} for rows in zip(*drawn, strict=True)
+        ]
         batch = self.transform.transform(pool.rows(start), params, space, pool)
-        parts = {"vertices": batch.shapes}
+        parts = {"vertices": batch.shapes, "vertex_labels": batch.vertex_labels, "shape_labels": batch.shape_labels}
         if self.with_normals:
             parts["normals"] = vertex_normals(batch.shapes, space.faces)
-        if batch.vertex_labels is not None:
-            parts["vertex_labels"] = batch.vertex_labels
-        if batch.shape_labels is not None:
-            parts["shape_labels"] = batch.shape_labels
         samples: list[Sample] = []
         for row in range(len(indices)):
             # Copies: a view would carry the whole batch to another process.
-            sample: Sample = {name: part[row].clone() for name, part in parts.items()}
+            sample: Sample = {name: part[row].clone() for name, part in parts.items() if part is not None}
             sample |= {"set": number, "keyframe": int(start[row])}
             if self.with_faces:
                 sample["faces"] = space.faces
@@ -171,27 +157,25 @@ class ShapeDataset(Dataset[Sample]):
         state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
         return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
-    def _open(self, number: int) -> _Opened:
-        def make() -> _Opened:
-            stored = open_set(self.sets[number])
-            space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
-            labels = self.labels(stored)
-            vertex_labels, shape_labels = (labels.get(name) for name in ("vertex_labels", "shape_labels"))
-            k, v = len(space), space.n_vertices
-            if vertex_labels is not None and vertex_labels.shape[:2] != (k, v) and vertex_labels.shape[:1] == (v,):
-                vertex_labels = vertex_labels.expand(k, *vertex_labels.shape)
-            for name, value, wanted in (
-                ("vertex_labels", vertex_labels, (k, v)),
-                ("shape_labels", shape_labels, (k,)),
-            ):
-                if value is not None and value.shape[: len(wanted)] != wanted:
-                    raise ValueError(
-                        f"{stored.folder}: {name} of {k} key-frames and {v} vertices begin with the shape {wanted}; "
-                        f"got {tuple(value.shape)}"
-                    )
-            return _Opened(space, ShapeBatch.of_keyframes(space, None, vertex_labels, shape_labels))
+    def _open(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
+        """The space of a set, and its key-frames with their labels."""
+        found: tuple[ShapeSpace, ShapeBatch] = self._opened.get(number, lambda: self._read(number))
+        return found
 
-        return self._opened.get(number, make)
+    def _read(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
+        stored = open_set(self.sets[number])
+        space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
+        labels = dict(self.labels(stored))
+        k, v = len(space), space.n_vertices
+        of_vertices = labels.get("vertex_labels")
+        if of_vertices is not None and of_vertices.shape[:2] != (k, v) and of_vertices.shape[:1] == (v,):
+            labels["vertex_labels"] = of_vertices.expand(k, *of_vertices.shape)
+        try:
+            check_labels((k, v), labels)
+        except ValueError as error:
+            raise ValueError(f"{stored.folder}: {error}") from error
+        pool = ShapeBatch.of_keyframes(space, None, labels.get("vertex_labels"), labels.get("shape_labels"))
+        return space, pool
 
 
 class SetBatchSampler(Sampler[list[int]]):
@@ -230,7 +214,3 @@ class SetBatchSampler(Sampler[list[int]]):
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
             yield batches[place]
-
-
-def _joined(rows: Sequence[Parameters]) -> Parameters:
-    return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
-from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
-from torch_modal.data.reference import KeyframeReference
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
+from torch_modal.data.in_betweens import by_kind
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
@@ -63,60 +63,52 @@ class RandomModalDeformation(ShapeAugmentation):
             raise ValueError(f"max_strain is above 0 and below 1, got {max_strain}")
         self.max_strain = max_strain
 
-    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``noise``, a standard normal number for each mode, and the ``strain``."""
-        space = self._space(space)
         strain = self.strain[0] + (self.strain[1] - self.strain[0]) * uniform(n, generator)
         return {"strain": strain, "noise": normal(n, generator, space.n_modes)}
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
     ) -> ShapeBatch:
-        """Deform each shape."""
-        space = self._space(space)
-        assert batch.nearest is not None and batch.given is not None
+        """Deform each shape along the modes of its nearest key-frame."""
+        assert batch.nearest is not None
         amplitudes = params["strain"][:, None] * params["noise"]
         chunk = max(1, _CHUNK_NUMBERS // (9 * len(space.faces)))
-        shapes, order = [], []
-        for index in batch.nearest.unique().tolist():
-            for rows in torch.nonzero(batch.nearest == index).flatten().split(chunk):
-                here = rows.to(amplitudes.device)
-                shapes.append(self._deformed(batch.shapes[here], amplitudes[here], space, index))
-                order.append(rows)
-        back = torch.argsort(torch.cat(order)).to(amplitudes.device)
-        return batch._replace(shapes=torch.cat(shapes)[back], given=torch.zeros_like(batch.given))
+
+        def deformed(kind: list[int], rows: Tensor) -> Tensor:
+            parts = rows.to(amplitudes.device).split(chunk)
+            return torch.cat([self._deformed(batch.shapes[part], amplitudes[part], space, kind[0]) for part in parts])
+
+        return batch._replace(shapes=by_kind(batch.nearest[:, None], deformed))
 
     def _deformed(self, x: Tensor, amplitudes: Tensor, space: ShapeSpace, index: int) -> Tensor:
         """Shapes that are nearest to one key-frame. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
-        reference = space.reference(index, x)
-        reconstruction = space.reconstruction(x.device)
+        basis, reconstruction = space.bases[index], space.reconstruction(x.device)
+        keyframe, modes, scales = (part.to(x) for part in (basis.reference, basis.modes, space.mode_scales(index)))
+        displacement = (amplitudes[:, : len(scales)] * scales) @ modes.flatten(1)
+        displacement = displacement.unflatten(1, (-1, 3)).movedim(-1, 0).contiguous()
         with torch.no_grad():
-            scale, deformed = self._bounded(x.detach(), amplitudes.detach(), space, reference, reconstruction)
+            scale, deformed = self._bounded(x.detach(), displacement.detach(), keyframe, space)
         recording = torch.is_grad_enabled() and (x.requires_grad or amplitudes.requires_grad)
         if not recording and not transformed(x) and not transformed(amplitudes):
             return deformed
-        deformed = deform(x, scale[:, None] * amplitudes, reference, reconstruction)
+        deformed = deform(x, scale[:, None] * displacement, keyframe, reconstruction)
         # Shapes beyond the bound stay as they were.
         with torch.no_grad():
             within = (space.strain(deformed, x).abs() <= self.max_strain).all(1) & (scale > 0)
         return torch.where(within[:, None, None], deformed, x)
 
-    def _bounded(
-        self,
-        x: Tensor,
-        amplitudes: Tensor,
-        space: ShapeSpace,
-        reference: KeyframeReference,
-        reconstruction: Reconstruction,
-    ) -> tuple[Tensor, Tensor]:
+    def _bounded(self, x: Tensor, displacement: Tensor, keyframe: Tensor, space: ShapeSpace) -> tuple[Tensor, Tensor]:
         """The scale of each draw within the bound, ``(B,)``, and the shapes; unchanged shapes if none is found."""
+        reconstruction = space.reconstruction(x.device)
         bound = (1 - _ROUNDING) * self.max_strain
-        expected = linear_strain(amplitudes, reference, reconstruction.edges)
+        expected = linear_strain(displacement, keyframe, reconstruction.edges)
         scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
         shapes = x.clone()
         rows = torch.arange(len(x), device=x.device)
         for _ in range(_ROUNDS):
-            tried = deform(x[rows], (scale[:, None] * amplitudes)[rows], reference, reconstruction)
+            tried = deform(x[rows], (scale[:, None] * displacement)[:, rows], keyframe, reconstruction)
             largest = space.strain(tried, x[rows]).abs().amax(1).nan_to_num(torch.inf)
             within = largest <= bound
             shapes = shapes.index_copy(0, rows[within], tried[within])
@@ -128,25 +120,24 @@ class RandomModalDeformation(ShapeAugmentation):
         return scale.index_fill(0, rows, 0), shapes
 
 
-def deform(x: Tensor, amplitudes: Tensor, reference: KeyframeReference, reconstruction: Reconstruction) -> Tensor:
-    """Shapes bent along a key-frame's modes.
+def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Reconstruction) -> Tensor:
+    """Shapes bent as a linear displacement of a key-frame turns and strains its triangles.
 
-    The modes give rotations and strains of the key-frame's triangles. A shape of another pose gets the same
-    rotations, and strains along its own triangles.
+    A shape of another pose gets the same rotations, and strains along its own triangles.
 
     Args:
         x: Shapes near the key-frame. *Shape:* ``(B, V, 3)``.
-        amplitudes: Of the scaled modes. *Shape:* ``(B, n)``, n at least their number.
-        reference: The key-frame.
+        displacement: Of the key-frame, components first. *Shape:* ``(3, B, V)``.
+        keyframe: *Shape:* ``(V, 3)``.
         reconstruction: Of its connectivity.
 
     Returns:
         Aligned with ``x``. *Shape:* ``(B, V, 3)``.
     """
     faces, weights = reconstruction.faces, reconstruction.areas.to(x)
-    displacement = _displacement(amplitudes, reference)
-    turn, strain = bend(sides(displacement, faces), reference.frames)
-    pose = best_fit(reference.shape.expand_as(x), x, weights).rotation
+    own = frames(sides(keyframe.mT[:, None].contiguous(), faces))
+    turn, strain = bend(sides(displacement, faces), own)
+    pose = best_fit(keyframe.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
     rest = x.movedim(-1, 0).contiguous()
     wanted = bent_sides(BentTriangles(turn, strain), frames(sides(rest, faces)))
@@ -154,16 +145,9 @@ def deform(x: Tensor, amplitudes: Tensor, reference: KeyframeReference, reconstr
     return best_fit(bent, x, weights).apply(bent)
 
 
-def linear_strain(amplitudes: Tensor, reference: KeyframeReference, edges: Tensor) -> Tensor:
-    """Largest edge strain of the linear displacement: that of the bent shape to first order. *Shape:* ``(B,)``."""
+def linear_strain(displacement: Tensor, keyframe: Tensor, edges: Tensor) -> Tensor:
+    """Largest edge strain of a linear displacement, that of the bent shape to first order. *Shape:* ``(B,)``."""
     i, j = edges.unbind(1)
-    displacement = _displacement(amplitudes, reference)
-    side = (reference.shape[j] - reference.shape[i]).mT[:, None]
+    side = (keyframe[j] - keyframe[i]).mT[:, None]
     along = ((pick(displacement, j) - pick(displacement, i)) * side).sum(0)
     return (along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)).abs().amax(1)
-
-
-def _displacement(amplitudes: Tensor, reference: KeyframeReference) -> Tensor:
-    """Of the vertices, components first. *Shape:* ``(B, n) -> (3, B, V)``."""
-    modes = reference.modes
-    return (amplitudes[:, : len(modes)] @ modes).unflatten(1, (3, -1)).movedim(1, 0)

@@ -1,7 +1,6 @@
 """Key-frames that follow each other in time."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,23 +8,17 @@ from torch import Tensor
 from torch_modal.keyframes.arrays import checked_times
 
 
-class Span(NamedTuple):
-    """An interval between two successive key-frames, in either direction, with their neighbours."""
-
-    keyframes: list[int]
-    """Indices of these two and their neighbours, three or four in all, in the order of time."""
-    times: Tensor
-    """Times of these: 0 at the start of the interval, 1 at its end. *Shape:* ``(3,)`` or ``(4,)``."""
-
-
 class Motion:
     """The order and the times of the key-frames of a motion.
 
     Args:
-        times: When the key-frames are, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``,
+        times: Times of the key-frames, ascending; if cyclic, one more, when the first comes again. *Shape:* ``(K,)``,
             or ``(K + 1,)`` if cyclic.
         n_keyframes: Their number, K.
         cyclic: Whether the last key-frame leads on to the first.
+
+    Attributes:
+        neighbours: The key-frames before and after each in time; twice the same at an end. *Shape:* ``(K, 2)``.
 
     Raises:
         ValueError: Another number of times, or times that do not ascend.
@@ -35,6 +28,8 @@ class Motion:
         self.times = checked_times(times, n_keyframes, cyclic)
         self.n_keyframes = n_keyframes
         self.cyclic = cyclic
+        both, last = torch.arange(n_keyframes)[:, None] + torch.tensor([-1, 1]), n_keyframes - 1
+        self.neighbours = both % n_keyframes if cyclic else last - (last - both.abs()).abs()
 
     @classmethod
     def of(cls, times: Tensor | Sequence[float] | None, n_keyframes: int, cyclic: bool) -> "Motion | None":
@@ -47,33 +42,18 @@ class Motion:
             raise ValueError(f"cyclic key-frames are a motion and need their times: range({n_keyframes + 1}) if even")
         return None if times is None else cls(times, n_keyframes, cyclic)
 
-    @property
-    def neighbours(self) -> Tensor:
-        """The key-frames before and after each in time; twice the same at an end. *Shape:* ``(K, 2)``."""
-        last = self.n_keyframes - 1
-        both = torch.arange(self.n_keyframes)[:, None] + torch.tensor([-1, 1])
-        return both % self.n_keyframes if self.cyclic else last - (last - both.abs()).abs()
-
-    def span(self, i: int, j: int) -> Span | None:
-        """The interval from key-frame ``i`` to ``j``.
+    def span(self, i: int, j: int) -> tuple[float, float] | None:
+        """The times of two successive key-frames, in either direction.
 
         Returns:
-            None if they are not successive, or have no neighbours.
+            The times of ``i`` and of ``j``; in a cycle, those before the first and after the last go on. None if they
+            are not successive, or have no neighbours.
         """
-        n, ahead, back = self.n_keyframes, j - i, i - j
-        if self.cyclic:
-            ahead, back = ahead % n, back % n
-        if n < 3 or 1 not in (ahead, back):
+        n, back = self.n_keyframes, -1 % self.n_keyframes if self.cyclic else -1
+        step = (j - i) % n if self.cyclic else j - i
+        if n < 3 or step not in (1, back):
             return None
-        if ahead == 1:
-            return self._to_next(i)
-        keyframes, times = self._to_next(j)
-        return Span(keyframes[::-1], 1 - times.flip(0))
-
-    def _to_next(self, i: int) -> Span:
-        """The interval from a key-frame to the next."""
-        n = self.n_keyframes
-        places = [place for place in range(i - 1, i + 3) if self.cyclic or 0 <= place < n]
+        first = i if step == 1 else j
         period = self.times[-1] - self.times[0]
-        when = torch.stack([self.times[place % n] + place // n * period for place in (i, i + 1, *places)])
-        return Span([place % n for place in places], (when[2:] - when[0]) / (when[1] - when[0]))
+        start, end = (float(self.times[place % n] + place // n * period) for place in (first, first + 1))
+        return (start, end) if step == 1 else (end, start)

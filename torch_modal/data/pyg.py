@@ -36,18 +36,15 @@ class RandomShape(BaseTransform):
         space: ShapeSpace | None = None,
         y: torch.Tensor | None = None,
     ) -> None:
-        if isinstance(augmentation, ShapeAugmentation):
-            augmentation = AugmentationSequential(
-                augmentation, generator=augmentation.generator, space=augmentation.space
-            )
         found = augmentation.space if space is None else space
         if found is None:
             raise ValueError("RandomShape needs key-frames and modes: pass space=ShapeSpace(bases, faces)")
         self.space = found
         self.y = y
+        transforms = [augmentation] if isinstance(augmentation, ShapeAugmentation) else augmentation.each()
         keys = ("shapes", "normals", "shape_labels")
         self.augmentation = AugmentationSequential(
-            *augmentation.transforms, data_keys=keys, generator=augmentation.generator, space=found
+            *transforms, data_keys=keys, generator=augmentation.generator, space=found
         )
 
     def forward(self, data: Data) -> Data:
@@ -56,29 +53,27 @@ class RandomShape(BaseTransform):
         Raises:
             ValueError: A graph has not as many nodes as the space has vertices.
         """
-        n_vertices = self.space.n_vertices
-        n_graphs = data.num_graphs if isinstance(data, Batch) else 1
+        n, n_vertices = data.num_graphs if isinstance(data, Batch) else 1, self.space.n_vertices
         pos: Any = data.pos
-        if pos is None or pos.shape != (n_graphs * n_vertices, 3) or not self._even(data):
+        even = not isinstance(data, Batch) or bool((data.ptr.diff() == n_vertices).all())
+        if pos is None or pos.shape != (n * n_vertices, 3) or not even:
             got = None if pos is None else tuple(pos.shape)
-            of = f"{n_graphs} graphs of " if isinstance(data, Batch) else ""
-            raise ValueError(f"data.pos of {of}this space has the shape ({n_graphs * n_vertices}, 3); got {got}")
-        label = data.y if self.y is not None else None
-        pool = ShapeBatch.of_keyframes(self.space, pos, shape_labels=None if self.y is None else self.y.to(pos.device))
-        # Labels have one row a graph; of a single one, it may be missing.
-        rows = None if label is None else label.reshape(n_graphs, *pool.shape_labels.shape[1:])  # type: ignore[union-attr]
-        shapes, normals, labels = self.augmentation(pos.unflatten(0, (n_graphs, n_vertices)), None, rows, pool=pool)
+            raise ValueError(
+                f"data.pos of {n} graphs of this space has the shape ({n * n_vertices}, 3), {n_vertices} nodes each; "
+                f"got {got}"
+            )
+        given = rows = None
+        if self.y is not None and data.y is not None:
+            given = self.y.to(pos.device)
+            rows = data.y.reshape(n, *given.shape[1:])  # of a single graph, the row may be missing
+        pool = ShapeBatch.of_keyframes(self.space, pos, shape_labels=given)
+        shapes, normals, labels = self.augmentation(pos.unflatten(0, (n, n_vertices)), None, rows, pool=pool)
         data.pos = shapes.flatten(0, 1)
         if "normal" in data:
             data.normal = normals.flatten(0, 1)
-        if label is not None:
-            data.y = labels.reshape(label.shape)
+        if rows is not None:
+            data.y = labels.reshape(data.y.shape)
         return data
-
-    def _even(self, data: Data) -> bool:
-        """Whether each graph of a batch has the space's number of nodes."""
-        ptr = data.ptr if isinstance(data, Batch) else None
-        return ptr is None or bool((ptr.diff() == self.space.n_vertices).all())
 
     def __repr__(self) -> str:
         inside = ", ".join(repr(each) for each in self.augmentation.transforms)

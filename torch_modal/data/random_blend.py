@@ -5,8 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch
-from torch_modal.data.space import ShapeSpace, check_density
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch
+from torch_modal.data.space import check_density
 from torch_modal.geometry.rigid import best_fit
 
 
@@ -27,16 +27,15 @@ class RandomBlend(ShapeAugmentation):
     """
 
     shown = ("concentration", "locality")
-    uses_keyframes = True
 
     def __init__(self, concentration: float = 0.2, locality: float = 3.0, p: float = 0.5, **options: Any) -> None:
         super().__init__(p, **options)
         check_density(concentration, locality)
         self.concentration, self.locality = concentration, locality
 
-    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``weights`` of the key-frames, and ``factors`` by which they vary over the surface."""
-        variation = self._space(space).variation()
+        variation = space.variation()
         drawn = [variation.draw(self.concentration, self.locality, generator) for _ in range(n)]
         if not drawn:
             return {"weights": torch.zeros(0, len(variation)), "factors": torch.zeros(0, len(variation), 0)}
@@ -44,13 +43,11 @@ class RandomBlend(ShapeAugmentation):
         return {"weights": weights, "factors": factors}
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
-        space = self._space(space)
-        assert batch.given is not None
         variation, areas = space.variation(), space.reconstruction(batch.shapes.device).areas.to(batch.shapes)
         rows = zip(*(params[name].detach().double().cpu() for name in ("weights", "factors")), strict=True)
         found = torch.stack([variation.member(*row)[0] for row in rows]).to(batch.shapes)
         shapes: Tensor = best_fit(found, batch.shapes, areas).apply(found)
-        return batch._replace(shapes=shapes, nearest=space.nearest(shapes), given=torch.zeros_like(batch.given))
+        return batch._replace(shapes=shapes, nearest=space.nearest(shapes))

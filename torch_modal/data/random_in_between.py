@@ -5,113 +5,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, uniform
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_range, uniform
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.triangle_frames import frames, mirrored_sides, sides
 
 
-class _Pairwise(ShapeAugmentation):
-    """Draws a partner and a time for each shape, and mixes labels.
-
-    Args:
-        blend_labels: See :class:`RandomInBetween`.
-        p: Probability that a shape is transformed.
-        options: As for :class:`ShapeAugmentation`.
-    """
-
-    def __init__(self, blend_labels: bool, p: float, **options: Any) -> None:
-        super().__init__(p, **options)
-        self.blend_labels = blend_labels
-
-    def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
-        """*Shape:* ``(n,)``."""
-        raise NotImplementedError
-
-    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
-        """``partner`` in [0, 1), the partner's place among the other shapes of the pool, and the times ``t``.
-
-        In a motion these are the key-frame before (below 0.5) and the one after.
-        """
-        return {"partner": uniform(n, generator), "t": self.draw_times(n, generator)}
-
-    def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
-    ) -> ShapeBatch:
-        """Move each shape towards its partner, or away from it."""
-        space = self._space(space)
-        size = len(pool.batch.shapes)
-        if size < 2:
-            return batch
-        assert pool.own is not None
-        along = params["partner"].cpu()
-        if pool.neighbours is None:
-            partner = (pool.own + (along * (size - 1)).long().clamp(0, size - 2) + 1) % size
-        else:
-            partner = pool.neighbours[pool.own, (along >= 0.5).long()]
-        other = pool.batch.rows(partner)
-        t = params["t"]
-        assert batch.nearest is not None and batch.given is not None
-        assert other.nearest is not None and other.given is not None
-        tracked = batch.shapes.requires_grad or other.shapes.requires_grad
-        known = batch.given & other.given & (batch.nearest != other.nearest) & (not tracked)
-        # The same two key-frames in either order are solved together.
-        swap = batch.nearest > other.nearest
-        turn = swap.to(t.device)
-        x_a, x_b = (
-            torch.where(turn[:, None, None], *shapes)
-            for shapes in ((other.shapes, batch.shapes), (batch.shapes, other.shapes))
-        )
-        ends = torch.stack([batch.nearest, other.nearest], 1).sort(1).values
-        kinds, kind = torch.cat([ends, known[:, None].long()], 1).unique(dim=0, return_inverse=True)
-        times = torch.where(turn, 1 - t, t)
-        shapes, order = [], []
-        for number, (i, j, is_known) in enumerate(kinds.tolist()):
-            rows = torch.nonzero(kind == number).flatten()
-            here = rows.to(t.device)
-            pair = _Pair(space, x_a[here], x_b[here], i, j, bool(is_known))
-            shapes.append(self.moved(pair, times[here]))
-            order.append(rows)
-        back = torch.argsort(torch.cat(order)).to(t.device)
-        nearer = (t.detach() > 0.5).cpu()
-        return ShapeBatch(
-            torch.cat(shapes)[back],
-            torch.where(nearer, other.nearest, batch.nearest),
-            torch.zeros_like(batch.given),
-            self._labels("vertex_labels", batch.vertex_labels, other.vertex_labels, t),
-            self._labels("shape_labels", batch.shape_labels, other.shape_labels, t),
-        )
-
-    def moved(self, pair: "_Pair", t: Tensor) -> Tensor:
-        """The shapes at the times ``t``. *Shape:* ``(B,) -> (B, V, 3)``."""
-        raise NotImplementedError
-
-    def _labels(self, name: str, own: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
-        if own is None or others is None:
-            return own
-        t = t.detach().to(own.device).reshape(-1, *[1] * (own.dim() - 1))
-        if not self.blend_labels:
-            return torch.where(t > 0.5, others, own)
-        if not own.is_floating_point():
-            raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {own.dtype}")
-        return torch.lerp(own, others, t.clamp(0, 1).to(own.dtype))
-
-
-class _Pair:
-    """Shapes with their partners, all with the modes of the same two key-frames, ``i <= j``."""
-
-    def __init__(self, space: ShapeSpace, x_a: Tensor, x_b: Tensor, i: int, j: int, known: bool) -> None:
-        self.space, self.x_a, self.x_b, self.i, self.j, self.known = space, x_a, x_b, i, j, known
-
-    def at(self, t: Tensor) -> Tensor:
-        """In-betweens. *Shape:* ``(B,) -> (B, V, 3)``."""
-        if self.known:
-            return self.space.keyframe_in_between(self.i, self.j, t)
-        return self.space.in_between(self.x_a, self.x_b, t, self.i, self.j)
-
-
-class RandomInBetween(_Pairwise):
+class RandomInBetween(ShapeAugmentation):
     """Replaces a shape by one between it and a partner, of least elastic energy (:class:`torch_modal.InBetween`).
 
     Partners are other shapes of the batch, as in kornia's ``RandomMixUpV2``, or key-frames of a call's ``pool``.
@@ -131,24 +32,59 @@ class RandomInBetween(_Pairwise):
         ValueError: ``t`` is no range within [0, 1].
     """
 
-    shown = ("t", "blend_labels")
+    shown: tuple[str, ...] = ("t", "blend_labels")
 
     def __init__(
         self, t: tuple[float, float] = (0.0, 1.0), blend_labels: bool = False, p: float = 0.5, **options: Any
     ) -> None:
-        super().__init__(blend_labels, p, **options)
+        super().__init__(p, **options)
         self.t = check_range("t", t, 0, 1)
+        self.blend_labels = blend_labels
+
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``partner`` in [0, 1), the partner's place among the other shapes of the pool, and the times ``t``.
+
+        In a motion these are the key-frame before (below 0.5) and the one after.
+        """
+        return {"partner": uniform(n, generator), "t": self.draw_times(n, generator)}
 
     def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
-        """Uniform in the range."""
+        """Times, uniform in the range. *Shape:* ``(n,)``."""
         return self.t[0] + (self.t[1] - self.t[0]) * uniform(n, generator)
 
-    def moved(self, pair: _Pair, t: Tensor) -> Tensor:
-        """The in-betweens."""
-        return pair.at(t)
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+    ) -> ShapeBatch:
+        """Move each shape towards its partner, or away from it."""
+        assert partners is not None and batch.nearest is not None and partners.nearest is not None
+        t = params["t"]
+        nearer = (t.detach() > 0.5).cpu()
+        return batch._replace(
+            shapes=self.shapes(batch, partners, t, space),
+            nearest=torch.where(nearer, partners.nearest, batch.nearest),
+            vertex_labels=self._labels("vertex_labels", batch.vertex_labels, partners.vertex_labels, t),
+            shape_labels=self._labels("shape_labels", batch.shape_labels, partners.shape_labels, t),
+        )
+
+    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
+        """The shapes at the times ``t``. *Shape:* ``(B,) -> (B, V, 3)``."""
+        (x_a, i, is_a), (x_b, j, is_b) = batch[:3], partners[:3]
+        assert i is not None and j is not None and is_a is not None and is_b is not None
+        tracked = x_a.requires_grad or x_b.requires_grad
+        return space.in_betweens(x_a, x_b, t, i, j, is_a & is_b & (i != j) & (not tracked))
+
+    def _labels(self, name: str, own: Tensor | None, others: Tensor | None, t: Tensor) -> Tensor | None:
+        if own is None or others is None:
+            return own
+        t = t.detach().to(own.device).reshape(-1, *[1] * (own.dim() - 1))
+        if not self.blend_labels:
+            return torch.where(t > 0.5, others, own)
+        if not own.is_floating_point():
+            raise ValueError(f"blended {name} must be floating-point, one-hot for classes; got {own.dtype}")
+        return torch.lerp(own, others, t.clamp(0, 1).to(own.dtype))
 
 
-class RandomExtrapolation(_Pairwise):
+class RandomExtrapolation(RandomInBetween):
     r"""Replaces a shape by an extrapolation of the motion between it and a partner.
 
     The shape at :math:`1 + s` is the mirror image of the in-between at :math:`1 - s` in the partner, and the one at
@@ -173,21 +109,21 @@ class RandomExtrapolation(_Pairwise):
     def __init__(
         self, beyond: tuple[float, float] = (0.0, 0.2), blend_labels: bool = False, p: float = 0.5, **options: Any
     ) -> None:
-        super().__init__(blend_labels, p, **options)
+        super().__init__(blend_labels=blend_labels, p=p, **options)
         self.beyond = check_range("beyond", beyond, 0, 1)
 
     def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
-        """Below 0 or above 1, with the same probability."""
+        """Times below 0 or above 1, with the same probability. *Shape:* ``(n,)``."""
         draw = uniform(n, generator, 2)
         beyond = self.beyond[0] + (self.beyond[1] - self.beyond[0]) * draw[:, 0]
         return torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)
 
-    def moved(self, pair: _Pair, t: Tensor) -> Tensor:
-        """The mirror images."""
+    def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
+        """Mirror images of in-betweens. *Shape:* ``(B,) -> (B, V, 3)``."""
         after = t > 0.5
-        before_end = pair.at(torch.where(after, 2 - t, -t))
-        ends = torch.where(after[:, None, None], pair.x_b, pair.x_a)
-        return mirror(ends, before_end, pair.space.reconstruction(ends.device))
+        before_end = super().shapes(batch, partners, torch.where(after, 2 - t, -t), space)
+        ends = torch.where(after[:, None, None], partners.shapes, batch.shapes)
+        return mirror(ends, before_end, space.reconstruction(ends.device))
 
 
 def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Tensor:

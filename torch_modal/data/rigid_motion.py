@@ -7,8 +7,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_axis_angle
 from torch.nn.functional import normalize
 
-from torch_modal.data.augmentation import Parameters, Pool, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
-from torch_modal.data.space import ShapeSpace
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
 from torch_modal.geometry.rigid import RigidMotion
 from torch_modal.geometry.rotations import exp
 
@@ -50,7 +49,7 @@ class RandomRigidMotion(ShapeAugmentation):
             raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
         self.translation = translation
 
-    def generate_parameters(self, n: int, space: ShapeSpace | None, generator: torch.Generator | None) -> Parameters:
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
         direction, angle = normal(n, generator, 4), uniform(n, generator)
         move = self.translation * (2 * uniform(n, generator, 3) - 1)
@@ -65,11 +64,10 @@ class RandomRigidMotion(ShapeAugmentation):
         return {"rotation": angle[:, None] * normalize(axis, dim=1), "translation": move}
 
     def apply_transform(
-        self, batch: ShapeBatch, params: Parameters, space: ShapeSpace | None, pool: Pool
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
     ) -> ShapeBatch:
         """Move each shape."""
         x = batch.shapes
         centre, diagonal = x.mean(1), (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
         motion = RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * diagonal)
-        given = None if batch.given is None else torch.zeros_like(batch.given)
-        return batch._replace(shapes=motion.apply(x), given=given)
+        return batch._replace(shapes=motion.apply(x))

@@ -34,9 +34,9 @@ class Sample(NamedTuple):
     true_times: tuple[float, ...]
     """Times of these, in intervals of key-frames: 0.5 is half-way between the first two. T numbers."""
     cyclic: bool
-    """Whether the last key-frame leads on to the first."""
+    """True if the last key-frame leads on to the first."""
     seconds: float
-    """How long the sequence lasts."""
+    """Duration of the sequence."""
     view: tuple[float, float]
     """Azimuth and elevation, in degrees, from which it is seen well."""
 

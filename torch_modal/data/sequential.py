@@ -1,6 +1,6 @@
 """Several random transforms as one, with labels and normals."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -58,12 +58,8 @@ class AugmentationSequential(nn.Module):
         self.keepdim = keepdim
         self.generator = generator
         self.space = space
-        self._params: list[Parameters] = []
-
-    @property
-    def params(self) -> list[Parameters]:
-        """Parameters of the last call, of each transform."""
-        return self._params
+        #: Parameters of the last call, of each transform.
+        self.params: list[Parameters] = []
 
     def forward_parameters(
         self, n: int, space: ShapeSpace | None = None, generator: torch.Generator | None = None
@@ -71,7 +67,7 @@ class AugmentationSequential(nn.Module):
         """Draw parameters for ``n`` shapes, of each transform."""
         space = self.space if space is None else space
         generator = self.generator if generator is None else generator
-        return [one.forward_parameters(n, space, generator, self.same_on_batch) for one in self._each()]
+        return [one.forward_parameters(n, space, generator, self.same_on_batch) for one in self.each()]
 
     def transform(
         self,
@@ -88,7 +84,7 @@ class AugmentationSequential(nn.Module):
         space = self.space if space is None else space
         if len(params) != len(self.transforms):
             raise ValueError(f"{len(self.transforms)} transforms need as many sets of parameters; got {len(params)}")
-        for one, own in zip(self._each(), params, strict=True):
+        for one, own in zip(self.each(), params, strict=True):
             batch = one.transform(batch, own, space, pool)
         return batch
 
@@ -123,38 +119,44 @@ class AugmentationSequential(nn.Module):
             raise ValueError("shapes are None")
         check_shapes(shapes, space)
         single = shapes.dim() == 2
-        batch = _as_batch(named, single)
-        self._params = self.forward_parameters(len(batch.shapes), space) if params is None else list(params)
-        out = self.transform(batch, self._params, space, pool)
-        found = {
-            "shapes": out.shapes,
-            "normals": self._normals(out.shapes, space) if "normals" in named else None,
-            "vertex_labels": out.vertex_labels,
-            "shape_labels": out.shape_labels,
+        parts: dict[str, Any] = {
+            name: value[None] if single and value is not None else value for name, value in named.items()
         }
+        parts.pop("normals", None)
+        check_labels(parts["shapes"].shape[:2], parts)
+        batch = ShapeBatch(**parts)
+        self.params = self.forward_parameters(len(batch.shapes), space) if params is None else list(params)
+        out = self.transform(batch, self.params, space, pool)
+        found = {name: getattr(out, name) for name in parts}
+        if "normals" in named:
+            found["normals"] = self._normals(out.shapes, space)
         if single and self.keepdim:
             found = {name: None if value is None else value[0] for name, value in found.items()}
         results = tuple(found[name] for name in self.data_keys)
         return results[0] if len(results) == 1 else results
 
-    def _each(self) -> list[Any]:
+    def each(self) -> list[Any]:
+        """The transforms."""
         return list(self.transforms)
 
     def _normals(self, x: Tensor, space: ShapeSpace | None) -> Tensor:
-        spaces = [space, *(each.space for each in self._each())]
-        known = next((each for each in spaces if each is not None), None)
-        if known is None:
+        known = [each for each in (space, *(one.space for one in self.each())) if each is not None]
+        if not known:
             raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
-        return vertex_normals(x, known.faces)
+        return vertex_normals(x, known[0].faces)
 
 
-def _as_batch(named: dict[str, Tensor | None], single: bool) -> ShapeBatch:
-    parts = {name: value[None] if single and value is not None else value for name, value in named.items()}
-    parts.pop("normals", None)
-    shapes = parts["shapes"]
-    assert shapes is not None
-    for name, wanted in (("vertex_labels", shapes.shape[:2]), ("shape_labels", shapes.shape[:1])):
-        value = parts.get(name)
+def check_labels(shape: Sequence[int], labels: Mapping[str, Tensor | None]) -> None:
+    """Raise unless labels belong to shapes.
+
+    Args:
+        shape: Number of shapes and of vertices.
+        labels: ``vertex_labels`` and ``shape_labels``, if there are any.
+
+    Raises:
+        ValueError: The message names both shapes.
+    """
+    for name, wanted in (("vertex_labels", tuple(shape)), ("shape_labels", tuple(shape[:1]))):
+        value = labels.get(name)
         if value is not None and value.shape[: len(wanted)] != wanted:
-            raise ValueError(f"{name} begin with the shape {tuple(wanted)} of the shapes; got {tuple(value.shape)}")
-    return ShapeBatch(shapes, vertex_labels=parts.get("vertex_labels"), shape_labels=parts.get("shape_labels"))
+            raise ValueError(f"{name} begin with the shape {wanted} of the shapes; got {tuple(value.shape)}")

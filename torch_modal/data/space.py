@@ -1,42 +1,30 @@
-"""Key-frames of one connectivity with their modes, and what augmentations compute from them at first use."""
+"""Key-frames of one connectivity with their modes: a space of shapes with a mean, components, new members and fits."""
 
-import math
 import os
-import warnings
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial, wraps
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent, lasting, transformed
-from torch_modal.data.motion import Motion, Span
-from torch_modal.data.reference import KeyframeReference, keyframe_reference
+from torch_modal.data.in_betweens import InBetweens
+from torch_modal.data.motion import Motion
 from torch_modal.data.stored import StoredSet
-from torch_modal.data.table import interpolate, read_table, write_table
+from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.vectors import norm, pick
-from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
-from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
-from torch_modal.layers.in_between import InBetween
-from torch_modal.motion.path import Path as MotionPath
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.solve.implicit import ConvergenceWarning
-from torch_modal.solve.minimise import Status
 from torch_modal.statistics.coordinates import Components
 from torch_modal.statistics.fit import Fitted, Observations, checked_observations, checked_weights, fit
 from torch_modal.statistics.variation import Variation
-from torch_modal.version import __version__
 
 # Sizes whose squares, and squares of areas, are usual numbers of float32.
 _SIZES = 1e-3, 1e6
@@ -44,34 +32,13 @@ _SIZES = 1e-3, 1e6
 # Key-frames whose modes a mean has, at most.
 _BASES_OF_MEAN = 6
 
-Method = TypeVar("Method", bound=Callable[..., Any])
-
-
-def kept(limit: int) -> Callable[[Method], Method]:
-    """Decorate a method of a space whose most recent results are kept, for each dtype and device of a tensor.
-
-    Args:
-        limit: How many. Fewer than a batch needs would be computed again for each batch.
-    """
-
-    def decorate(method: Any) -> Any:
-        @wraps(method)
-        def run(self: "ShapeSpace", *args: Any, **named: Any) -> Any:
-            given = [*enumerate(args), *sorted(named.items())]
-            key = tuple((name, (x.dtype, x.device) if isinstance(x, Tensor) else x) for name, x in given)
-            recent = self._made.setdefault(method.__name__, Recent(limit))
-            return recent.get(key, lambda: method(self, *args, **named))
-
-        return run
-
-    return decorate
-
 
 class ShapeSpace:
     """Key-frames of one connectivity with their modes; random shapes are drawn from it.
 
-    Layers, factorisations and tables are computed at first use, in the process and on the device that use them; only
-    the most recent stay in memory. Pickling leaves them out, so that worker processes can receive a space.
+    Results that take long and that not every use needs (in-betweens of a pair, scales of the modes of a key-frame, the
+    variation of the key-frames) are computed once, when they are needed. Copies and pickles leave them out, so that
+    worker processes can receive a space.
 
     Args:
         bases: The basis of each key-frame (:func:`torch_modal.extract_bases`).
@@ -116,20 +83,19 @@ class ShapeSpace:
         sizes = {basis.n_vertices for basis in self.bases}
         if len(sizes) > 1:
             raise ValueError(f"the bases belong to meshes of {sorted(sizes)} vertices; a space has one connectivity")
-        if times is not None and times < 4:
-            raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between")
         # Checks and repairs the faces, as everywhere.
         self.faces = check_keyframes([self.bases[0].reference.double()], faces, warn=False).faces.cpu()
         self.settings = settings(preset, objective, solver, contact)
         if self.settings.objective.contact:
             require_contact()
-        self.times = times
         self.dtype = dtype
-        self.folder = None if folder is None else Path(folder)
         self.motion = Motion.of(keyframe_times, len(self.bases), cyclic)
-        self._made: dict[str, Recent] = {}
-        #: The space in the caller's units, if this is another (:meth:`in_units`).
-        self._given: ShapeSpace | None = None
+        self.in_betweens = InBetweens(self.bases, self.faces, *self.settings, self.motion, times, dtype, folder)
+        self._keyframes = torch.stack([basis.reference.double() for basis in self.bases])
+        length = size(self._keyframes[0].numpy(), self.faces.numpy())
+        #: The least precise dtype that can square areas of these shapes.
+        self.least_dtype = torch.float32 if _SIZES[0] <= length <= _SIZES[1] else torch.float64
+        self._reconstructions, self._scales, self._variation = Recent(4), Recent(len(self.bases)), Recent(1)
 
     @classmethod
     def open(cls, stored: StoredSet, **options: Any) -> "ShapeSpace":
@@ -139,9 +105,6 @@ class ShapeSpace:
         """
         own = {"folder": stored.folder, "keyframe_times": stored.times, "cyclic": stored.cyclic}
         return cls(stored.bases, stored.faces, **{**own, **options})
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_made": {}}
 
     def __len__(self) -> int:
         """Number of key-frames, K."""
@@ -164,32 +127,9 @@ class ShapeSpace:
 
     def keyframes(self, like: Tensor | None = None) -> Tensor:
         """A copy of the key-frames, in the dtype and on the device of another tensor. *Shape:* ``(K, V, 3)``."""
-        return self._keyframes_like(torch.empty(0, dtype=self.dtype) if like is None else like).clone()
-
-    @kept(4)
-    def _keyframes_like(self, like: Tensor) -> Tensor:
-        return torch.stack([basis.reference for basis in self.bases]).to(like)
-
-    @property
-    def unit(self) -> float:
-        """A power of two near the size of the first key-frame, or 1 where its squares are usual numbers of float32."""
-        length = self._size()
-        return 1.0 if _SIZES[0] <= length <= _SIZES[1] else 2.0 ** round(math.log2(length))
-
-    @kept(1)
-    def _size(self) -> float:
-        return size(self.bases[0].reference.double().numpy(), self.faces.numpy())
-
-    @kept(1)
-    def in_units(self) -> "ShapeSpace":
-        """The same space with key-frames divided by :attr:`unit`, for computations in float32; tables are shared."""
-        if self.unit == 1:
-            return self
-        found = copy(self)
-        found._made, found._given = {}, self
-        parts = ((b.reference / self.unit, b.eigenvalues, b.modes, b.rigid_eigenvalues) for b in self.bases)
-        found.bases = [ModalBasis(*part) for part in parts]
-        return found
+        if like is None:
+            return self._keyframes.to(self.dtype, copy=True)
+        return self._keyframes.to(like.device, like.dtype, copy=True)
 
     def nearest(self, x: Tensor) -> Tensor:
         """Index of the closest key-frame, up to a rigid motion. *Shape:* ``(B, V, 3) -> (B,)``."""
@@ -200,7 +140,7 @@ class ShapeSpace:
             weights = self.reconstruction(x.device).areas.to(x)
             distances = [
                 ((best_fit(key.expand_as(x), x, weights).apply(key) - x) ** 2).sum(-1) @ weights
-                for key in self._keyframes_like(x)
+                for key in self._keyframes.to(x)
             ]
         return torch.stack(distances).argmin(0).cpu()
 
@@ -210,6 +150,19 @@ class ShapeSpace:
         rows = (y.movedim(-1, 0).contiguous() for y in (x, rest))
         after, before = (norm(pick(y, j) - pick(y, i)) for y in rows)
         return after / before - 1
+
+    def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
+        """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
+        device = torch.device(device)
+        found: Reconstruction = self._reconstructions.get(
+            device, lambda: Reconstruction(self._keyframes[0], self.faces).to(device)
+        )
+        return found
+
+    def mode_scales(self, index: int) -> Tensor:
+        """Scales of the modes of a key-frame (:func:`~torch_modal.data.strain.mode_scales`). *Shape:* ``(k,)``."""
+        found: Tensor = self._scales.get(index, lambda: mode_scales(self.bases[index], self.faces, self.edges))
+        return found
 
     # ----------------------------------------------------------------------------------------------------- statistics
     @torch.no_grad()
@@ -223,14 +176,11 @@ class ShapeSpace:
             *Shape:* ``(V, 3)``, float64.
         """
         even = torch.full((len(self),), 1 / len(self), dtype=torch.float64)
-        return self._blend()(self._keyframes_like(even), even if weights is None else weights.to(even))
-
-    @kept(1)
-    def _blend(self) -> Blend:
         objective, solver = self.settings
         # Modes of a few tell those of all; further ones cost more than they give.
         few = self.bases[:: max(1, len(self) // _BASES_OF_MEAN)][:_BASES_OF_MEAN]
-        return Blend(few, self.faces, objective=replace(objective, contact=False), solver=solver)
+        blend = Blend(few, self.faces, objective=replace(objective, contact=False), solver=solver)
+        return blend(self._keyframes, even if weights is None else weights.to(even))
 
     def components(self, n: int | None = None) -> Components:
         """Principal components of the key-frames, with coordinates of shapes and shapes of coordinates.
@@ -249,9 +199,8 @@ class ShapeSpace:
         variation = self.variation()
         return Components(variation.coordinates, variation.average + variation.deviations, n, variation.origin)
 
-    @kept(1)
     def variation(self) -> Variation:
-        """How the key-frames vary, which :meth:`sample` and :meth:`fit` share.
+        """Variation of the key-frames, which :meth:`sample` and :meth:`fit` share.
 
         Raises:
             ValueError: There is only one key-frame.
@@ -260,8 +209,8 @@ class ShapeSpace:
             raise ValueError(
                 "one key-frame alone does not vary; a space for sample, fit or components needs two or more"
             )
-        shapes = self._keyframes_like(torch.empty(0, dtype=torch.float64))
-        return Variation(shapes, self.faces)
+        found: Variation = self._variation.get((), lambda: Variation(self._keyframes, self.faces))
+        return found
 
     @torch.no_grad()
     def sample(
@@ -347,123 +296,6 @@ class ShapeSpace:
             return Fitted(*(points.new_zeros(*lead, *shape) for shape in sizes))
         return Fitted(*(torch.stack(part).view(*lead, *part[0].shape).to(points) for part in zip(*found, strict=True)))
 
-    # ------------------------------------------------------------------------------------------- computed at first use
-    def reconstruction(self, device: torch.device | str = "cpu") -> Reconstruction:
-        """The Poisson problem of the connectivity. The first key-frame's weights serve for all shapes."""
-        return self._reconstruction(torch.device(device))
-
-    @kept(4)
-    def _reconstruction(self, device: torch.device) -> Reconstruction:
-        return Reconstruction(self.bases[0].reference, self.faces).to(device)
-
-    @kept(16)
-    def reference(self, index: int, like: Tensor) -> KeyframeReference:
-        """A key-frame for modal deformation, in the dtype and on the device of another tensor."""
-        return keyframe_reference(self.bases[index], self.faces, self.edges, like)
-
-    @kept(32)
-    def layer(self, i: int, j: int, like: Tensor) -> InBetween:
-        """The in-between layer of two key-frames' modes; ``i`` and ``j`` may be the same."""
-        return self._layer(i, j, like)
-
-    def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
-        objective, solver = self.settings
-        return InBetween([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver).to(like)
-
-    def _span(self, i: int, j: int) -> Span | None:
-        return None if self.motion is None else self.motion.span(i, j)
-
-    def _between(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
-        """Between two key-frames themselves: along the motion if they follow each other in it, else of the pair."""
-        span = self._span(i, j)
-        objective, solver = self.settings
-        if span is None and objective.contact:
-            # A path separates contacts the same way at all times, so that tables are smooth.
-            pair = MotionPath([self.bases[i], self.bases[j]], self.faces, objective=objective, solver=solver).to(like)
-            return partial(pair.solve, self._keyframes_like(like)[[i, j]])
-        if span is None:
-            return partial(self._layer(i, j, like).solve, *self._keyframes_like(like)[[i, j]])
-        bases = [self.bases[key] for key in span.keyframes]
-        # The shapes depend on the neighbours only; a path of all key-frames would be computed for each table.
-        path = MotionPath(bases, self.faces, span.times, objective=objective, solver=solver).to(like)
-        return partial(path.solve, self._keyframes_like(like)[span.keyframes])
-
-    @kept(64)
-    def table(self, i: int, j: int) -> Tensor:
-        """In-betweens of two key-frames at even times, from disk if stored. *Shape:* ``(T, V, 3)``."""
-        if self.times is None:
-            raise ValueError("a space of times=None solves each in-between: it has no tables")
-        if self._given is not None:
-            return self._given.table(i, j) / self._given.unit
-        path, key = self._place(i, j)
-        stored = None if path is None else read_table(path, key)
-        if stored is not None:
-            return stored
-        t = torch.linspace(0, 1, self.times, dtype=torch.float64)
-        with torch.no_grad():
-            result = self._between(i, j, t)(t)
-        table = _shapes(result, i, j).to(self.dtype)
-        # Tables that did not converge are not stored, so that each run warns.
-        if path is not None and bool(result.solution.usable.all()):
-            write_table(path, table, key)
-        return table
-
-    def _place(self, i: int, j: int) -> tuple[Path | None, dict[str, str]]:
-        """The file of a table and its key; None where it is not stored.
-
-        Warns:
-            CacheWarning: The objective has a term of the user's own, so that each process computes its tables again.
-        """
-        if self.folder is None:
-            return None, {}
-        try:
-            content = self._content(i, j)
-        except ContentError as error:
-            warnings.warn(
-                f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
-                f"terms: {error}",
-                CacheWarning,
-                stacklevel=5,
-            )
-            return None, {}
-        key = {"times": str(self.times), "dtype": str(self.dtype), "content": content}
-        return self.folder / f"between-{i}-{j}.safetensors", key
-
-    def _content(self, i: int, j: int) -> str:
-        """A hash of all inputs of a table: bases, times, faces, settings and code."""
-        span = self._span(i, j)
-        bases = [self.bases[key] for key in (span.keyframes if span else (i, j))]
-        tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
-        code = __version__, str(torch.__version__), code_digest()
-        return content_digest([*code, tensors, self.faces, span and span.times, self.settings])
-
-    # -------------------------------------------------------------------------------------------------- in-betweens
-    def keyframe_in_between(self, i: int, j: int, t: Tensor) -> Tensor:
-        """Between two key-frames themselves, from the table; along the motion if they follow each other in it.
-
-        *Shape:* ``(B,) -> (B, V, 3)``, in the dtype of ``t``.
-        """
-        if i > j:
-            return self.keyframe_in_between(j, i, 1 - t)  # one table serves both ways
-        if self.times is None:
-            return _shapes(self._kept_between(i, j, t)(t), i, j)
-        table = self._table_on(i, j, t.device)
-        return interpolate(table, t.to(table.dtype)).to(t.dtype)
-
-    @kept(32)
-    def _kept_between(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
-        return self._between(i, j, like)
-
-    @kept(64)
-    def _table_on(self, i: int, j: int, device: torch.device) -> Tensor:
-        return self.table(i, j).to(device)
-
-    def in_between(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: int, j: int) -> Tensor:
-        """Between any shapes, with the modes of two key-frames. *Shape:* ``(B, V, 3), (B, V, 3), (B,)``."""
-        if i > j:
-            return self.in_between(x_b, x_a, 1 - t, j, i)
-        return _shapes(self.layer(i, j, x_a).solve(x_a, x_b, t), i, j)
-
 
 def check_density(concentration: float, locality: float) -> None:
     """Check what new members are drawn with.
@@ -473,24 +305,3 @@ def check_density(concentration: float, locality: float) -> None:
     """
     if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
         raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")
-
-
-def _shapes(result: InBetweenResult, i: int, j: int) -> Tensor:
-    """The in-betweens; raises for invalid shapes and warns of unconverged ones."""
-    if not bool(result.shapes.isfinite().all()):
-        raise ValueError(
-            f"there is no in-between of some shapes near the key-frames {i} and {j}: one is not finite, has no size, "
-            "or is the mirror image of the other"
-        )
-    status = result.solution.status
-    missed = ~result.solution.usable
-    if bool(missed.any()):
-        names = ", ".join(sorted({Status(value).name for value in status[missed].tolist()}))
-        warnings.warn(
-            f"{int(missed.sum())} of {missed.numel()} in-betweens near the key-frames {i} and {j} did not converge "
-            f"({names}) and are only the best shapes found: give the space a solver of more max_steps or a larger "
-            "tolerance, or key-frames that are nearer to each other",
-            ConvergenceWarning,
-            stacklevel=2,
-        )
-    return result.shapes

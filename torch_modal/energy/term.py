@@ -100,8 +100,6 @@ class Term(nn.Module):
 
     total = False
     """Whether the measures of all elements add up to one, such as a volume."""
-    one_sided = False
-    """Whether a difference of zero stands for all on one side of the rest, where nothing is stiff either."""
     sampled = False
     """Whether elements name vertices of the caller's mesh, for which a coarse mesh has no counterpart."""
     stiffness: Any
@@ -182,10 +180,7 @@ class Term(nn.Module):
 
     def curvatures(self, measures: Tensor, rest: Tensor, weights: Tensor) -> tuple[Tensor, Tensor | None]:
         """A second derivative that is never negative, and what the true one has beyond it; None where nothing."""
-        twice = 2 * weights.expand_as(measures)
-        if not self.one_sided:
-            return twice, None
-        return torch.where(self.difference(measures, rest.squeeze(-2)) == 0, 0, twice), None
+        return 2 * weights.expand_as(measures), None
 
     def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
         """The measures of K rest shapes, such that weighted sums make sense. *Shape:* ``(..., K, M)`` each."""

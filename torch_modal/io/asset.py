@@ -15,7 +15,8 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
-from torch_modal.io.write import refuse_existing, save_mesh
+from torch_modal.io.files import write_files
+from torch_modal.io.write import check_frames, refuse_existing, to_numpy
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 """Content of mesh files besides positions and triangles."""
@@ -72,14 +73,14 @@ class Part(NamedTuple):
     vertices: IntArray
     """The vertex of each point. *Shape:* ``(P,)``."""
     triangles: IntArray
-    """Of points. *Shape:* ``(F, 3)``."""
+    """Indices of points. *Shape:* ``(F, 3)``."""
     material: Material
     texcoords: FloatArray | None = None
     """Origin at the upper left, as in glTF. *Shape:* ``(P, 2)``."""
     colors: FloatArray | None = None
     """Linear RGBA. *Shape:* ``(P, 4)``."""
     normals: FloatArray | None = None
-    """As the file has them. *Shape:* ``(P, 3)``."""
+    """Those of the file. *Shape:* ``(P, 3)``."""
 
 
 class Polygons(NamedTuple):
@@ -90,7 +91,7 @@ class Polygons(NamedTuple):
     corners: IntArray
     """Vertices, one polygon after the other. *Shape:* ``(sum of sizes,)``."""
     texcoords: FloatArray | None = None
-    """Of each corner, origin at the lower left. *Shape:* ``(sum of sizes, 2)``."""
+    """Texture coordinates of the corners, origin at the lower left. *Shape:* ``(sum of sizes, 2)``."""
 
 
 class Asset(ABC):
@@ -110,7 +111,7 @@ class Asset(ABC):
     """Features that :meth:`with_positions` keeps."""
 
     suffix: str
-    """Of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
+    """Ending of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -151,13 +152,15 @@ class Asset(ABC):
         Raises:
             ValueError: The positions or the ending do not fit.
             FileExistsError: A file exists and ``overwrite`` is off; then none is written.
-
-        Warns:
-            MeshWarning: A skeleton, animations or morph targets are left out.
         """
-        if Path(path).suffix.lower() != self.suffix:
-            raise ValueError(f"{self.path.name} is written as {self.suffix}, got {Path(path).name!r}.")
-        return save_mesh(positions, self.faces, path, overwrite, self)
+        path = Path(path)
+        if path.suffix.lower() != self.suffix:
+            raise ValueError(f"{self.path.name} is written as {self.suffix}, got {path.name!r}.")
+        shapes, _ = check_frames(to_numpy(positions)[None], self.faces, "positions[None]")
+        self.check(shapes)
+        refuse_existing(path, overwrite)
+        write_files([*self.missing_companions(path.parent, overwrite), (path, self.with_positions(shapes[0]))])
+        return path
 
     def missing_companions(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
         """The companions that a copy in this folder lacks.

@@ -347,7 +347,7 @@ def _bytes_of(x: Tensor) -> bytes:
 
 
 def _is_of_package(kind: type) -> bool:
-    """Whether a class is the one of its name in this package."""
+    """True for a class that stands in this package under its own name."""
     found: Any = sys.modules.get(kind.__module__) if kind.__module__.startswith("torch_modal.") else None
     for name in kind.__qualname__.split("."):
         found = getattr(found, name, None)

@@ -110,7 +110,7 @@ class Timing(NamedTuple):
     """Times and repetitions of a sequence that plays."""
 
     duration: float
-    """Of the whole sequence once, in seconds; for a cycle, with the step back to its start."""
+    """Seconds of the whole sequence once; for a cycle, with the step back to its start."""
     fps: float
     """Pictures a second, for formats that have a fixed rate."""
     cyclic: bool
@@ -229,7 +229,7 @@ class Animation(NamedTuple):
     timing: Timing
     """Times of the frames in seconds, and samples at a fixed rate."""
     name: str
-    """Of the file, for messages."""
+    """Name of the file, for messages."""
     keyframes: list[int]
     """Frame numbers of the key-frames."""
     asset: Asset | None

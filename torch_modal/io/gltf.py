@@ -254,7 +254,7 @@ class Drawn(NamedTuple):
     inverse: FloatArray
     """From the scene to the node. *Shape:* ``(4, 4)``."""
     normals: FloatArray | None = None
-    """Of each frame, or of frame 0 alone if they do not move. *Shape:* ``(N, P, 3)`` or ``(1, P, 3)``."""
+    """Normals of each frame, or of frame 0 alone if they do not move. *Shape:* ``(N, P, 3)`` or ``(1, P, 3)``."""
 
 
 def place_frames(document: Document, drawn: Sequence[Drawn], frames: FloatArray) -> None:
@@ -287,7 +287,7 @@ def _differences(frames: FloatArray) -> NDArray[np.float32]:
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    """Of unit length, as glTF demands; ``(0, 0, 1)`` where there is none. Unit vectors stay bit for bit."""
+    """Unit vectors, as glTF demands; ``(0, 0, 1)`` for those without length. Unit vectors stay bit for bit."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     usable = length > 1e-12
     scaled = np.where(np.abs(length - 1) < 1e-6, vectors, vectors / np.where(usable, length, 1.0))

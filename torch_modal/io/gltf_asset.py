@@ -36,7 +36,7 @@ class _Primitive(NamedTuple):
     points: slice
     """Its vertices among those of the asset; primitives that share them are alike here."""
     triangles: IntArray
-    """Of its own vertices. *Shape:* ``(F, 3)``."""
+    """Indices of its own vertices. *Shape:* ``(F, 3)``."""
 
 
 class GltfAsset(Asset):

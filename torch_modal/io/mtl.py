@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -9,9 +10,8 @@ from typing import NamedTuple
 from torch_modal.errors import MeshWarning
 from torch_modal.io.asset import Material, as_image
 
-# Options of a texture line, with the number of words that follow; up to three for those of coordinates.
-_OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-clamp": 1}
-_OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1, "-colorspace": 1}
+_OPTION = re.compile(r"-(?:[ost](?:\s+-?[\d.]+){1,3}|mm\s+\S+\s+\S+|\w+\s+\S+)\s+")
+"""An option of a texture line with its values: those of coordinates have up to three numbers."""
 
 
 class Libraries(NamedTuple):
@@ -70,17 +70,18 @@ def _property(material: Material, key: str, words: list[str]) -> Material:
         numbers = [float(word) for word in words]
     except ValueError:
         return material
-    if key == "kd" and len(numbers) >= 3:
-        return material._replace(color=(*numbers[:3], material.color[3]))
-    if key in ("d", "tr") and numbers:
-        opacity = numbers[0] if key == "d" else 1 - numbers[0]
-        return material._replace(color=(*material.color[:3], min(max(opacity, 0.0), 1.0)))
-    if key == "ns" and numbers:
-        # Of a Blinn-Phong exponent, the roughness whose highlight has the same width.
-        return material._replace(roughness=min(1.0, (2 / (max(numbers[0], 0.0) + 2)) ** 0.25))
-    if key in ("pr", "pm") and numbers:
-        value = min(max(numbers[0], 0.0), 1.0)
-        return material._replace(roughness=value) if key == "pr" else material._replace(metallic=value)
+    *rgb, alpha = material.color
+    match key, numbers:
+        case "kd", [r, g, b, *_]:
+            return material._replace(color=(r, g, b, alpha))
+        case (("d" | "tr"), [x, *_]):
+            return material._replace(color=(*rgb, min(max(x if key == "d" else 1 - x, 0.0), 1.0)))
+        case "ns", [x, *_]:  # of a Blinn-Phong exponent, the roughness whose highlight has the same width
+            return material._replace(roughness=min(1.0, (2 / (max(x, 0.0) + 2)) ** 0.25))
+        case "pr", [x, *_]:
+            return material._replace(roughness=min(max(x, 0.0), 1.0))
+        case "pm", [x, *_]:
+            return material._replace(metallic=min(max(x, 0.0), 1.0))
     return material
 
 
@@ -106,16 +107,9 @@ def _take_texture(path: Path, library: Path, line: str, key: str, material: str,
 
 def _texture_name(line: str) -> str:
     """The file that a texture line names, after its options; it may hold blanks."""
-    rest = line.strip().split(None, 1)[1:]
-    text = rest[0] if rest else ""
-    while text.startswith("-"):
-        option, _, text = text.partition(" ")
-        for _ in range(_OPTIONS.get(option, 1)):
-            word, _, after = text.lstrip().partition(" ")
-            if option in ("-o", "-s", "-t") and not word.replace(".", "").lstrip("-").isdigit():
-                break  # one or two numbers are enough for these
-            text = after
-        text = text.lstrip()
+    text = "".join(line.strip().split(None, 1)[1:])
+    while option := _OPTION.match(text):
+        text = text[option.end() :]
     return text.replace("\\", "/").strip()
 
 

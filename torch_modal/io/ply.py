@@ -28,7 +28,7 @@ _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 class _Property(NamedTuple):
     type: str
     count_type: str | None = None
-    """Of a list."""
+    """Type of the count of a list."""
 
 
 class _Element(NamedTuple):

@@ -40,7 +40,9 @@ def write_tensors(
         OSError: The file cannot be written.
     """
     header = json.dumps({"format": format, "version": version, **(metadata or {})}, sort_keys=True)
-    parts = {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()}
+    parts = {
+        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
+    }
     rows = [_digest(name, parts[name]) for name in sorted(parts)]
     table = bytearray(b"".join([_header_digest(header, sorted(parts), rows), *rows]))
     parts[DIGESTS] = torch.frombuffer(table, dtype=torch.uint8).reshape(-1, 32)

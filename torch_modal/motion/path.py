@@ -172,9 +172,16 @@ class Path(PreciseModule):
         other = Path(own, self.faces, times, self.cyclic, self.scheme or self.smooth, **given)
         return other.to(self.bases[0].reference)
 
-    def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
-        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        return self._solved(keyframes, t, None)
+    def solve(self, keyframes: Tensor, t: Tensor | float, knots: Knots | None = None) -> InBetweenResult:
+        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`.
+
+        ``knots``, of :meth:`knots`, are found once for several calls with the same key-frames.
+        """
+        return self._solved(keyframes, t, None, knots)
+
+    def knots(self, keyframes: Tensor) -> Knots | None:
+        """The velocities at the key-frames of smooth paths. *Shape:* ``(..., K, V, 3)``."""
+        return self.spline.knots(keyframes.to(self.dtype).flatten(0, -4)) if self.smooth else None
 
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
@@ -193,9 +200,11 @@ class Path(PreciseModule):
         return self._solved(keyframes, t, self.layers[0].report() if self.layers else warn_of_starts).shapes
 
     @full_precision
-    def _solved(self, keyframes: Tensor, t: Tensor | float, report: Report | None) -> InBetweenResult:
+    def _solved(
+        self, keyframes: Tensor, t: Tensor | float, report: Report | None, knots: Knots | None = None
+    ) -> InBetweenResult:
         flat, which, segment, u, lead = self._located(keyframes, t)
-        knots = self.spline.knots(flat) if self.smooth else None
+        knots = self.spline.knots(flat) if self.smooth and knots is None else knots
 
         def of_interval(i: int, rows: Tensor | slice) -> InBetweenResult:
             own, at = which[rows], u[rows]

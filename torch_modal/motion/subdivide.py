@@ -21,7 +21,7 @@ from torch_modal.layers.mid_shape import MidShape
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.modes import bases_of_checked
+from torch_modal.precompute.extract import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
 
 MAX_LEVELS = 12
@@ -162,10 +162,10 @@ def _along_path(
     """Shapes between the key-frames of each interval."""
     path = Path(bases, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
     path.to(keyframes.device)
-    left = total = 0
+    knots, left, total = path.knots(keyframes[None]), 0, 0
     for when in _times_of_intervals(path.times, places):
         path.n_searched = len(when) - 2
-        result = path.solve(keyframes, when[1:-1])
+        result = path.solve(keyframes, when[1:-1], knots)
         warn_of_starts(result.solution)
         if chosen.objective.contact:
             total += len(when) - 2

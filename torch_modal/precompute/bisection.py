@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,25 +14,9 @@ _SECOND_HALF = np.array([(0, 1, 2, 3), (1, 1, 2, 3), (1, 2, 2, 3), (1, 2, 3, 3)]
 """Corners of the second half by the end of the bisected edge; the midpoint replaces the one at its place."""
 
 
-class BisectedMesh(NamedTuple):
-    """Conforming tetrahedra of different sizes.
-
-    Attributes:
-        vertices: Positions, in cube edges. *Shape:* ``(N, 3)``.
-        tets: Vertex indices, with positive volumes. *Shape:* ``(T, 4)``.
-        sizes: Edge length of the cube with six times the volume, in cube edges. *Shape:* ``(T,)``.
-        owner: Tetrahedron that contains each point. *Shape:* ``(P,)``.
-    """
-
-    vertices: FloatArray
-    tets: IntArray
-    sizes: FloatArray
-    owner: IntArray
-
-
 def bisected(
     cubes: IntArray, points: FloatArray, wanted: FloatArray, is_inside: Callable[[FloatArray], BoolArray], most: int
-) -> BisectedMesh:
+) -> tuple[FloatArray, IntArray, IntArray]:
     """Cut cubes into tetrahedra and bisect them until none is larger than the target size at the points it contains.
 
     Each cube is cut into six tetrahedra, the paths along its edges from its lowest corner to its highest (Kuhn 1960).
@@ -47,6 +30,10 @@ def bisected(
         is_inside: Whether points are inside. *Shape:* ``(n, 3) -> (n,)``. Tetrahedra without
             samples are removed if neither their corners nor their centroids are inside.
         most: Approximate limit of the number of tetrahedra; the largest relative to their target size come first.
+
+    Returns:
+        Vertices in cube edges, *Shape:* ``(N, 3)``; tetrahedra of positive volume, *Shape:* ``(T, 4)``; the tetrahedron
+        that contains each point, *Shape:* ``(P,)``.
     """
     mesh = _Mesh(cubes, points)
     while True:
@@ -106,6 +93,7 @@ class _Mesh:
         return np.stack([x, *np.divmod(rest, self.stride[1])], axis=-1) / UNITS
 
     def sizes(self) -> FloatArray:
+        """Edge length of the cube with six times the volume of each tetrahedron, in cube edges. *Shape:* ``(T,)``."""
         return 2.0 ** (-self.halvings / 3)
 
     def halve(self, chosen: BoolArray) -> None:
@@ -162,14 +150,15 @@ class _Mesh:
         self.vertices = np.sort(np.concatenate([self.vertices, added]))
         return added
 
-    def result(self) -> BisectedMesh:
+    def result(self) -> tuple[FloatArray, IntArray, IntArray]:
+        """Vertices, tetrahedra, and the tetrahedron of each point."""
         used, tets = np.unique(self.tets, return_inverse=True)
         tets = tets.reshape(-1, 4)
         vertices = self._coordinates(used)
         corners = vertices[tets]
         mirrored = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
         tets[mirrored] = tets[mirrored][:, [1, 0, 2, 3]]
-        return BisectedMesh(vertices, tets, self.sizes(), self.owner)
+        return vertices, tets, self.owner
 
 
 def _paths() -> IntArray:

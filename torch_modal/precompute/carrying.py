@@ -1,6 +1,6 @@
 """Deformation of the tetrahedra of one key-frame to other poses, so that each set is meshed once."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,27 +24,6 @@ MAX_INVERTED = 0.04
 FLAT = 1e-3
 """Determinant over the cubed norm, below which a matrix counts as singular; a rotation has 0.19."""
 MOST_POLAR_STEPS = 20
-
-
-class Carried(NamedTuple):
-    """Tetrahedra of one key-frame in the pose of another.
-
-    Attributes:
-        tetrahedra: Some of them may be inverted.
-        fit_rms: Root mean square distance of the carried surface from the key-frame, in bounding-box diagonals.
-        fit_max: The largest distance.
-        inverted: Fraction of the tetrahedra that are inverted.
-    """
-
-    tetrahedra: Tetrahedra
-    fit_rms: float
-    fit_max: float
-    inverted: float
-
-    @property
-    def is_good(self) -> bool:
-        """Whether the tetrahedra are good enough for modes; otherwise the key-frame is meshed separately."""
-        return self.fit_rms <= MAX_FIT_RMS and self.fit_max <= MAX_FIT and self.inverted <= MAX_INVERTED
 
 
 class Carrier:
@@ -80,11 +59,14 @@ class Carrier:
         laplacian = dirichlet_matrix(tetrahedra, self._gradients).tocsc()
         self._factors = factorize(laplacian + weights.T @ self._pull)
 
-    def carry(self, points: FloatArray) -> Carried:
-        """Deform the tetrahedra to the pose of another key-frame.
+    def carry(self, points: FloatArray) -> FloatArray | None:
+        """Vertices of the tetrahedra in the pose of another key-frame. *Shape:* ``(N, 3)``.
 
         Args:
             points: The surface in the new pose. *Shape:* ``(U, 3)``.
+
+        Returns:
+            The positions; None if they are too bad for modes: far from the surface, or with many inverted tetrahedra.
 
         Raises:
             LinAlgError: The result is not finite.
@@ -99,20 +81,13 @@ class Carrier:
         rotations = nearest_rotations(field[self._rest.tets].mean(axis=1))
         vertices = self._place(rotations, target)
         for _ in range(N_STEPS):
-            vertices = self._place(nearest_rotations(self._deformation(vertices)), target)
+            gradients = np.einsum("tai,taj->tij", vertices[self._rest.tets], self._gradients)
+            vertices = self._place(nearest_rotations(gradients), target)
 
-        carried = self._rest._replace(vertices=vertices * scale)
         distance = np.linalg.norm(self._weights @ vertices - target, axis=1) / np.linalg.norm(np.ptp(target, axis=0))
-        return Carried(
-            carried,
-            float(np.sqrt(np.average(distance**2, weights=areas))),
-            float(distance.max()),
-            float((tet_volumes(carried) <= 0).mean()),
-        )
-
-    def _deformation(self, vertices: FloatArray) -> FloatArray:
-        """Deformation gradient of each tetrahedron. *Shape:* ``(T, 3, 3)``."""
-        return np.einsum("tai,taj->tij", vertices[self._rest.tets], self._gradients)
+        inverted = (tet_volumes(self._rest._replace(vertices=vertices)) <= 0).mean()
+        fits = np.sqrt(np.average(distance**2, weights=areas)) <= MAX_FIT_RMS and distance.max() <= MAX_FIT
+        return vertices * scale if fits and inverted <= MAX_INVERTED else None
 
     def _place(self, rotations: FloatArray, points: FloatArray) -> FloatArray:
         """Minimise ``sum_t vol_t |∇x - R_t|²`` with the surface pulled to the points. *Shape:* ``(N, 3)``."""

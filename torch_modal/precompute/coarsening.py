@@ -102,11 +102,11 @@ class Collapses:
         """The partition by the collapses of one key-frame to a number of faces."""
         key = places[keyframe], n_faces
         if key not in self._known:
-            self._known[key] = _collapse_once(self._poses[key[0]], self.faces, n_faces)
+            self._known[key] = collapsed(self._poses[key[0]], self.faces, n_faces)
         return self._known[key]
 
 
-def _collapse_once(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
+def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
     """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately."""
     root = _roots(points, faces, n_faces)
     coarse_faces = _coarse_faces(root, faces)

@@ -1,45 +1,55 @@
 """Lowest vibration modes: the generalised eigenproblem ``K phi = lambda M phi``."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import LinearOperator, eigsh
 
-from torch_modal.arrays import FloatArray
-from torch_modal.precompute.lanczos import lowest_spans
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.geometry.sparse import factorize
 from torch_modal.precompute.parallel import one_blas_thread
-from torch_modal.precompute.stiffness import Mass
 
 N_RIGID = 6
-GUARD = 4
-"""Additional pairs: the last ones of a batch have converged least."""
+DENSE_BELOW = 600
+"""Number of unknowns below which LAPACK is as fast as Lanczos."""
+MORE_VECTORS = 20
+"""Lanczos vectors beside the wanted ones."""
 RIGID_TOLERANCE = 1e-5
 """Largest eigenvalue of a rigid motion relative to the first elastic one: typically 1e-13, and 1e-7 for a wire with
 aspect ratio 300."""
-EXACT = 1e-6
-"""Residual at which modes count as exact."""
-ENOUGH = 1e-3
-"""Residual without effect on in-betweens. It consists of high frequencies, which ``K`` magnifies: the modes lie within
-1e-4 of the exact space. It is always accepted if further steps do not help: for wires and flat tetrahedra it is the
-rounding of ``K phi``."""
-INVERTED = 0.3
-"""Residual of the inverted problem, relative to the tolerance, at which the residuals of the modes are checked."""
-
-
-class Scale(NamedTuple):
-    """Orders of eigenvalues."""
-
-    shift: float
-    """Lanczos is shifted by minus this: it is near the lowest modes of slender bodies."""
-    zero: float
-    """Largest eigenvalue that counts as zero."""
-    enough: float = ENOUGH
-    """Residual that is accepted if further steps do not help."""
+ZERO = 1e-7
+"""Largest eigenvalue that counts as zero, in shifts: rounding leaves 1e-12, and the first mode of a rod of aspect ratio
+10,000 is near 1e-6."""
+LARGEST_RESIDUAL = 1e-3
+"""Largest residual of a mode; typically 1e-11. For wires and flat tetrahedra it is the rounding of ``K phi``."""
 
 
 class ModalAnalysisError(RuntimeError):
     """The eigenproblem has no trustworthy solution; the message says which check failed."""
+
+
+class ElasticBody(NamedTuple):
+    """The eigenproblem of an elastic body with ``N`` vertices, of a surface with ``U`` points.
+
+    Attributes:
+        points: Vertices at rest. *Shape:* ``(N, 3)``.
+        stiffness: Row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
+        mass: Entries for vertices. *Shape:* ``(N, N)``.
+        to_surface: Displacements of the surface from those of the body. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
+        shift: As for :func:`lowest_modes`.
+        largest_residual: Likewise.
+    """
+
+    points: FloatArray
+    stiffness: sp.csc_matrix
+    mass: sp.csr_matrix
+    to_surface: Callable[[FloatArray], FloatArray]
+    shift: float | None = None
+    largest_residual: float = LARGEST_RESIDUAL
 
 
 class ElasticModes(NamedTuple):
@@ -49,34 +59,15 @@ class ElasticModes(NamedTuple):
         eigenvalues: Ascending. *Shape:* ``(k,)``.
         modes: M-orthonormal and M-orthogonal to the rigid motions. *Shape:* ``(3N, k)``.
         rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
-        n_zero: Number of zero eigenvalues: six for each loose component.
-        residual: Largest ``|K phi - lambda M phi| / (lambda |M phi|)``.
+        n_zero: Number of zero eigenvalues, including the six rigid ones.
+        n_pieces: Number of connected components.
     """
 
     eigenvalues: FloatArray
     modes: FloatArray
     rigid_eigenvalues: FloatArray
     n_zero: int
-    residual: float
-
-
-def rigid_motions(positions: FloatArray, mass: Mass) -> FloatArray:
-    """M-orthonormal basis of the translations and infinitesimal rotations. *Shape:* ``(3N, 6)``.
-
-    Args:
-        positions: Rest positions, not all on one line. *Shape:* ``(N, 3)``.
-        mass: Mass matrix.
-    """
-    n = len(positions)
-    lumped = mass.lumped()
-    centered = positions - np.average(positions, axis=0, weights=lumped)
-    # Scaled to order 1 like the translations, for a well-conditioned factorisation.
-    centered = centered / np.sqrt(np.average((centered**2).sum(axis=1), weights=lumped))
-    motions = np.zeros((n, 3, 6))
-    motions[:, :, :3] = np.eye(3)
-    for axis in range(3):
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centered)
-    return mass.orthonormal(motions.reshape(3 * n, 6))[0]
+    n_pieces: int
 
 
 @one_blas_thread()
@@ -85,30 +76,32 @@ def lowest_modes(
     mass: sp.spmatrix,
     positions: FloatArray,
     n_modes: int,
-    tolerance: float = EXACT,
-    scale: Scale | None = None,
+    shift: float | None = None,
+    largest_residual: float = LARGEST_RESIDUAL,
 ) -> ElasticModes:
     """Lowest elastic modes of ``K phi = lambda M phi``.
 
-    Shift-invert block Lanczos with a negative shift: ``K + |shift| M`` is positive definite, and the modes are those of
-    ``K`` itself. The span is then made M-orthogonal to the rigid motions, and ``K`` is diagonalised in it
-    (Rayleigh-Ritz). Lanczos continues until the residuals of the modes are small enough. Small problems are solved
-    densely. The first of the largest components of each mode is positive.
+    Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite, and the modes are those of ``K``
+    itself. Rigid motions are known and projected out, so that Lanczos need not find six equal eigenvalues. Connected
+    components are solved separately for the same reason. Small problems are solved densely. The first of the largest
+    components of each mode is positive.
 
     Args:
         k: Stiffness, symmetric positive semi-definite. *Shape:* ``(3N, 3N)``.
         mass: Mass matrix, entries for vertices. *Shape:* ``(N, N)``.
         positions: Rest positions. *Shape:* ``(N, 3)``.
         n_modes: Number of elastic modes.
-        tolerance: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` at which Lanczos ends.
-        scale: Orders of eigenvalues; by default those of a solid.
+        shift: Positive; near the lowest eigenvalues of slender bodies. Default: that of a solid, the inverse square of
+            the diagonal of the bounding box.
+        largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
 
     Returns:
-        The modes. Further zero modes, of loose components, come first.
+        The modes. Rigid motions of connected components against each other come first, six for each further component,
+        beside the ``n_modes`` requested ones.
 
     Raises:
         ValueError: More modes than the mesh has.
-        ModalAnalysisError: The six zero modes are missing, the stiffness is indefinite, all modes are zero modes, or a
+        ModalAnalysisError: Rigid motions have energy, the stiffness is indefinite, all modes are zero modes, or a
             residual is too large.
     """
     possible = 3 * len(positions) - N_RIGID
@@ -117,93 +110,172 @@ def lowest_modes(
             f"{n_modes} modes requested, but a mesh of {len(positions)} vertices has {possible} elastic modes; "
             f"give 1 to {possible}"
         )
-    inertia = Mass(sp.csr_matrix(mass))
-    if not (has_mass := inertia.lumped() > 0).all():
-        raise ModalAnalysisError(f"{int((~has_mass).sum())} vertices have no mass; remove unused vertices first")
-    n_pairs = min(n_modes + N_RIGID + GUARD, k.shape[0])
-    scale = scale or solid_scale(positions)
-    spans = lowest_spans(k, inertia, n_pairs, scale.shift, INVERTED * tolerance)
+    n_massless = int((np.asarray(mass.sum(axis=1)) <= 0).sum())
+    if n_massless:
+        raise ModalAnalysisError(f"{n_massless} vertices have no mass; remove unused vertices first")
+    if shift is None:
+        shift = 1 / float((np.ptp(positions, axis=0) ** 2).sum())
+    inertia = sp.kron(mass, sp.identity(3), format="csr")
+    n_pieces, piece = connected_components(_vertex_graph(k), directed=False)
+    if n_pieces == 1:
+        return _component_modes(k, inertia, positions, n_modes, shift, largest_residual)
+
+    rigid = np.zeros((len(inertia.indptr) - 1, N_RIGID * n_pieces))
+    eigenvalues, modes, n_zero = [], [], N_RIGID * n_pieces
+    for index in range(n_pieces):
+        vertices = np.flatnonzero(piece == index)
+        own = _unknowns(vertices)
+        part, part_inertia = sp.csc_matrix(k[own][:, own]), inertia[own][:, own]
+        n_own = min(n_modes, 3 * len(vertices) - N_RIGID)
+        found = _component_modes(part, part_inertia, positions[vertices], n_own, shift, largest_residual)
+        whole = np.zeros((len(rigid), n_own))
+        whole[own] = found.modes
+        modes.append(whole)
+        eigenvalues.append(found.eigenvalues)
+        rigid[own, N_RIGID * index : N_RIGID * (index + 1)] = rigid_motions(positions[vertices], part_inertia)
+        n_zero += found.n_zero - N_RIGID
+    # The rigid motions of components, without those of the whole.
+    whole_rigid = rigid_motions(positions, inertia)
+    relative = rigid @ scipy.linalg.qr(rigid.T @ (inertia @ whole_rigid))[0][:, N_RIGID:]
+    order = np.argsort(np.concatenate(eigenvalues), kind="stable")[:n_modes]
+    columns = np.concatenate([relative, np.concatenate(modes, axis=1)[:, order]], axis=1)
+    values = np.concatenate([np.zeros(relative.shape[1]), np.concatenate(eigenvalues)[order]])
+    rigid_eigenvalues = np.linalg.eigvalsh(whole_rigid.T @ (k @ whole_rigid))
+    return ElasticModes(values, columns * _signs(columns), rigid_eigenvalues, n_zero, n_pieces)
+
+
+def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
+    """M-orthonormal basis of the translations and infinitesimal rotations. *Shape:* ``(3N, 6)``.
+
+    Args:
+        positions: Rest positions, not all on one line. *Shape:* ``(N, 3)``.
+        inertia: Mass matrix of coordinates. *Shape:* ``(3N, 3N)``.
+    """
+    centered = positions - positions.mean(axis=0)
+    # Scaled to order 1 like the translations, for a well-conditioned factorisation.
+    centered = centered / np.sqrt((centered**2).sum(axis=1).mean())
+    motions = np.zeros((len(positions), 3, N_RIGID))
+    motions[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centered)
+    return _orthonormal(motions.reshape(-1, N_RIGID), inertia)
+
+
+def _component_modes(
+    k: sp.csc_matrix, inertia: sp.csr_matrix, positions: FloatArray, n_modes: int, shift: float, largest_residual: float
+) -> ElasticModes:
+    """Lowest elastic modes of a connected component, with checks."""
     rigid = rigid_motions(positions, inertia)
-    while (span := _next_of(spans)) is not None:
-        found, first_elastic = _modes_in_span(k, inertia, scale.zero, span, rigid, n_modes)
-        not_rigid = float(np.abs(found.rigid_eigenvalues).max())
-        if found.residual < tolerance and not_rigid < RIGID_TOLERANCE * first_elastic:
-            return found
+    momentum = inertia @ rigid
+    try:
+        if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
+            complement = scipy.linalg.qr(momentum)[0][:, N_RIGID:]
+            matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
+            span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
+        else:
+            span = _lanczos(k, inertia, rigid, momentum, n_modes, shift)
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # ARPACK, SuperLU on a singular matrix, LAPACK
+        raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
+
+    # Rayleigh-Ritz, after which modes are orthonormal up to rounding.
+    span = _orthonormal(span - rigid @ (momentum.T @ span), inertia)
+    forces = k @ span
+    restricted = span.T @ forces
+    eigenvalues, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
+    modes, forces = span @ rotation, forces @ rotation
+    rigid_eigenvalues = np.linalg.eigvalsh(rigid.T @ (k @ rigid))
+
+    n_zero = int((eigenvalues < ZERO * shift).sum())
+    if eigenvalues[0] < -ZERO * shift:
+        raise ModalAnalysisError(
+            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; the mesh is likely degenerate"
+        )
+    if n_zero == n_modes:
+        raise ModalAnalysisError(
+            f"all of the lowest {n_zero} modes are motions without deformation: the mesh consists of parts that hang "
+            "together on vertices or edges; join them, or request more modes"
+        )
+    first_elastic, not_rigid = eigenvalues[n_zero], np.abs(rigid_eigenvalues).max()
     if not not_rigid < RIGID_TOLERANCE * first_elastic:
         raise ModalAnalysisError(
             f"the six rigid motions have eigenvalues up to {not_rigid:.2e}, which is not zero beside the first elastic "
             f"one, {first_elastic:.2e}; the mesh is degenerate"
         )
-    if found.residual < scale.enough:
-        return found
-    raise ModalAnalysisError(
-        f"the modes leave a relative residual of {found.residual:.2e} (allowed: {scale.enough:g}), and further "
-        "steps do not help; the mesh is likely degenerate"
+    impulses = inertia @ modes
+    residuals = np.linalg.norm(forces - impulses * eigenvalues, axis=0)
+    residual = (residuals / (np.maximum(eigenvalues, first_elastic) * np.linalg.norm(impulses, axis=0))).max()
+    if not residual < largest_residual:
+        raise ModalAnalysisError(
+            f"the modes leave a relative residual of {residual:.2e} (allowed: {largest_residual:g}); the mesh is "
+            "likely degenerate"
+        )
+    # Zero eigenvalues of hinges may be -1e-13; their roots must exist.
+    return ElasticModes(
+        np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, N_RIGID + n_zero, n_pieces=1
     )
 
 
-def _next_of(spans: Iterator[FloatArray]) -> FloatArray | None:
-    """The next span, or None after the last."""
-    try:
-        return next(spans, None)
-    except (RuntimeError, np.linalg.LinAlgError) as error:  # Lanczos, SuperLU on a singular matrix, LAPACK
-        raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
+def _lanczos(
+    k: sp.csc_matrix, inertia: sp.csr_matrix, rigid: FloatArray, momentum: FloatArray, n_modes: int, shift: float
+) -> FloatArray:
+    """Lowest eigenvectors that are M-orthogonal to the rigid motions, by ARPACK. *Shape:* ``(3N, n_modes)``."""
+    n = k.shape[0]
+    solve = _inverse(k + shift * inertia)
+
+    def elastic_solve(forces: FloatArray) -> FloatArray:
+        found = solve(forces.reshape(-1))
+        return found - rigid @ (momentum.T @ found)
+
+    # A fixed start makes modes reproducible. Full accuracy: a looser tolerance misses copies of equal eigenvalues.
+    start = elastic_solve(np.random.default_rng(0).standard_normal(n))
+    inverse = LinearOperator((n, n), matvec=elastic_solve, dtype=np.float64)
+    n_vectors = min(n_modes + MORE_VECTORS, n)
+    vectors: FloatArray = eigsh(k, n_modes, inertia, sigma=-shift, OPinv=inverse, v0=start, ncv=n_vectors, tol=0)[1]
+    return vectors
 
 
-def _modes_in_span(
-    k: sp.csc_matrix, mass: Mass, zero: float, span: FloatArray, rigid: FloatArray, n_modes: int
-) -> tuple[ElasticModes, float]:
-    """Lowest elastic modes in a span, and the first non-zero eigenvalue."""
-    rigid_eigenvalues = _rayleigh_ritz(span, k @ span)[0][:N_RIGID]
+def _inverse(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
+    """Solver with a symmetric positive definite matrix of three unknowns for each vertex.
 
-    # Remove the rigid part: six directions of the span become zero and are dropped.
-    moved = mass @ rigid
-    elastic = span - rigid @ (moved.T @ span)
-    lengths, directions = np.linalg.eigh(elastic.T @ (mass @ elastic))
-    elastic = elastic @ (directions / np.sqrt(np.maximum(lengths, np.finfo(np.float64).tiny)))[:, N_RIGID:]
-    elastic -= rigid @ (moved.T @ elastic)
-    # Nearly orthonormal already, so Cholesky is as accurate as QR, in a fifth of the time.
-    elastic = elastic @ np.linalg.inv(np.linalg.cholesky(elastic.T @ (mass @ elastic))).T
-    forces = k @ elastic
-    eigenvalues, rotation = _rayleigh_ritz(elastic, forces)
-
-    first_elastic, n_zero = _count_zeros(eigenvalues, zero)
-    eigenvalues, rotation = eigenvalues[:n_modes], rotation[:, :n_modes]
-    modes = elastic @ rotation
-    residual = relative_residual(forces @ rotation, mass @ modes, eigenvalues, first_elastic)
-    # Zero eigenvalues of loose pieces may be -1e-13; their roots must exist.
-    found = ElasticModes(np.maximum(eigenvalues, 0.0), modes * _signs(modes), rigid_eigenvalues, n_zero, residual)
-    return found, first_elastic
-
-
-def relative_residual(forces: FloatArray, inertia: FloatArray, eigenvalues: FloatArray, smallest: float) -> float:
-    """Largest ``|K phi - lambda M phi| / (lambda |M phi|)``, Euclidean norms.
-
-    For zero modes, ``smallest`` replaces the eigenvalue.
-
-    Args:
-        forces: ``K phi`` of each mode. *Shape:* ``(3N, k)``.
-        inertia: ``M phi``. *Shape:* ``(3N, k)``.
-        eigenvalues: *Shape:* ``(k,)``.
-        smallest: The first non-zero eigenvalue.
+    Vertices are ordered instead of unknowns, which gives a third less fill: by minimum degree, from the factorisation
+    of a well-conditioned matrix with their graph.
     """
-    difference = np.linalg.norm(forces - inertia * eigenvalues, axis=0)
-    return float((difference / (np.maximum(eigenvalues, smallest) * np.linalg.norm(inertia, axis=0))).max())
+    graph = _vertex_graph(matrix)
+    laplacian = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
+    degrees = np.diff(graph.indptr)
+    by_vertex = factorize(laplacian + sp.identity(len(degrees)) * (1.0 + degrees.max()))
+    order = _unknowns(np.argsort(by_vertex.perm_c))
+    # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
+    factors = factorize(matrix[order][:, order].tocsr().T, "NATURAL")
+
+    def solve(right: FloatArray) -> FloatArray:
+        found = np.empty_like(right)
+        found[order] = factors.solve(right[order])
+        return found
+
+    return solve
 
 
-def _count_zeros(eigenvalues: FloatArray, zero: float) -> tuple[float, int]:
-    """The first non-zero eigenvalue, and the number of zero ones, including the rigid ones."""
-    if eigenvalues[0] < -zero:
-        raise ModalAnalysisError(
-            f"the stiffness is indefinite: its lowest eigenvalue is {eigenvalues[0]:.2e}; the mesh is likely degenerate"
-        )
-    n_extra = int((eigenvalues < zero).sum())
-    if n_extra == len(eigenvalues):
-        raise ModalAnalysisError(
-            f"all of the lowest {n_extra} modes are motions without deformation: the mesh falls into loose "
-            "pieces, each of which has six rigid motions; join them, or request more modes"
-        )
-    return float(eigenvalues[n_extra]), N_RIGID + n_extra
+def _unknowns(vertices: IntArray) -> IntArray:
+    """Indices of the unknowns of vertices. *Shape:* ``(N,) -> (3N,)``."""
+    return (3 * vertices[:, None] + np.arange(3)).reshape(-1)
+
+
+def _vertex_graph(k: sp.csc_matrix) -> sp.csc_matrix:
+    """Vertex adjacency from the block structure of a matrix. *Shape:* ``(3N, 3N) -> (N, N)``."""
+    blocks = k.T.tobsr((3, 3))
+    n = k.shape[0] // 3
+    return sp.csc_matrix((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr), shape=(n, n))
+
+
+def _orthonormal(columns: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
+    """M-orthonormal basis of the span of independent columns. *Shape:* ``(3N, k) -> (3N, k)``."""
+    root = np.sqrt(np.asarray(inertia.sum(axis=1)))
+    basis = np.linalg.qr(root * columns)[0] / root
+    # Scaled by the lumped masses, the spectrum of M is within [1/5, 1]: the product is well conditioned.
+    upper = scipy.linalg.cholesky(basis.T @ (inertia @ basis))
+    orthonormal: FloatArray = scipy.linalg.solve_triangular(upper, basis.T, trans="T").T
+    return orthonormal
 
 
 def _signs(modes: FloatArray) -> FloatArray:
@@ -215,22 +287,3 @@ def _signs(modes: FloatArray) -> FloatArray:
     magnitude = np.abs(modes)
     first = (magnitude >= 0.999 * magnitude.max(axis=0)).argmax(axis=0)
     return np.where(np.take_along_axis(modes, first[None], axis=0)[0] < 0, -1.0, 1.0)
-
-
-def solid_scale(positions: FloatArray) -> Scale:
-    """Orders of eigenvalues of a solid: proportional to the inverse square of the diagonal of its bounding box.
-
-    Rounding is 1e-13 to 1e-12 in these units, and the first mode of a rod of aspect ratio 10,000 near 1e-6.
-    """
-    unit = 1 / float(((positions.max(axis=0) - positions.min(axis=0)) ** 2).sum())
-    return Scale(shift=unit, zero=1e-9 * unit)
-
-
-def _rayleigh_ritz(basis: FloatArray, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues of ``K`` within the span of an M-orthonormal basis, and its eigenvectors in that basis.
-
-    *Shape:* ``(3N, k), (3N, k) -> (k,), (k, k)``; the second is ``K`` times the first.
-    """
-    restricted = basis.T @ forces
-    values, rotation = np.linalg.eigh((restricted + restricted.T) / 2)
-    return values, rotation

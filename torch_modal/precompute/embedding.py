@@ -1,7 +1,5 @@
 """Surface points embedded in tetrahedra by moving least squares with linear precision."""
 
-from typing import NamedTuple
-
 import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
@@ -25,19 +23,7 @@ _CANDIDATES = (6, 32)
 _CHUNK = 4096
 
 
-class Neighbours(NamedTuple):
-    """Tetrahedral vertices in the support of each point, padded with zero kernels.
-
-    Attributes:
-        vertex: *Shape:* ``(V, 12)``.
-        kernel: Moving-least-squares kernel, which falls to zero with the distance. *Shape:* ``(V, 12)``.
-    """
-
-    vertex: IntArray
-    kernel: FloatArray
-
-
-def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: Neighbours) -> sp.csr_matrix:
+def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: IntArray, kernels: FloatArray) -> sp.csr_matrix:
     """Moving-least-squares weights that map displacements of the tetrahedra's vertices to surface points.
 
     A linear function is fitted to the displacements of the neighbours of each point. Constant and linear displacements
@@ -46,21 +32,24 @@ def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: Neighbours
     Args:
         points: Positions on the surface. *Shape:* ``(V, 3)``.
         vertices: Positions of the tetrahedra's vertices in the same pose. *Shape:* ``(N, 3)``.
-        neighbours: Neighbours of each point, from this pose or another.
+        neighbours: Vertices in the support of each point, in this pose or another. *Shape:* ``(V, 12)``.
+        kernels: Their weights in the fit, which fall to zero with the distance. *Shape:* ``(V, 12)``.
 
     Returns:
         Rows sum to one, and ``weights @ vertices`` are the points. *Shape:* ``(V, N)``.
     """
     rows = np.repeat(np.arange(len(points)), N_NEIGHBOURS)
     weights = [
-        _moving_least_squares(points[chunk], vertices, Neighbours(neighbours.vertex[chunk], neighbours.kernel[chunk]))
+        _moving_least_squares(points[chunk], vertices, neighbours[chunk], kernels[chunk])
         for chunk in _chunks(np.arange(len(points)))
     ]
-    entries = (np.concatenate(weights).reshape(-1), (rows, neighbours.vertex.reshape(-1)))
+    entries = (np.concatenate(weights).reshape(-1), (rows, neighbours.reshape(-1)))
     return sp.coo_matrix(entries, shape=(len(points), len(vertices))).tocsr()
 
 
-def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None) -> Neighbours:
+def find_neighbours(
+    points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None
+) -> tuple[IntArray, FloatArray]:
     """Nearest vertices of each point within a few edges of its closest tetrahedron.
 
     The search for the closest tetrahedron starts slightly below the surface, so that touching limbs do not mix.
@@ -69,6 +58,9 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
         points: Positions on the surface. *Shape:* ``(V, 3)``.
         tetrahedra: The volume mesh.
         normals: Outward unit normals at the points; without them the search starts at the points. *Shape:* ``(V, 3)``.
+
+    Returns:
+        Neighbours and kernels for :func:`fit_weights`, padded with zero kernels. *Shape:* ``(V, 12), (V, 12)``.
     """
     extent = np.ptp(tetrahedra.vertices, axis=0)
     below = points if normals is None else points - PUSH * np.linalg.norm(extent) * normals
@@ -77,7 +69,7 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
     adjacency = sp.csr_matrix(incidence.T @ incidence)  # of vertices, with a non-zero diagonal
 
     wanted = min(N_NEIGHBOURS, len(tetrahedra.vertices))
-    found = Neighbours(np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64), np.zeros((len(points), N_NEIGHBOURS)))
+    neighbours, kernels = np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64), np.zeros((len(points), N_NEIGHBOURS))
     left = np.arange(len(points))
     reached = adjacency
     for rings in range(2, MAX_RINGS + 1):
@@ -85,15 +77,15 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
         last = rings == MAX_RINGS
         retry = []
         for chunk in _chunks(left):
-            nearest, number = _nearest_reached(points[chunk], tetrahedra, closest[chunk], reached)
-            fit = _moving_least_squares(points[chunk], tetrahedra.vertices, nearest)
+            nearest, kernel, number = _nearest_reached(points[chunk], tetrahedra, closest[chunk], reached)
+            fit = _moving_least_squares(points[chunk], tetrahedra.vertices, nearest, kernel)
             good = (number >= wanted) & (np.abs(fit).sum(axis=1) <= MAX_AMPLIFICATION) | last
-            found.vertex[chunk[good]], found.kernel[chunk[good]] = nearest.vertex[good], nearest.kernel[good]
+            neighbours[chunk[good]], kernels[chunk[good]] = nearest[good], kernel[good]
             retry.append(chunk[~good])
         left = np.concatenate(retry)
         if len(left) == 0:
             break
-    return found
+    return neighbours, kernels
 
 
 def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
@@ -135,8 +127,8 @@ def _incidence(tets: IntArray, n_vertices: int) -> sp.csr_matrix:
 
 def _nearest_reached(
     points: FloatArray, tetrahedra: Tetrahedra, closest: IntArray, reached: sp.csr_matrix
-) -> tuple[Neighbours, IntArray]:
-    """Nearest vertices among those that ``reached`` connects with the closest tetrahedron, and their number."""
+) -> tuple[IntArray, FloatArray, IntArray]:
+    """Nearest vertices that ``reached`` connects with the closest tetrahedron, their kernels, and their number."""
     tets, row_of_point = np.unique(closest, return_inverse=True)
     around = sp.csr_matrix(_incidence(tetrahedra.tets[tets], len(tetrahedra.vertices)) @ reached)
     sizes = np.diff(around.indptr)
@@ -162,16 +154,18 @@ def _nearest_reached(
     radius = np.where(np.isfinite(squared[:, -1:]), squared[:, -1:], 1.2 * last)
     kernel = np.clip(1 - np.where(np.isfinite(squared), squared, np.inf) / np.maximum(radius, 1e-300), 0, None) ** 2
     vertex = np.maximum(np.take_along_axis(index, order, axis=1)[:, :N_NEIGHBOURS], 0)
-    return Neighbours(vertex, kernel[:, :N_NEIGHBOURS]), count
+    return vertex, kernel[:, :N_NEIGHBOURS], count
 
 
-def _moving_least_squares(points: FloatArray, vertices: FloatArray, nearest: Neighbours) -> FloatArray:
+def _moving_least_squares(
+    points: FloatArray, vertices: FloatArray, neighbours: IntArray, kernels: FloatArray
+) -> FloatArray:
     """Weights ``θ_j p_jᵀ (Σ θ p pᵀ)⁻¹ p(x)`` with ``p = (1, (x_j - x) / r)``. *Shape:* ``(·, 12)``."""
-    offset = vertices[nearest.vertex] - points[:, None]
+    offset = vertices[neighbours] - points[:, None]
     squared = (offset**2).sum(axis=2)
-    radius = np.sqrt((squared * (nearest.kernel > 0)).max(axis=1))
+    radius = np.sqrt((squared * (kernels > 0)).max(axis=1))
     offset /= radius[:, None, None]
-    theta = nearest.kernel / nearest.kernel.sum(axis=1, keepdims=True)
+    theta = kernels / kernels.sum(axis=1, keepdims=True)
     mean = (theta[:, None] @ offset)[:, 0]
     centered = offset - mean[:, None]
     covariance = (theta[..., None] * centered).transpose(0, 2, 1) @ centered

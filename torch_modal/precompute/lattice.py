@@ -5,11 +5,12 @@ Deterministic; accepts every surface.
 
 import itertools
 import threading
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.fft import irfftn, next_fast_len, rfftn
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
@@ -17,11 +18,9 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import bisected
 from torch_modal.precompute.parallel import closest_in
-from torch_modal.precompute.proximity import clearances
-from torch_modal.precompute.surface import CanonicalSurface, SurfaceSamples, sampled
+from torch_modal.precompute.surface import CanonicalSurface, SurfaceSamples, clearances, sampled
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
-    TetrahedralizationError,
     face_connected_pieces,
     kept_tetrahedra,
     solid_volumes,
@@ -31,10 +30,6 @@ from torch_modal.precompute.tetrahedra import (
 
 VERSION = "whole"
 """Part of the cache key: change it when the algorithm changes."""
-EDGE = 0.04
-"""Default of the target edge length, in bounding-box diagonals."""
-CUBE = 0.75
-"""Edge length of the cubes at the surface, relative to the target edge length."""
 COARSER = 1.1
 """Factor by which cubes grow until their number is within the limit."""
 TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
@@ -49,8 +44,8 @@ SMALLEST = 1 / 12
 """Smallest tetrahedron size, relative to the largest at the surface."""
 MOST_TETRAHEDRA = 12_000
 """Approximate limit before the fit to the surface; it grows with the volume in units of finer cubes."""
-USUAL_EDGE = 0.03
-"""Edge length of the cubes to which the limit applies, in bounding-box diagonals."""
+USUAL_CUBE = 0.03
+"""Edge length of the cubes to which the limit applies, in sizes."""
 MOST_CUBES = 20_000
 """Limit of the number of root cubes."""
 SAMPLES_APART = 0.7
@@ -88,26 +83,31 @@ class Lattice:
     Tetrahedra around a thin wall along the faces of the cubes share hardly any faces with each other.
 
     Attributes:
-        edge_length_fac: Target edge length as a fraction of the bounding-box diagonal; None takes the default.
+        cube: Edge length of the cubes where nothing is thin, as a fraction of the size of the surface; larger ones are
+            taken if there would be too many.
+
+    Raises:
+        ValueError: ``cube`` is out of range.
     """
 
-    edge_length_fac: float | None = None
+    cube: float = USUAL_CUBE
+
+    def __post_init__(self) -> None:
+        if not 0 < self.cube <= 1:
+            raise ValueError(f"cube is {self.cube}; give a number above 0, up to 1")
 
     def key(self) -> dict[str, Any]:
-        """The target edge length and the version."""
-        return {**asdict(self), "lattice": VERSION, "mesher": "lattice"}
+        """The edge length and the version."""
+        return {"mesher": "lattice", "cube": self.cube, "version": VERSION}
 
-    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
-        """Fill the surface with tetrahedra."""
-        cube = CUBE * (self.edge_length_fac or EDGE)
-        while is_too_fine(surface, cube):
-            cube *= COARSER
-        found = lattice(surface, cube)
+    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+        """Fill a surface with tetrahedra."""
+        found = lattice(surface, self.cube)
         pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
         most = connected_pieces(pairs, len(surface.points)).max()
         if face_connected_pieces(found.tets).max() <= most:
             return found
-        turned = lattice(replace(surface, points=surface.points @ TURN.T), cube)
+        turned = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
         if face_connected_pieces(turned.tets).max() >= face_connected_pieces(found.tets).max():
             return found
         return turned._replace(vertices=turned.vertices @ TURN)
@@ -137,7 +137,7 @@ class Indicator(NamedTuple):
 
     def at(self, points: FloatArray) -> FloatArray:
         """Trilinear interpolation, with a sharper transition near the surface. *Shape:* ``(P, 3) -> (P,)``."""
-        values = self._by_grid(points)
+        values = map_coordinates(self.values, ((points - self.low) / self.spacing).T, order=1, mode="nearest")
         doubtful = np.flatnonzero(values < SURELY_INSIDE)
         distance, nearest = closest_in(self.samples.tree, points[doubtful], within=NEARBY * self.spacing)
         # Beyond the boundary of an open surface there is no tangent plane.
@@ -148,25 +148,8 @@ class Indicator(NamedTuple):
         values[doubtful] = 0.5 - height / (RAMP * self.spacing)
         return np.clip(values, 0.0, 1.0)
 
-    def _by_grid(self, points: FloatArray) -> FloatArray:
-        # Coordinate by coordinate: half the time of rows of three.
-        strides = np.array(self.values.strides) // self.values.itemsize
-        index, shares = np.zeros(len(points), dtype=np.int64), []
-        for axis in range(3):
-            place = (points[:, axis] - self.low[axis]) / self.spacing
-            base = np.clip(place.astype(np.int64), 0, self.values.shape[axis] - 2)
-            part = np.clip(place - base, 0.0, 1.0)
-            index += base * strides[axis]
-            shares.append((1 - part, part))
-        flat, found = self.values.reshape(-1), np.zeros(len(points))
-        for x, y in itertools.product((0, 1), repeat=2):
-            column = shares[0][x] * shares[1][y]
-            for z in (0, 1):
-                found += column * shares[2][z] * flat[index + int(np.array((x, y, z)) @ strides)]
-        return found
 
-
-def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
+def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     """Fill a surface with a graded lattice of tetrahedra, with the outer vertices moved onto the surface.
 
     Tetrahedra are bisected where the body or a gap is thin. Each has the fraction of its volume that is inside. The
@@ -175,19 +158,16 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
 
     Args:
         surface: The surface.
-        edge_length_fac: Edge length of the cubes at the surface where nothing is thin, in bounding-box diagonals.
-
-    Raises:
-        TetrahedralizationError: The lattice would be too fine.
+        cube: Edge length of the cubes at the surface where nothing is thin, in sizes.
     """
-    largest = edge_length_fac * CANONICAL_SIZE
-    root = ROOT * largest
-    low, counts = _box(surface, root)
-    if is_too_fine(surface, edge_length_fac):
-        raise TetrahedralizationError(
-            f"a lattice with cubes of {largest:g} % of the diagonal needs {counts.prod()} of them; give a larger "
-            "edge_length_fac"
-        )
+    largest = cube * CANONICAL_SIZE
+    while True:
+        root = ROOT * largest
+        low = surface.points.min(axis=0) - 1.5 * root
+        counts = np.ceil((surface.points.max(axis=0) + 1.5 * root - low) / root).astype(np.int64)
+        if counts.prod() <= MOST_CUBES:
+            break
+        largest *= COARSER
     thickness, gap = clearances(surface)
     sizes = np.clip(np.minimum(thickness / ACROSS, gap / ACROSS_GAP), SMALLEST * largest, largest)
     samples = sampled(surface, np.minimum(SAMPLES_APART * sizes, (surface.area / FEWEST_SAMPLES) ** 0.5))
@@ -209,26 +189,15 @@ def lattice(surface: CanonicalSurface, edge_length_fac: float) -> Tetrahedra:
     def is_inside(places: FloatArray) -> BoolArray:
         return indicator.at(low + root * places) >= 0.5
 
-    most = int(MOST_TETRAHEDRA * max(1.0, USUAL_EDGE / edge_length_fac) ** 3)
-    mesh = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
-    vertices = low + root * mesh.vertices
-    inside = indicator.inside(vertices[mesh.tets])
+    most = int(MOST_TETRAHEDRA * max(1.0, USUAL_CUBE * CANONICAL_SIZE / largest) ** 3)
+    places, tets, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    vertices = low + root * places
+    inside = indicator.inside(vertices[tets])
     kept = inside >= LEAST_INSIDE
-    kept[mesh.owner] = True
-    kept = _bridged(mesh.tets, kept, np.ones(len(kept), dtype=bool))
-    filled = kept_tetrahedra(Tetrahedra(vertices, mesh.tets, np.maximum(inside, LEAST_INSIDE)), kept)
+    kept[owner] = True
+    kept = _bridged(tets, kept, np.ones(len(kept), dtype=bool))
+    filled = kept_tetrahedra(Tetrahedra(vertices, tets, np.maximum(inside, LEAST_INSIDE)), kept)
     return _fitted(without_debris(filled), indicator)
-
-
-def is_too_fine(surface: CanonicalSurface, edge_length_fac: float) -> bool:
-    """Whether a lattice would have too many root cubes."""
-    return bool(_box(surface, ROOT * edge_length_fac * CANONICAL_SIZE)[1].prod() > MOST_CUBES)
-
-
-def _box(surface: CanonicalSurface, cell: float) -> tuple[FloatArray, IntArray]:
-    """Lowest corner of the lattice, and the number of cubes along each axis."""
-    low = surface.points.min(axis=0) - 1.5 * cell
-    return low, np.ceil((surface.points.max(axis=0) + 1.5 * cell - low) / cell).astype(np.int64)
 
 
 def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:

@@ -31,7 +31,11 @@ def n_cpus() -> int:
 
 
 def run_all(
-    work: Callable[[int], Result], n: int, stop: threading.Event, meanwhile: Callable[[], object] | None = None
+    work: Callable[[int], Result],
+    n: int,
+    stop: threading.Event,
+    most: int | None = None,
+    meanwhile: Callable[[], object] | None = None,
 ) -> list[Result]:
     """Results of ``work(0)`` to ``work(n - 1)``, computed in one thread per processor.
 
@@ -42,6 +46,7 @@ def run_all(
         work: The function; long calls check ``stop`` and raise `StoppedError`.
         n: Number of calls.
         stop: Cancels the work.
+        most: Largest number of threads, to bound memory.
         meanwhile: Background task for the first idle thread; skipped if only one thread is used.
     """
 
@@ -49,7 +54,7 @@ def run_all(
         with one_blas_thread():
             return work(index)
 
-    n_threads = min(n, n_cpus())
+    n_threads = min(n, n_cpus(), n if most is None else max(most, 1))
     if n_threads < 2:
         return [alone(index) for index in range(n)]
     with one_blas_thread(), ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
@@ -115,29 +120,3 @@ def closest_in(tree: cKDTree, points: FloatArray, k: int = 1, within: float = np
     n_threads = n_cpus() if len(points) >= MANY else 1
     distance, index = tree.query(points, k=k, distance_upper_bound=within, workers=n_threads)
     return distance, index
-
-
-class Budget:
-    """A shared resource such as memory; threads block until enough of it is free.
-
-    Args:
-        total: The amount. Larger requests get all of it exclusively.
-    """
-
-    def __init__(self, total: int) -> None:
-        self._total = self._left = total
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def part(self, amount: int) -> Iterator[None]:
-        """Reserve an amount."""
-        amount = min(amount, self._total)
-        with self._changed:
-            self._changed.wait_for(lambda: self._left >= amount)
-            self._left -= amount
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._left += amount
-                self._changed.notify_all()

@@ -1,18 +1,16 @@
 """Stiffness and mass matrices of as-rigid-as-possible deformation on tetrahedra."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
 
-HessianForm = Literal["edge", "element", "vertex"]
-HESSIAN_FORMS: tuple[HessianForm, ...] = ("edge", "element", "vertex")
+HessianForm = Literal["edge", "vertex"]
+HESSIAN_FORMS: tuple[HessianForm, ...] = ("edge", "vertex")
 
 WEIGHT_FLOOR = 1e-3
 """Smallest edge weight of the vertex form, as a fraction of the mean magnitude."""
@@ -21,16 +19,15 @@ WEIGHT_FLOOR = 1e-3
 def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_matrix:
     """Hessian of the as-rigid-as-possible energy at rest, in the displacements ``u`` of the vertices.
 
-    All forms measure ``min_W ∫ |∇u - W|²`` over infinitesimal rotations ``W`` (skew matrices), with one rotation for
-    each edge, tetrahedron or vertex; all are positive semi-definite, with the rigid motions in the null space, and in
-    the same units, so that their eigenvalues can be compared.
+    Both forms measure ``min_W ∫ |∇u - W|²`` over infinitesimal rotations ``W`` (skew matrices), with one rotation for
+    each edge or vertex; both are positive semi-definite, with the rigid motions in the null space, and in the same
+    units, so that their eigenvalues can be compared.
 
     - ``"edge"``: ``sum_e vol_e |sym ∇u_e|²``, where ``∇u_e`` is the mean of ``∇u`` over the tetrahedra around an edge
       and ``vol_e`` a sixth of their volume (edge-based smoothed finite elements; Cazes and Meschke 2013 for
       tetrahedra). Linear tetrahedra are too stiff in bending, by half or more with one or two across a limb; smoothing
-      removes most of this error. It is bounded by the element form and about a fifth of it, so no mode is spurious.
+      removes most of this error. The energy is at least a fifth of that of linear tetrahedra, so no mode is spurious.
       Couples vertices whose tetrahedra share an edge.
-    - ``"element"``: ``sum_t vol_t |sym ∇u|²``. Couples vertices that share a tetrahedron.
     - ``"vertex"`` (Huang, Wicke, Adams and Guibas 2009): ``½ sum_i sum_{j in N(i)} c_ij |u_i - u_j - w_i ×
       (x_i - x_j)|²`` with the rotations ``w_i`` eliminated, ``K = L ⊗ I - Bᵀ C⁻¹ B``. Couples vertices two
       edges apart. The weights ``c_ij`` are the cotangent weights of the tetrahedra, **clamped from below** to
@@ -47,13 +44,9 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_m
     Raises:
         ValueError: ``form`` is unknown.
     """
-    if form == "edge":
-        return _edge_hessian(tetrahedra)
-    if form == "element":
-        return _element_hessian(tetrahedra)
-    if form == "vertex":
-        return _vertex_hessian(tetrahedra)
-    raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
+    if form not in HESSIAN_FORMS:
+        raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
+    return _edge_hessian(tetrahedra) if form == "edge" else _vertex_hessian(tetrahedra)
 
 
 def mass_matrix(tetrahedra: Tetrahedra) -> sp.csr_matrix:
@@ -65,49 +58,6 @@ def mass_matrix(tetrahedra: Tetrahedra) -> sp.csr_matrix:
     # For each tetrahedron: (1 + δ) / 20 if consistent, δ / 4 if lumped.
     entries = solid_volumes(tetrahedra)[:, None, None] * (np.full((4, 4), 1 / 40) + np.eye(4) * (1 / 40 + 1 / 8))
     return _assembled(entries, tetrahedra).tocsr()
-
-
-@dataclass(frozen=True)
-class Mass:
-    """Mass matrix of a tetrahedral mesh, the same for the three coordinates.
-
-    Attributes:
-        matrix: Entries for vertices, symmetric positive definite; diagonal if lumped. *Shape:* ``(N, N)``.
-    """
-
-    matrix: sp.csr_matrix
-
-    def lumped(self) -> FloatArray:
-        """Row sums: the mass of each vertex. *Shape:* ``(N,)``."""
-        return np.asarray(self.matrix.sum(axis=1)).reshape(-1)
-
-    def of_vertices(self, vertices: IntArray) -> "Mass":
-        """Submatrix of some vertices."""
-        return Mass(sp.csr_matrix(self.matrix[vertices][:, vertices]))
-
-    def for_coordinates(self) -> sp.csc_matrix:
-        """The matrix with rows and columns for each coordinate. *Shape:* ``(3N, 3N)``."""
-        return sp.kron(self.matrix, sp.identity(3), format="csc")
-
-    def __matmul__(self, columns: FloatArray) -> FloatArray:
-        """``M u`` for displacements with interleaved coordinates. *Shape:* ``(3N, k) -> (3N, k)``."""
-        n, k = columns.shape[0] // 3, columns.shape[1]
-        return (self.matrix @ np.ascontiguousarray(columns).reshape(n, 3 * k)).reshape(3 * n, k)
-
-    def orthonormal(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """QR factorisation in the M inner product: ``columns = q r`` with ``qᵀ M q = 1`` and upper triangular ``r``.
-
-        Linearly dependent columns also give an orthonormal ``q``.
-
-        Args:
-            columns: At most as many as rows. *Shape:* ``(3N, k)``.
-        """
-        root = np.sqrt(np.repeat(self.lumped(), 3))[:, None]
-        q, r = np.linalg.qr(root * columns)
-        q /= root
-        # Scaled by the lumped masses, the spectrum of M is within [1/5, 1]: the product is well conditioned.
-        upper = scipy.linalg.cholesky(q.T @ (self @ q))
-        return scipy.linalg.solve_triangular(upper, q.T, trans="T").T, upper @ r
 
 
 def dirichlet_matrix(tetrahedra: Tetrahedra, gradients: FloatArray) -> sp.coo_matrix:
@@ -136,29 +86,14 @@ def hat_gradients(tetrahedra: Tetrahedra) -> FloatArray:
     return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
 
 
-def _element_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
-    """Blocks ``K_ab = vol ((g_a · g_b) I + g_b g_aᵀ)``.
-
-    They follow from ``|sym G|² = ½ (|G|² + tr G²)`` with ``G = ∇u = Σ u_a g_aᵀ`` and hat gradients ``g``.
-    """
-    g = hat_gradients(tetrahedra)
-    volumes = solid_volumes(tetrahedra)
-    blocks = np.einsum("tbi,taj->tabij", g, g)
-    blocks += np.einsum("tak,tbk->tab", g, g)[..., None, None] * np.eye(3)
-    blocks *= volumes[:, None, None, None, None]
-    rows = np.broadcast_to(tetrahedra.tets[:, :, None], blocks.shape[:3])
-    columns = np.broadcast_to(tetrahedra.tets[:, None, :], blocks.shape[:3])
-    k = _from_blocks(blocks.reshape(-1, 3, 3), rows, columns, len(tetrahedra.vertices))
-    return sp.csc_matrix((k + k.T) / 2)  # symmetric to the last bit
-
-
 _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
 def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     """Blocks ``K_ab = sum_e vol_e ((g_a · g_b) I + g_b g_aᵀ)`` with the mean gradients ``g`` around each edge.
 
-    As in the element form; one sparse matrix product gives all ``g_a g_bᵀ``.
+    They follow from ``|sym G|² = ½ (|G|² + tr G²)`` with ``G = ∇u = Σ u_a g_aᵀ`` and hat gradients ``g``. One sparse
+    matrix product gives all ``g_a g_bᵀ``.
     """
     n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
     columns = 3 * tetrahedra.tets[:, :, None] + np.arange(3)

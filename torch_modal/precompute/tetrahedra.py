@@ -1,4 +1,4 @@
-"""Tetrahedral meshes and the protocol of meshers."""
+"""Tetrahedral meshes, and meshers, whose failures are remembered."""
 
 import threading
 from typing import Any, NamedTuple, Protocol
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
+from torch_modal.io.cache import Cache
 from torch_modal.precompute.surface import CanonicalSurface
 
 SMALL_AMOUNT = 0.01
@@ -31,6 +32,10 @@ class Tetrahedra(NamedTuple):
     tets: IntArray
     inside: FloatArray | None = None
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays by name, without those that are None."""
+        return {name: array for name, array in self._asdict().items() if array is not None}
+
 
 class TetrahedralizationError(RuntimeError):
     """The mesher failed; the message names the mesh, the reason and a remedy.
@@ -47,21 +52,17 @@ class TetrahedralizationError(RuntimeError):
 
 
 class Mesher(Protocol):
-    """Fills surfaces with tetrahedra. Its attributes are the settings.
-
-    A mesher is one file; an entry in :data:`~torch_modal.precompute.filling.MESHERS` gives it a name.
-    """
+    """Fills surfaces with tetrahedra. A mesher with a time limit has an attribute ``timeout``, in seconds."""
 
     def key(self) -> dict[str, Any]:
         """Cache key besides the surface: name, settings and versions, as numbers, strings or None."""
         ...
 
-    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
+    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         """Fill a surface with tetrahedra, in its units.
 
         Args:
             surface: A closed surface, or one that is nearly closed.
-            timeout: Time limit in seconds; a fast mesher may ignore it.
             stop: Event that cancels the work.
 
         Raises:
@@ -69,6 +70,31 @@ class Mesher(Protocol):
             StoppedError: ``stop`` was set.
         """
         ...
+
+
+def filled(surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> Tetrahedra:
+    """Tetrahedra of a mesher; it is not run where it failed before with at least as long a timeout.
+
+    Raises:
+        TetrahedralizationError: The mesher failed, now or earlier.
+    """
+    inputs, key = {"points": surface.points, "faces": surface.faces}, mesher.key()
+    failure, timeout = cache.find("failure", inputs, key), getattr(mesher, "timeout", np.inf)
+    if failure is not None and timeout <= (fails_until := float(failure["fails_until"][0])):
+        longer = f"give a timeout of more than {fails_until:g} s, " if np.isfinite(fails_until) else ""
+        raise TetrahedralizationError(
+            f"{failure['reason'].tobytes().decode()}. An earlier run found this for the same surface and settings, "
+            f"and it was not tried again; to try again, {longer}clear the cache in {cache.folder} "
+            "(torch-modal cache --clear), or do without it",
+            fails_until,
+        )
+    try:
+        return mesher.fill(surface, stop)
+    except TetrahedralizationError as error:
+        if error.fails_until > 0:
+            reason = np.frombuffer(str(error).encode(), dtype=np.uint8)
+            cache.keep("failure", inputs, key, {"reason": reason, "fails_until": np.array([error.fails_until])})
+        raise
 
 
 def tet_volumes(tetrahedra: Tetrahedra) -> FloatArray:
@@ -112,19 +138,6 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
     if volumes[debris].sum() > MOST_DEBRIS * volumes.sum():
         return tetrahedra
     return kept_tetrahedra(tetrahedra, ~debris[piece])
-
-
-def is_small(tetrahedra: Tetrahedra, piece: IntArray) -> BoolArray:
-    """Whether pieces have little volume and extent; false for the largest.
-
-    Args:
-        tetrahedra: Mesh of ``P`` pieces.
-        piece: Piece index of each tetrahedron. *Shape:* ``(T,)``.
-
-    Returns:
-        *Shape:* ``(P,)``.
-    """
-    return small_pieces(np.bincount(piece, solid_volumes(tetrahedra)), tetrahedra.vertices[tetrahedra.tets], piece)
 
 
 def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) -> BoolArray:

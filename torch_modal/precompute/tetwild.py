@@ -8,7 +8,7 @@ import tempfile
 import threading
 import time
 import zipfile
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.processes import describe_exit, end_process, last_line
-from torch_modal.precompute.surface import CanonicalSurface, outward
+from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
+BOX_DIAGONAL = 100.0
+"""Bounding-box diagonal of the surfaces that fTetWild gets."""
 EDGES_PER_THICKNESS = 0.65
 EDGE_RANGE = (0.018, 0.04)
 """Range of default edge lengths: one tetrahedron across a limb is far too stiff, bulky bodies need no finer ones."""
@@ -38,17 +39,19 @@ memory or threads run out."""
 
 
 @dataclass(frozen=True)
-class TetrahedraSettings:
-    """How fine the tetrahedra are. The defaults take about 2 s on meshes of 3k to 27k faces.
+class TetWild:
+    """The mesher ``"tetwild"``: fTetWild in a child process. The defaults take about 2 s on meshes of 3k to 27k faces.
+
+    fTetWild remeshes the surface within its tolerance, and is not deterministic. In a process of its own, crashes and
+    hangs become exceptions, and threads and data-loader workers may use it.
 
     Attributes:
         edge_length_fac: Ideal edge length as a fraction of the bounding-box diagonal; None takes about two
-            thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04. The lattice has cubes of
-            three quarters of it (default 0.04); larger ones if there would be too many.
+            thirds of the mean thickness (twice the volume over the area), from 0.018 to 0.04.
         epsilon: Largest distance of the tetrahedra's surface from the input, as a fraction of the diagonal.
-        stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is
-            10).
+        stop_energy: Quality at which fTetWild stops improving; lower is better and slower (its own default is 10).
         max_surface_faces: The surface is decimated to about this many faces first.
+        timeout: Seconds for a key-frame, after which the child process is killed.
 
     Raises:
         ValueError: A number is out of range (fTetWild hangs on an ``epsilon`` of zero, for example).
@@ -58,6 +61,7 @@ class TetrahedraSettings:
     epsilon: float = 4e-3
     stop_energy: float = 200.0
     max_surface_faces: int = 1500
+    timeout: float = 600.0
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -65,42 +69,47 @@ class TetrahedraSettings:
             ("epsilon", 1e-5, 0.1),
             ("stop_energy", 4.0, 1e6),
             ("max_surface_faces", 100, 10**8),
+            ("timeout", 0.0, np.inf),
         ):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise ValueError(f"{name} is {value}; give a number from {low:g} to {high:g}")
 
-    def edge_length(self, points: FloatArray, faces: IntArray) -> float:
-        """Edge length for a surface, as a fraction of its bounding-box diagonal.
-
-        Args:
-            points: *Shape:* ``(V, 3)``.
-            faces: *Shape:* ``(F, 3)``.
-        """
-        if self.edge_length_fac is not None:
-            return self.edge_length_fac
-        volume = abs(signed_volume(points - points.mean(axis=0), faces))
-        thickness = 2 * volume / vertex_areas(points, faces).sum() / np.linalg.norm(np.ptp(points, axis=0))
-        return float(np.clip(EDGES_PER_THICKNESS * thickness, *EDGE_RANGE))
-
-
-@dataclass(frozen=True)
-class TetWild:
-    """The mesher ``"tetwild"``: :func:`tetrahedralize`."""
-
-    settings: TetrahedraSettings = field(default_factory=TetrahedraSettings)
-
     def key(self) -> dict[str, Any]:
         """Settings, and the versions of the packages."""
-        return {
-            **asdict(self.settings),
-            **{name: _installed(name) for name in ("pytetwild", "fast-simplification")},
-            "mesher": "tetwild",
-        }
+        settings = {name: value for name, value in asdict(self).items() if name != "timeout"}
+        versions = {name: _installed(name) for name in ("pytetwild", "fast-simplification")}
+        return {"mesher": "tetwild", **settings, **versions}
 
-    def fill(self, surface: CanonicalSurface, timeout: float, stop: threading.Event) -> Tetrahedra:
-        """Tetrahedra that fill the surface."""
-        return tetrahedralize(surface.points, surface.faces, self.settings, timeout=timeout, stop=stop)
+    def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
+        """Fill a closed surface with tetrahedra of positive volume.
+
+        Args:
+            surface: The surface.
+            stop: Event that kills the child process.
+
+        Raises:
+            TetrahedralizationError: The child process crashed, took longer than the timeout, or gave no tetrahedra or
+                ones that do not fill the surface.
+            StoppedError: ``stop`` was set.
+        """
+        low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+        center, scale = (low + high) / 2, BOX_DIAGONAL / np.linalg.norm(high - low)
+        points = (surface.points - center) * scale
+        edge_length_fac = self.edge_length_fac
+        if edge_length_fac is None:
+            volume = abs(signed_volume(points, surface.faces))
+            thickness = 2 * volume / vertex_areas(points, surface.faces).sum() / BOX_DIAGONAL
+            edge_length_fac = float(np.clip(EDGES_PER_THICKNESS * thickness, *EDGE_RANGE))
+        settings = replace(self, edge_length_fac=edge_length_fac)
+        try:
+            raw = _run_worker(points, surface.faces, settings, stop)
+            tetrahedra = without_debris(oriented(raw))
+            _check_fills(tetrahedra, points, edge_length_fac, self.epsilon)
+        except TetrahedralizationError as error:
+            mesh = f"a mesh of {len(points)} vertices and {len(surface.faces)} faces"
+            raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.fails_until) from error
+        return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
 
 
 def _installed(name: str) -> str | None:
@@ -109,71 +118,15 @@ def _installed(name: str) -> str | None:
     return None  # the worker reports it
 
 
-def tetrahedralize(
-    vertices: FloatArray,
-    faces: IntArray,
-    settings: TetrahedraSettings | None = None,
-    *,
-    timeout: float = 600.0,
-    stop: threading.Event | None = None,
-) -> Tetrahedra:
-    """Fill a closed surface with tetrahedra.
-
-    fTetWild remeshes the surface within its tolerance, so the vertices of the surface are not among those
-    of the result: embed them with :func:`~torch_modal.precompute.embedding.fit_weights`. It is not
-    deterministic. It runs in a child process: crashes and hangs become exceptions, and threads and data-loader workers
-    may call this function.
-
-    Args:
-        vertices: Positions, any units. *Shape:* ``(V, 3)``.
-        faces: Vertex indices of a closed surface; unreferenced vertices are ignored. *Shape:*
-            ``(F, 3)``.
-        settings: How fine the tetrahedra are.
-        timeout: Seconds after which the child process is killed.
-        stop: Event that kills it.
-
-    Returns:
-        Tetrahedra in the units of ``vertices``: positive volumes, every vertex used.
-
-    Raises:
-        TetrahedralizationError: The child process crashed, took longer than ``timeout``, or gave no
-            tetrahedra or ones that do not fill the surface.
-        StoppedError: ``stop`` was set.
-    """
-    settings = settings or TetrahedraSettings()
-    used, compact = np.unique(faces, return_inverse=True)
-    surface = vertices[used]
-    center = (surface.min(axis=0) + surface.max(axis=0)) / 2
-    scale = CANONICAL_SIZE / np.linalg.norm(surface.max(axis=0) - surface.min(axis=0))
-    surface = (surface - center) * scale
-
-    compact = outward(surface, compact.reshape(-1, 3))
-    settings = replace(settings, edge_length_fac=settings.edge_length(surface, compact))
-    try:
-        raw = _run_worker(surface, compact, settings, timeout, stop or threading.Event())
-        tetrahedra = without_debris(oriented(raw))
-        _check_fills(tetrahedra, surface, settings)
-    except TetrahedralizationError as error:
-        mesh = f"a mesh of {len(vertices)} vertices and {len(faces)} faces"
-        raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.fails_until) from error
-    return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
-
-
-def _run_worker(
-    surface: FloatArray,
-    faces: IntArray,
-    settings: TetrahedraSettings,
-    timeout: float,
-    stop: threading.Event,
-) -> Tetrahedra:
-    """Run the worker process on the surface and read its result."""
+def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
+    """Run the worker process on a surface with a bounding-box diagonal of 100 and read its result."""
     if not sys.executable:
         raise TetrahedralizationError(
             "sys.executable is empty, so no worker process can be started. Run in a normal interpreter"
         )
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
         job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
-        np.savez(job, vertices=surface, faces=faces, timeout=timeout, **asdict(settings))
+        np.savez(job, vertices=points, faces=faces, **asdict(settings))
         command = [sys.executable, str(WORKER), str(job), str(result)]
         # Output goes to a file: a full pipe would block the child.
         with log.open("wb") as output:
@@ -187,14 +140,14 @@ def _run_worker(
                 start_new_session=True,
             )
         try:
-            code = _wait(process, timeout, stop)
+            code = _wait(process, settings.timeout, stop)
         finally:
             end_process(process)  # also on KeyboardInterrupt
         if code is None:
             raise TetrahedralizationError(
-                f"no result after the timeout of {timeout:g} s. "
+                f"no result after the timeout of {settings.timeout:g} s. "
                 "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections",
-                timeout,
+                settings.timeout,
             )
         if code != 0:
             tail = last_line(log.read_text(errors="replace"))
@@ -226,19 +179,19 @@ def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Even
                 return None
 
 
-def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: TetrahedraSettings) -> None:
-    """Reject a mesh that is empty, not finite, or does not cover the surface (diagonal 100)."""
+def _check_fills(tetrahedra: Tetrahedra, points: FloatArray, edge_length_fac: float, epsilon: float) -> None:
+    """Reject a mesh that is empty, not finite, or does not cover the surface (bounding-box diagonal 100)."""
     advice = (
         "Check that the surface is closed, its winding consistent, and no part thinner than "
-        f"{100 * settings.epsilon:g} % of the diagonal, or give a smaller epsilon"
+        f"{100 * epsilon:g} % of the diagonal, or give a smaller epsilon"
     )
     if len(tetrahedra.tets) == 0:
         raise TetrahedralizationError(f"the result is empty. {advice}", np.inf)
     if not np.isfinite(tetrahedra.vertices).all():
         raise TetrahedralizationError(f"the result has coordinates that are not finite. {advice}", np.inf)
     # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
-    reach = CANONICAL_SIZE * (0.05 + 2 * (settings.edge_length_fac or EDGE_RANGE[1]))
-    distance = cKDTree(tetrahedra.vertices).query(surface)[0]
+    reach = BOX_DIAGONAL * (0.05 + 2 * edge_length_fac)
+    distance = cKDTree(tetrahedra.vertices).query(points)[0]
     n_far = int((distance > reach).sum())
     if n_far:
         raise TetrahedralizationError(
@@ -246,6 +199,6 @@ def _check_fills(tetrahedra: Tetrahedra, surface: FloatArray, settings: Tetrahed
             "max_surface_faces if small parts were lost in the decimation",
             np.inf,
         )
-    low, high = surface.min(axis=0) - reach, surface.max(axis=0) + reach
+    low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
     if (tetrahedra.vertices < low).any() or (tetrahedra.vertices > high).any():
         raise TetrahedralizationError(f"the result reaches far beyond the surface. {advice}", np.inf)

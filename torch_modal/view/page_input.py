@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.data.batch.tree import natural
+from torch_modal.data.tree import natural
 from torch_modal.errors import MeshError
 from torch_modal.io.gltf_asset import GltfAsset
 from torch_modal.io.read import open_asset

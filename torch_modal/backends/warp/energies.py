@@ -10,7 +10,7 @@ from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.energies import CoarseEnergy, FineEnergy, FurtherTerms, RestShapes
 from torch_modal.backends.torch.fine_steps import FurtherEnergy
 from torch_modal.backends.warp.fine_steps import WarpSteps
-from torch_modal.backends.warp.modal_energy import WarpModalEnergy, reference_of
+from torch_modal.backends.warp.modal_energy import WarpModalEnergy
 from torch_modal.backends.warp.shell import WarpShell
 from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.shell import N_SHELL_TERMS
@@ -30,14 +30,14 @@ class WarpCoarseEnergy(CoarseEnergy):
 
     def reference(self, rests: RestShapes) -> Any:
         """Overrides the base class."""
-        return reference_of(self.shell, rests)
+        return self.shell.reference(rests)
 
     def softened(self, reference: Any, base: Tensor) -> Any:
         """Overrides the base class."""
-        full = self.fullness(1, base).to(reference.bend)
-        factors = torch.ones_like(reference.bend[..., 0]).index_copy(1, self.shell.interior, full)
-        weights, others = reference.bend.split([1, 6], -1)
-        return reference._replace(bend=torch.cat([factors[..., None] * weights, others], -1))
+        edges, hinges = reference.elements.split([2, 5], -1)
+        full = self.fullness(1, base).to(hinges)
+        factors = torch.ones_like(hinges[..., 0]).index_copy(1, self.shell.interior, full)
+        return reference._replace(elements=torch.cat([edges, factors[..., None] * hinges], -1))
 
 
 class WarpFineEnergy(FineEnergy):
@@ -58,7 +58,7 @@ class WarpFineEnergy(FineEnergy):
         if not alone and ((torch.is_grad_enabled() and x.requires_grad) or traced(x) or transformed(x)):
             return super().relax_chunk(x, rests, stages, beside)
         others = [*beside, *([] if self.further is None else [FurtherTerms(self.further, rests)])]
-        to, moved = reference_of(self.steps, rests), x
+        to, moved = self.steps.reference(rests), x
         for n_steps, n_products in stages:
             if alone:
                 moved = self.steps(moved, to, n_steps, n_products)

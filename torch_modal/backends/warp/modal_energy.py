@@ -7,13 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.autograd import applied, flattened, made_outside, pushed, recorded, traced, transformed
-from torch_modal.backends.torch.energies import RestShapes
-from torch_modal.backends.warp.launch import kernels, launch
+from torch_modal.autograd import made_outside, traced, transformed
+from torch_modal.backends.warp.launch import Constants, kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
-from torch_modal.energy.shell import N_SHELL_TERMS
-from torch_modal.energy.term import Mesh, PeriodicTerm, Term
+from torch_modal.energy.term import Mesh
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8
@@ -23,82 +21,6 @@ _BLOCKS_OF_PRODUCTS = 16
 
 MOST_NUMBERS = 2**27
 """Of an array that all samples of a batch have at a time (1 GiB): kernels index with 32 bits, and memory is finite."""
-
-
-def shell_reference(shell: WarpShell, first: Tensor, second: Tensor, t: Tensor, *stiffness: Tensor) -> ShellReference:
-    """:meth:`WarpShell.reference`, of tensors of any dtype, for all that autograd and ``torch.func`` do."""
-    given = [value.double() for value in (first, second, t, *stiffness)]
-    return shell.reference_by_torch(*given) if traced(t) else ShellReference(*applied(_Referred, shell, *given))
-
-
-def reference_of(shell: WarpShell, rests: RestShapes) -> ShellReference:
-    """The reference towards the terms of Eq. 5 of rest shapes."""
-    return merged_reference(shell, rests.shapes, rests.weights, *rests.stiffness[:N_SHELL_TERMS])
-
-
-def merged_reference(shell: WarpShell, shapes: Tensor, weights: Tensor, *stiffness: Tensor) -> ShellReference:
-    """The reference towards K rest shapes of each sample: Eq. 8 for any number of them.
-
-    Args:
-        shell: The energy.
-        shapes: *Shape:* ``(B, K, V, 3)``.
-        weights: *Shape:* ``(B, K)``.
-        stiffness: Of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``.
-    """
-    flat, n = shapes.flatten(0, 1), shapes.shape[1]
-    if n == 2:
-        return shell_reference(shell, *shapes.unbind(1), weights[:, 1], *stiffness)
-    alone = (value.repeat_interleave(n, 0) for value in stiffness)
-    own = shell_reference(shell, flat, flat, flat.new_zeros(len(flat)), *alone)
-    stretch, bend, hard, volume, _ = (value.unflatten(0, weights.shape) for value in own)
-    weights = weights.to(stretch)[..., None]
-    lengths = Term().merged(stretch[..., 1], weights * stretch[..., 0])
-    volumes = Term().merged(volume[..., None], weights * hard[..., None])
-    angles = PeriodicTerm().merged(torch.atan2(bend[..., 2], bend[..., 1]), weights * bend[..., 0])
-    angle, *moments = angles.measures.unbind(-2)
-    # Weights are doubled, for derivatives.
-    constant = 0.5 * (lengths.constant.sum(-1) + volumes.constant.squeeze(-1))
-    return ShellReference(
-        torch.stack([lengths.weights, lengths.measures.squeeze(-2)], -1),
-        torch.stack([angles.weights, angle.cos(), angle.sin(), *moments], -1),
-        volumes.weights.squeeze(-1),
-        volumes.measures.flatten(),
-        constant,
-    )
-
-
-class _Referred(torch.autograd.Function):
-    @staticmethod
-    def forward(shell: WarpShell, *given: Tensor) -> tuple[Tensor, ...]:
-        return tuple(shell.reference(*(value.detach().contiguous() for value in given)))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.shell, *given = inputs
-        ctx.mark_non_differentiable(output[-1])
-        ctx.save_for_backward(*given)
-        ctx.save_for_forward(*given)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        given = ctx.saved_tensors
-        found = pushed(lambda *given: tuple(ctx.shell.reference_by_torch(*given)), given, tangents[1:])
-        return *found[:-1], None
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        given = ctx.saved_tensors
-        if recorded(*grads, *given):
-            return (None, *torch.func.vjp(lambda *given: tuple(ctx.shell.reference_by_torch(*given)), *given)[1](grads))
-        received = ShellReference(*(grad.contiguous() for grad in grads))
-        return (None, *ctx.shell.from_reference(received, *(value.detach().contiguous() for value in given)))
-
-    @staticmethod
-    def vmap(
-        info: Any, in_dims: tuple[Any, ...], shell: WarpShell, *given: Tensor
-    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        found = _Referred.apply(shell, *flattened(info.batch_size, in_dims[1:], given))
-        return tuple(value.unflatten(0, (info.batch_size, -1)) for value in found), (0,) * len(found)
 
 
 class WarpModalEnergy(ModalEnergy):
@@ -115,22 +37,22 @@ class WarpModalEnergy(ModalEnergy):
 
     flat: Tensor
     blocks: Tensor
-    pairs: Tensor
-    slots: Tensor
-    face_slots: Tensor
 
     def __init__(self, shell: WarpShell, mesh: Mesh, columns: Tensor) -> None:
         super().__init__(shell.energy, columns)
         self._shell = (shell,)
-        places = self.curvature.places.int()
-        n_edges, n_hinges = len(shell.record), len(shell.interior)
-        slots = places.new_zeros(n_edges, 7)
-        slots[:, 0] = places[:n_edges]
-        slots[shell.interior, 1:] = places[n_edges : n_edges + 6 * n_hinges].unflatten(0, (6, -1)).T
-        self.register_buffer("slots", slots, persistent=False)
-        capped_faces = places[n_edges + 6 * n_hinges :].unflatten(0, (3, -1)).T.contiguous()
-        self.register_buffer("face_slots", capped_faces, persistent=False)
-        self.register_buffer("pairs", self.curvature.pairs.int(), persistent=False)
+        places = self.curvature.places.int().cpu()
+        on_edges, on_hinges, on_faces = places.split([shell.n_edges, 6 * shell.n_hinges, 3 * shell.n_faces])
+        edges = places.new_zeros(shell.n_edges, 7)
+        edges[:, 0] = on_edges
+        edges[shell.interior.cpu(), 1:] = on_hinges.view(6, -1).T
+        arrays = {
+            "edges": edges,
+            "faces": on_faces.view(3, -1).T.contiguous(),
+            "pairs": self.curvature.pairs.int().cpu(),
+        }
+        #: Places of second derivatives, as an argument of kernels.
+        self.slots = Constants("modal", "slots", **{name: x for name, x in arrays.items()})
         self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
         rows = self.columns.permute(2, 1, 0).flatten(0, 1)
         blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()
@@ -219,8 +141,8 @@ class WarpModalEnergy(ModalEnergy):
     def _chunks(self, a: Tensor, placement: Placement) -> list[tuple[Tensor, Placement]]:
         """Samples whose derivatives are taken at a time."""
         shell, width = self.shell, self.blocks.shape[1]
-        rows = len(shell.record) + len(shell.interior) + 1, len(self.blocks)
-        most = max(1, MOST_NUMBERS // max(width * max(rows), 18 * len(self.pairs)))
+        rows = shell.n_edges + shell.n_hinges + 1, len(self.blocks)
+        most = max(1, MOST_NUMBERS // max(width * max(rows), 18 * len(self.curvature.pairs)))
         if len(a) <= most:
             return [(a, placement)]
         every = [slice(i, i + most) for i in range(0, len(a), most)]
@@ -230,12 +152,11 @@ class WarpModalEnergy(ModalEnergy):
         to: Any = placement.reference
         x, shell = self._shapes(a, placement.base), self.shell
         (b, n), blocks = (len(x), len(self.columns)), self.blocks.double()
-        n_measures = len(shell.record) + len(shell.interior)
+        n_measures = shell.n_edges + shell.n_hinges
         # One row for each measure, the last for the volume; the residuals are a column like the others.
         jacobian, stiffness = x.new_empty(b, n_measures + 1, blocks.shape[1]), to.stiffness.clone()
-        given = [x, shell.record, shell.hinge, to.stretch, to.bend, blocks, None, shell.n_vertices, n]
-        given += [blocks.shape[1] // _BLOCK, n_measures + 1, jacobian, jacobian, stiffness]
-        launch(kernels("modal").jacobian, (b, len(shell.record)), given)
+        given = [shell.constants, x, to.elements, blocks, n, blocks.shape[1] // _BLOCK, n_measures + 1]
+        launch(kernels("modal").jacobian, (b, shell.n_edges), [*given, jacobian, jacobian, stiffness])
         volume, normal = shell.volume(x)
         root, off, last = to.stiffness.sqrt()[:, None], volume - to.volume, jacobian[:, -1]
         last[:, :n] = normal.flatten(1) @ self.flat.double().mT
@@ -263,13 +184,11 @@ class WarpModalEnergy(ModalEnergy):
         to: Any = placement.reference
         shell, n_pairs = self.shell, len(self.curvature.pairs)
         found = x.new_zeros(len(x), 2 * n_pairs, 3, 3)
-        given = [x, shell.record, to.stretch, to.bend, self.slots, shell.n_vertices, 2 * n_pairs, found]
-        launch(kernels("modal").curved_edges, (len(x), len(shell.record)), given)
-        given = [x, shell.centre(x), shell.capped_faces, moment, self.face_slots, shell.n_vertices, 2 * n_pairs, found]
-        launch(kernels("modal").curved_faces, (len(x), len(shell.capped_faces)), given)
+        given = [shell.constants, self.slots, x, to.elements, shell.centre(x), moment, found]
+        launch(kernels("modal").curvature, (len(x), max(shell.n_edges, shell.n_faces)), given)
         columns, n = self.blocks.double(), len(self.columns)
         pushed = x.new_zeros(len(x), *columns.shape)
-        given = [self.pairs, found, columns, None, len(columns) // 3, n, columns.shape[1] // _BLOCK, pushed, pushed]
+        given = [self.slots, found, columns, len(columns) // 3, columns.shape[1] // _BLOCK, pushed]
         launch(kernels("modal").curved_columns, (len(x), n_pairs), given)
         return (columns.mT @ pushed)[:, :n, :n]
 

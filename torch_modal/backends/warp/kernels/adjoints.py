@@ -6,7 +6,7 @@ function that it calls does (``add_sides``, ``enclosed``) is done once more: suc
 
 import warp as wp
 
-from torch_modal.backends.warp.kernels import references, rotations, shell
+from torch_modal.backends.warp.kernels import rotations, shell
 
 
 def _with_adjoint(kernel: wp.Kernel) -> wp.Kernel:
@@ -14,7 +14,7 @@ def _with_adjoint(kernel: wp.Kernel) -> wp.Kernel:
 
 
 trajectory_edges = _with_adjoint(rotations.trajectory_edges)
-weigh = _with_adjoint(references.weigh)
-sizes = _with_adjoint(references.sizes)
-rest = _with_adjoint(references.rest)
+sizes = _with_adjoint(shell.sizes)
+rest_sums = _with_adjoint(shell.rest_sums)
+merge = _with_adjoint(shell.merge)
 linearise = _with_adjoint(shell.linearise)

@@ -1,6 +1,7 @@
-"""Types and functions of one edge, hinge or vertex, shared by all kernels."""
+"""Types and functions of one edge, hinge or face, shared by all kernels."""
 
 import warp as wp
+from torch import Tensor
 
 from torch_modal.energy.bend import COLLAPSED
 
@@ -9,19 +10,47 @@ vec3 = wp.vec3d
 vec4 = wp.vec4d
 symmetric = wp.types.vector(length=6, dtype=real)
 """Entries ``xx, xy, xz, yy, yz, zz`` of a symmetric matrix."""
-stretched = wp.types.vector(length=5, dtype=real)
-"""An edge: unit vector, stiffness across it, and how much more along it."""
-moments = wp.types.vector(length=7, dtype=real)
-"""Rest angles of a hinge: doubled weight, ``cos, sin`` of one, and the four moments of the differences from it."""
-bent = wp.types.vector(length=10, dtype=real)
-"""A hinge: gradients of the angle in the edge and in both tips, and the stiffness."""
+moments = wp.types.vector(length=5, dtype=real)
+"""Sums over rest angles: doubled weight, then that times ``cos``, ``sin``, and ``cos``, ``sin`` of twice the angle."""
+rested = wp.types.vector(length=7, dtype=real)
+"""What an edge and its hinge are compared with: doubled weight and length of the edge, then the moments."""
+linearised = wp.types.vector(length=15, dtype=real)
+"""Factors of an edge and its hinge in the convex Hessian: unit vector, stiffness across and how much more along it;
+gradients of the angle in the edge and in both tips, and the stiffness."""
 
 TINY = wp.constant(real(1.4916681462400413e-154))  # vectors.tiny of float64
 TINIEST = wp.constant(real(2.2250738585072014e-308))
 FLAT = wp.constant(real(COLLAPSED))
 HALF = wp.constant(real(0.5))
-THIRD = wp.constant(real(1 / 3))
+SIXTH = wp.constant(real(1 / 6))
 LARGEST = wp.constant(0x7FFFFFFF)
+
+
+@wp.struct
+class Mesh:
+    record: wp.array(dtype=wp.vec4i)
+    """Vertices of each edge and of its hinge, whose tips are -1 where it has none."""
+    hinge: wp.array(dtype=wp.int32)
+    """Number of the hinge of each edge."""
+    capped_faces: wp.array(dtype=wp.vec3i)
+    """Faces, and cones from the boundary to the centre, a vertex of -1."""
+    n_vertices: int
+
+
+def mesh(
+    device: object,
+    record: Tensor,
+    hinge: Tensor,
+    capped_faces: Tensor,
+    n_vertices: int,
+) -> Mesh:
+    """The constants of a mesh on a device."""
+    made = Mesh()
+    made.record = wp.array(record.numpy(), dtype=wp.vec4i, device=device)
+    made.hinge = wp.array(hinge.numpy(), dtype=wp.int32, device=device)
+    made.capped_faces = wp.array(capped_faces.numpy(), dtype=wp.vec3i, device=device)
+    made.n_vertices = n_vertices
+    return made
 
 
 @wp.func
@@ -33,12 +62,6 @@ def place(start: int, i: int):
 @wp.func
 def length_of(e: vec3):
     return wp.sqrt(wp.max(wp.dot(e, e), TINY))
-
-
-@wp.func
-def is_flat(e: vec3, n: vec3):
-    bound = FLAT * wp.dot(e, e)
-    return wp.dot(n, n) <= bound * bound + TINY
 
 
 @wp.func
@@ -55,56 +78,89 @@ def applied(m: symmetric, g: vec3):
     )
 
 
-@wp.func
-def phase_of(e: vec3, b: vec3, n1: vec3, n2: vec3):
-    """Cosine and sine of the dihedral angle."""
-    scale = real(1.0) / wp.sqrt(wp.dot(n1, n1) * wp.dot(n2, n2))
-    return wp.vec2d(scale * wp.dot(n1, n2), -scale * length_of(e) * wp.dot(n1, b))
+# ------------------------------------------------------------------------------------------------------------- hinges
+@wp.struct
+class Hinge:
+    e: vec3
+    a: vec3
+    b: vec3
+    n1: vec3
+    n2: vec3
+    flat: bool
 
 
 @wp.func
-def turn_between(p: wp.vec2d, q: wp.vec2d):
-    """``1 - cos`` and ``sin`` of the angle from the one phase to the other."""
-    d = q - p
-    return wp.vec2d(HALF * wp.dot(d, d), p[0] * q[1] - p[1] * q[0])
+def is_flat(e: vec3, n: vec3):
+    bound = FLAT * wp.dot(e, e)
+    return wp.dot(n, n) <= bound * bound + TINY
 
 
 @wp.func
-def doubled(d: wp.vec2d):
-    """The same of twice the angle."""
-    return wp.vec2d(real(2.0) * d[1] * d[1], real(2.0) * d[1] * (real(1.0) - d[0]))
+def hinge_of(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
+    """The edge, the vectors to both tips, and the normals of the hinge of a record."""
+    h = Hinge()
+    origin = x[place(at, q[0])]
+    h.e = x[place(at, q[1])] - origin
+    h.a = x[place(at, q[2])] - origin
+    h.b = x[place(at, q[3])] - origin
+    h.n1 = wp.cross(h.e, h.a)
+    h.n2 = wp.cross(h.b, h.e)
+    h.flat = is_flat(h.e, h.n1) or is_flat(h.e, h.n2)
+    return h
 
 
 @wp.func
-def bend_energy(p: wp.vec2d, w: moments):
-    """Twice the energy of a hinge: :class:`torch_modal.energy.term.PeriodicTerm`."""
-    d = turn_between(wp.vec2d(w[1], w[2]), p)
-    e = doubled(d)
-    first = w[3] * (real(1.0) - d[0]) - w[4] * d[1]
-    second = w[5] * (real(1.0) - e[0]) - w[6] * e[1]
-    return w[0] * (d[0] * (real(2.0) + d[0] * THIRD) + real(8.0) * THIRD * first - HALF * THIRD * second)
+def phase_of(h: Hinge):
+    """Cosine and sine of the dihedral angle of a hinge that is not flat."""
+    scale = real(1.0) / wp.sqrt(wp.dot(h.n1, h.n1) * wp.dot(h.n2, h.n2))
+    return wp.vec2d(scale * wp.dot(h.n1, h.n2), -scale * length_of(h.e) * wp.dot(h.n1, h.b))
 
 
 @wp.func
-def bend_slope(p: wp.vec2d, w: moments):
+def doubled(p: wp.vec2d):
+    """Cosine and sine of twice the angle."""
+    return wp.vec2d(p[0] * p[0] - p[1] * p[1], real(2.0) * p[0] * p[1])
+
+
+@wp.func
+def angle_gradients(h: Hinge):
+    """Gradients of the dihedral angle in the edge and in both tips, of a hinge that is not flat."""
+    length = length_of(h.e)
+    ga = (-length / wp.dot(h.n1, h.n1)) * h.n1
+    gb = (-length / wp.dot(h.n2, h.n2)) * h.n2
+    ge = (real(-1.0) / wp.dot(h.e, h.e)) * (wp.dot(h.a, h.e) * ga + wp.dot(h.b, h.e) * gb)
+    return ge, ga, gb
+
+
+# The function of torch_modal.energy.term.PeriodicTerm is 5/2 - 8/3 cos d + 1/6 cos 2d.
+ALL = wp.constant(real(5 / 2))
+ONCE = wp.constant(real(8 / 3))
+FOUR_THIRDS = wp.constant(real(4 / 3))
+THIRD = wp.constant(real(1 / 3))
+
+
+@wp.func
+def bend_energy(p: wp.vec2d, w: rested):
+    """Twice the energy of a hinge."""
+    t = doubled(p)
+    return ALL * w[2] - ONCE * (w[3] * p[0] + w[4] * p[1]) + SIXTH * (w[5] * t[0] + w[6] * t[1])
+
+
+@wp.func
+def bend_slope(p: wp.vec2d, w: rested):
     """First derivative of the energy in the angle."""
-    d = turn_between(wp.vec2d(w[1], w[2]), p)
-    e = doubled(d)
-    first = w[3] * d[1] + w[4] * (real(1.0) - d[0])
-    second = w[5] * e[1] + w[6] * (real(1.0) - e[0])
-    return w[0] * (d[1] * (real(1.0) + THIRD * d[0]) - real(4.0) * THIRD * first + HALF * THIRD * second)
+    t = doubled(p)
+    return FOUR_THIRDS * (w[3] * p[1] - w[4] * p[0]) - SIXTH * (w[5] * t[1] - w[6] * t[0])
 
 
 @wp.func
-def bend_beyond(p: wp.vec2d, w: moments):
+def bend_beyond(p: wp.vec2d, w: rested):
     """Second derivative beyond that of the square."""
-    d = turn_between(wp.vec2d(w[1], w[2]), p)
-    e = doubled(d)
-    first = w[3] * (real(1.0) - d[0]) - w[4] * d[1]
-    second = w[5] * (real(1.0) - e[0]) - w[6] * e[1]
-    return w[0] * THIRD * (second - real(2.0) * d[0] * d[0] - real(4.0) * first)
+    t = doubled(p)
+    return FOUR_THIRDS * (w[3] * p[0] + w[4] * p[1]) - THIRD * (w[5] * t[0] + w[6] * t[1]) - w[2]
 
 
+# -------------------------------------------------------------------------------------------------------------- faces
 @wp.func
 def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
     found = centre
@@ -114,11 +170,9 @@ def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
 
 
 @wp.func
-def middle_of(
-    x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), capped_faces: wp.array(dtype=wp.vec3i), sample: int, at: int
-):
+def middle_of(mesh: Mesh, x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), sample: int):
     """The origin of volumes: the centre; any vertex where the surface is closed."""
-    found = x[place(at, capped_faces[0][0])]
+    found = x[place(sample * mesh.n_vertices, mesh.capped_faces[0][0])]
     if centre:
         found = centre[sample]
     return found

@@ -1,39 +1,67 @@
 """Eq. 5 through the columns of a modal space: the Jacobian, and the second-order term."""
 
 import warp as wp
+from torch import Tensor
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
+    SIXTH,
     TINY,
+    Mesh,
+    angle_gradients,
     bend_beyond,
     bend_slope,
     corner,
-    is_flat,
+    hinge_of,
     length_of,
     middle_of,
-    moments,
     phase_of,
     place,
     real,
+    rested,
     vec3,
 )
 
 wide = wp.types.vector(length=8, dtype=real)
 """A row's entries of eight columns."""
 seven = wp.types.vector(length=7, dtype=wp.int32)
-"""Where the block of an edge goes, and the six of its hinge."""
+"""Places of the block of an edge, and of the six of its hinge."""
+
+
+@wp.struct
+class Slots:
+    edges: wp.array(dtype=seven)
+    faces: wp.array(dtype=wp.vec3i)
+    pairs: wp.array(dtype=wp.vec2i)
+
+
+def slots(device: object, edges: Tensor, faces: Tensor, pairs: Tensor) -> Slots:
+    """Places of the second derivatives among the pairs of vertices, on a device."""
+    made = Slots()
+    made.edges = wp.array(edges.numpy(), dtype=seven, device=device)
+    made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
+    made.pairs = wp.array(pairs.numpy(), dtype=wp.vec2i, device=device)
+    return made
+
+
+@wp.func
+def along_edge(columns: wp.array(dtype=wide), g: vec3, start: int, end: int, n_blocks: int, c: int):
+    """Change of an edge vector along eight columns, projected on a vector."""
+    y = c + n_blocks
+    z = y + n_blocks
+    return (
+        g[0] * (columns[place(end, c)] - columns[place(start, c)])
+        + g[1] * (columns[place(end, y)] - columns[place(start, y)])
+        + g[2] * (columns[place(end, z)] - columns[place(start, z)])
+    )
 
 
 @wp.kernel(enable_backward=False)
 def jacobian(
+    mesh: Mesh,
     x: wp.array(dtype=vec3),
-    record: wp.array(dtype=wp.vec4i),
-    hinge: wp.array(dtype=wp.int32),
-    stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=moments),
+    rests: wp.array(dtype=rested),
     columns: wp.array(dtype=wide),
-    extra: wp.array(dtype=vec3),
-    n: int,
     n_columns: int,
     n_blocks: int,
     n_rows: int,
@@ -42,80 +70,55 @@ def jacobian(
     stiffness: wp.array(dtype=real),
     threads: int,
 ):
-    """Change of each measure along the columns and along one more that is the sample's own, and the measure's residual.
+    """Change of each measure along the columns, and the measure's residual.
 
     All by the root of its weight. The residual comes in the column after the last. A component of a vertex has a row of
     blocks of eight columns; those of the measures are the same memory twice.
     """
     i = wp.tid()
     s = i // threads
-    v = s * n
-    residual = n_columns
-    if extra:
-        residual += 1
+    v = s * mesh.n_vertices
     total = real(0.0)
-    for k in range(i - s * threads, record.shape[0], threads):
-        q = record[place(k, 0)]
-        at = place(s * record.shape[0], k)
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        w = rests[place(s * mesh.record.shape[0], k)]
         o = 3 * n_blocks * q[0]
         j = 3 * n_blocks * q[1]
         row = s * n_rows + k
-        origin = x[place(v, q[0])]
-        e = x[place(v, q[1])] - origin
+        e = x[place(v, q[1])] - x[place(v, q[0])]
         length = length_of(e)
-        wanted = stretch[at]
-        root = wp.sqrt(wanted[0])
+        root = wp.sqrt(w[0])
         g = vec3()
         if wp.dot(e, e) > TINY:
             g = (root / length) * e
         for c in range(n_blocks):
-            y = c + n_blocks
-            z = y + n_blocks
-            out[place(row * n_blocks, c)] = (
-                g[0] * (columns[place(j, c)] - columns[place(o, c)])
-                + g[1] * (columns[place(j, y)] - columns[place(o, y)])
-                + g[2] * (columns[place(j, z)] - columns[place(o, z)])
-            )
-        if extra:
-            entries[place(row * n_blocks * 8, n_columns)] = wp.dot(g, extra[place(v, q[1])] - extra[place(v, q[0])])
-        entries[place(row * n_blocks * 8, residual)] = root * (length - wanted[1])
-        total += wanted[0]
+            out[place(row * n_blocks, c)] = along_edge(columns, g, o, j, n_blocks, c)
+        entries[place(row * n_blocks * 8, n_columns)] = root * (length - w[1])
+        total += w[0]
         if q[2] >= 0:
-            row = s * n_rows + record.shape[0] + hinge[place(k, 0)]
-            a = 3 * n_blocks * q[2]
-            b = 3 * n_blocks * q[3]
-            tip_a = x[place(v, q[2])] - origin
-            tip_b = x[place(v, q[3])] - origin
-            n1 = wp.cross(e, tip_a)
-            n2 = wp.cross(tip_b, e)
-            w = bend[at]
+            row = s * n_rows + mesh.record.shape[0] + mesh.hinge[place(k, 0)]
+            h = hinge_of(x, v, q)
             ge = vec3()
             ga = vec3()
             gb = vec3()
             off = real(0.0)
-            if not (is_flat(e, n1) or is_flat(e, n2)):
-                stiff = wp.sqrt(w[0])
+            stiff = real(0.0)
+            if not h.flat:
+                stiff = wp.sqrt(w[2])
+                ge, ga, gb = angle_gradients(h)
                 if stiff > real(0.0):
-                    off = bend_slope(phase_of(e, tip_b, n1, n2), w) / stiff
-                ga = (-stiff * length / wp.dot(n1, n1)) * n1
-                gb = (-stiff * length / wp.dot(n2, n2)) * n2
-                ge = (real(-1.0) / wp.dot(e, e)) * (wp.dot(tip_a, e) * ga + wp.dot(tip_b, e) * gb)
-                total += w[0]
-            gi = -(ge + ga + gb)
+                    off = bend_slope(phase_of(h), w) / stiff
+                total += w[2]
+            ge = stiff * ge
+            ga = stiff * ga
+            gb = stiff * gb
             for c in range(n_blocks):
-                y = c + n_blocks
-                z = y + n_blocks
                 out[place(row * n_blocks, c)] = (
-                    (gi[0] * columns[place(o, c)] + gi[1] * columns[place(o, y)] + gi[2] * columns[place(o, z)])
-                    + (ge[0] * columns[place(j, c)] + ge[1] * columns[place(j, y)] + ge[2] * columns[place(j, z)])
-                    + (ga[0] * columns[place(a, c)] + ga[1] * columns[place(a, y)] + ga[2] * columns[place(a, z)])
-                    + (gb[0] * columns[place(b, c)] + gb[1] * columns[place(b, y)] + gb[2] * columns[place(b, z)])
+                    along_edge(columns, ge, o, j, n_blocks, c)
+                    + along_edge(columns, ga, o, 3 * n_blocks * q[2], n_blocks, c)
+                    + along_edge(columns, gb, o, 3 * n_blocks * q[3], n_blocks, c)
                 )
-            if extra:
-                start = extra[place(v, q[0])]
-                along = wp.dot(ge, extra[place(v, q[1])] - start) + wp.dot(ga, extra[place(v, q[2])] - start)
-                entries[place(row * n_blocks * 8, n_columns)] = along + wp.dot(gb, extra[place(v, q[3])] - start)
-            entries[place(row * n_blocks * 8, residual)] = off
+            entries[place(row * n_blocks * 8, n_columns)] = off
     wp.atomic_add(stiffness, s, total)
 
 
@@ -134,84 +137,78 @@ def half_of_hinge(e: vec3, tip: vec3, normal: vec3, w: vec3, length: real):
 
 
 @wp.kernel(enable_backward=False)
-def curved_edges(
+def curvature(
+    mesh: Mesh,
+    slots: Slots,
     x: wp.array(dtype=vec3),
-    record: wp.array(dtype=wp.vec4i),
-    stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=moments),
-    slots: wp.array(dtype=seven),
-    n: int,
-    n_slots: int,
+    rests: wp.array(dtype=rested),
+    centre: wp.array(dtype=vec3),
+    moment: wp.array(dtype=real),
     out: wp.array(dtype=wp.mat33d),
     threads: int,
 ):
-    """The second-order term between the pairs of vertices of edges and hinges: assembly.Curvature."""
+    """The second-order term between pairs of vertices: assembly.Curvature. The moment is the volume's."""
     i = wp.tid()
     s = i // threads
-    v = s * n
-    to = s * n_slots
-    for k in range(i - s * threads, record.shape[0], threads):
-        q = record[place(k, 0)]
-        at = place(s * record.shape[0], k)
-        slot = slots[place(k, 0)]
-        origin = x[place(v, q[0])]
-        e = x[place(v, q[1])] - origin
-        base = wp.dot(e, e)
+    v = s * mesh.n_vertices
+    to = 2 * s * slots.pairs.shape[0]
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        w = rests[place(s * mesh.record.shape[0], k)]
+        slot = slots.edges[place(k, 0)]
+        e = x[place(v, q[1])] - x[place(v, q[0])]
         length = length_of(e)
-        wanted = stretch[at]
-        slope = wanted[0] * (length - wanted[1])
-        if base > TINY:
+        if wp.dot(e, e) > TINY:
             unit = e / length
-            wp.atomic_add(
-                out, place(to, slot[0]), (slope / length) * (wp.outer(unit, unit) - wp.identity(3, dtype=real))
-            )
+            slope = w[0] * (length - w[1]) / length
+            wp.atomic_add(out, place(to, slot[0]), slope * (wp.outer(unit, unit) - wp.identity(3, dtype=real)))
         if q[2] >= 0:
-            a = x[place(v, q[2])] - origin
-            b = x[place(v, q[3])] - origin
-            n1 = wp.cross(e, a)
-            n2 = wp.cross(b, e)
-            if not (is_flat(e, n1) or is_flat(e, n2)):
-                w = bend[at]
-                phase = phase_of(e, b, n1, n2)
-                moment = bend_slope(phase, w)
+            h = hinge_of(x, v, q)
+            if not h.flat:
+                phase = phase_of(h)
+                slope = bend_slope(phase, w)
                 beyond = bend_beyond(phase, w)
-                ga = (-length / wp.dot(n1, n1)) * n1
-                gb = (-length / wp.dot(n2, n2)) * n2
-                ge = (real(-1.0) / base) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)
+                ge, ga, gb = angle_gradients(h)
                 gi = -(ga + gb + ge)
-                own1, across1, rest1 = half_of_hinge(e, a, n1, wp.cross(n1, e), length)
-                own2, across2, rest2 = half_of_hinge(e, b, n2, wp.cross(e, n2), length)
-                wp.atomic_add(out, place(to, slot[1]), beyond * wp.outer(gi, ge) - moment * (own1 + own2))
-                wp.atomic_add(out, place(to, slot[2]), beyond * wp.outer(ga, gi) - moment * rest1)
-                wp.atomic_add(out, place(to, slot[3]), beyond * wp.outer(ga, ge) + moment * across1)
-                wp.atomic_add(out, place(to, slot[4]), beyond * wp.outer(gb, gi) - moment * rest2)
-                wp.atomic_add(out, place(to, slot[5]), beyond * wp.outer(gb, ge) + moment * across2)
+                own1, across1, rest1 = half_of_hinge(e, h.a, h.n1, wp.cross(h.n1, e), length)
+                own2, across2, rest2 = half_of_hinge(e, h.b, h.n2, wp.cross(e, h.n2), length)
+                wp.atomic_add(out, place(to, slot[1]), beyond * wp.outer(gi, ge) - slope * (own1 + own2))
+                wp.atomic_add(out, place(to, slot[2]), beyond * wp.outer(ga, gi) - slope * rest1)
+                wp.atomic_add(out, place(to, slot[3]), beyond * wp.outer(ga, ge) + slope * across1)
+                wp.atomic_add(out, place(to, slot[4]), beyond * wp.outer(gb, gi) - slope * rest2)
+                wp.atomic_add(out, place(to, slot[5]), beyond * wp.outer(gb, ge) + slope * across2)
                 wp.atomic_add(out, place(to, slot[6]), beyond * wp.outer(ga, gb))
+    middle = middle_of(mesh, x, centre, s)
+    sixth = SIXTH * moment[s]
+    for k in range(i - s * threads, mesh.capped_faces.shape[0], threads):
+        face = mesh.capped_faces[place(k, 0)]
+        places = slots.faces[place(k, 0)]
+        wp.atomic_add(out, place(to, places[0]), -wp.skew(sixth * (corner(x, middle, v, face[2]) - middle)))
+        wp.atomic_add(out, place(to, places[1]), -wp.skew(sixth * (x[place(v, face[0])] - middle)))
+        wp.atomic_add(out, place(to, places[2]), -wp.skew(sixth * (x[place(v, face[1])] - middle)))
 
 
 @wp.kernel(enable_backward=False)
 def curved_columns(
-    pairs: wp.array(dtype=wp.vec2i),
+    slots: Slots,
     blocks: wp.array(dtype=wp.mat33d),
     columns: wp.array(dtype=wide),
-    extra: wp.array(dtype=vec3),
     n: int,
-    n_columns: int,
     n_blocks: int,
     out: wp.array(dtype=wide),
-    entries: wp.array(dtype=real),
     threads: int,
 ):
-    """The operator of pairs of vertices on all columns, and on the sample's own: assembly.PairBlocks.push.
+    """The operator of pairs of vertices on all columns: assembly.PairBlocks.push.
 
-    The blocks of pairs in descending order follow the others. The results are the same memory twice.
+    The blocks of pairs in descending order follow the others.
     """
     i = wp.tid()
     s = i // threads
-    for k in range(i - s * threads, pairs.shape[0], threads):
-        first = pairs[place(k, 0)][0]
-        second = pairs[place(k, 0)][1]
-        b = blocks[place(2 * s * pairs.shape[0], k)] + wp.transpose(blocks[place((2 * s + 1) * pairs.shape[0], k)])
+    n_pairs = slots.pairs.shape[0]
+    for k in range(i - s * threads, n_pairs, threads):
+        first = slots.pairs[place(k, 0)][0]
+        second = slots.pairs[place(k, 0)][1]
+        b = blocks[place(2 * s * n_pairs, k)] + wp.transpose(blocks[place((2 * s + 1) * n_pairs, k)])
         to_i = 3 * n_blocks * (s * n + first)
         to_j = 3 * n_blocks * (s * n + second)
         for c in range(n_blocks):
@@ -223,37 +220,3 @@ def curved_columns(
             for r in range(3):
                 wp.atomic_add(out, place(to_i + r * n_blocks, c), b[r, 0] * dx + b[r, 1] * dy + b[r, 2] * dz)
                 wp.atomic_add(out, place(to_j + r * n_blocks, c), -b[0, r] * dx - b[1, r] * dy - b[2, r] * dz)
-        if extra:
-            across = extra[place(s * n, second)] - extra[place(s * n, first)]
-            up = b * across
-            down = wp.transpose(b) * across
-            for r in range(3):
-                wp.atomic_add(entries, place((to_i + r * n_blocks) * 8, n_columns), up[r])
-                wp.atomic_add(entries, place((to_j + r * n_blocks) * 8, n_columns), -down[r])
-
-
-@wp.kernel(enable_backward=False)
-def curved_faces(
-    x: wp.array(dtype=vec3),
-    centre: wp.array(dtype=vec3),
-    capped_faces: wp.array(dtype=wp.vec3i),
-    slope: wp.array(dtype=real),
-    slots: wp.array(dtype=wp.vec3i),
-    n: int,
-    n_slots: int,
-    out: wp.array(dtype=wp.mat33d),
-    threads: int,
-):
-    """The same of the volume."""
-    i = wp.tid()
-    s = i // threads
-    v = s * n
-    to = s * n_slots
-    middle = middle_of(x, centre, capped_faces, s, v)
-    sixth = slope[s] / real(6.0)
-    for k in range(i - s * threads, capped_faces.shape[0], threads):
-        q = capped_faces[place(k, 0)]
-        slot = slots[place(k, 0)]
-        wp.atomic_add(out, place(to, slot[0]), -wp.skew(sixth * (corner(x, middle, v, q[2]) - middle)))
-        wp.atomic_add(out, place(to, slot[1]), -wp.skew(sixth * (x[place(v, q[0])] - middle)))
-        wp.atomic_add(out, place(to, slot[2]), -wp.skew(sixth * (x[place(v, q[1])] - middle)))

@@ -1,20 +1,74 @@
-"""Triangles that turn between shapes, and the vertices that fit them."""
+"""Triangles that turn between two shapes, or along a trajectory."""
 
 import warp as wp
+from torch import Tensor
 
-from torch_modal.backends.warp.kernels.elements import HALF, TINIEST, TINY, length_of, place, real, vec3, vec4
+from torch_modal.backends.warp.kernels.elements import (
+    HALF,
+    SIXTH,
+    TINIEST,
+    TINY,
+    length_of,
+    place,
+    real,
+    vec3,
+    vec4,
+)
 from torch_modal.geometry import rotations, triangle_frames
 
-packed_trajectory = wp.types.vector(length=31, dtype=real)
+packed_trajectory = wp.types.vector(length=30, dtype=real)
 """A row of :meth:`torch_modal.geometry.local_rotations.Trajectory`, in the order of its parts."""
 
 packed_turn = wp.types.vector(length=12, dtype=real)
-"""Of a triangle, both axes of its frame in the first shape, the entries of its stretch there, and how they change."""
+"""Both axes of the frame of a triangle in the first shape, and the entries of its stretch in both."""
 
 FLAT = wp.constant(real(triangle_frames.FLAT))
 HEIGHT = wp.constant(real(triangle_frames.HEIGHT))
 PER_HEIGHT = wp.constant(real(1 / triangle_frames.HEIGHT))
 SMALL = wp.constant(real(rotations.SMALL))
+
+
+@wp.struct
+class Surface:
+    faces: wp.array(dtype=wp.vec3i)
+    sides: wp.array(dtype=wp.vec3i)
+    """Edges of the sides of each triangle."""
+    signs: wp.array(dtype=vec3)
+    """Senses of the sides."""
+    shares: wp.array(dtype=vec3)
+    """Senses times the part that the side has in its edge vector."""
+    order: wp.array(dtype=wp.int32)
+    """Triangles, parents before children."""
+    parent: wp.array(dtype=wp.int32)
+    piece: wp.array(dtype=wp.int32)
+    n_vertices: int
+    n_edges: int
+    n_pieces: int
+
+
+def surface(
+    device: object,
+    faces: Tensor,
+    sides: Tensor,
+    signs: Tensor,
+    shares: Tensor,
+    order: Tensor,
+    parent: Tensor,
+    piece: Tensor,
+    **counts: int,
+) -> Surface:
+    """The constants of a surface on a device."""
+    made = Surface()
+    made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
+    made.sides = wp.array(sides.numpy(), dtype=wp.vec3i, device=device)
+    made.signs = wp.array(signs.numpy(), dtype=vec3, device=device)
+    made.shares = wp.array(shares.numpy(), dtype=vec3, device=device)
+    made.order = wp.array(order.numpy(), dtype=wp.int32, device=device)
+    made.parent = wp.array(parent.numpy(), dtype=wp.int32, device=device)
+    made.piece = wp.array(piece.numpy(), dtype=wp.int32, device=device)
+    for name, count in counts.items():
+        setattr(made, name, count)
+    return made
 
 
 # ----------------------------------------------------------------------------------------------------------- triangles
@@ -89,65 +143,51 @@ def quaternion(a: Triangle, b: Triangle):
     return quaternion_of(wp.outer(b.e1, a.e1) + wp.outer(b.e2, a.e2) + wp.outer(b.normal, a.normal))
 
 
+@wp.func
+def triangle_of(surface: Surface, x: wp.array(dtype=vec3), at: int, k: int):
+    f = surface.faces[place(k, 0)]
+    return triangle(x[place(at, f[0])], x[place(at, f[1])], x[place(at, f[2])])
+
+
 @wp.kernel(enable_backward=False)
 def turns(
-    first: wp.array(dtype=vec3),
-    second: wp.array(dtype=vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    n: int,
+    surface: Surface,
+    x: wp.array(dtype=vec3),
     quaternions: wp.array(dtype=vec4),
     areas: wp.array(dtype=real),
     packed: wp.array(dtype=packed_turn),
     threads: int,
 ):
-    """Quaternions between the frames of triangles, twice both areas, and the other inputs of :func:`part_turned`."""
+    """Quaternions between the frames of two shapes, twice both areas, and the other inputs of :func:`part_turned`."""
     i = wp.tid()
     s = i // threads
-    v = s * n
-    for k in range(i - s * threads, faces.shape[0], threads):
-        f = faces[place(k, 0)]
-        p = place(v, f[0])
-        q = place(v, f[1])
-        r = place(v, f[2])
-        a = triangle(first[p], first[q], first[r])
-        b = triangle(second[p], second[q], second[r])
-        at = place(s * faces.shape[0], k)
+    v = 2 * s * surface.n_vertices
+    for k in range(i - s * threads, surface.faces.shape[0], threads):
+        a = triangle_of(surface, x, v, k)
+        b = triangle_of(surface, x, v + surface.n_vertices, k)
+        at = place(s * surface.faces.shape[0], k)
         quaternions[at] = quaternion(a, b)
         areas[at] = doubled_area(a.xx, a.xy, a.yy) + doubled_area(b.xx, b.xy, b.yy)
         packed[at] = packed_turn(
-            a.e1[0],
-            a.e1[1],
-            a.e1[2],
-            a.e2[0],
-            a.e2[1],
-            a.e2[2],
-            a.xx,
-            a.xy,
-            a.yy,
-            b.xx - a.xx,
-            b.xy - a.xy,
-            b.yy - a.yy,
+            a.e1[0], a.e1[1], a.e1[2], a.e2[0], a.e2[1], a.e2[2], a.xx, a.xy, a.yy, b.xx, b.xy, b.yy
         )
 
 
 @wp.kernel(enable_backward=False)
 def sign_votes(
+    surface: Surface,
     quaternions: wp.array(dtype=vec4),
     areas: wp.array(dtype=real),
-    order: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    piece: wp.array(dtype=wp.int32),
-    n_pieces: int,
     sign: wp.array(dtype=real),
     vote: wp.array(dtype=real),
 ):
     """Signs passed down the tree, parents before children; then each piece votes. One thread for a sample."""
     s = wp.tid()
-    n = order.shape[0]
+    n = surface.order.shape[0]
     for j in range(n):
-        k = order[place(j, 0)]
+        k = surface.order[place(j, 0)]
         at = place(s * n, k)
-        above = parent[place(k, 0)]
+        above = surface.parent[place(k, 0)]
         q = quaternions[at]
         own = real(1.0)
         if above != k:
@@ -155,9 +195,9 @@ def sign_votes(
             if wp.dot(q, quaternions[place(s * n, above)]) < real(0.0):
                 own = -own
         sign[at] = own
-        wp.atomic_add(vote, place(s * n_pieces, piece[place(k, 0)]), areas[at] * own * q[0])
+        wp.atomic_add(vote, place(s * surface.n_pieces, surface.piece[place(k, 0)]), areas[at] * own * q[0])
     for k in range(n):
-        if vote[place(s * n_pieces, piece[place(k, 0)])] < real(0.0):
+        if vote[place(s * surface.n_pieces, surface.piece[place(k, 0)])] < real(0.0):
             sign[place(s * n, k)] = -sign[place(s * n, k)]
 
 
@@ -169,13 +209,22 @@ def rotated(real_part: real, axis: vec3, v: vec3):
 
 @wp.func
 def sinc(squared_angle: real):
-    # Of the square: with all derivatives at zero.
-    found = real(1.0) - squared_angle / real(6.0) * (
-        real(1.0) - squared_angle / real(20.0) * (real(1.0) - squared_angle / real(42.0))
-    )
-    if squared_angle >= SMALL:
-        angle = wp.sqrt(squared_angle)
+    """Of the square: with all derivatives at zero, by a series."""
+    z = squared_angle
+    found = real(1.0) - SIXTH * z * (real(1.0) - z / real(20.0) * (real(1.0) - z / real(42.0)))
+    if z >= SMALL:
+        angle = wp.sqrt(z)
         found = wp.sin(angle) / angle
+    return found
+
+
+@wp.func
+def cosine(squared_angle: real):
+    """Likewise."""
+    z = squared_angle
+    found = real(1.0) - HALF * z * (real(1.0) - z / real(12.0) * (real(1.0) - z / real(30.0)))
+    if z >= SMALL:
+        found = wp.cos(wp.sqrt(z))
     return found
 
 
@@ -215,49 +264,8 @@ def add_sides(total: wp.array(dtype=vec4), edge: int, e: wp.vec3i, g: vec3, area
 def about(half: vec3):
     """The quaternion that turns about an axis by twice its length."""
     z = wp.dot(half, half)
-    # Both are functions of the square: up to a whole turn, interpolated at Chebyshev's nodes to 2e-19.
-    w = z * z
-    even = real(1.0) + w * (
-        real(0.041666666666666644)
-        + w
-        * (
-            real(2.4801587301543947e-05)
-            + w * (real(2.087675689868704e-09) + w * (real(4.7794436302050165e-14) + w * (real(4.086623381139723e-19))))
-        )
-    )
-    odd = real(-0.5) + w * (
-        real(-0.001388888888888844)
-        + w
-        * (
-            real(-2.7557319221516713e-07)
-            + w
-            * (real(-1.1470743476144586e-11) + w * (real(-1.561566465023175e-16) + w * (real(-7.978335129390308e-22))))
-        )
-    )
-    cosine = even + z * odd
-    even = real(1.0) + w * (
-        real(0.008333333333333333)
-        + w
-        * (
-            real(2.755731922396843e-06)
-            + w
-            * (real(1.6059043800914716e-10) + w * (real(2.8114436905160995e-15) + w * (real(1.947767908073262e-20))))
-        )
-    )
-    odd = real(-0.16666666666666666) + w * (
-        real(-0.0001984126984126966)
-        + w
-        * (
-            real(-2.505210838444744e-08)
-            + w
-            * (real(-7.647162877752289e-13) + w * (real(-8.219210144599324e-18) + w * (real(-3.4993887391279544e-23))))
-        )
-    )
-    sine = even + z * odd
-    if z > real(10.0):
-        cosine = wp.cos(wp.sqrt(z))
-        sine = sinc(z)
-    return vec4(cosine, sine * half[0], sine * half[1], sine * half[2])
+    sine = sinc(z)
+    return vec4(cosine(z), sine * half[0], sine * half[1], sine * half[2])
 
 
 @wp.func
@@ -298,90 +306,71 @@ def turned(q: vec4, v: vec3):
 
 @wp.kernel(enable_backward=False)
 def part_turned(
+    surface: Surface,
     quaternions: wp.array(dtype=vec4),
-    areas: wp.array(dtype=real),
-    packed: wp.array(dtype=packed_turn),
-    time: wp.array(dtype=real),
-    sides: wp.array(dtype=wp.vec3i),
-    signs: wp.array(dtype=vec3),
     sign: wp.array(dtype=real),
-    n_edges: int,
-    total: wp.array(dtype=vec4),
+    packed: wp.array(dtype=packed_turn),
+    weights: wp.array(dtype=wp.vec2d),
+    edges: wp.array(dtype=vec3),
     threads: int,
 ):
-    """Sides of all triangles at their times, summed on the edges by area, and the areas, of turns that are known."""
+    """Edge vectors between two shapes from the sides of all triangles, of turns whose signs are known."""
     i = wp.tid()
     s = i // threads
-    t = time[s]
-    for k in range(i - s * threads, sides.shape[0], threads):
-        at = place(s * sides.shape[0], k)
+    w = weights[s]
+    to = s * surface.n_edges
+    for k in range(i - s * threads, surface.sides.shape[0], threads):
+        at = place(s * surface.sides.shape[0], k)
         c = packed[at]
-        turn = about(t * half_turn(sign[at] * quaternions[at]))
+        turn = about(w[1] * half_turn(sign[at] * quaternions[at]))
         one = turned(turn, vec3(c[0], c[1], c[2]))
         two = turned(turn, vec3(c[3], c[4], c[5]))
-        x = c[6] + t * c[9]
-        y = c[7] + t * c[10]
-        z = c[8] + t * c[11]
+        x = w[0] * c[6] + w[1] * c[9]
+        y = w[0] * c[7] + w[1] * c[10]
+        z = w[0] * c[8] + w[1] * c[11]
         first = x * one + y * two
         second = HALF * first + HEIGHT * (y * one + z * two)
-        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], areas[at], first, second)
+        of = surface.sides[place(k, 0)]
+        share = surface.shares[place(k, 0)]
+        wp.atomic_add(edges, place(to, of[0]), share[0] * first)
+        wp.atomic_add(edges, place(to, of[1]), share[1] * (second - first))
+        wp.atomic_add(edges, place(to, of[2]), -share[2] * second)
 
 
 @wp.kernel(enable_backward=False)
 def trajectory_edges(
+    surface: Surface,
     trajectory: wp.array(dtype=packed_trajectory),
     which: wp.array(dtype=wp.int32),
     time: wp.array(dtype=real),
-    sides: wp.array(dtype=wp.vec3i),
-    signs: wp.array(dtype=vec3),
-    n_edges: int,
     total: wp.array(dtype=vec4),
     threads: int,
 ):
-    """The same of triangles on a smooth trajectory."""
+    """Sides of triangles on a smooth trajectory, summed on the edges by area, and the areas."""
     i = wp.tid()
     s = i // threads
     u = time[s]
     a = u * (real(1.0) - u) * (real(1.0) - u)
     b = -u * (real(1.0) - u) * u
-    for k in range(i - s * threads, sides.shape[0], threads):
-        c = trajectory[place(which[s] * sides.shape[0], k)]
+    for k in range(i - s * threads, surface.sides.shape[0], threads):
+        c = trajectory[place(which[s] * surface.sides.shape[0], k)]
         e1 = vec3(c[0], c[1], c[2])
         e2 = vec3(c[3], c[4], c[5])
         normal = vec3(c[6], c[7], c[8])
         straight = about((HALF * u) * vec3(c[12], c[13], c[14]))
         bend = about(HALF * (a * vec3(c[18], c[19], c[20]) + b * vec3(c[24], c[25], c[26])))
-        unit = c[30]
-        xx = c[9] + unit * (u * c[15] + a * c[21] + b * c[27])
-        xy = c[10] + unit * (u * c[16] + a * c[22] + b * c[28])
-        yy = c[11] + unit * (u * c[17] + a * c[23] + b * c[29])
+        xx = c[9] + u * c[15] + a * c[21] + b * c[27]
+        xy = c[10] + u * c[16] + a * c[22] + b * c[28]
+        yy = c[11] + u * c[17] + a * c[23] + b * c[29]
         q = composed(straight, bend)
         x = first_axis(q)
         y = second_axis(q)
         one = x[0] * e1 + x[1] * e2 + x[2] * normal
         two = y[0] * e1 + y[1] * e2 + y[2] * normal
         area = (real(1.0) - u) * doubled_area(c[9], c[10], c[11])
-        area += u * doubled_area(c[9] + unit * c[15], c[10] + unit * c[16], c[11] + unit * c[17])
+        area += u * doubled_area(c[9] + c[15], c[10] + c[16], c[11] + c[17])
         first = xx * one + xy * two
         second = HALF * first + HEIGHT * (xy * one + yy * two)
-        add_sides(total, s * n_edges, sides[place(k, 0)], signs[place(k, 0)], area, first, second)
-
-
-# ---------------------------------------------------------------------------------------------------- Poisson problem
-@wp.kernel(enable_backward=False)
-def pulls(
-    wanted: wp.array(dtype=vec3),
-    weights: wp.array(dtype=real),
-    ends: wp.array(dtype=wp.vec2i),
-    n: int,
-    out: wp.array(dtype=vec3),
-    threads: int,
-):
-    """The right side of the Poisson problem: the divergence of the edges."""
-    i = wp.tid()
-    s = i // threads
-    for k in range(i - s * threads, ends.shape[0], threads):
-        pull = weights[place(k, 0)] * wanted[place(s * ends.shape[0], k)]
-        both = ends[place(k, 0)]
-        wp.atomic_add(out, place(s * n, both[0]), -pull)
-        wp.atomic_add(out, place(s * n, both[1]), pull)
+        add_sides(
+            total, s * surface.n_edges, surface.sides[place(k, 0)], surface.signs[place(k, 0)], area, first, second
+        )

@@ -11,17 +11,16 @@ from torch_modal.backends.warp.kernels.rotations import (
     HEIGHT,
     PER_HEIGHT,
     SMALL,
+    Surface,
     Triangle,
     about,
-    doubled_area,
     half_turn,
     quaternion,
     sinc,
-    triangle,
+    triangle_of,
     turned,
 )
 
-TWO = wp.constant(real(2.0))
 NO_LENGTH = wp.constant(real(1e-70))
 
 
@@ -88,56 +87,40 @@ def from_triangle(t: Triangle, torque: vec3, to_xx: real, to_xy: real, to_yy: re
 
 @wp.kernel(enable_backward=False)
 def from_turned(
-    first: wp.array(dtype=vec3),
-    second: wp.array(dtype=vec3),
-    time: wp.array(dtype=real),
-    faces: wp.array(dtype=wp.vec3i),
-    sides: wp.array(dtype=wp.vec3i),
-    signs: wp.array(dtype=vec3),
+    surface: Surface,
+    shapes: wp.array(dtype=vec3),
+    weights: wp.array(dtype=wp.vec2d),
     sign: wp.array(dtype=real),
-    n: int,
-    n_edges: int,
-    to_total: wp.array(dtype=vec4),
-    to_first: wp.array(dtype=vec3),
-    to_second: wp.array(dtype=vec3),
-    to_time: wp.array(dtype=real),
+    to_edges: wp.array(dtype=vec3),
+    to_shapes: wp.array(dtype=vec3),
+    to_weights: wp.array(dtype=wp.vec2d),
     threads: int,
 ):
-    """Adjoint of ``rotations.part_turned``: adds the gradients of both shapes and the times."""
+    """Adjoint of ``rotations.part_turned``: adds the gradients of both shapes and the weights."""
     i = wp.tid()
     s = i // threads
-    v = s * n
-    edge = s * n_edges
-    t = time[s]
-    to_t = real(0.0)
-    for k in range(i - s * threads, faces.shape[0], threads):
-        f = faces[place(k, 0)]
-        p = place(v, f[0])
-        q = place(v, f[1])
-        r = place(v, f[2])
-        a = triangle(first[p], first[q], first[r])
-        b = triangle(second[p], second[q], second[r])
-        turn = sign[place(s * faces.shape[0], k)] * quaternion(a, b)
+    v = 2 * s * surface.n_vertices
+    edge = s * surface.n_edges
+    u = weights[s][0]
+    t = weights[s][1]
+    to_w = wp.vec2d()
+    for k in range(i - s * threads, surface.faces.shape[0], threads):
+        a = triangle_of(surface, shapes, v, k)
+        b = triangle_of(surface, shapes, v + surface.n_vertices, k)
+        turn = sign[place(s * surface.faces.shape[0], k)] * quaternion(a, b)
         half = half_turn(turn)
         part = about(t * half)
-        x = a.xx + t * (b.xx - a.xx)
-        y = a.xy + t * (b.xy - a.xy)
-        z = a.yy + t * (b.yy - a.yy)
+        x = u * a.xx + t * b.xx
+        y = u * a.xy + t * b.xy
+        z = u * a.yy + t * b.yy
         one = turned(part, x * a.e1 + y * a.e2)
         two = HALF * one + HEIGHT * turned(part, y * a.e1 + z * a.e2)
-        # From the edges: of the sides ``one``, ``two - one`` and ``-two``, and of the area.
-        of = sides[place(k, 0)]
-        g = signs[place(k, 0)]
-        e1 = to_total[place(edge, of[0])]
-        e2 = to_total[place(edge, of[1])]
-        e3 = to_total[place(edge, of[2])]
-        across = g[1] * vec3(e2[0], e2[1], e2[2])
-        by_one = g[0] * vec3(e1[0], e1[1], e1[2]) - across
-        by_two = across - g[2] * vec3(e3[0], e3[1], e3[2])
-        to_area = wp.dot(by_one, one) + wp.dot(by_two, two) + e1[3] + e2[3] + e3[3]
-        area = doubled_area(a.xx, a.xy, a.yy) + doubled_area(b.xx, b.xy, b.yy)
-        to_one = area * by_one
-        to_two = area * by_two
+        # From the edges: of the sides ``one``, ``two - one`` and ``-two``.
+        of = surface.sides[place(k, 0)]
+        share = surface.shares[place(k, 0)]
+        across = share[1] * to_edges[place(edge, of[1])]
+        to_one = share[0] * to_edges[place(edge, of[0])] - across
+        to_two = across - share[2] * to_edges[place(edge, of[2])]
         torque = wp.cross(one, to_one) + wp.cross(two, to_two)
         back = inverse(part)
         flat_one = turned(back, to_one + HALF * to_two)
@@ -145,23 +128,20 @@ def from_turned(
         to_x = wp.dot(a.e1, flat_one)
         to_y = wp.dot(a.e2, flat_one) + wp.dot(a.e1, flat_two)
         to_z = wp.dot(a.e2, flat_two)
-        to_t += TWO * wp.dot(torque, half)
-        to_t += (b.xx - a.xx) * to_x + (b.xy - a.xy) * to_y + (b.yy - a.yy) * to_z
-        to_area = HEIGHT * to_area
-        whole = reached(turn, half, part, t, torque)
-        u, w = from_triangle(
-            a,
-            turned(back, torque) - turned(inverse(turn), whole),
-            to_x - t * to_x + to_area * a.yy,
-            to_y - t * to_y - TWO * to_area * a.xy,
-            to_z - t * to_z + to_area * a.xx,
+        to_w += wp.vec2d(
+            a.xx * to_x + a.xy * to_y + a.yy * to_z,
+            b.xx * to_x + b.xy * to_y + b.yy * to_z + real(2.0) * wp.dot(torque, half),
         )
-        wp.atomic_add(to_first, p, -(u + w))
-        wp.atomic_add(to_first, q, u)
-        wp.atomic_add(to_first, r, w)
-        to_xy = t * to_y - TWO * to_area * b.xy
-        u, w = from_triangle(b, whole, t * to_x + to_area * b.yy, to_xy, t * to_z + to_area * b.xx)
-        wp.atomic_add(to_second, p, -(u + w))
-        wp.atomic_add(to_second, q, u)
-        wp.atomic_add(to_second, r, w)
-    wp.atomic_add(to_time, s, to_t)
+        whole = reached(turn, half, part, t, torque)
+        f = surface.faces[place(k, 0)]
+        own = turned(back, torque) - turned(inverse(turn), whole)
+        one, two = from_triangle(a, own, u * to_x, u * to_y, u * to_z)
+        wp.atomic_add(to_shapes, place(v, f[0]), -(one + two))
+        wp.atomic_add(to_shapes, place(v, f[1]), one)
+        wp.atomic_add(to_shapes, place(v, f[2]), two)
+        one, two = from_triangle(b, whole, t * to_x, t * to_y, t * to_z)
+        other = v + surface.n_vertices
+        wp.atomic_add(to_shapes, place(other, f[0]), -(one + two))
+        wp.atomic_add(to_shapes, place(other, f[1]), one)
+        wp.atomic_add(to_shapes, place(other, f[2]), two)
+    wp.atomic_add(to_weights, s, to_w)

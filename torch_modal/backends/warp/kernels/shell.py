@@ -1,264 +1,320 @@
-"""Eq. 5 towards a reference: value, gradient, convex Hessian, products with it."""
+"""Eq. 5: its reference towards K rest shapes, value, gradient, convex Hessian, products with it."""
 
 import warp as wp
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
+    SIXTH,
     TINIEST,
     TINY,
+    Hinge,
+    Mesh,
+    angle_gradients,
     bend_energy,
     bend_slope,
-    bent,
     corner,
-    is_flat,
+    doubled,
+    hinge_of,
     length_of,
+    linearised,
     middle_of,
     moments,
     phase_of,
     place,
     real,
+    rested,
     squared,
-    stretched,
     symmetric,
     vec3,
 )
+from torch_modal.energy.bend import MAX_BENDING_RATIO
 from torch_modal.energy.stretch import SLACK
 
 SLACKNESS = wp.constant(real(SLACK))
+RATIO = wp.constant(real(MAX_BENDING_RATIO))
+summed = wp.types.vector(length=8, dtype=real)
+"""Sums over rest shapes: weights of an edge, then those times its length and its square; then the moments."""
 
 
+# -------------------------------------------------------------------------------------------------------- rest shapes
 @wp.kernel(enable_backward=False)
-def value(
-    x: wp.array(dtype=vec3),
-    record: wp.array(dtype=wp.vec4i),
-    stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=moments),
-    n: int,
-    n_references: int,
-    centre: wp.array(dtype=vec3),
-    capped_faces: wp.array(dtype=wp.vec3i),
-    energy: wp.array(dtype=real),
-    total: wp.array(dtype=real),
-    threads: int,
-):
-    """The energy but for the volume's, and the volume; references come round where there are fewer than shapes."""
+def sizes(mesh: Mesh, x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), found: wp.array(dtype=vec3), threads: int):
+    """All edges together, the volume about the centre, and the surface, closed towards the centre."""
     i = wp.tid()
     s = i // threads
-    v = s * n
-    to = (s % n_references) * record.shape[0]
-    found = real(0.0)
-    for k in range(i - s * threads, record.shape[0], threads):
-        q = record[place(k, 0)]
-        at = place(to, k)
-        origin = x[place(v, q[0])]
-        e = x[place(v, q[1])] - origin
-        wanted = stretch[at]
-        d = length_of(e) - wanted[1]
-        found += wanted[0] * d * d
-        if q[2] >= 0:
-            a = x[place(v, q[2])] - origin
-            b = x[place(v, q[3])] - origin
-            n1 = wp.cross(e, a)
-            n2 = wp.cross(b, e)
-            phase = wp.vec2d(real(1.0), real(0.0))
-            if not (is_flat(e, n1) or is_flat(e, n2)):
-                phase = phase_of(e, b, n1, n2)
-            found += bend_energy(phase, bend[at])
-    wp.atomic_add(energy, s, HALF * found)
-    middle = middle_of(x, centre, capped_faces, s, v)
-    enclosed = real(0.0)
-    for k in range(i - s * threads, capped_faces.shape[0], threads):
-        face = capped_faces[place(k, 0)]
+    v = s * mesh.n_vertices
+    length = real(0.0)
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        length += length_of(x[place(v, q[1])] - x[place(v, q[0])])
+    middle = middle_of(mesh, x, centre, s)
+    volume = real(0.0)
+    area = real(0.0)
+    for k in range(i - s * threads, mesh.capped_faces.shape[0], threads):
+        face = mesh.capped_faces[place(k, 0)]
+        a = x[place(v, face[0])] - middle
+        b = x[place(v, face[1])] - middle
         c = corner(x, middle, v, face[2]) - middle
-        enclosed += wp.dot(x[place(v, face[0])] - middle, wp.cross(x[place(v, face[1])] - middle, c))
-    wp.atomic_add(total, s, enclosed / real(6.0))
+        volume += SIXTH * wp.dot(a, wp.cross(b, c))
+        area += HALF * length_of(wp.cross(b - a, c - a))
+    wp.atomic_add(found, s, vec3(length, volume, area))
 
 
 @wp.func
-def enclosed(
-    x: wp.array(dtype=vec3),
-    middle: vec3,
-    q: wp.vec3i,
-    at: int,
-    gradient: wp.array(dtype=vec3),
-):
-    """Six times the volume of the tetrahedron from the middle, a vertex of -1, to a triangle.
+def bend_weight(h: Hinge):
+    base = wp.dot(h.e, h.e)
+    area = HALF * (length_of(h.n1) + length_of(h.n2))
+    return base / wp.max(area, base / RATIO)
 
-    A sixth of its gradient, where the middle stays, is added.
+
+@wp.kernel(enable_backward=False)
+def rest_sums(
+    mesh: Mesh,
+    x: wp.array(dtype=vec3),
+    pulls: wp.array(dtype=real),
+    shortest: wp.array(dtype=real),
+    alpha: wp.array(dtype=real),
+    beta: wp.array(dtype=real),
+    n_shapes: int,
+    n_alpha: int,
+    n_beta: int,
+    out: wp.array(dtype=summed),
+    threads: int,
+):
+    """Sums over the K rest shapes of each sample, one thread or more for each. Weights are doubled."""
+    i = wp.tid()
+    s = i // threads
+    v = s * mesh.n_vertices
+    sample = s // n_shapes
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        pull = real(2.0) * pulls[s]
+        length = length_of(x[place(v, q[1])] - x[place(v, q[0])])
+        edge = vec3()
+        if length > shortest[s]:
+            own = pull * alpha[place(sample * n_alpha, wp.min(k, n_alpha - 1))]
+            edge = own * vec3(real(1.0) / length, real(1.0), length)
+        bend = moments()
+        if q[2] >= 0:
+            h = hinge_of(x, v, q)
+            if not h.flat:
+                own = pull * beta[place(sample * n_beta, wp.min(mesh.hinge[place(k, 0)], n_beta - 1))]
+                p = phase_of(h)
+                t = doubled(p)
+                bend = (own * bend_weight(h)) * moments(real(1.0), p[0], p[1], t[0], t[1])
+        found = summed(edge[0], edge[1], edge[2], bend[0], bend[1], bend[2], bend[3], bend[4])
+        wp.atomic_add(out, place(sample * mesh.record.shape[0], k), found)
+
+
+@wp.kernel(enable_backward=False)
+def merge(
+    mesh: Mesh,
+    sums: wp.array(dtype=summed),
+    out: wp.array(dtype=rested),
+    constant: wp.array(dtype=real),
+    threads: int,
+):
+    """K rest shapes as one reference (Eq. 8), and the energy of the edges that remains, where it is wanted."""
+    i = wp.tid()
+    s = i // threads
+    left = real(0.0)
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        at = place(s * mesh.record.shape[0], k)
+        w = sums[at]
+        # Weights below zero may outweigh the others: then there is no minimum, and no weight.
+        weight = real(0.0)
+        length = real(0.0)
+        if w[0] > real(0.0):
+            weight = w[0]
+            length = w[1] / w[0]
+            left += w[2] - w[1] * length
+        counts = real(0.0)
+        if w[3] > real(0.0):
+            counts = real(1.0)
+        out[at] = rested(weight, length, counts * w[3], counts * w[4], counts * w[5], counts * w[6], counts * w[7])
+    if constant:
+        wp.atomic_add(constant, s, HALF * left)
+
+
+# --------------------------------------------------------------------------------------------------------- the energy
+@wp.func
+def enclosed(x: wp.array(dtype=vec3), middle: vec3, q: wp.vec3i, at: int, gradient: wp.array(dtype=vec3)):
+    """The volume of the tetrahedron from the middle, a vertex of -1, to a triangle.
+
+    Its gradient, where the middle stays, is added where there is an array for it.
     """
     a = x[place(at, q[0])] - middle
     b = x[place(at, q[1])] - middle
     c = corner(x, middle, at, q[2]) - middle
     bc = wp.cross(b, c)
-    sixth = real(1.0) / real(6.0)
-    wp.atomic_add(gradient, place(at, q[0]), sixth * bc)
-    wp.atomic_add(gradient, place(at, q[1]), sixth * wp.cross(c, a))
-    if q[2] >= 0:
-        wp.atomic_add(gradient, place(at, q[2]), sixth * wp.cross(a, b))
-    return wp.dot(a, bc)
+    if gradient:
+        wp.atomic_add(gradient, place(at, q[0]), SIXTH * bc)
+        wp.atomic_add(gradient, place(at, q[1]), SIXTH * wp.cross(c, a))
+        if q[2] >= 0:
+            wp.atomic_add(gradient, place(at, q[2]), SIXTH * wp.cross(a, b))
+    return SIXTH * wp.dot(a, bc)
 
 
 @wp.kernel(enable_backward=False)
 def volume(
+    mesh: Mesh,
     x: wp.array(dtype=vec3),
     centre: wp.array(dtype=vec3),
-    capped_faces: wp.array(dtype=wp.vec3i),
-    n: int,
-    total: wp.array(dtype=real),
-    gradient: wp.array(dtype=vec3),
+    total: wp.array(dtype=wp.vec2d),
+    normal: wp.array(dtype=vec3),
     threads: int,
 ):
-    """The volume and its gradient alone."""
+    """The volume, the second of the totals, and its gradient alone."""
     i = wp.tid()
     s = i // threads
-    v = s * n
-    middle = middle_of(x, centre, capped_faces, s, v)
+    middle = middle_of(mesh, x, centre, s)
     found = real(0.0)
-    for k in range(i - s * threads, capped_faces.shape[0], threads):
-        found += enclosed(x, middle, capped_faces[place(k, 0)], v, gradient)
-    wp.atomic_add(total, s, found / real(6.0))
+    for k in range(i - s * threads, mesh.capped_faces.shape[0], threads):
+        found += enclosed(x, middle, mesh.capped_faces[place(k, 0)], s * mesh.n_vertices, normal)
+    wp.atomic_add(total, s, wp.vec2d(real(0.0), found))
 
 
 @wp.kernel(enable_backward=False)
 def linearise(
+    mesh: Mesh,
     x: wp.array(dtype=vec3),
-    record: wp.array(dtype=wp.vec4i),
-    stretch: wp.array(dtype=wp.vec2d),
-    bend: wp.array(dtype=moments),
+    rests: wp.array(dtype=rested),
+    n_references: int,
     centre: wp.array(dtype=vec3),
-    capped_faces: wp.array(dtype=wp.vec3i),
-    n: int,
-    energy: wp.array(dtype=real),
+    total: wp.array(dtype=wp.vec2d),
     gradient: wp.array(dtype=vec3),
-    diagonal: wp.array(dtype=symmetric),
-    edges: wp.array(dtype=stretched),
-    hinges: wp.array(dtype=bent),
-    total: wp.array(dtype=real),
     normal: wp.array(dtype=vec3),
+    diagonal: wp.array(dtype=symmetric),
+    factors: wp.array(dtype=linearised),
     threads: int,
 ):
-    """Energy, gradient, the 3 x 3 blocks of the convex Hessian's diagonal, and the factors of products with it.
+    """Energy but for the volume's, and volume; their gradients; blocks and factors of the convex Hessian.
 
-    The volume and its gradient are separate outputs. Without arrays for the others, the kernel computes only these
-    and the gradient.
+    Derivatives without arrays are left out. References come round where there are fewer than shapes.
     """
     i = wp.tid()
     s = i // threads
-    v = s * n
+    v = s * mesh.n_vertices
     own = real(0.0)
-    for k in range(i - s * threads, record.shape[0], threads):
-        q = record[place(k, 0)]
-        at = place(s * record.shape[0], k)
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        w = rests[place((s % n_references) * mesh.record.shape[0], k)]
         q0 = place(v, q[0])
         q1 = place(v, q[1])
-        origin = x[q0]
-        e = x[q1] - origin
-        base = wp.dot(e, e)
+        e = x[q1] - x[q0]
         length = length_of(e)
         per_length = real(0.0)
-        if base > TINY:
+        if wp.dot(e, e) > TINY:
             per_length = real(1.0) / length
-        wanted = stretch[at]
-        d = length - wanted[1]
-        slope = wanted[0] * d
+        slope = w[0] * (length - w[1])
+        own += slope * (length - w[1])
         unit = per_length * e
-        width = SLACKNESS * wanted[0] * length
+        width = SLACKNESS * w[0] * length
         across = HALF * (slope + wp.sqrt(slope * slope + width * width + TINIEST)) / length
-        along = wanted[0] - across
-        pull = slope * unit
-        own += slope * d
-        wp.atomic_add(gradient, q0, -pull)
-        wp.atomic_add(gradient, q1, pull)
+        along = w[0] - across
+        ge = vec3()
+        ga = vec3()
+        gb = vec3()
+        stiffness = real(0.0)
+        if q[2] >= 0:
+            h = hinge_of(x, v, q)
+            if h.flat:
+                own += bend_energy(wp.vec2d(real(1.0), real(0.0)), w)
+            else:
+                p = phase_of(h)
+                own += bend_energy(p, w)
+                if gradient:
+                    ge, ga, gb = angle_gradients(h)
+                    stiffness = w[2]
+                    moment = bend_slope(p, w)
+                    gi = -(ge + ga + gb)
+                    q2 = place(v, q[2])
+                    q3 = place(v, q[3])
+                    wp.atomic_add(gradient, q0, moment * gi)
+                    wp.atomic_add(gradient, q1, moment * ge)
+                    wp.atomic_add(gradient, q2, moment * ga)
+                    wp.atomic_add(gradient, q3, moment * gb)
+                    if diagonal:
+                        wp.atomic_add(diagonal, q0, stiffness * squared(gi))
+                        wp.atomic_add(diagonal, q1, stiffness * squared(ge))
+                        wp.atomic_add(diagonal, q2, stiffness * squared(ga))
+                        wp.atomic_add(diagonal, q3, stiffness * squared(gb))
+        if gradient:
+            wp.atomic_add(gradient, q0, -slope * unit)
+            wp.atomic_add(gradient, q1, slope * unit)
         if diagonal:
-            edges[at] = stretched(unit[0], unit[1], unit[2], across, along)
             block = along * squared(unit) + symmetric(across, real(0.0), real(0.0), across, real(0.0), across)
             wp.atomic_add(diagonal, q0, block)
             wp.atomic_add(diagonal, q1, block)
-        found = bent()
-        if q[2] >= 0:
-            q2 = place(v, q[2])
-            q3 = place(v, q[3])
-            a = x[q2] - origin
-            b = x[q3] - origin
-            n1 = wp.cross(e, a)
-            n2 = wp.cross(b, e)
-            w = bend[at]
-            if is_flat(e, n1) or is_flat(e, n2):
-                own += bend_energy(wp.vec2d(real(1.0), real(0.0)), w)
-            else:
-                phase = phase_of(e, b, n1, n2)
-                moment = bend_slope(phase, w)
-                stiffness = w[0]
-                ga = (-length / wp.dot(n1, n1)) * n1
-                gb = (-length / wp.dot(n2, n2)) * n2
-                ge = (-per_length * per_length) * (wp.dot(a, e) * ga + wp.dot(b, e) * gb)
-                gi = -(ga + gb + ge)
-                found = bent(ge[0], ge[1], ge[2], ga[0], ga[1], ga[2], gb[0], gb[1], gb[2], stiffness)
-                own += bend_energy(phase, w)
-                wp.atomic_add(gradient, q0, moment * gi)
-                wp.atomic_add(gradient, q1, moment * ge)
-                wp.atomic_add(gradient, q2, moment * ga)
-                wp.atomic_add(gradient, q3, moment * gb)
-                if diagonal:
-                    wp.atomic_add(diagonal, q0, stiffness * squared(gi))
-                    wp.atomic_add(diagonal, q1, stiffness * squared(ge))
-                    wp.atomic_add(diagonal, q2, stiffness * squared(ga))
-                    wp.atomic_add(diagonal, q3, stiffness * squared(gb))
-        if diagonal:
-            hinges[at] = found
-    if energy:
-        wp.atomic_add(energy, s, HALF * own)
-    middle = middle_of(x, centre, capped_faces, s, v)
-    sixfold = real(0.0)
-    for k in range(i - s * threads, capped_faces.shape[0], threads):
-        sixfold += enclosed(x, middle, capped_faces[place(k, 0)], v, normal)
-    wp.atomic_add(total, s, sixfold / real(6.0))
+            factors[place(s * mesh.record.shape[0], k)] = linearised(
+                unit[0],
+                unit[1],
+                unit[2],
+                across,
+                along,
+                ge[0],
+                ge[1],
+                ge[2],
+                ga[0],
+                ga[1],
+                ga[2],
+                gb[0],
+                gb[1],
+                gb[2],
+                stiffness,
+            )
+    middle = middle_of(mesh, x, centre, s)
+    inside = real(0.0)
+    for k in range(i - s * threads, mesh.capped_faces.shape[0], threads):
+        inside += enclosed(x, middle, mesh.capped_faces[place(k, 0)], v, normal)
+    wp.atomic_add(total, s, wp.vec2d(HALF * own, inside))
 
 
 @wp.kernel(enable_backward=False)
 def product(
-    field: wp.array(dtype=vec3),
-    record: wp.array(dtype=wp.vec4i),
-    edges: wp.array(dtype=stretched),
-    hinges: wp.array(dtype=bent),
-    n: int,
+    mesh: Mesh,
+    fields: wp.array(dtype=vec3),
+    start: int,
+    factors: wp.array(dtype=linearised),
     out: wp.array(dtype=vec3),
-    form: wp.array(dtype=real),
+    out_start: int,
+    scalars: wp.array(dtype=vec3),
+    first: int,
     threads: int,
 ):
-    """The convex Hessian times a field, and the field times that, where there is an array for it."""
+    """The convex Hessian times a field, and the field times that, the third of the scalars, where there are some.
+
+    Fields, results and scalars begin at the given places of their arrays.
+    """
     i = wp.tid()
     s = i // threads
-    v = s * n
+    v = start + s * mesh.n_vertices
+    to = out_start + s * mesh.n_vertices
     total = real(0.0)
-    for k in range(i - s * threads, record.shape[0], threads):
-        q = record[place(k, 0)]
-        at = place(s * record.shape[0], k)
-        q0 = place(v, q[0])
-        q1 = place(v, q[1])
-        origin = field[q0]
-        e = field[q1] - origin
-        r = edges[at]
-        unit = vec3(r[0], r[1], r[2])
-        rate = wp.dot(unit, e)
-        to_j = r[3] * e + (r[4] * rate) * unit
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        f = factors[place(s * mesh.record.shape[0], k)]
+        q0 = place(to, q[0])
+        q1 = place(to, q[1])
+        origin = fields[place(v, q[0])]
+        e = fields[place(v, q[1])] - origin
+        unit = vec3(f[0], f[1], f[2])
+        to_j = f[3] * e + (f[4] * wp.dot(unit, e)) * unit
         total += wp.dot(to_j, e)
         if q[2] >= 0:
-            q2 = place(v, q[2])
-            q3 = place(v, q[3])
-            h = hinges[at]
-            ge = vec3(h[0], h[1], h[2])
-            ga = vec3(h[3], h[4], h[5])
-            gb = vec3(h[6], h[7], h[8])
-            change = wp.dot(ge, e) + wp.dot(ga, field[q2] - origin) + wp.dot(gb, field[q3] - origin)
-            moment = h[9] * change
+            ge = vec3(f[5], f[6], f[7])
+            ga = vec3(f[8], f[9], f[10])
+            gb = vec3(f[11], f[12], f[13])
+            change = wp.dot(ge, e) + wp.dot(ga, fields[place(v, q[2])] - origin)
+            change += wp.dot(gb, fields[place(v, q[3])] - origin)
+            moment = f[14] * change
             total += moment * change
-            wp.atomic_add(out, q0, -moment * (ga + gb + ge) - to_j)
+            wp.atomic_add(out, q0, -moment * (ge + ga + gb) - to_j)
             wp.atomic_add(out, q1, moment * ge + to_j)
-            wp.atomic_add(out, q2, moment * ga)
-            wp.atomic_add(out, q3, moment * gb)
+            wp.atomic_add(out, place(to, q[2]), moment * ga)
+            wp.atomic_add(out, place(to, q[3]), moment * gb)
         else:
             wp.atomic_add(out, q0, -to_j)
             wp.atomic_add(out, q1, to_j)
-    if form:
-        wp.atomic_add(form, s, total)
+    if scalars:
+        wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))

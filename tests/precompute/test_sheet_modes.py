@@ -16,11 +16,10 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.canonical import size
 from torch_modal.io.cache import cache_content
 from torch_modal.keyframes.check import MeshError, MeshWarning
-from torch_modal.precompute import filling, modes
+from torch_modal.precompute import extract
 from torch_modal.precompute.eigen import ModalAnalysisError
-from torch_modal.precompute.method import why_shell
-from torch_modal.precompute.modes import extract_bases, extract_modes
-from torch_modal.precompute.shell import Sheet
+from torch_modal.precompute.extract import extract_bases, extract_modes, why_shell
+from torch_modal.precompute.sheet import sheet_body
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import TetrahedralizationError
 
@@ -91,25 +90,27 @@ def test_modes_have_unit_mass() -> None:
 
 def test_rigid_motions_and_strains_are_carried_exactly() -> None:
     sample = load_sample("creature")
-    sheet = Sheet(CanonicalSurface.of(sample.keyframes[0].numpy(), sample.faces.numpy()), 30)
-    assert len(sheet.points) < 0.6 * len(sheet.surface.points)
+    surface = CanonicalSurface.of(sample.keyframes[0].numpy(), sample.faces.numpy())
+    sheet = sheet_body(surface, 30)
+    assert len(sheet.points) < 0.6 * len(surface.points)
     rng = np.random.default_rng(0)
     turn, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     turn = turn - turn.T
     coarse = (sheet.points @ turn.T + shift)[..., None]
-    np.testing.assert_allclose(sheet.carried(coarse)[..., 0], sheet.surface.points @ turn.T + shift, atol=1e-9)
-    flat = Sheet(CanonicalSurface.of(*strip(cells=(200, 40))), 30)
+    np.testing.assert_allclose(sheet.to_surface(coarse)[..., 0], surface.points @ turn.T + shift, atol=1e-9)
+    surface = CanonicalSurface.of(*strip(cells=(200, 40)))
+    flat = sheet_body(surface, 30)
     plane = np.diag([0.3, -0.1, 0.0])  # the normal turns with the faces, and has no strain of its own
-    assert len(flat.points) < 0.6 * len(flat.surface.points)
+    assert len(flat.points) < 0.6 * len(surface.points)
     np.testing.assert_allclose(
-        flat.carried((flat.points @ plane)[..., None])[..., 0], flat.surface.points @ plane, atol=1e-9
+        flat.to_surface((flat.points @ plane)[..., None])[..., 0], surface.points @ plane, atol=1e-9
     )
 
 
 def test_the_coarse_mesh_has_the_modes_of_the_fine_one(monkeypatch: pytest.MonkeyPatch) -> None:
     sample = load_sample("creature")
     coarse = extract_modes(sample.keyframes[0], sample.faces, 20, method="shell", cache=False)
-    monkeypatch.setattr("torch_modal.precompute.shell.COARSE_FACES", 10**6)
+    monkeypatch.setattr("torch_modal.precompute.sheet.COARSE_FACES", 10**6)
     fine = extract_modes(sample.keyframes[0], sample.faces, 30, method="shell", cache=False)
     spans = [torch.linalg.qr(basis.modes.flatten(1).T).Q for basis in (coarse.truncate(10), fine)]
     assert torch.linalg.svdvals(spans[0].T @ spans[1]).min() > 0.95
@@ -241,7 +242,7 @@ def test_where_no_shell_can_be_had(monkeypatch: pytest.MonkeyPatch) -> None:
     solid = extract_modes(
         vertices * (1, 1, 0) + [0, 0, 0.01] * np.cos(vertices[:, :1]), faces, 4, method="solid", cache=False
     )
-    monkeypatch.setattr(modes.KeyframeSet, "shells", fail)
+    monkeypatch.setattr(extract._Extraction, "shells", fail)
     found = extract_modes(vertices * (1, 1, 0) + [0, 0, 0.01] * np.cos(vertices[:, :1]), faces, 4, cache=False)
     torch.testing.assert_close(found.modes, solid.modes, rtol=0, atol=0)
 
@@ -252,29 +253,9 @@ def test_the_cache_knows_the_method(capsule: Mesh, tmp_path: Path, monkeypatch: 
     assert cache_content(tmp_path).n_entries == 1
     solid = extract_modes(*capsule, 4, method="solid", cache_dir=folder)
     assert not torch.equal(shell.modes, solid.modes)
-    monkeypatch.setattr("torch_modal.precompute.solving.lowest_modes", None)
-    monkeypatch.setattr(filling, "MESHERS", {})
+    monkeypatch.setattr(extract, "lowest_modes", None)
     again = extract_modes(*capsule, 4, method="shell", cache_dir=folder, mesher=None)  # type: ignore[arg-type]
     torch.testing.assert_close(again.modes, shell.modes, rtol=0, atol=0)
-
-
-def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    vertices, faces = strip(cells=(120, 30))
-    poses = np.stack([vertices + [0, 0, 0.1 * i] * np.sin(vertices[:, :1]) for i in range(4)])
-    found = []
-    for cpus in (1, 4):
-        monkeypatch.setattr("torch_modal.precompute.parallel.n_cpus", lambda cpus=cpus: cpus)
-        found.append(extract_bases(poses, faces, 5, method="shell", cache=False, progress=False))
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one.modes, other.modes, rtol=0, atol=0)
-
-
-def test_progress_counts_both_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
-    counted: list[int] = []
-    monkeypatch.setattr("torch_modal.progress.ProgressReport.update", lambda self: counted.append(1))
-    poses = np.stack([strip()[0]] * 3)
-    extract_bases(poses, strip()[1], 3, cache=False)
-    assert len(counted) == 6
 
 
 def test_coincident_vertices_are_one() -> None:

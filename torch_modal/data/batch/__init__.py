@@ -1,1 +1,0 @@
-"""Modal bases of every key-frame set of a folder tree."""

@@ -1,0 +1,284 @@
+"""In-betweens of key-frames in pairs, of which tables are kept, and of shapes near them."""
+
+import contextlib
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_modal.autograd import Recent
+from torch_modal.data.motion import Motion
+from torch_modal.inbetween.results import InBetweenResult
+from torch_modal.inbetween.settings import Objective, Solver
+from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest
+from torch_modal.io.tensors import TensorFile, write_tensors
+from torch_modal.layers.in_between import InBetween
+from torch_modal.motion.path import Path as MotionPath
+from torch_modal.precompute.basis import ModalBasis
+from torch_modal.solve.implicit import ConvergenceWarning
+from torch_modal.solve.minimise import Status
+from torch_modal.version import __version__
+
+FORMAT = "torch_modal.between"
+VERSION = "1"
+
+
+class InBetweens:
+    """In-betweens of the key-frames of a space, and of shapes near them.
+
+    Between two key-frames they are solved once, at even times, and cubics interpolate among these; if the two follow
+    each other in a motion, the shapes are those of its path. Other shapes are solved each, with the modes of the two
+    nearest key-frames. K key-frames have K (K - 1) / 2 pairs: layers and tables are made for those that are used, and
+    the most recent stay in memory.
+
+    Args:
+        bases: The basis of each key-frame.
+        faces: Vertex indices. *Shape:* ``(F, 3)``.
+        objective: What the in-betweens minimise.
+        solver: How they are solved.
+        motion: The order of the key-frames in time, if they are a motion.
+        times: Number of even times in a table, at least 4; None: there are no tables, and each in-between is solved.
+        dtype: Of the tables.
+        folder: Stores tables between runs, if it is given and writable.
+
+    Raises:
+        ValueError: ``times`` is below 4.
+    """
+
+    def __init__(
+        self,
+        bases: Sequence[ModalBasis],
+        faces: Tensor,
+        objective: Objective,
+        solver: Solver,
+        motion: Motion | None,
+        times: int | None,
+        dtype: torch.dtype,
+        folder: str | os.PathLike[str] | None,
+    ) -> None:
+        if times is not None and times < 4:
+            raise ValueError(f"times is {times}; cubics need 4 or more, and None solves each in-between")
+        self.bases, self.faces, self.objective, self.solver = bases, faces, objective, solver
+        self.motion = motion
+        self.times, self.dtype = times, dtype
+        self.folder = None if folder is None else Path(folder)
+        self._layers, self._paths, self._tables = Recent(32), Recent(32), Recent(64)
+
+    def __call__(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: Tensor, j: Tensor, keyframes: Tensor) -> Tensor:
+        """In-betweens of a batch.
+
+        Args:
+            x_a: Shapes at 0. *Shape:* ``(B, V, 3)``.
+            x_b: Shapes at 1. *Shape:* ``(B, V, 3)``.
+            t: Times. *Shape:* ``(B,)``.
+            i: The key-frame whose modes serve at 0, on the CPU. *Shape:* ``(B,)``.
+            j: Likewise at 1. *Shape:* ``(B,)``.
+            keyframes: Whether both shapes are these key-frames, on the CPU. *Shape:* ``(B,)``, bool.
+
+        Returns:
+            *Shape:* ``(B, V, 3)``.
+
+        Raises:
+            ValueError: As for :meth:`of_shapes`.
+        """
+        # The same two key-frames in either order are solved together.
+        swap = (i > j).to(t.device)
+        t = torch.where(swap, 1 - t, t)
+        starts, ends = (torch.where(swap[:, None, None], *pair) for pair in ((x_b, x_a), (x_a, x_b)))
+        kinds = torch.stack([torch.minimum(i, j), torch.maximum(i, j), keyframes.long()], 1)
+
+        def solve(kind: Sequence[int], rows: Tensor) -> Tensor:
+            rows = rows.to(t.device)
+            if kind[2]:
+                return self.of_keyframes(kind[0], kind[1], t[rows])
+            return self.of_shapes(starts[rows], ends[rows], t[rows], kind[0], kind[1])
+
+        return by_kind(kinds, solve)
+
+    def of_shapes(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: int, j: int) -> Tensor:
+        """Shapes between any two, with the modes of two key-frames, which may be the same.
+
+        *Shape:* ``(B, V, 3), (B, V, 3), (B,) -> (B, V, 3)``.
+
+        Raises:
+            ValueError: A shape is not finite, has no size, or is the mirror image of the other.
+
+        Warns:
+            ConvergenceWarning: Some did not converge.
+        """
+        if i > j:
+            return self.of_shapes(x_b, x_a, 1 - t, j, i)
+        key = i, j, x_a.dtype, x_a.device
+        return _checked(self._layers.get(key, lambda: self._layer(i, j, x_a)).solve(x_a, x_b, t), i, j)
+
+    def of_keyframes(self, i: int, j: int, t: Tensor) -> Tensor:
+        """Shapes between two key-frames, from their table if there are tables.
+
+        *Shape:* ``(B,) -> (B, V, 3)``, in the dtype and on the device of ``t``.
+
+        Raises:
+            ValueError: There are no in-betweens of the two.
+
+        Warns:
+            ConvergenceWarning: Some did not converge.
+        """
+        if i > j:
+            return self.of_keyframes(j, i, 1 - t)  # one table serves both ways
+        if self.times is None:
+            key = i, j, t.dtype, t.device
+            return _checked(self._paths.get(key, lambda: self._path(i, j, t))(t), i, j)
+        return interpolate(self.table(i, j), t.to("cpu", self.dtype)).to(t)
+
+    def table(self, i: int, j: int) -> Tensor:
+        """In-betweens of two key-frames at even times, from disk if stored. *Shape:* ``(T, V, 3)``.
+
+        Raises:
+            ValueError: There are no tables, or no in-betweens of the two.
+
+        Warns:
+            CacheWarning: The objective has a term of the user's own, so that each process computes its tables again.
+            ConvergenceWarning: Some did not converge; the table is not stored, so that each run warns.
+        """
+        if self.times is None:
+            raise ValueError("a space of times=None solves each in-between: it has no tables")
+        found: Tensor = self._tables.get((i, j), lambda: self._stored_or_solved(i, j))
+        return found
+
+    def _stored_or_solved(self, i: int, j: int) -> Tensor:
+        assert self.times is not None
+        key = None if self.folder is None else self._key(i, j)
+        path = (self.folder or Path()) / f"between-{i}-{j}.safetensors"
+        if key is not None and (stored := read_table(path, key)) is not None:
+            return stored
+        t = torch.linspace(0, 1, self.times, dtype=torch.float64)
+        with torch.no_grad():
+            result = self._path(i, j, t)(t)
+        table = _checked(result, i, j).to(self.dtype)
+        if key is not None and bool(result.solution.usable.all()):
+            write_table(path, table, key)
+        return table
+
+    def _layer(self, i: int, j: int, like: Tensor) -> InBetween:
+        ends = [self.bases[i], self.bases[j]]
+        return InBetween(ends, self.faces, objective=self.objective, solver=self.solver).to(like)
+
+    def _path(self, i: int, j: int, like: Tensor) -> Callable[[Tensor], InBetweenResult]:
+        """Shapes between two key-frames: along the motion if they follow each other in it, else of the pair."""
+        motion, span = self.motion, None if self.motion is None else self.motion.span(i, j)
+        bases = [self.bases[i], self.bases[j]] if span is None else list(self.bases)
+        shapes = torch.stack([basis.reference for basis in bases]).to(like)
+        if span is None and not self.objective.contact:
+            return partial(self._layer(i, j, like).solve, *shapes)
+        # A path separates contacts the same way at all times, so that tables are smooth.
+        given: dict[str, Any] = {"objective": self.objective, "solver": self.solver}
+        if span is None or motion is None:
+            return partial(MotionPath(bases, self.faces, **given).to(like).solve, shapes)
+
+        def made() -> MotionPath:
+            return MotionPath(bases, self.faces, motion.times, motion.cyclic, **given).to(like)
+
+        path = self._paths.get((like.dtype, like.device), made)
+        start, end = torch.tensor(span, dtype=torch.float64, device=like.device)
+        return lambda t: path.solve(shapes, torch.lerp(start, end, t.double()))  # exact at both ends
+
+    def _key(self, i: int, j: int) -> dict[str, str] | None:
+        """Digest of all inputs of a table: bases, times, faces, settings and code; None, with a warning, if unknown."""
+        span = None if self.motion is None else self.motion.span(i, j)
+        bases = self.bases if span else [self.bases[place] for place in (i, j)]
+        tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]
+        code = __version__, str(torch.__version__), code_digest()
+        when = self.motion and span and (span, self.motion.times)
+        try:
+            content = content_digest([*code, tensors, self.faces, when, self.objective, self.solver])
+        except ContentError as error:
+            warnings.warn(
+                f"tables of in-betweens are not stored in {self.folder}, as their key cannot hold the objective's own "
+                f"terms: {error}",
+                CacheWarning,
+                stacklevel=5,
+            )
+            return None
+        return {"times": str(self.times), "dtype": str(self.dtype), "content": content}
+
+
+def by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
+    """Results of a batch whose rows of one kind are computed together.
+
+    Args:
+        kinds: On the CPU. *Shape:* ``(B, n)``.
+        compute: Returns the results of the rows of a kind, from the kind and the indices of its rows.
+
+    Returns:
+        In the order of the batch. *Shape:* ``(B, ...)``.
+    """
+    each, kind = kinds.unique(dim=0, return_inverse=True)
+    rows = [torch.nonzero(kind == number).flatten() for number in range(len(each))]
+    found = torch.cat([compute(own, mine) for own, mine in zip(each.tolist(), rows, strict=True)])
+    return found[torch.argsort(torch.cat(rows)).to(found.device)]
+
+
+def interpolate(table: Tensor, t: Tensor) -> Tensor:
+    """Cubic Lagrange interpolation among the four nearest of even times in [0, 1].
+
+    Reads these four only, so that a memory-mapped table is not loaded whole. Exact at the times of the table.
+
+    Args:
+        table: Four shapes or more. *Shape:* ``(T, V, 3)``.
+        t: Times in [0, 1]. *Shape:* ``(B,)``.
+
+    Returns:
+        *Shape:* ``(B, V, 3)``.
+    """
+    n = len(table)
+    place = t * (n - 1)
+    start = (place.detach().floor().long() - 1).clamp(0, n - 4)
+    x = place - start
+    # The basis polynomials of the nodes 0, 1, 2, 3.
+    weights = [
+        (1 - x) * (2 - x) * (3 - x) / 6,
+        x * (2 - x) * (3 - x) / 2,
+        x * (x - 1) * (3 - x) / 2,
+        x * (x - 1) * (x - 2) / 6,
+    ]
+    return sum(weight[:, None, None] * table[start + i] for i, weight in enumerate(weights))  # type: ignore[return-value]
+
+
+def read_table(path: Path, key: dict[str, str]) -> Tensor | None:
+    """A memory-mapped table; None if it is missing, damaged, or of another key."""
+    with contextlib.suppress(OSError, ValueError):
+        file = TensorFile(path, FORMAT, VERSION, ("shapes",))
+        if file.metadata == {"format": FORMAT, "version": VERSION, **key}:
+            return file.tensor("shapes")
+    return None
+
+
+def write_table(path: Path, table: Tensor, key: dict[str, str]) -> None:
+    """Store a table, if its folder is writable."""
+    with contextlib.suppress(OSError):
+        write_tensors(path, FORMAT, VERSION, {"shapes": table}, key)
+
+
+def _checked(result: InBetweenResult, i: int, j: int) -> Tensor:
+    """The in-betweens; raises for invalid shapes and warns of unconverged ones."""
+    if not bool(result.shapes.isfinite().all()):
+        raise ValueError(
+            f"there is no in-between of some shapes near the key-frames {i} and {j}: one is not finite, has no size, "
+            "or is the mirror image of the other"
+        )
+    status = result.solution.status
+    missed = ~result.solution.usable
+    if bool(missed.any()):
+        names = ", ".join(sorted({Status(value).name for value in status[missed].tolist()}))
+        warnings.warn(
+            f"{int(missed.sum())} of {missed.numel()} in-betweens near the key-frames {i} and {j} did not converge "
+            f"({names}) and are only the best shapes found: give the space a solver of more max_steps or a larger "
+            "tolerance, or key-frames that are nearer to each other",
+            ConvergenceWarning,
+            stacklevel=3,
+        )
+    return result.shapes

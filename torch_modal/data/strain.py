@@ -1,0 +1,66 @@
+"""Strains that vibration modes cause, and the scales of modes that give them the strain of one."""
+
+import torch
+from torch import Tensor
+
+from torch_modal.energy.bend import dihedral_gradient
+from torch_modal.geometry.canonical import size
+from torch_modal.geometry.connectivity import Connectivity
+from torch_modal.geometry.vectors import cross, norm
+from torch_modal.precompute.basis import ModalBasis
+from torch_modal.precompute.sheet import THICKNESS
+
+# Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
+_NOT_ELASTIC = 1e-8
+
+
+def mode_scales(basis: ModalBasis, faces: Tensor, edges: Tensor) -> Tensor:
+    r"""Factors of the modes, proportional to :math:`1 / \sqrt{\lambda}`; zero for modes that do not deform.
+
+    Independent standard normal amplitudes of modes so scaled give an expected root mean square strain of one: of the
+    edges, or, of sheets, where bending strains their sides more than that, of their sides.
+
+    Args:
+        basis: Of the key-frame.
+        faces: *Shape:* ``(F, 3)``.
+        edges: *Shape:* ``(E, 2)``.
+
+    Returns:
+        Float64. *Shape:* ``(k,)``.
+    """
+    x, values = basis.reference.double(), basis.eigenvalues.double()
+    scales = torch.where(values > _NOT_ELASTIC * values.amax(), values, torch.inf).rsqrt()
+    modes = basis.modes.double() * scales[:, None, None]
+    i, j = edges.unbind(1)
+    side = x[j] - x[i]
+    lengths = side.square().sum(-1)
+    strains = ((modes[:, j] - modes[:, i]) * side).sum(-1) / lengths.clamp_min(1e-300)
+    expected = _expected(strains, torch.ones_like(lengths))
+    bending, areas = _bending_strains(modes, x, faces)
+    by_bending = _expected(bending, areas)
+    if by_bending > _expected(strains, lengths):  # a sheet, which bends without a change of length
+        expected = by_bending
+    return scales / expected.clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def _expected(strains: Tensor, weights: Tensor) -> Tensor:
+    """Expected root mean square for standard normal amplitudes. *Shape:* ``(k, n), (n,) -> ()``."""
+    return (strains.square() @ weights / weights.sum()).sum().sqrt()
+
+
+def _bending_strains(modes: Tensor, x: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Strain of the sides of a sheet across each hinge, for the thickness that shell modes have, and the hinges' areas.
+
+    *Shape:* ``(k, V, 3), (V, 3), (F, 3) -> (k, H), (H,)``, to first order.
+    """
+    hinges = torch.tensor(Connectivity(faces.numpy(), len(x)).hinges)
+    first, *others = (torch.cat([x[None], modes])[:, corner] for corner in hinges.unbind(1))
+    vectors = torch.stack([other - first for other in others]).movedim(-1, 1)
+    rest, moves = vectors[:, :, 0], vectors[:, :, 1:]
+    angles = (dihedral_gradient(rest)[:, :, None] * moves).sum((0, 1))
+    e, a, b = rest
+    tiny = torch.finfo(x.dtype).tiny
+    areas = 0.5 * (norm(cross(e, a)) + norm(cross(e, b)))
+    apart = 2 * areas / (3 * norm(e)).clamp_min(tiny)  # of the centroids
+    thickness = THICKNESS * size(x.numpy(), faces.numpy())
+    return 0.5 * thickness * angles / apart.clamp_min(tiny), areas

@@ -1,0 +1,148 @@
+"""The solid inside a surface: its tetrahedra, and the surface embedded in them."""
+
+import threading
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.io.cache import Cache
+from torch_modal.precompute.eigen import ElasticBody
+from torch_modal.precompute.embedding import N_NEIGHBOURS, find_neighbours, fit_weights
+from torch_modal.precompute.stiffness import HessianForm, arap_hessian, mass_matrix
+from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import (
+    Mesher,
+    Tetrahedra,
+    filled,
+    kept_tetrahedra,
+    loose_pieces,
+    small_pieces,
+    solid_volumes,
+)
+
+REACH = 2.0
+"""Radius of the region that a small piece follows, relative to its distance from the body or its own size."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """Tetrahedra in the pose of a key-frame: its own, or carried from another.
+
+    Mass and embedding come from the pose that was meshed, in which no tetrahedron is inverted and no point is closer to
+    another limb than to its own.
+
+    Attributes:
+        surface: The key-frame.
+        tetrahedra: The volume mesh, in the units of the surface.
+        neighbours: Embedding of the surface in the pose that was meshed
+            (:func:`~torch_modal.precompute.embedding.find_neighbours`). *Shape:* ``(U, 12)``.
+        kernel: Likewise. *Shape:* ``(U, 12)``.
+        meshed: The key-frame that the tetrahedra were carried from; None if they are its own.
+    """
+
+    surface: CanonicalSurface
+    tetrahedra: Tetrahedra
+    neighbours: IntArray
+    kernel: FloatArray
+    meshed: "Solid | None" = None
+
+    @classmethod
+    def filling(cls, surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> "Solid":
+        """Mesh a surface, unless the cache has its tetrahedra.
+
+        Raises:
+            TetrahedralizationError: The mesher failed.
+            StoppedError: ``stop`` was set.
+        """
+
+        def compute() -> dict[str, NDArray[Any]]:
+            tetrahedra = filled(surface, mesher, cache, stop)
+            neighbours, kernel = find_neighbours(surface.points, tetrahedra, surface.normals)
+            piece = loose_pieces(tetrahedra)
+            bears = np.bincount(piece[neighbours[kernel > 0]], minlength=piece.max() + 1) > 0
+            if not bears.all():  # pieces without any point of the surface
+                tetrahedra = kept_tetrahedra(tetrahedra, bears[piece[tetrahedra.tets[:, 0]]])
+                neighbours, kernel = find_neighbours(surface.points, tetrahedra, surface.normals)
+            return {**tetrahedra.arrays(), "neighbours": neighbours, "kernel": kernel}
+
+        inputs = {"points": surface.points, "faces": surface.faces}
+        found = cache.get("solid", inputs, mesher.key(), compute)
+        tetrahedra = Tetrahedra(found["vertices"], found["tets"], found.get("inside"))
+        return cls(surface, tetrahedra, found["neighbours"], found["kernel"])
+
+    def carried(self, surface: CanonicalSurface, vertices: FloatArray) -> "Solid":
+        """The solid in the pose of another key-frame."""
+        tetrahedra = self.tetrahedra._replace(vertices=vertices)
+        return replace(self, surface=surface, tetrahedra=tetrahedra, meshed=self)
+
+    def weights(self) -> sp.csr_matrix:
+        """Displacements of the surface from those of the tetrahedra. *Shape:* ``(U, N)``."""
+        return fit_weights(self.surface.points, self.tetrahedra.vertices, self.neighbours, self.kernel)
+
+    def mass(self) -> sp.csr_matrix:
+        """Mass at a density of 1. *Shape:* ``(N, N)``."""
+        rest = (self.meshed or self).tetrahedra
+        return mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
+
+    def body(self, form: HessianForm) -> ElasticBody:
+        """Stiffness and mass of the larger pieces."""
+        tetrahedra, vertices, following = larger_pieces(self.tetrahedra)
+        weights = sp.csr_matrix(self.weights() @ following)
+
+        def to_surface(motions: FloatArray) -> FloatArray:
+            return (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:])
+
+        mass = self.mass()[vertices][:, vertices]
+        return ElasticBody(tetrahedra.vertices, arap_hessian(tetrahedra, form), mass, to_surface)
+
+
+def larger_pieces(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, sp.csr_matrix]:
+    """Tetrahedra without small loose pieces, which follow the nearest part of the others.
+
+    Small pieces have little mass, so their rigid motions of unit mass would be larger than other modes by orders of
+    magnitude.
+
+    Returns:
+        The larger pieces; indices of their vertices in the whole mesh, *Shape:* ``(M,)``; displacements of all vertices
+        from these, exact for linear fields, *Shape:* ``(N, M)``.
+    """
+    n, piece = len(tetrahedra.vertices), loose_pieces(tetrahedra)
+    of_tets = piece[tetrahedra.tets[:, 0]]
+    volumes = np.bincount(of_tets, solid_volumes(tetrahedra))
+    small = small_pieces(volumes, tetrahedra.vertices[tetrahedra.tets], of_tets)
+    stays = np.flatnonzero(~small[piece])
+    if len(stays) == n:
+        return tetrahedra, stays, sp.identity(n, format="csr")
+    kept = kept_tetrahedra(tetrahedra, ~small[of_tets])
+    rows, weights = [stays], [sp.identity(len(stays), format="csr")]
+    for own in (np.flatnonzero(piece == index) for index in np.flatnonzero(small)):
+        points = tetrahedra.vertices[own]
+        around = np.tile(_around(points, kept.vertices, piece[stays]), (len(own), 1))
+        rows.append(own)
+        weights.append(fit_weights(points, kept.vertices, around, np.ones(around.shape)))
+    order = np.argsort(np.concatenate(rows))
+    return kept, stays, sp.csr_matrix(sp.vstack(weights, format="csr")[order])
+
+
+def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArray:
+    """Vertices of the nearest piece, spread by farthest-point sampling over a region as large as its distance.
+
+    *Shape:* ``(n, 3), (N, 3), (N,) -> (12,)``.
+    """
+    center = points.mean(axis=0)
+    nearest = int(np.linalg.norm(vertices - center, axis=1).argmin())
+    reach = REACH * max(np.linalg.norm(vertices[nearest] - center), np.linalg.norm(np.ptp(points, axis=0)))
+    distance = np.linalg.norm(vertices - vertices[nearest], axis=1)
+    distance[piece != piece[nearest]] = np.inf
+    near = np.argsort(distance, kind="stable")
+    near = near[: max(int((distance <= reach).sum()), min(N_NEIGHBOURS, int(np.isfinite(distance).sum())))]
+    # Farthest-point sampling.
+    found, to_found = [0], distance[near]
+    while len(found) < N_NEIGHBOURS:
+        found.append(int(to_found.argmax()))
+        to_found = np.minimum(to_found, np.linalg.norm(vertices[near] - vertices[near[found[-1]]], axis=1))
+    return near[found]
