@@ -177,6 +177,7 @@ def test_velocities_are_continuous_where_edges_change(bars: Shapes) -> None:
     """Both sides of a key-frame fit vertices to edges by the same weights."""
     x, key, h = bars.keyframes.clone(), times(1.0), 1e-5
     x[1] *= 1 + 0.5 * torch.sin(3 * x[1][:, :1])
+    x[2] *= 1 + 0.5 * torch.sin(2 * x[2][:, 1:2])
     jumps = [
         largest((trajectory(x, key + h) + trajectory(x, key - h) - 2 * x[1]) / h)
         for trajectory in (Path(x, bars.faces, smooth=smooth) for smooth in (True, False))

@@ -212,7 +212,8 @@ class LocalRotations(nn.Module):
             x, y, z = turned(straight[:3], turned(bent[:3], side))
             return x * trajectory.e1 + y * trajectory.e2 + z * trajectory.normal
 
-        areas = doubled_areas(*trajectory.size) + doubled_areas(*(trajectory.size + trajectory.step[3:]))
+        # At a key-frame, the intervals on both sides weigh alike: velocities of edges are continuous.
+        areas = torch.lerp(doubled_areas(*trajectory.size), doubled_areas(*(trajectory.size + trajectory.step[3:])), u)
         first, second = mapped(xx, xy, xy, yy) if bending is None else stretched(bending[3:], xx, xy, yy)
         return self._edges(Sides(placed(*first), placed(*second)), areas)
 

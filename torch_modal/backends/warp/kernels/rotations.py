@@ -367,8 +367,8 @@ def trajectory_edges(
         y = second_axis(q)
         one = x[0] * e1 + x[1] * e2 + x[2] * normal
         two = y[0] * e1 + y[1] * e2 + y[2] * normal
-        area = doubled_area(c[9], c[10], c[11])
-        area += doubled_area(c[9] + c[15], c[10] + c[16], c[11] + c[17])
+        area = (real(1.0) - u) * doubled_area(c[9], c[10], c[11])
+        area += u * doubled_area(c[9] + c[15], c[10] + c[16], c[11] + c[17])
         first = xx * one + xy * two
         second = HALF * first + HEIGHT * (xy * one + yy * two)
         add_sides(
