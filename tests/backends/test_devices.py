@@ -16,14 +16,14 @@ from conftest import Shapes
 from torch import Tensor, nn
 from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.overrides import TorchFunctionMode
-from torch_modal.backends.torch.alignment import Pair
 
 import torch_modal as tm
+from torch_modal import trees
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
 from torch_modal.contact.active import ContactEnergy, Contacts
 from torch_modal.energy.energy import Energy
-from torch_modal.geometry.rigid import RigidMotion
-from torch_modal.inbetween.results import Samples
+from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.settings import PRESETS
 
 DOUBLE = torch.float64
@@ -116,21 +116,16 @@ def steps(energy: Energy, x: Tensor, reference: Any) -> None:
     assert_there(_solved(energy, ConvexHessian(energy, at), right, 3, []))
 
 
-def assert_member_runs(member: Any, x: Tensor, t: Tensor, stiffness: list[Tensor]) -> None:
-    """An in-between of the joint or paired space but for its loops: where it starts, one step, the way back."""
-    if hasattr(member.space, "blend"):
-        member.space.blend = None  # its factors are applied by the processor, to numbers
-    samples = Samples(x, x + 1, None, t, torch.ones_like(t), stiffness)
-    still = RigidMotion(blank(2, 3, 3), blank(2, 3), blank(2, 3))
-    pair = Pair(samples.x_a, samples.x_b, still, still)
-    problem = member.problem(pair, samples)
-    a = t.new_zeros(len(t), member.space.n_unknowns)
-    derivatives = member.space.energy.derivatives(a, problem.placement)
-    shapes = member.space.lift(a, problem)
-    assert_there([problem, derivatives, shapes, member.frame.restore(shapes, pair, t)])
-    reference = member.rests(samples, pair, None).reference(member.fine.energy)
-    assert_there([reference, member.anchors(pair, t) or []])
-    steps(member.fine.energy, shapes, reference)
+def assert_core_runs(core: Any, x: Tensor, stiffness: list[Tensor]) -> None:
+    """An in-between but for its base and its loops: one step, the way back."""
+    rests = RestShapes(torch.stack([x, x + 1], 1), blank(2, 2), stiffness)
+    placement, a = core.space.place(x, rests, blank(2)), blank(2, core.space.energy.n_amplitudes)
+    pose, shapes = Pose(blank(2, 3, 3), blank(2, 3)), core.space.lift(a, x)
+    assert_there([placement, core.space.energy.derivatives(a, placement), shapes])
+    assert_there([core.alignment.restore(shapes, pose), core.alignment.bring(shapes, pose)])
+    reference = rests.reference(core.fine.energy)
+    assert_there(reference)
+    steps(core.fine.energy, shapes, reference)
 
 
 def test_shell_energy(small_bars: Shapes) -> None:
@@ -142,18 +137,16 @@ def test_shell_energy(small_bars: Shapes) -> None:
 
 @pytest.mark.parametrize("backend", ["torch", "warp"])
 @pytest.mark.parametrize("preset", ["accurate", "fast", "paper"])
-@pytest.mark.parametrize("kind", ["InBetween", "InBetween with contact", "MidShape", "Path"])
+@pytest.mark.parametrize("kind", ["InBetween", "InBetween with contact", "MidShape"])
 def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> None:
     if backend == "warp":
         pytest.importorskip("warp")
-    if preset == "paper" and kind in ("InBetween with contact", "Path"):
-        pytest.skip("the paired space has neither")
+    if preset == "paper" and "contact" in kind:
+        pytest.skip("the paired space has none")
     solver = replace(PRESETS[preset].solver, backend=backend)
     bases, faces = small_bars.bases[:2], small_bars.faces
     if kind == "MidShape":
         layer: Any = tm.MidShape(bases, faces, preset=preset, solver=solver).in_between
-    elif kind == "Path":
-        layer = tm.Path(bases, faces, preset=preset, solver=solver).layer
     else:
         if "contact" in kind:
             pytest.importorskip("ipctk")
@@ -166,7 +159,20 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
             on_gpu(own, mode)
             part._kept = part.columns, own
         t = blank(2)
-        assert_member_runs(layer.core, blank(2, 30, 3), t, layer.stiffness_of(t, t.shape))
+        assert_core_runs(layer.core, blank(2, 30, 3), layer.stiffness_of(t, t.shape))
+
+
+@pytest.mark.parametrize("backend", ["torch", "warp"])
+def test_splines(small_bars: Shapes, backend: str) -> None:
+    """Triangles and poses between key-frames."""
+    spline = tm.Path(small_bars.keyframes, small_bars.faces, solver=tm.Solver(backend=backend)).spline
+    knots = spline.knots(small_bars.keyframes[None])
+    with gpu() as mode, torch.no_grad():
+        on_gpu(spline, mode)
+        knots = trees.filled(knots, [there(x, mode) for x in trees.leaves(knots)])
+        u, which = blank(2), torch.zeros(2, dtype=torch.int64, device="cuda")
+        assert_there([spline.straight(knots, 1, which, u), spline.pose(knots, 1, which, u)])
+        assert_there(spline.rotations[1].along(spline.trajectory(knots, 1), which, u))
 
 
 def test_contacts() -> None:

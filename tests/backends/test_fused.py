@@ -16,7 +16,6 @@ from conftest import Shapes
 from terms import Area, Spring
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
-from torch_modal.geometry.hermite import Spacing
 
 import torch_modal as tm
 from torch_modal import trees
@@ -39,8 +38,9 @@ from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
-from torch_modal.geometry.local_rotations import LocalRotations
+from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 from torch_modal.inbetween.settings import PRESETS
+from torch_modal.motion.cubics import cubics
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
@@ -152,55 +152,48 @@ class TestModal:
     """The energy in the amplitudes of a space."""
 
     @staticmethod
-    def both(case: Case, extra: bool) -> list[tuple[ModalEnergy, Placement]]:
+    def both(case: Case) -> list[tuple[ModalEnergy, Placement]]:
         start, generator = case.given[0], torch.Generator().manual_seed(2)
         columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
-        own = torch.randn(start.shape, dtype=DOUBLE, generator=generator) if extra else None
         shell = WarpShell(case.energy, case.mesh)
         modals = WarpModalEnergy(shell, case.mesh, columns), ModalEnergy(case.energy, columns)
         rests = case.rests(*case.given[1:])
         return [
-            (modals[0], modals[0].place(start, shell.reference(rests), own)),
-            (modals[1], modals[1].place(start, rests.reference(case.energy), own)),
+            (modals[0], modals[0].place(start, shell.reference(rests))),
+            (modals[1], modals[1].place(start, rests.reference(case.energy))),
         ]
 
-    @pytest.mark.parametrize("extra", [False, True])
     @torch.no_grad()
-    def test_values_and_derivatives(self, case: Case, extra: bool) -> None:
-        a = 0.1 * torch.randn(2, 5 + extra, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
-        (fused, own), (plain, truth) = self.both(case, extra)
+    def test_values_and_derivatives(self, case: Case) -> None:
+        a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), (plain, truth) = self.both(case)
         several = torch.stack([a, 2 * a, -a])
         torch.testing.assert_close(fused.value(several, own), plain.value(several, truth), rtol=1e-12, atol=0)
         torch.testing.assert_close(fused.rows(a, own), plain.rows(a, truth), rtol=0, atol=1e-11)
         found, wanted = fused.derivatives(a, own), plain.derivatives(a, truth)
         assert float(wanted.second_order.abs().max()) > 1e-3 * float(wanted.gauss_newton.abs().max())
         assert_alike(found, wanted, 1e-9)
-        assert_alike((fused.second_order(a, own),), (plain.second_order(a, truth),), 1e-9)
         value, gradient = fused.value_and_gradient(a, own)
         torch.testing.assert_close(value, plain.value(a, truth), rtol=1e-12, atol=0)
         torch.testing.assert_close(plain.value_and_gradient(a, truth)[0], plain.value(a, truth), rtol=1e-12, atol=0)
         assert_alike((gradient, plain.value_and_gradient(a, truth)[1]), (wanted.gradient,) * 2, 1e-9)
 
-    @pytest.mark.parametrize("extra", [False, True])
-    def test_pull_back(self, case: Case, extra: bool) -> None:
+    def test_pull_back(self, case: Case) -> None:
         generator = torch.Generator().manual_seed(4)
-        a, direction = torch.randn(2, 2, 5 + extra, dtype=DOUBLE, generator=generator).mul(0.1)
-        (fused, own), _ = self.both(case, extra)
+        a, direction = torch.randn(2, 2, 5, dtype=DOUBLE, generator=generator).mul(0.1)
+        (fused, own), _ = self.both(case)
         with torch.no_grad():
             found = trees.leaves(fused.pull_back(a, direction, own))
         by_torch = fused.pull_back(a, direction, own)  # to be differentiated
         assert_alike(found, trees.leaves(by_torch), 1e-10)
 
-    @pytest.mark.parametrize("extra", [False, True])
     @torch.no_grad()
-    def test_samples_that_are_too_many_at_a_time(
-        self, case: Case, extra: bool, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_samples_that_are_too_many_at_a_time(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
         """No array of all samples outgrows what kernels count: they are taken in chunks."""
-        a = 0.1 * torch.randn(2, 5 + extra, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
-        (fused, own), _ = self.both(case, extra)
+        a = 0.1 * torch.randn(2, 5, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+        (fused, own), _ = self.both(case)
         several, many = torch.cat([a, -a, 2 * a])[:5], trees.rows(own, torch.tensor([0, 1, 0, 1, 0]))
-        truth = [*fused.derivatives(several, many), fused.second_order(several, many)]
+        truth = fused.derivatives(several, many)
         largest = len(fused.blocks) * fused.blocks.shape[1] * 8
         monkeypatch.setattr(fused_modal, "MOST_NUMBERS", largest)
         sizes: list[int] = []
@@ -210,9 +203,9 @@ class TestModal:
             launch.launch(kernel, dim, given)
 
         monkeypatch.setattr(fused_modal, "launch", watched)
-        found = [*fused.derivatives(several, many), fused.second_order(several, many)]
+        found = fused.derivatives(several, many)
         assert max(sizes) <= largest
-        assert_alike(tuple(found), tuple(truth), 1e-13)
+        assert_alike(found, truth, 1e-13)
         assert fused.derivatives(several, many, second_order=False).second_order is None
 
     @pytest.mark.parametrize("n_shapes", [1, 2, 4])
@@ -294,11 +287,13 @@ class TestRotations:
 
     def test_on_a_course(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes
-        hours = Spacing(*(torch.ones(1, dtype=DOUBLE) for _ in range(3)))
         which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
 
         def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-            trajectory = rotations.trajectory(x[2:3], first, second, None, hours)
+            before, own, after = (rotations.frames(shape) for shape in (x[2:3], first, second))
+            found = cubics(torch.stack([rotations.step(before, own), rotations.step(own, after)]), t.new_ones(2), False)
+            size = torch.stack(own[3:])
+            trajectory = Trajectory(own.e1, own.e2, own.normal, size, *(part[1] for part in found))
             return kind.along(rotations, trajectory, which, t)
 
         def by_warp(*given: Tensor) -> Tensor:
@@ -366,7 +361,7 @@ class TestLayers:
         for kind in ("warp", "torch"):
             solver = tm.Solver(backend=kind, polish=1)  # type: ignore[arg-type]
             path = tm.Path(bars.bases[:n], bars.faces, objective=objective, solver=solver)
-            assert isinstance(path.core.fine, WarpFineEnergy) == (kind == "warp")
+            assert isinstance(path.layers[0].core.fine, WarpFineEnergy) == (kind == "warp")
             keyframes = bars.keyframes[:n].clone().requires_grad_()
             shape = path(keyframes, t)
             with torch.no_grad():
@@ -379,15 +374,10 @@ class TestLayers:
         from torch._subclasses import FakeTensorMode
 
         layer = tm.InBetween(small_bars.bases[:2], small_bars.faces)
-        member = layer.core
         with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
             x = mode.from_tensor(small_bars.keyframes[:1])
-            assert (
-                member.space.blend.rotations(
-                    torch.stack([x, x], 1), mode.from_tensor(torch.zeros(1, 2, dtype=DOUBLE))
-                ).shape[0]
-                == 3
-            )
+            weights = mode.from_tensor(torch.zeros(1, 2, dtype=DOUBLE))
+            assert layer.core.blend.rotations(torch.stack([x, x], 1), weights).shape[0] == 3
 
 
 def test_what_a_kernel_would_read_wrongly_is_refused() -> None:

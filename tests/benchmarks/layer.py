@@ -5,9 +5,8 @@
 
 Everything compared is measured in one run, in turns, so that a busy machine slows both sides; what to read are the
 ratios. The reference of a batch is a loop of single calls over the same samples. Each sample has key-frames and a time
-of its own. 30 + 30 and 50 + 50 modes make 60 and 100 unknowns, and one more for the difference of the key-frames;
-dependent modes are dropped. What is timed is the modal solve alone, to the last digit (base="linear", local_steps=0),
-which all else is added to; ``--preset`` times that of a name instead.
+of its own. 30 + 30 and 50 + 50 modes make 60 and 100 unknowns; dependent modes are dropped. What is timed is the modal
+solve with what it starts from (local_steps=0); ``--preset`` times that of a name instead.
 
 On a machine that others use too, threads wait for each other, small calls the most: the loop then looks bad without
 being so. ``--threads 1 --cpu-time`` counts the time of the processor instead of the clock's.
@@ -44,7 +43,7 @@ class Case:
         if arguments.preset:
             layer = tm.InBetween(bases, faces, arguments.preset)
         else:
-            objective = tm.Objective(base="linear", coarse_faces=arguments.coarse_faces)
+            objective = tm.Objective(coarse_faces=arguments.coarse_faces)
             layer = tm.InBetween(bases, faces, objective=objective, solver=tm.Solver(local_steps=0))
         self.layer = layer.to(arguments.device, dtype)
         generator = torch.Generator().manual_seed(0)
@@ -91,12 +90,12 @@ def speed(arguments: argparse.Namespace, modes: int, dtype_name: str) -> None:
     device, batches = arguments.device, sorted(arguments.batches)
     case = Case(modes, batches[-1], DTYPES[dtype_name], arguments)
     layer, n_single = case.layer, min(batches[-1], arguments.singles)
-    space: Any = layer.core.space
+    energy: Any = layer.core.space.energy
     solution = layer.solve(*case.samples).solution
     lost = int((~solution.usable).sum())
     mean_steps = float(solution.n_steps.double().mean())
     print(
-        f"\n{modes}+{modes} modes ({space.n_unknowns} unknowns), {len(space.frame.coarse.faces)} coarse faces, "
+        f"\n{modes}+{modes} modes ({energy.n_amplitudes} unknowns), {arguments.coarse_faces} coarse faces, "
         f"{dtype_name}, {device}: {mean_steps:.1f} steps a sample on average, {int(solution.n_steps.max())} at most"
         + (f", {lost} of {batches[-1]} not converged" if lost else "")
     )
@@ -173,8 +172,7 @@ def probe(arguments: argparse.Namespace) -> None:
 
 def limit(layer: tm.InBetween, gradient: str, max_steps: int) -> None:
     """Other settings in a layer that stands."""
-    for owner in (layer, *layer.members):
-        owner.solver = replace(owner.solver, gradient=gradient, max_steps=max_steps)
+    layer.solver = layer.core.solver = replace(layer.solver, gradient=gradient, max_steps=max_steps)
 
 
 def _resident_peak(reset: bool = False) -> float:

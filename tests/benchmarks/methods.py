@@ -26,9 +26,6 @@ import torch_modal as tm
 from torch_modal.geometry.rigid import blend
 
 PEER_SECONDS = 180
-# The modes alone, in two ways: as plain as can be, to the last digit, and as the preset "accurate" has it.
-BARE = {"objective": tm.Objective(base="linear"), "solver": tm.Solver(local_steps=0)}
-MODES_ONLY = {"solver": tm.Solver(local_steps=0)}
 MOST_VERTICES = 15_000  # over all vertices: more take minutes a step
 # One thread, as for all others; with more, jax 0.10 waits for itself for ever on few cores and large meshes.
 PEER_ENVIRONMENT = {
@@ -102,14 +99,8 @@ def paired(case: Case) -> Outcome:
 
 @method("joint")
 def joint(case: Case) -> Outcome:
-    """The modes added to linear interpolation: 30 of each end, 1,000 coarse faces, to the last digit."""
-    return by_layer(case, 30, **BARE)
-
-
-@method("joint + rotations")
-def rotations(case: Case) -> Outcome:
-    """As "accurate" without its local steps: onto a blend by local rotations, and not to the last digit."""
-    return by_layer(case, 30, **MODES_ONLY)
+    """The modes added to the blend by local rotations: as "accurate" without its local steps."""
+    return by_layer(case, 30, solver=tm.Solver(local_steps=0))
 
 
 @method("fast")

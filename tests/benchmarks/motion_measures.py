@@ -50,34 +50,28 @@ class Measured:
 
     def __init__(self, motion: Motion) -> None:
         self.motion, shapes = motion, motion.shapes
-        self.path = Path(shapes.bases(30), shapes.faces, motion.times, motion.cyclic)
+        #: Smooth, and each pair alone.
+        self.paths = {
+            smooth: Path(shapes.bases(30), shapes.faces, motion.times, motion.cyclic, smooth)
+            for smooth in (True, False)
+        }
         n = len(shapes.keyframes)
         self.yards = [Yardstick(Case(motion.name, shapes, i, (i + 1) % n, {})) for i in range(len(motion.times) - 1)]
         self.truths = None if motion.truth is None else [motion.truth(t) for t in motion.measured]
 
-    def at(self, times: Any, smooth: bool = True, knots: Tensor | None = None) -> Tensor:
-        """Shapes; of a path whose key-frames are at other times, each at the same part of its interval."""
-        path, t = self.path, torch.as_tensor(times, dtype=torch.float64)
-        own = path.times
-        if knots is not None:
-            t = own[0] + (t - own[0]) % (own[-1] - own[0]) if self.motion.cyclic else t
-            i = (torch.searchsorted(own, t, right=True) - 1).clamp(0, len(own) - 2)
-            t = knots[i] + (t - own[i]) / own.diff()[i] * knots.diff()[i]
-        path.smooth, path.times = smooth, own if knots is None else knots
-        try:
-            with torch.no_grad():
-                return path(self.motion.shapes.keyframes, t)
-        finally:
-            path.smooth, path.times = True, own
+    def at(self, times: Any, smooth: bool = True) -> Tensor:
+        """Shapes."""
+        with torch.no_grad():
+            return self.paths[smooth](self.motion.shapes.keyframes, torch.as_tensor(times, dtype=torch.float64))
 
-    def measure(self, smooth: bool = True, knots: Tensor | None = None) -> Found:
+    def measure(self, smooth: bool = True) -> Found:
         """All that can be measured on shapes."""
         motion, found = self.motion, Found()
-        for n, (t, x) in enumerate(zip(motion.measured, self.at(motion.measured, smooth, knots), strict=True)):
+        for n, (t, x) in enumerate(zip(motion.measured, self.at(motion.measured, smooth), strict=True)):
             i, u = motion.located(t)
             truth = None if self.truths is None else self.truths[n]
             self._shape(found, self.yards[i], u, x, truth)
-        self.in_time(found, lambda times: self.at(times, smooth, knots), DENSE if smooth else 4)
+        self.in_time(found, lambda times: self.at(times, smooth), DENSE if smooth else 4)
         return found
 
     def of_truth(self) -> Found:

@@ -150,8 +150,7 @@ class Ours:
         """As the others."""
         if self._path is None or self._path[0] is not keyframes:
             bases = tm.extract_bases(keyframes, faces, N_MODES, progress=False)
-            path = tm.Path(bases, faces, when, preset=self.preset, solver=self.solver)  # type: ignore[arg-type]
-            path.smooth = self.smooth
+            path = tm.Path(bases, faces, when, False, self.smooth, self.preset, solver=self.solver)  # type: ignore[arg-type]
             self._path = keyframes, path
         return self._path[1](keyframes, times)
 

@@ -17,7 +17,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -33,7 +32,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 
 WORK = ("whole", "without local steps", "forward and backward", "making a layer")
-MOTION = ("193 shapes", "making a path", "each further pair", "and its in-between")
+MOTION = ("193 shapes", "making a path")
 BASELINE = "torch"
 
 
@@ -75,17 +74,8 @@ def worker(name: str, backend: str, answer: str) -> None:
         def make() -> Any:
             return tm.Path(bases, faces, cyclic=True, solver=solvers(backend)[0])
 
-        def between(n: int, called: bool) -> Any:
-            """A layer of the first key-frames, and what it is made for."""
-            layer = tm.InBetween(bases[:n], faces, solver=solvers(backend)[0])
-            for i in range(n - 1 if called else 0):
-                layer(sample.keyframes[i], sample.keyframes[i + 1], 0.5, pair=i)
-
         with torch.no_grad():
             found = {"193 shapes": seconds(lambda: path(sample.keyframes, t), 2), "making a path": seconds(make, 3)}
-            for name, called in (("each further pair", False), ("and its in-between", True)):
-                two, all_pairs = (seconds(partial(between, n, called), 5) for n in (2, len(bases)))
-                found[name] = (all_pairs - two) / (len(bases) - 2)
             np.savez(answer, shape=path(sample.keyframes, t).numpy(), gradient=0, **found)
         return
     case = all_cases()[name]

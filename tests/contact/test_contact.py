@@ -9,10 +9,9 @@ import torch
 from conftest import Shapes
 from scipy.optimize import minimize
 from torch import Tensor
-from torch_modal.inbetween.between import Between
 
 import torch_modal as tm
-from torch_modal import trees
+from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.cli import main as cli
 from torch_modal.contact import in_between as contact_layer
 from torch_modal.contact import modal, separate
@@ -134,7 +133,7 @@ def test_layer_pushes_fingers_apart(hand: Shapes) -> None:
 def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     x_a, x_b = hand.keyframes
     layer = tm.InBetween(hand.bases, hand.faces, contact=True)
-    member, search = layer.core, ContactSearch.__call__
+    search = ContactSearch.__call__
     found: list[Any] = []
     calls = 0
 
@@ -151,7 +150,8 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
         nonlocal calls
         calls = 0
         mu, stiffness = layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape)
-        return member(Samples(x_a[None], x_b[None], None, t, mu, stiffness), None).shapes[0]
+        samples = Samples(torch.stack([x_a, x_b])[None], torch.stack([1 - t, t], -1), mu, stiffness)
+        return layer.core(samples, None).shapes[0]
 
     given = [x_a.clone(), x_b.clone(), torch.tensor([0.875], dtype=DOUBLE)]
     for tensor in given:
@@ -319,14 +319,14 @@ def test_a_displacement_fades_out_where_it_makes_shapes_worse() -> None:
 
 
 def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    def folding(member: Between, grid: Samples, shapes: Tensor) -> contact_layer.Displacement:
+    push_apart = path_module.push_apart
+
+    def folding(core: Any, x: Tensor, u: Tensor, *given: Any) -> contact_layer.Displacement:
         """One half of the hand onto the other."""
-        own = member.frame.bring(shapes, trees.picked(member.placed(grid), grid.which), grid.t)
-        side = own[..., 0] - own[..., 0].mean(-1, keepdim=True)
-        field = torch.zeros_like(own)
+        side = x[..., 0] - x[..., 0].mean(-1, keepdim=True)
+        field = torch.zeros_like(x)
         field[..., 0] = -2 * side.clamp_min(0)
-        none = torch.zeros(len(shapes), dtype=torch.int64)
-        return contact_layer.Displacement(field, grid.t, none, none)
+        return push_apart(core, x, u, *given)._replace(field=field)
 
     t = torch.tensor([0.3, 0.45], dtype=DOUBLE)
     with torch.no_grad():
@@ -386,26 +386,23 @@ def test_counting_finds_what_searching_finds(hand: Shapes) -> None:
 
 
 # ------------------------------------------------------------------------------------------------ steps of each shape
-@pytest.mark.parametrize("smooth", [False, True], ids=["pair", "trajectory"])
-def test_kernels_and_torch_step_alike(hand: Shapes, smooth: bool) -> None:
+def test_kernels_and_torch_step_alike(hand: Shapes) -> None:
     pytest.importorskip("warp")
-    # Between the first two key-frames of a hand that closes and opens; no parts meet in the first shape.
-    t, three = torch.tensor([0.2, 0.75 if smooth else 0.875], dtype=DOUBLE), hand.pick(0, 1, 0)
-    results = []
+    t = torch.tensor([0.2, 0.875], dtype=DOUBLE)  # no parts meet in the first shape
+    weights, results = torch.stack([1 - t, t], -1), []
     for backend in ("torch", "warp"):
-        path = tm.Path(three.bases, hand.faces, smooth=smooth, solver=tm.Solver(backend=backend))
-        member = path.core
-        samples = path.samples(three.keyframes[None], 0, torch.zeros(2, dtype=torch.int64), t)
-        pair = member.placed(samples)
-        x = member.frame.bring(member(samples, None).shapes, trees.picked(pair, samples.which), t)
-        search = contact_layer._search(member, pair, 0, 2)
+        layer = tm.InBetween(hand.bases, hand.faces, solver=tm.Solver(backend=backend))
+        core = layer.core
+        shapes, pose, _ = core.alignment(hand.keyframes.expand(2, -1, -1, -1), weights)
+        x = core.alignment.bring(layer(*hand.keyframes, t), pose)
+        search = contact_layer.contact_search(core, shapes[0], 2)
         active, _ = search(x, torch.arange(2))
         assert active.shapes.unique().tolist() == [1]
         # One shape is free, the other has contacts, and a corner of both is pulled elsewhere.
         distance = (x[0] - x[0].amin(0)).norm(dim=-1)
         corner = distance <= distance.kthvalue(40).values
         pull = Pull(x + torch.tensor([0.5, 0, 0], dtype=DOUBLE), 40.0 * corner * search.areas)
-        steps = contact_layer._steps(member, member.rests(samples, pair, None))
+        steps = contact_layer._steps(core, RestShapes(shapes, weights, layer.stiffness_of(t, t.shape)))
         y, beside = x, separate._energies(active, pull, search.areas)
         for _ in range(2):
             y = steps(y, torch.arange(2), beside)
@@ -415,15 +412,6 @@ def test_kernels_and_torch_step_alike(hand: Shapes, smooth: bool) -> None:
         assert bool((pull.value(y) < 0.5 * pull.value(x)).all())
         results.append(y)
     torch.testing.assert_close(*results, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("which", [None, torch.tensor([0, 0, 1])], ids=["own", "shared"])
-def test_some_samples_keep_what_is_theirs(which: Tensor | None) -> None:
-    x, t = torch.zeros(3, 4, 3, dtype=DOUBLE), torch.tensor([0.1, 0.2, 0.3], dtype=DOUBLE)
-    some = Samples(x, x, which, t, 10 * t, [20 * t[:, None]]).rows(torch.tensor([2, 0]))
-    assert some.t.tolist() == [0.3, 0.1] and some.which is not None
-    assert some.which.tolist() == ([2, 0] if which is None else [1, 0])
-    torch.testing.assert_close([some.mu, some.stiffness[0][:, 0]], [10 * some.t, 20 * some.t])
 
 
 # ---------------------------------------------------------------------------------------------------------- trajectory

@@ -65,6 +65,13 @@ class TestTwo:
             assert apart(blend(bars.keyframes[1:], pulls(1 - t, t)), x) < 1e-9
 
 
+def test_key_frames_in_the_place_of_bases_leave_out_the_modal_solve(bars: Shapes, poses: Tensor) -> None:
+    plain, w = Blend(bars.keyframes, bars.faces), pulls(0.5, 0.2, 0.3)
+    none = Blend(bars.bases, bars.faces, solver=tm.Solver(max_steps=0))
+    assert apart(plain(poses, w), none.solve(poses, w).shapes) < 1e-12
+    assert torch.equal(plain(poses, torch.eye(3, dtype=DOUBLE)), poses)
+
+
 class TestInvariances:
     def test_all_the_weight_gives_the_key_frame_bit_for_bit(self, layer: Blend, poses: Tensor) -> None:
         for dtype in (DOUBLE, torch.float32):

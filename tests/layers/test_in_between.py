@@ -108,6 +108,23 @@ class TestValues:
         single = copy.deepcopy(layers[1]).float()(x_a.float(), x_b.float(), at.float())
         assert float((single - together).abs().max()) < 1e-3 * diagonal(x_a)
 
+    def test_key_frames_in_the_place_of_bases_leave_out_the_modal_solve(self, bars: Shapes) -> None:
+        x = bars.keyframes[1:]
+        plain, modal_steps = InBetween(x, bars.faces), InBetween(bars.bases[1:], bars.faces, solver=Solver(max_steps=0))
+        found = plain.solve(*x, times(0.0, 0.3, 1.0))
+        assert torch.equal(found.shapes[::2], x) and bool(found.solution.converged.all())
+        truth = modal_steps.solve(*x, times(0.3)).shapes[0]
+        torch.testing.assert_close(found.shapes[1], truth, rtol=0, atol=1e-12)
+        base = InBetween(x, bars.faces, solver=Solver(local_steps=0))(*x, 0.3)
+        shell, scale = ShellEnergy(bars.faces), 100 / diagonal(x[0])
+        energies = [
+            sum(w * float(shell(scale * y, scale * end)) for w, end in zip((0.7, 0.3), x, strict=True))
+            for y in (found.shapes[1], base)
+        ]
+        assert energies[0] < energies[1]
+        with pytest.raises(ValueError, match="is one of modes; pass bases"):
+            InBetween(x, bars.faces, "paper")
+
     def test_where_the_blend_is_far_worse_than_straight_lines_they_are_returned(
         self, bars: Shapes, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -70,17 +70,6 @@ def test_loose_pieces_come_along_with_a_loaded_state(small_bars: Shapes, others:
     torch.testing.assert_close(values(decoder), values(other), rtol=0, atol=1e-12)
 
 
-def test_functional_call(small_bars: Shapes) -> None:
-    decoder = decoder_of(small_bars)
-    before = values(decoder)
-    moved = 1.5 * small_bars.keyframes
-    wanted = values(decoder_of(Shapes(moved, small_bars.faces, small_bars.bases)))
-    given = AMPLITUDES[:, None], torch.tensor([0.3, 1.0, 2.2], dtype=DOUBLE)
-    found = torch.func.functional_call(decoder, {"keyframes": moved}, given)
-    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
-    torch.testing.assert_close(values(decoder), before, rtol=0, atol=0)
-
-
 def test_mapped_times(small_bars: Shapes) -> None:
     layer, times = decoder_of(small_bars), torch.tensor([0.5, 1.5, 1.0, 0.0], dtype=DOUBLE)
     a = torch.linspace(-1, 1, 4 * layer.n_modes, dtype=DOUBLE).view(4, -1)

@@ -66,8 +66,8 @@ class TestFallBack:
         space, x_a, x_b = layer.core.space, *bars.keyframes[1:]
         spoiled = type(space).lift
 
-        def lift(self: Any, a: Tensor, problem: Any) -> Tensor:
-            x = spoiled(self, a, problem)
+        def lift(self: Any, a: Tensor, base: Tensor) -> Tensor:
+            x = spoiled(self, a, base)
             return torch.cat([x[:1] + 10 * torch.sin(37 * x[:1]), x[1:]])
 
         good = layer.solve(x_a, x_b, torch.tensor([0.5, 0.5]))

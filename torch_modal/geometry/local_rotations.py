@@ -129,7 +129,10 @@ class LocalRotations(nn.Module):
         turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
         if self.clusters is None:
             signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), own.doubled_areas.detach().flatten(0, 1))
-            turns = signs.view(turns.shape[1:]) * turns
+            # A triangle that is a point has no frame and a quaternion of 0.5: with the other sign it would make a whole
+            # turn, whose axis has no derivative.
+            signs = torch.where(turns.detach().square().sum(0) < 0.5, 1.0, signs.view(turns.shape[1:]))
+            turns = signs * turns
             turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
             turn = self.clusters(turns, weights[..., None])
