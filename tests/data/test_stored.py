@@ -11,7 +11,18 @@ from safetensors.torch import save_file
 
 from torch_modal.data.dataset import stored_labels
 from torch_modal.data.space import ShapeSpace
-from torch_modal.data.stored import LABELS_FILE, SET_FILE, StoredSet, find_sets, open_set, read_note, write_set
+from torch_modal.data.stored import (
+    FORMAT,
+    LABELS_FILE,
+    SET_FILE,
+    VERSION,
+    StoredSet,
+    find_sets,
+    open_set,
+    read_note,
+    write_set,
+)
+from torch_modal.io.tensors import write_tensors
 from torch_modal.precompute.basis import ModalBasis
 
 NAMES = ("straight.obj", "bent.obj", "twisted.obj")
@@ -159,15 +170,14 @@ def test_refuses_what_is_no_set(small_bars: Shapes, folder: Path) -> None:
     with pytest.raises(ValueError, match="damaged"):
         open_set(folder)
     small_bars.bases[0].save(path)
-    with pytest.raises(ValueError, match=r"not 'torch_modal\.set'"):
+    with pytest.raises(ValueError, match=r"holds no torch_modal\.set"):
         StoredSet(folder)
-    shapes = {"keyframes": small_bars.keyframes.contiguous(), "faces": small_bars.faces.contiguous()}
-    good = {"format": "torch_modal.set", "version": "2", "names": "[]", "times": "null"}
-    for tensors, metadata, message in (
-        (shapes, good, r"lacks the tensors 0\.reference"),
-        ({**shapes, "faces": small_bars.faces[0]}, good, r"needs keyframes \(K, V, 3\) and faces"),
-        (shapes, {**good, "version": "3"}, "version '3'"),
+    shapes = {"keyframes": small_bars.keyframes, "faces": small_bars.faces}
+    for tensors, version, message in (
+        (shapes, VERSION, r"lacks the tensors 0\.reference"),
+        ({**shapes, "faces": small_bars.faces[0]}, VERSION, r"needs keyframes \(K, V, 3\) and faces"),
+        (shapes, "3", "version '3'"),
     ):
-        save_file(tensors, path, metadata)
+        write_tensors(path, FORMAT, version, tensors, {"names": [], "times": None, "note": ""})
         with pytest.raises(ValueError, match=message):
             read_note(folder)
