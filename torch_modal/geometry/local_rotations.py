@@ -87,7 +87,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("sides", torch.tensor(mesh.sides), persistent=False)
         self.register_buffer("side_signs", torch.tensor(mesh.signs).to(references), persistent=False)
-        #: The first reference, from which rotations are measured. *Shape:* ``(1, V, 3)``.
+        #: The first reference, from which rotations of more than two shapes are measured. *Shape:* ``(1, V, 3)``.
         self.register_buffer("reference", references[:1].clone(), persistent=False)
         #: Twice the sums of those of the references. *Shape:* ``(F,)``.
         self.register_buffer("areas", torch.cat([x.doubled_areas for x in every]).sum(0), persistent=False)
@@ -123,18 +123,20 @@ class LocalRotations(nn.Module):
         Returns:
             *Shape:* ``(3, B, E)``.
         """
-        start, own = _frames(self.reference, self.faces), _frames(shapes.flatten(0, 1), self.faces)
-        turns = _turn_between(start, own)
+        # From one of two shapes: the way from a third to a triangle that collapses in one has no bounded gradient.
+        start = _frames(shapes[:, 0] if shapes.shape[1] == 2 else self.reference, self.faces)
+        own = Frames(*(x.unflatten(-2, weights.shape) for x in _frames(shapes.flatten(0, 1), self.faces)))
+        turns = _turn_between(Frames(*(x[..., None, :] for x in start)), own)
         if self.clusters is None:
-            signs = self.sign(turns.detach().movedim(0, -1), own.doubled_areas.detach())
+            signs = self.sign(turns.detach().flatten(1, 2).movedim(0, -1), own.doubled_areas.detach().flatten(0, 1))
             # A triangle that is a point has no frame and a quaternion of 0.5: with the other sign it would make a whole
             # turn, whose axis has no derivative.
-            signs = torch.where(turns.detach().square().sum(0) < 0.5, 1.0, signs)
-            turns = (signs * turns).unflatten(1, weights.shape)
+            signs = torch.where(turns.detach().square().sum(0) < 0.5, 1.0, signs.view(turns.shape[1:]))
+            turns = signs * turns
             turn = mean(self._agreeing(turns.detach(), weights.detach()) * turns, weights[..., None])
         else:
-            turn = self.clusters(turns.unflatten(1, weights.shape), weights[..., None])
-        stretches = ((weights[..., None] * x.unflatten(0, weights.shape)).sum(-2) for x in own[3:])
+            turn = self.clusters(turns, weights[..., None])
+        stretches = ((weights[..., None] * x).sum(-2) for x in own[3:])
         return self._edges(_turned(turn, start, *stretches), self.areas.expand(len(weights), -1))
 
     def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ from functools import cache
 from typing import Any, Literal
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_modal.progress import ProgressReport
@@ -91,10 +90,10 @@ class Constants:
     Args:
         module: The module of the kernels.
         maker: Its function that makes the struct on a device, of these values.
-        values: Arrays, int32 or float64, and numbers.
+        values: Tensors of int32 or float64 on the CPU, and numbers.
     """
 
-    def __init__(self, module: str, maker: str, **values: NDArray[Any] | int) -> None:
+    def __init__(self, module: str, maker: str, **values: Tensor | int) -> None:
         self.module, self.maker, self.values = module, maker, values
         self._made: dict[torch.device, Any] = {}
 

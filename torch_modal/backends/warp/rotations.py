@@ -39,8 +39,8 @@ class WarpRotations(LocalRotations):
         self.constants = Constants(
             "rotations",
             "surface",
-            **{name: x.int().contiguous().numpy().copy() for name, x in integers.items()},
-            **{name: x.double().contiguous().numpy().copy() for name, x in numbers.items()},
+            **{name: x.int().contiguous() for name, x in integers.items()},
+            **{name: x.double().contiguous() for name, x in numbers.items()},
             n_vertices=references.shape[1],
             n_edges=self.n_edges,
             n_pieces=self.n_pieces,

@@ -1,8 +1,7 @@
 """Types and functions of one edge, hinge or face, shared by all kernels."""
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from torch import Tensor
 
 from torch_modal.energy.bend import COLLAPSED
 
@@ -40,16 +39,16 @@ class Mesh:
 
 def mesh(
     device: object,
-    record: NDArray[np.int32],
-    hinge: NDArray[np.int32],
-    capped_faces: NDArray[np.int32],
+    record: Tensor,
+    hinge: Tensor,
+    capped_faces: Tensor,
     n_vertices: int,
 ) -> Mesh:
     """The constants of a mesh on a device."""
     made = Mesh()
-    made.record = wp.array(record, dtype=wp.vec4i, device=device)
-    made.hinge = wp.array(hinge, dtype=wp.int32, device=device)
-    made.capped_faces = wp.array(capped_faces, dtype=wp.vec3i, device=device)
+    made.record = wp.array(record.numpy(), dtype=wp.vec4i, device=device)
+    made.hinge = wp.array(hinge.numpy(), dtype=wp.int32, device=device)
+    made.capped_faces = wp.array(capped_faces.numpy(), dtype=wp.vec3i, device=device)
     made.n_vertices = n_vertices
     return made
 

@@ -1,8 +1,7 @@
 """Eq. 5 through the columns of a modal space: the Jacobian, and the second-order term."""
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from torch import Tensor
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
@@ -36,12 +35,12 @@ class Slots:
     pairs: wp.array(dtype=wp.vec2i)
 
 
-def slots(device: object, edges: NDArray[np.int32], faces: NDArray[np.int32], pairs: NDArray[np.int32]) -> Slots:
+def slots(device: object, edges: Tensor, faces: Tensor, pairs: Tensor) -> Slots:
     """Places of the second derivatives among the pairs of vertices, on a device."""
     made = Slots()
-    made.edges = wp.array(edges, dtype=seven, device=device)
-    made.faces = wp.array(faces, dtype=wp.vec3i, device=device)
-    made.pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
+    made.edges = wp.array(edges.numpy(), dtype=seven, device=device)
+    made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
+    made.pairs = wp.array(pairs.numpy(), dtype=wp.vec2i, device=device)
     return made
 
 

@@ -1,8 +1,7 @@
 """Triangles that turn between two shapes, or along a trajectory."""
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from torch import Tensor
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
@@ -49,24 +48,24 @@ class Surface:
 
 def surface(
     device: object,
-    faces: NDArray[np.int32],
-    sides: NDArray[np.int32],
-    signs: NDArray[np.float64],
-    shares: NDArray[np.float64],
-    order: NDArray[np.int32],
-    parent: NDArray[np.int32],
-    piece: NDArray[np.int32],
+    faces: Tensor,
+    sides: Tensor,
+    signs: Tensor,
+    shares: Tensor,
+    order: Tensor,
+    parent: Tensor,
+    piece: Tensor,
     **counts: int,
 ) -> Surface:
     """The constants of a surface on a device."""
     made = Surface()
-    made.faces = wp.array(faces, dtype=wp.vec3i, device=device)
-    made.sides = wp.array(sides, dtype=wp.vec3i, device=device)
-    made.signs = wp.array(signs, dtype=vec3, device=device)
-    made.shares = wp.array(shares, dtype=vec3, device=device)
-    made.order = wp.array(order, dtype=wp.int32, device=device)
-    made.parent = wp.array(parent, dtype=wp.int32, device=device)
-    made.piece = wp.array(piece, dtype=wp.int32, device=device)
+    made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
+    made.sides = wp.array(sides.numpy(), dtype=wp.vec3i, device=device)
+    made.signs = wp.array(signs.numpy(), dtype=vec3, device=device)
+    made.shares = wp.array(shares.numpy(), dtype=vec3, device=device)
+    made.order = wp.array(order.numpy(), dtype=wp.int32, device=device)
+    made.parent = wp.array(parent.numpy(), dtype=wp.int32, device=device)
+    made.piece = wp.array(piece.numpy(), dtype=wp.int32, device=device)
     for name, count in counts.items():
         setattr(made, name, count)
     return made
