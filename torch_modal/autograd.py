@@ -19,19 +19,19 @@ Given = ParamSpec("Given")
 
 
 def traced(x: Tensor) -> bool:
-    """Whether a tensor has no data (torch.compile, export, fake and meta tensors), so that no kernel can use it."""
+    """True for a tensor without data (torch.compile, export, fake and meta tensors), so that no kernel can use it."""
     return torch.compiler.is_compiling() or type(x) not in (Tensor, torch.nn.Parameter) or x.is_meta
 
 
 def transformed(x: Tensor) -> bool:
-    """Whether a tensor is a wrapper of a ``torch.func`` transform, or has a tangent of forward-mode differentiation."""
+    """True for a wrapper of a ``torch.func`` transform, or a tensor with a tangent of forward-mode differentiation."""
     if torch.func.debug_unwrap(x, recurse=False) is not x:
         return True
     return forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None  # the first alone is fast
 
 
 def mapped(x: Tensor) -> bool:
-    """Whether ``vmap`` maps a tensor, so that no number of it is one number."""
+    """True where ``vmap`` maps a tensor, so that no number of it is one number."""
     inner = torch.func.debug_unwrap(x, recurse=False)
     return inner is not x and (torch._C._functorch.is_batchedtensor(x) or mapped(inner))
 
@@ -57,7 +57,7 @@ def require_numbers(layer: str, x: Tensor) -> None:
 
 
 def recorded(*given: Tensor) -> bool:
-    """Whether what is made of tensors in a backward pass is to be differentiated once more, which kernels cannot be."""
+    """True where a backward pass is itself differentiated, which kernels cannot be."""
     return torch.is_grad_enabled() or any(map(transformed, given))
 
 
@@ -199,7 +199,7 @@ def once(x: Tensor, message: str) -> Tensor:
 
 
 class _Once(torch.autograd.Function):
-    """Of the order that is left: at 0, any derivative raises."""
+    """The order that is left: at 0, any derivative raises."""
 
     generate_vmap_rule = True
 

@@ -27,7 +27,7 @@ def mapped(tree: Any, function: Callable[[Any], Any]) -> Any:
 
 
 def skeleton(tree: Any) -> Any:
-    """The same tree with :data:`HERE` in the places of its tensors."""
+    """The tree with :data:`HERE` in the places of its tensors."""
     return mapped(tree, lambda _: HERE)
 
 
@@ -38,10 +38,10 @@ def filled(tree: Any, tensors: Iterable[Tensor]) -> Any:
 
 
 def picked(tree: Any, index: Tensor | None) -> Any:
-    """The same for some of the samples, or for all where None."""
+    """Pick some of the samples, or all where None."""
     return tree if index is None else rows(tree, index)
 
 
 def rows(tree: Any, samples: Tensor | slice) -> Any:
-    """The same for some of the samples."""
+    """Pick some of the samples."""
     return mapped(tree, lambda tensor: tensor[samples])

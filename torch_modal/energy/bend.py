@@ -173,7 +173,7 @@ def fullness(edge_vectors: Tensor) -> Tensor:
 
 
 def collapsed(edge: Tensor, normal: Tensor) -> Tensor:
-    """Whether a triangle on this edge has no altitude. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
+    """True for triangles without an altitude on this edge. *Shape:* ``(3, ...), (3, ...) -> (...)``."""
     bound = max(COLLAPSED, 100 * torch.finfo(edge.dtype).eps)
     base = (edge * edge).sum(0)
     return (normal * normal).sum(0) <= (bound * base) ** 2 + tiny(edge)

@@ -194,7 +194,7 @@ class Energy(nn.Module):
         return Rest(tuple(measures), tuple(weights))
 
     def rest_of(self, x: Tensor) -> Rest:
-        """The same of vertices alone. *Shape:* ``(B, V, 3)``."""
+        """The rest shape from vertices alone. *Shape:* ``(B, V, 3)``."""
         return self.rest(self.extend(x.movedim(-1, 0).contiguous()))
 
     def among(self, rests: Sequence[Rest], weights: Tensor, stiffness: Sequence[float | Tensor]) -> Reference:

@@ -60,7 +60,7 @@ class _Tables(nn.Module):
 
     @property
     def edge_vectors(self) -> list[Tensor | None]:
-        """Of each term's elements in each direction; None of a total. *Shape of each:* ``(M, 3(n-1), n)``."""
+        """Edge vectors of the terms in each direction; None of a total. *Shape of each:* ``(M, 3(n-1), n)``."""
         return [getattr(self, f"edge_vectors_{i}") for i in range(self.n_terms)]
 
 

@@ -137,7 +137,7 @@ class ShellEnergy(nn.Module):
 
     @property
     def stiffness(self) -> list[Any]:
-        """Of each term."""
+        """The stiffness of each term."""
         return [term.stiffness for term in self.terms]
 
     alpha = _stiffness(0, "Stretching stiffness; it may be replaced.")

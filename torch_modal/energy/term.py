@@ -141,7 +141,7 @@ class Term(nn.Module):
         return measures
 
     def difference(self, measures: Tensor, rest: Tensor) -> Tensor:
-        """How far measures are from others. *Shape:* ``(..., M), (..., M) -> (..., M)``."""
+        """Differences of measures from others. *Shape:* ``(..., M), (..., M) -> (..., M)``."""
         return measures - rest
 
     # ---------------------------------------------------------------- the square of the difference, and its derivatives
@@ -287,7 +287,7 @@ class PeriodicTerm(Term):
         return 2 * weights.expand_as(measures), lacking
 
     def on_one_branch(self, measures: Tensor, pulls: Tensor) -> Tensor:
-        """The same angles, within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
+        """Bring angles within half a turn of their weighted mean. *Shape:* ``(..., K, M)`` each."""
         with torch.no_grad():
             mean = torch.atan2((pulls * measures.sin()).sum(-2, True), (pulls * measures.cos()).sum(-2, True))
         return mean + wrap_angle(measures - mean)
@@ -305,5 +305,5 @@ def _versine(angle: Tensor) -> Tensor:
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle in ``[-pi, pi)``, with derivative one."""
+    """Bring an angle into ``[-pi, pi)``, with derivative one."""
     return angle - 2 * math.pi * torch.floor(angle.detach() / (2 * math.pi) + 0.5)

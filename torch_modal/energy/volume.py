@@ -62,7 +62,7 @@ class Volume(Term):
 
 
 def encloses(x: Tensor, mesh: Connectivity) -> bool:
-    """Whether a shape encloses a volume: it has small holes at most, and is not flat. *Shape:* ``(V, 3)``."""
+    """True for a shape that encloses a volume: it has small holes at most, and is not flat. *Shape:* ``(V, 3)``."""
     points = x.detach().cpu().double().numpy()
     if open_part(points, mesh) > OPEN:
         return False

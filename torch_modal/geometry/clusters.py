@@ -73,7 +73,7 @@ class Clusters(nn.Module):
 
 
 def beyond_a_turn(turns: Tensor, areas: Tensor, ancestors: Tensor, piece: Tensor) -> bool:
-    """Whether parts of a piece turn by more than a full turn from each other. Arguments as for :class:`Clusters`."""
+    """True where parts of a piece turn by more than a full turn from each other. Arguments as for :class:`Clusters`."""
     areas, off = areas.double(), _from_mean(turns, areas, ancestors, piece)
     beyond = torch.bincount(piece, areas * (off > BEYOND)) > PART_BEYOND * torch.bincount(piece, areas)
     return bool(beyond.any())

@@ -52,7 +52,7 @@ def require_contact() -> None:
 
 
 def has_contact() -> bool:
-    """Whether the extra ``contact`` is installed."""
+    """True if the extra ``contact`` is installed."""
     try:
         require_contact()
     except MissingPackageError:
@@ -192,7 +192,7 @@ class Crossings:
         return pairs[self.is_far(pairs)]
 
     def reach(self, x: FloatArray, pairs: IntArray) -> float:
-        """How far triangles of given pairs reach through each other, at most, along a normal. *Shape:* ``(P, 2)``."""
+        """Largest reach of triangles of given pairs through each other, along a normal. *Shape:* ``(P, 2)``."""
         least = np.full(len(pairs), np.inf)
         for own, other in (pairs.T, pairs.T[::-1]):
             a, b, c = x[self.mesh.faces[other]].transpose(1, 0, 2)
@@ -226,7 +226,7 @@ class Crossings:
         return np.all(found, axis=0)
 
     def separated(self, vertices: IntArray, faces: IntArray) -> BoolArray:
-        """Whether a vertex and a face are more than :data:`FAR` apart along the surface.
+        """True where a vertex and a face are more than :data:`FAR` apart along the surface.
 
         Args:
             vertices: *Shape:* ``(n,)``.
@@ -315,7 +315,7 @@ class Surface:
 
     @cached_property
     def normals(self) -> FloatArray:
-        """Of the faces. *Shape:* ``(F, 3)``."""
+        """Normals of the faces. *Shape:* ``(F, 3)``."""
         return _unit(self.doubled)
 
     @cached_property
@@ -331,7 +331,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def _ones(matrix: Any) -> sparse.csr_matrix:
-    """The same pattern with ones."""
+    """Replace the values of a pattern by ones."""
     found = sparse.csr_matrix(matrix)
     found.data[:] = 1.0
     return found

@@ -150,11 +150,11 @@ class LocalRotations(nn.Module):
         return pick(agreeing(products, weights[:, None]).mT, self.piece)
 
     def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
-        """Whether parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
+        """True where parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
         return beyond_a_turn(*self._wound(*(_frames(x[None], self.faces) for x in (first, second))))
 
     def _wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What :class:`Clusters` are made of."""
+        """Arguments of :class:`Clusters`."""
         areas = (a.doubled_areas + b.doubled_areas).squeeze(0)
         return _turn_between(a, b).squeeze(1), areas, self.ancestors, self.piece
 
@@ -246,7 +246,7 @@ class LocalRotations(nn.Module):
 
 
 def weights_per_length(mesh: Connectivity, references: Tensor) -> Tensor:
-    """Of edges where edge vectors are fitted: one over their mean lengths. *Shape:* ``(K, V, 3) -> (E,)``."""
+    """Weights of edges where edge vectors are fitted: one over their mean lengths. *Shape:* ``(K, V, 3) -> (E,)``."""
     first, second = torch.tensor(mesh.edges).unbind(1)
     lengths = reduce(torch.add, ((x[second] - x[first]).norm(dim=-1) for x in references)) / len(references)
     return 1 / lengths.clamp_min(SHORTEST * lengths.mean())
@@ -264,5 +264,5 @@ def _turned(turn: Tensor, own: Frames, xx: Tensor, xy: Tensor, yy: Tensor) -> Si
 
 
 def _frames(x: Tensor, faces: Tensor) -> Frames:
-    """Of a batch of shapes. *Shape:* ``(B, V, 3), (F, 3)``."""
+    """Frames of a batch of shapes. *Shape:* ``(B, V, 3), (F, 3)``."""
     return frames(sides(x.movedim(-1, 0).contiguous(), faces))

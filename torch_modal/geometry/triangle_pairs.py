@@ -42,7 +42,7 @@ def triangles_cross(one: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def pierce_nearly(edges_of: FloatArray, through: FloatArray) -> BoolArray:
-    """Whether an edge of each triangle intersects another one within the margin.
+    """True where an edge of a triangle intersects another one within the margin.
 
     *Shape:* ``(n, 3, 3), (n, 3, 3) -> (n,)``.
     """

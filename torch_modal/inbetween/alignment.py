@@ -26,7 +26,7 @@ OTHER_SIZE = 3.0
 
 
 class Pose(NamedTuple):
-    """Where shapes of the frame are in the caller's coordinates."""
+    """Place of shapes of the frame in the caller's coordinates."""
 
     rotation: Tensor
     """*Shape:* ``(B, 3, 3)``."""

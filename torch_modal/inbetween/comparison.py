@@ -95,7 +95,7 @@ def _needs_gradient(distortion: Tensor, slight: Tensor, slack: float) -> bool:
 
 
 def _part(own: Tensor, other: Tensor, slack: float) -> Tensor:
-    """How far a shape gives way to one of its starts: 0 to 1. *Shape:* ``(B,)`` each."""
+    """Part by which a shape gives way to one of its starts, 0 to 1. *Shape:* ``(B,)`` each."""
     least = 1 + MARGIN * (slack - 1)
     part = ((own / other - least) / (slack - least)).clamp(0, 1)
     part = torch.where(own.isfinite(), part * part * (3 - 2 * part), 1)

@@ -78,7 +78,7 @@ class Objective:
 
 @dataclass(frozen=True)
 class Solver:
-    """How it is solved.
+    """The way to solve.
 
     Attributes:
         max_steps: Steps at most in the modal space; with ``gradient="unroll"`` exactly that many Newton steps.

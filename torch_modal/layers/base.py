@@ -1,4 +1,4 @@
-"""What the layers of in-betweens have in common: bases, settings, the solver, and the border."""
+"""The common part of all layers of in-betweens: bases, settings, the solver, and the border."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -114,7 +114,7 @@ class ModalDecoder(nn.Module):
 
     @lasting
     def through(self, keyframes: Tensor, times: Tensor) -> "ModalDecoder":
-        """The same modes beside a path through other key-frames, of the same connectivity."""
+        """Decoder with these modes beside a path through other key-frames, of the same connectivity."""
         other = ModalDecoder.__new__(ModalDecoder)
         nn.Module.__init__(other)
         other._mesh = self._mesh

@@ -95,7 +95,7 @@ class PathEditor:
 
     @lasting
     def _needed(self) -> list[list[Tensor]]:
-        """What the shapes of each interval follow from, in units in which a change of one is visible."""
+        """Data that the shapes of each interval follow from, in units in which a change of one is visible."""
         n, path = len(self._made), self.path
         size = (self.keyframes.amax(1) - self.keyframes.amin(1)).norm(dim=-1).amax()
         closed = torch.cat([self.keyframes, self.keyframes[:1]]) / size

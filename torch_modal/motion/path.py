@@ -144,7 +144,7 @@ class Path(PreciseModule):
 
     @lasting
     def insert(self, t: float) -> "Path":
-        """The same motion with one more key-frame, which borrows the modes of the nearer of those around it.
+        """Motion with one more key-frame, which borrows the modes of the nearer of those around it.
 
         Args:
             t: When it is, between the others; modulo the period, if cyclic.

@@ -225,7 +225,7 @@ def keyframe_places(
     n_frames: int | None = None,
     times: Tensor | Sequence[float] | None = None,
 ) -> list[int]:
-    """Where :func:`subdivide` puts the key-frames.
+    """Places of the key-frames in the result of :func:`subdivide`.
 
     Returns:
         The frame number of each key-frame; if cyclic, a further one where the first key-frame would come again.

@@ -108,7 +108,7 @@ class _Mesh:
 
     @staticmethod
     def _hanging(tets: IntArray, vertices: IntArray) -> BoolArray:
-        """Whether an edge has one of the vertices as its midpoint (a hanging vertex)."""
+        """True for an edge that has one of the vertices as its midpoint (a hanging vertex)."""
         if len(vertices) == 0:
             return np.zeros(len(tets), dtype=bool)
         middles = (tets[:, _EDGES[:, 0]] + tets[:, _EDGES[:, 1]]) // 2

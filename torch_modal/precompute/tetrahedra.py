@@ -141,7 +141,7 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
 
 
 def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) -> BoolArray:
-    """Whether pieces have little volume or area, and little extent; false for the largest.
+    """True for pieces that have little volume or area, and little extent; false for the largest.
 
     Args:
         amounts: Volume or area of each piece. *Shape:* ``(P,)``.

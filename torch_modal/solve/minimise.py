@@ -24,7 +24,7 @@ ENERGY_ROUNDING = 64.0
 
 
 class Status(IntEnum):
-    """How the minimisation of a sample ended."""
+    """End of the minimisation of a sample."""
 
     CONVERGED = 0
     """The gradient is within the tolerance, or as small as rounding lets it be."""

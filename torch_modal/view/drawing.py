@@ -30,7 +30,7 @@ LIGHTS = (((-2, 3, 4), 0.82), ((4, 1, 3), 0.30), ((0, -3, 2), 0.14))  # directio
 
 
 class Scene(NamedTuple):
-    """What a renderer gets: all shapes in view coordinates, the cell centred at the origin."""
+    """Input of a renderer: all shapes in view coordinates, the cell centred at the origin."""
 
     points: FloatArray  # (S, V, 3)
     colors: ByteArray  # (S, V, 3) RGB
