@@ -100,6 +100,8 @@ class KeyframeAlignment(nn.Module):
         sizes = (rows.amax(-1) - rows.amin(-1)).norm(dim=0) * self.scale
         usable = sizes.isfinite() & (sizes > SMALLEST_SIZE * CANONICAL_SIZE)  # what is not finite has no extent
         self._warn_of_size(sizes)
+        if not traced(usable) and not transformed(usable) and usable.all():
+            return keyframes, usable
         return torch.where(usable[..., None, None], keyframes, self.reference / self.scale), usable
 
     def _aligned(self, keyframes: Tensor, weights: Tensor) -> tuple[Tensor, Pose]:
