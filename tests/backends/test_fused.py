@@ -384,7 +384,7 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
     """Indices have 32 bits: beyond, they would wrap."""
     x, kernel = torch.zeros(4, 3, dtype=DOUBLE), launch.kernels("steps").inner
     for wrong in (x.float(), torch.zeros(3, 2, 4, dtype=DOUBLE).mT):
-        with pytest.raises(RuntimeError, match="contiguous tensor of torch.float64"):
+        with pytest.raises(RuntimeError, match=r"contiguous tensor of torch\.float64"):
             launch.launch(kernel, (1, 2), [wrong, x, 4, torch.zeros(1, 3, dtype=DOUBLE)])
     huge = torch.empty(2**31, 3, dtype=DOUBLE, device="meta")
     with pytest.raises(ValueError, match=r"2147483648 entries.* fewer samples"):

@@ -148,8 +148,6 @@ def launch(
         RuntimeError: A tensor is not contiguous, or of another type than the kernel's.
         ValueError: A tensor has more entries, or there are more threads, than 32 bits count.
     """
-    import warp as wp
-
     if 0 in dim:
         return
     if device is None:
@@ -177,7 +175,7 @@ class _Command:
         import warp as wp
 
         self.device, self.entries, self.last = device, _entries(kernel), list(given)
-        described = type(wp.from_torch(torch.zeros(1), return_ctype=True))
+        described: Any = type(wp.from_torch(torch.zeros(1), return_ctype=True))
 
         def nothing() -> list[Any]:
             pairs = zip(self.entries, given, strict=True)
@@ -200,7 +198,7 @@ class _Command:
             elif x is not self.last[i]:
                 self.recorded.set_param_at_index(i, x)
                 self.last[i] = x
-        for described, entry, x in zip(self.adjoints, self.entries, adjoints):  # those that follow have none
+        for described, entry, x in zip(self.adjoints, self.entries, adjoints, strict=False):  # not all have one
             if entry is not None:
                 _describe(described, x, *entry)
         self.recorded.set_dim(n_threads)
