@@ -131,12 +131,10 @@ def halves(layer: tm.MidShape, x_a: Tensor, x_b: Tensor) -> Halves:
     """The two shapes of Eq. 4, in the caller's coordinates."""
     with torch.no_grad():
         amplitudes = layer.solve(x_a, x_b).solution.amplitudes[None]
-        space = layer.space
-        pair = space.frame.place(x_a[None], x_b[None])
-        a1, a2 = space.energy.split(amplitudes)
-        half = torch.full((1,), 0.5, dtype=x_a.dtype)
-        shapes = pair.first + space.first.combine(a1), pair.second + space.second.combine(a2)
-        return Halves(*(space.frame.restore(x, pair, half)[0] for x in shapes))
+        space, alignment = layer.space, layer.in_between.core.alignment
+        placed, pose, _ = alignment(torch.stack([x_a, x_b])[None], torch.full((1, 2), 0.5, dtype=x_a.dtype))
+        ends = zip(space.ends, placed.unbind(1), space.energy.split(amplitudes), strict=True)
+        return Halves(*(alignment.restore(end.added(x, a), pose)[0] for end, x, a in ends))
 
 
 def interpolated(x: Tensor, other: Tensor, faces: Tensor, region: NDArray[np.bool_], rings: int = 2) -> Tensor:

@@ -36,10 +36,6 @@ class SubspaceBasis(nn.Module):
         """Fine shapes displaced by amplitudes. *Shape:* ``(B, V, 3), (B, n) -> (B, V, 3)``."""
         return torch.addmm(x.flatten(1), a, self.fine.flatten(1)).view_as(x)
 
-    def combine(self, a: Tensor) -> Tensor:
-        """Fine displacements of amplitudes. *Shape:* ``(..., n) -> (..., V, 3)``."""
-        return (a @ self.fine.flatten(1)).unflatten(-1, (-1, 3))
-
 
 def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coarse: CoarseMesh) -> SubspaceBasis:
     """Independent combinations of modes, without rigid motions, orthonormal on the coarse mesh.

@@ -12,7 +12,6 @@ from torch_modal.energy.energy import Energy, Reference
 from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
-from torch_modal.geometry.vectors import cross, pick
 
 # Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into
 # its memory (6 KB a vertex where gradients are recorded).
@@ -128,24 +127,15 @@ class FineEnergy(nn.Module):
         terms: The terms; those of Eq. 5 come first.
     """
 
-    faces: Tensor
-
     def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
         super().__init__()
         self.mesh = mesh
         self.energy = Energy(mesh, terms)
-        self.register_buffer("faces", mesh.faces, persistent=False)
 
     @property
     def terms(self) -> tuple[Term, ...]:
         """The terms; the layer owns them."""
         return tuple(part.term for part in self.energy.parts)
-
-    def volumes(self, x: Tensor) -> Tensor:
-        """Signed volumes of closed shapes. *Shape:* ``(B, V, 3) -> (B,)``."""
-        rows = x.detach().movedim(-1, 0).contiguous()
-        a, b, c = (pick(rows, corner) for corner in self.faces.unbind(1))
-        return (a * cross(b, c)).sum((0, -1)) / 6
 
     def relax(
         self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Beside | None = None

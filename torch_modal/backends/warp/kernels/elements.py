@@ -27,7 +27,7 @@ LARGEST = wp.constant(0x7FFFFFFF)
 
 
 @wp.struct
-class Mesh:
+class Elements:
     record: wp.array(dtype=wp.vec4i)
     """Vertices of each edge and of its hinge, whose tips are -1 where it has none."""
     hinge: wp.array(dtype=wp.int32)
@@ -43,9 +43,9 @@ def mesh(
     hinge: Tensor,
     capped_faces: Tensor,
     n_vertices: int,
-) -> Mesh:
+) -> Elements:
     """The constants of a mesh on a device."""
-    made = Mesh()
+    made = Elements()
     made.record = wp.array(record.numpy(), dtype=wp.vec4i, device=device)
     made.hinge = wp.array(hinge.numpy(), dtype=wp.int32, device=device)
     made.capped_faces = wp.array(capped_faces.numpy(), dtype=wp.vec3i, device=device)
@@ -170,7 +170,7 @@ def corner(x: wp.array(dtype=vec3), centre: vec3, at: int, v: int):
 
 
 @wp.func
-def middle_of(mesh: Mesh, x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), sample: int):
+def middle_of(mesh: Elements, x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), sample: int):
     """The origin of volumes: the centre; any vertex where the surface is closed."""
     found = x[place(sample * mesh.n_vertices, mesh.capped_faces[0][0])]
     if centre:

@@ -7,7 +7,7 @@ from torch_modal.backends.warp.kernels.elements import (
     HALF,
     SIXTH,
     TINY,
-    Mesh,
+    Elements,
     angle_gradients,
     bend_beyond,
     bend_slope,
@@ -58,7 +58,7 @@ def along_edge(columns: wp.array(dtype=wide), g: vec3, start: int, end: int, n_b
 
 @wp.kernel(enable_backward=False)
 def jacobian(
-    mesh: Mesh,
+    mesh: Elements,
     x: wp.array(dtype=vec3),
     rests: wp.array(dtype=rested),
     columns: wp.array(dtype=wide),
@@ -138,7 +138,7 @@ def half_of_hinge(e: vec3, tip: vec3, normal: vec3, w: vec3, length: real):
 
 @wp.kernel(enable_backward=False)
 def curvature(
-    mesh: Mesh,
+    mesh: Elements,
     slots: Slots,
     x: wp.array(dtype=vec3),
     rests: wp.array(dtype=rested),

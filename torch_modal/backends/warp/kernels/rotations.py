@@ -29,7 +29,7 @@ SMALL = wp.constant(real(rotations.SMALL))
 
 
 @wp.struct
-class Surface:
+class FaceTables:
     faces: wp.array(dtype=wp.vec3i)
     sides: wp.array(dtype=wp.vec3i)
     """Edges of the sides of each triangle."""
@@ -53,9 +53,9 @@ def surface(
     parent: Tensor,
     piece: Tensor,
     **counts: int,
-) -> Surface:
+) -> FaceTables:
     """The constants of a surface on a device."""
-    made = Surface()
+    made = FaceTables()
     made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
     made.sides = wp.array(sides.numpy(), dtype=wp.vec3i, device=device)
     made.signs = wp.array(signs.numpy(), dtype=vec3, device=device)
@@ -140,14 +140,14 @@ def quaternion(a: Triangle, b: Triangle):
 
 
 @wp.func
-def triangle_of(surface: Surface, x: wp.array(dtype=vec3), at: int, k: int):
+def triangle_of(surface: FaceTables, x: wp.array(dtype=vec3), at: int, k: int):
     f = surface.faces[place(k, 0)]
     return triangle(x[place(at, f[0])], x[place(at, f[1])], x[place(at, f[2])])
 
 
 @wp.kernel(enable_backward=False)
 def turns(
-    surface: Surface,
+    surface: FaceTables,
     x: wp.array(dtype=vec3),
     quaternions: wp.array(dtype=vec4),
     areas: wp.array(dtype=real),
@@ -171,7 +171,7 @@ def turns(
 
 @wp.kernel(enable_backward=False)
 def sign_votes(
-    surface: Surface,
+    surface: FaceTables,
     quaternions: wp.array(dtype=vec4),
     areas: wp.array(dtype=real),
     sign: wp.array(dtype=real),
@@ -302,7 +302,7 @@ def turned(q: vec4, v: vec3):
 
 @wp.kernel(enable_backward=False)
 def part_turned(
-    surface: Surface,
+    surface: FaceTables,
     quaternions: wp.array(dtype=vec4),
     sign: wp.array(dtype=real),
     packed: wp.array(dtype=packed_turn),
@@ -339,7 +339,7 @@ def part_turned(
 
 @wp.kernel(enable_backward=False)
 def trajectory_edges(
-    surface: Surface,
+    surface: FaceTables,
     trajectory: wp.array(dtype=packed_trajectory),
     which: wp.array(dtype=wp.int32),
     time: wp.array(dtype=real),

@@ -11,7 +11,7 @@ from torch_modal.backends.warp.kernels.rotations import (
     HEIGHT,
     PER_HEIGHT,
     SMALL,
-    Surface,
+    FaceTables,
     Triangle,
     about,
     half_turn,
@@ -87,7 +87,7 @@ def from_triangle(t: Triangle, torque: vec3, to_xx: real, to_xy: real, to_yy: re
 
 @wp.kernel(enable_backward=False)
 def from_turned(
-    surface: Surface,
+    surface: FaceTables,
     shapes: wp.array(dtype=vec3),
     weights: wp.array(dtype=wp.vec2d),
     sign: wp.array(dtype=real),

@@ -7,8 +7,8 @@ from torch_modal.backends.warp.kernels.elements import (
     SIXTH,
     TINIEST,
     TINY,
+    Elements,
     Hinge,
-    Mesh,
     angle_gradients,
     bend_energy,
     bend_slope,
@@ -38,7 +38,9 @@ summed = wp.types.vector(length=8, dtype=real)
 
 # -------------------------------------------------------------------------------------------------------- rest shapes
 @wp.kernel(enable_backward=False)
-def sizes(mesh: Mesh, x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), found: wp.array(dtype=vec3), threads: int):
+def sizes(
+    mesh: Elements, x: wp.array(dtype=vec3), centre: wp.array(dtype=vec3), found: wp.array(dtype=vec3), threads: int
+):
     """All edges together, the volume about the centre, and the surface, closed towards the centre."""
     i = wp.tid()
     s = i // threads
@@ -69,7 +71,7 @@ def bend_weight(h: Hinge):
 
 @wp.kernel(enable_backward=False)
 def rest_sums(
-    mesh: Mesh,
+    mesh: Elements,
     x: wp.array(dtype=vec3),
     pulls: wp.array(dtype=real),
     shortest: wp.array(dtype=real),
@@ -108,7 +110,7 @@ def rest_sums(
 
 @wp.kernel(enable_backward=False)
 def merge(
-    mesh: Mesh,
+    mesh: Elements,
     sums: wp.array(dtype=summed),
     out: wp.array(dtype=rested),
     constant: wp.array(dtype=real),
@@ -157,7 +159,7 @@ def enclosed(x: wp.array(dtype=vec3), middle: vec3, q: wp.vec3i, at: int, gradie
 
 @wp.kernel(enable_backward=False)
 def volume(
-    mesh: Mesh,
+    mesh: Elements,
     x: wp.array(dtype=vec3),
     centre: wp.array(dtype=vec3),
     total: wp.array(dtype=wp.vec2d),
@@ -176,7 +178,7 @@ def volume(
 
 @wp.kernel(enable_backward=False)
 def linearise(
-    mesh: Mesh,
+    mesh: Elements,
     x: wp.array(dtype=vec3),
     rests: wp.array(dtype=rested),
     n_references: int,
@@ -272,7 +274,7 @@ def linearise(
 
 @wp.kernel(enable_backward=False)
 def product(
-    mesh: Mesh,
+    mesh: Elements,
     fields: wp.array(dtype=vec3),
     start: int,
     factors: wp.array(dtype=linearised),

@@ -9,7 +9,7 @@ in the opposite order; for each product with ``H`` there is one more, with a fie
 import warp as wp
 
 from torch_modal.backends.torch import fine_steps as relax
-from torch_modal.backends.warp.kernels.elements import Mesh, applied, linearised, place, real, symmetric, vec3
+from torch_modal.backends.warp.kernels.elements import Elements, applied, linearised, place, real, symmetric, vec3
 
 RIDGE = wp.constant(real(relax.RIDGE))
 
@@ -310,7 +310,7 @@ def back_to_residual(
 
 @wp.kernel(enable_backward=False)
 def back_to_factors(
-    mesh: Mesh,
+    mesh: Elements,
     fields: wp.array(dtype=vec3),
     pushed: wp.array(dtype=vec3),
     factors: wp.array(dtype=linearised),
