@@ -344,6 +344,17 @@ class TestSingleSamples:
             assert found.solution.usable.tolist() == [True, False, True]
             assert bool(found.shapes[[0, 2]].isfinite().all())
 
+    @pytest.mark.parametrize("preset", ["fast", "accurate"])
+    @pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+    def test_at_a_key_frame_there_is_nothing_to_gain(self, women: Shapes, preset: Any, dtype: torch.dtype) -> None:
+        """The energy is zero there: less of it than rounding of sums as large as the weights may not stop a step."""
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            layer = InBetween([women.bases[i], women.bases[j]], women.faces, preset).to(dtype)
+            ends = women.keyframes[[i, j]].to(dtype)
+            with torch.no_grad():
+                solution = layer.solve(*ends, torch.tensor([0.0, 1.0], dtype=dtype)).solution
+            assert bool(solution.converged.all()), (i, j, solution.gradient_norm)
+
     def test_coincident_key_frames_stay(self, layer: InBetween, bars: Shapes) -> None:
         x = bars.keyframes[0].clone().requires_grad_()
         between = layer(x, x, times(0.2, 0.5))

@@ -139,18 +139,48 @@ FOUR_THIRDS = wp.constant(real(4 / 3))
 THIRD = wp.constant(real(1 / 3))
 
 
+@wp.struct
+class Turn:
+    """From the mean phase of the rest shapes: there, differences of sums as large as the weight would be rounding."""
+
+    d: wp.vec2d
+    """``1 - cos`` and ``sin`` of the angle."""
+    e: wp.vec2d
+    """The same of twice the angle."""
+    once: real
+    """Weighted sum of the phases, along the mean."""
+    twice: wp.vec2d
+    """That of the phases of twice the angle, along and across."""
+
+
+@wp.func
+def turn_to(p: wp.vec2d, w: rested):
+    size = wp.sqrt(wp.max(w[3] * w[3] + w[4] * w[4], TINIEST))
+    c = w[3] / size
+    s = w[4] / size
+    off = p - wp.vec2d(c, s)
+    mean = doubled(wp.vec2d(c, s))
+    turn = Turn()
+    turn.d = wp.vec2d(HALF * wp.dot(off, off), c * p[1] - s * p[0])
+    turn.e = real(2.0) * turn.d[1] * wp.vec2d(turn.d[1], real(1.0) - turn.d[0])
+    turn.once = c * w[3] + s * w[4]
+    turn.twice = wp.vec2d(mean[0] * w[5] + mean[1] * w[6], mean[0] * w[6] - mean[1] * w[5])
+    return turn
+
+
 @wp.func
 def bend_energy(p: wp.vec2d, w: rested):
     """Twice the energy of a hinge."""
-    t = doubled(p)
-    return ALL * w[2] - ONCE * (w[3] * p[0] + w[4] * p[1]) + SIXTH * (w[5] * t[0] + w[6] * t[1])
+    t = turn_to(p, w)
+    least = ALL * w[2] - ONCE * t.once + SIXTH * t.twice[0]
+    return least + ONCE * t.once * t.d[0] - SIXTH * (t.twice[0] * t.e[0] - t.twice[1] * t.e[1])
 
 
 @wp.func
 def bend_slope(p: wp.vec2d, w: rested):
     """First derivative of the energy in the angle."""
-    t = doubled(p)
-    return FOUR_THIRDS * (w[3] * p[1] - w[4] * p[0]) - SIXTH * (w[5] * t[1] - w[6] * t[0])
+    t = turn_to(p, w)
+    return FOUR_THIRDS * t.once * t.d[1] - SIXTH * (t.twice[0] * t.e[1] - t.twice[1] * (real(1.0) - t.e[0]))
 
 
 @wp.func
