@@ -21,10 +21,10 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 28869,
-    "lines of code": 17679,
+    "lines": 28901,
+    "lines of code": 17701,
     "files": 195,
-    "functions": 1617,
+    "functions": 1618,
     "named tuples": 75,
     "docstrings that begin with no noun": 13,
     "functions of in-between": 163,

@@ -174,7 +174,7 @@ class _Command:
     def __init__(self, kernel: Any, device: torch.device, back: bool, given: Sequence[Any]) -> None:
         import warp as wp
 
-        self.device, self.entries, self.last = device, _entries(kernel), list(given)
+        self.device, self.entries, self.last, self.n_threads = device, _entries(kernel), list(given), 1
         described: Any = type(wp.from_torch(torch.zeros(1), return_ctype=True))
 
         def nothing() -> list[Any]:
@@ -201,7 +201,9 @@ class _Command:
         for described, entry, x in zip(self.adjoints, self.entries, adjoints, strict=False):  # not all have one
             if entry is not None:
                 _describe(described, x, *entry)
-        self.recorded.set_dim(n_threads)
+        if n_threads != self.n_threads:
+            self.recorded.set_dim(n_threads)
+            self.n_threads = n_threads
         on_cpu = self.device.type == "cpu"
         self.recorded.launch(None if on_cpu else wp.stream_from_torch(torch.cuda.current_stream(self.device)))
 
