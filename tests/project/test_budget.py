@@ -21,10 +21,10 @@ import torch
 import torch_modal as tm
 
 BOUNDS = {
-    "lines": 28901,
-    "lines of code": 17701,
+    "lines": 28856,
+    "lines of code": 17665,
     "files": 195,
-    "functions": 1618,
+    "functions": 1615,
     "named tuples": 75,
     "docstrings that begin with no noun": 13,
     "functions of in-between": 163,

@@ -90,19 +90,28 @@ class Constants:
 
     Args:
         module: The module of the kernels.
-        maker: Its function that makes the struct on a device, of these values.
-        values: Tensors of int32 or float64 on the CPU, and numbers.
+        struct: The name of the struct there.
+        values: Its fields: tensors of int32 or float64 on the CPU, and numbers.
     """
 
-    def __init__(self, module: str, maker: str, **values: Tensor | int) -> None:
-        self.module, self.maker, self.values = module, maker, values
+    def __init__(self, module: str, struct: str, **values: Tensor | int) -> None:
+        self.module, self.struct, self.values = module, struct, values
         self._made: dict[torch.device, Any] = {}
 
     def on(self, device: torch.device) -> Any:
         """The struct on a device."""
         if device not in self._made:
-            maker = getattr(importlib.import_module(f"{PACKAGE}.{self.module}"), self.maker)
-            self._made[device] = maker(_device(device), **self.values)
+            import warp as wp
+
+            struct = getattr(importlib.import_module(f"{PACKAGE}.{self.module}"), self.struct)
+            made = struct()
+            for name, value in self.values.items():
+                if isinstance(value, Tensor):
+                    entry = struct.vars[name].type.dtype
+                    setattr(made, name, wp.array(value.numpy(), dtype=entry, device=_device(device)))
+                else:
+                    setattr(made, name, value)
+            self._made[device] = made
         return self._made[device]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -132,7 +141,6 @@ def launch(
     dim: tuple[int, ...],
     given: Sequence[Any],
     adjoints: Sequence[Any] = (),
-    device: torch.device | None = None,
 ) -> None:
     """Run a kernel, or its adjoint, on the tensors' device and torch's stream.
 
@@ -142,7 +150,6 @@ def launch(
             kernel's last argument. Each takes the first of what is left, then every so many-th. On a CPU there is one.
         given: Its arguments but for that: :class:`Constants`, contiguous tensors, None for no array, and integers.
         adjoints: Gradients of each, where the adjoint is wanted; None for what has none.
-        device: That of the tensors; by default that of the first one.
 
     Raises:
         RuntimeError: A tensor is not contiguous, or of another type than the kernel's.
@@ -150,8 +157,7 @@ def launch(
     """
     if 0 in dim:
         return
-    if device is None:
-        device = next(x.device for x in given if isinstance(x, Tensor))
+    device = next(x.device for x in given if isinstance(x, Tensor))
     n_threads = dim[0]
     if len(dim) == 2:
         given = [*given, 1 if device.type == "cpu" else dim[1]]

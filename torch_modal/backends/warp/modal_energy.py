@@ -52,7 +52,7 @@ class WarpModalEnergy(ModalEnergy):
             "pairs": self.curvature.pairs.int().cpu(),
         }
         #: Places of second derivatives, as an argument of kernels.
-        self.slots = Constants("modal", "slots", **{name: x for name, x in arrays.items()})
+        self.slots = Constants("modal", "Slots", **arrays)
         self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
         rows = self.columns.permute(2, 1, 0).flatten(0, 1)
         blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()

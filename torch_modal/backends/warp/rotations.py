@@ -41,7 +41,7 @@ class WarpRotations(LocalRotations):
         #: The surface as the first argument of kernels.
         self.constants = Constants(
             "rotations",
-            "surface",
+            "FaceTables",
             **{name: x.int().contiguous() for name, x in integers.items()},
             signs=self.side_signs.view(3, -1).T.double().contiguous(),
             n_vertices=references.shape[1],

@@ -75,7 +75,7 @@ class WarpShell(nn.Module):
         arrays = {"record": record, "hinge": interior.cumsum(0) - 1, "capped_faces": capped_faces}
         #: The mesh as the first argument of kernels.
         self.constants = Constants(
-            "elements", "mesh", **{k: x.int() for k, x in arrays.items()}, n_vertices=own.n_vertices
+            "elements", "Elements", **{k: x.int() for k, x in arrays.items()}, n_vertices=own.n_vertices
         )
         self._energy = (energy,)
         self.n_vertices, self.n_edges, self.n_hinges = own.n_vertices, len(record), len(mesh.hinges)

@@ -1,7 +1,6 @@
 """Types and functions of one edge, hinge or face, shared by all kernels."""
 
 import warp as wp
-from torch import Tensor
 
 from torch_modal.energy.bend import COLLAPSED
 
@@ -35,22 +34,6 @@ class Elements:
     capped_faces: wp.array(dtype=wp.vec3i)
     """Faces, and cones from the boundary to the centre, a vertex of -1."""
     n_vertices: int
-
-
-def mesh(
-    device: object,
-    record: Tensor,
-    hinge: Tensor,
-    capped_faces: Tensor,
-    n_vertices: int,
-) -> Elements:
-    """The constants of a mesh on a device."""
-    made = Elements()
-    made.record = wp.array(record.numpy(), dtype=wp.vec4i, device=device)
-    made.hinge = wp.array(hinge.numpy(), dtype=wp.int32, device=device)
-    made.capped_faces = wp.array(capped_faces.numpy(), dtype=wp.vec3i, device=device)
-    made.n_vertices = n_vertices
-    return made
 
 
 @wp.func

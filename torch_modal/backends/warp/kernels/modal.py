@@ -1,7 +1,6 @@
 """Eq. 5 through the columns of a modal space: the Jacobian, and the second-order term."""
 
 import warp as wp
-from torch import Tensor
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
@@ -33,15 +32,6 @@ class Slots:
     edges: wp.array(dtype=seven)
     faces: wp.array(dtype=wp.vec3i)
     pairs: wp.array(dtype=wp.vec2i)
-
-
-def slots(device: object, edges: Tensor, faces: Tensor, pairs: Tensor) -> Slots:
-    """Places of the second derivatives among the pairs of vertices, on a device."""
-    made = Slots()
-    made.edges = wp.array(edges.numpy(), dtype=seven, device=device)
-    made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
-    made.pairs = wp.array(pairs.numpy(), dtype=wp.vec2i, device=device)
-    return made
 
 
 @wp.func

@@ -1,7 +1,6 @@
 """Triangles that turn between two shapes, or along a trajectory."""
 
 import warp as wp
-from torch import Tensor
 
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
@@ -42,29 +41,6 @@ class FaceTables:
     n_vertices: int
     n_edges: int
     n_pieces: int
-
-
-def surface(
-    device: object,
-    faces: Tensor,
-    sides: Tensor,
-    signs: Tensor,
-    order: Tensor,
-    parent: Tensor,
-    piece: Tensor,
-    **counts: int,
-) -> FaceTables:
-    """The constants of a surface on a device."""
-    made = FaceTables()
-    made.faces = wp.array(faces.numpy(), dtype=wp.vec3i, device=device)
-    made.sides = wp.array(sides.numpy(), dtype=wp.vec3i, device=device)
-    made.signs = wp.array(signs.numpy(), dtype=vec3, device=device)
-    made.order = wp.array(order.numpy(), dtype=wp.int32, device=device)
-    made.parent = wp.array(parent.numpy(), dtype=wp.int32, device=device)
-    made.piece = wp.array(piece.numpy(), dtype=wp.int32, device=device)
-    for name, count in counts.items():
-        setattr(made, name, count)
-    return made
 
 
 # ----------------------------------------------------------------------------------------------------------- triangles
