@@ -151,13 +151,8 @@ def test_layers(small_bars: Shapes, kind: str, preset: Any, backend: Any) -> Non
         if "contact" in kind:
             pytest.importorskip("ipctk")
         layer = tm.InBetween(bases, faces, preset, solver=solver, contact="contact" in kind or None)
-    parts = [part for part in getattr(layer.core.space.energy, "parts", []) if hasattr(part, "_kept")]
-    tables = [part.tables for part in parts]  # made at the first use, of numbers
     with gpu() as mode, torch.no_grad():
         on_gpu(layer, mode)
-        for part, own in zip(parts, tables, strict=True):
-            on_gpu(own, mode)
-            part._kept = part.columns, own
         t = blank(2)
         assert_core_runs(layer.core, blank(2, 30, 3), layer.stiffness_of(t, t.shape))
 

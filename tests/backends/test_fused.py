@@ -156,7 +156,7 @@ class TestModal:
         start, generator = case.given[0], torch.Generator().manual_seed(2)
         columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
         shell = WarpShell(case.energy, case.mesh)
-        modals = WarpModalEnergy(shell, case.mesh, columns), ModalEnergy(case.energy, columns)
+        modals = WarpModalEnergy(shell, columns), ModalEnergy(case.energy, columns)
         rests = case.rests(*case.given[1:])
         return [
             (modals[0], modals[0].place(start, shell.reference(rests))),
@@ -178,14 +178,21 @@ class TestModal:
         torch.testing.assert_close(plain.value_and_gradient(a, truth)[0], plain.value(a, truth), rtol=1e-12, atol=0)
         assert_alike((gradient, plain.value_and_gradient(a, truth)[1]), (wanted.gradient,) * 2, 1e-9)
 
-    def test_pull_back(self, case: Case) -> None:
+    def test_gradients_are_differentiated(self, case: Case) -> None:
         generator = torch.Generator().manual_seed(4)
         a, direction = torch.randn(2, 2, 5, dtype=DOUBLE, generator=generator).mul(0.1)
-        (fused, own), _ = self.both(case)
-        with torch.no_grad():
-            found = trees.leaves(fused.pull_back(a, direction, own))
-        by_torch = fused.pull_back(a, direction, own)  # to be differentiated
-        assert_alike(found, trees.leaves(by_torch), 1e-10)
+        (fused, own), (plain, truth) = self.both(case)
+        given = [a, *trees.leaves(own)]
+
+        def by_kernels(a: Tensor, *leaves: Tensor) -> Tensor:
+            return fused.gradient(a, trees.filled(own, leaves))
+
+        def by_torch(a: Tensor, *leaves: Tensor) -> Tensor:
+            return plain.gradient(a, fused.unpacked(trees.filled(own, leaves)))
+
+        assert_alike([by_kernels(*given)], [plain.derivatives(a, truth).gradient], 1e-10)
+        found, wanted = (torch.func.vjp(each, *given)[1](direction) for each in (by_kernels, by_torch))
+        assert_alike(found, wanted, 1e-10)
 
     @torch.no_grad()
     def test_samples_that_are_too_many_at_a_time(self, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:

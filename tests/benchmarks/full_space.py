@@ -11,7 +11,6 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torch_modal.energy.assembly import PairBlocks
 from torch_modal.energy.bend import SquaredBend
 from torch_modal.energy.energy import Energy, Linearised, Reference, Rest
 from torch_modal.energy.stretch import Stretch
@@ -181,10 +180,6 @@ class _Assembly:
 
     def __init__(self, energy: Energy) -> None:
         self.energy, self.n = energy, energy.n_vertices
-        local = [part.corners for part in energy.parts if not part.term.total]
-        coupled = [torch.stack([c[s], c[t]], 1) for c in local for s in range(len(c)) for t in range(s + 1, len(c))]
-        self.blocks = PairBlocks(torch.cat([*coupled, *(part.pairs for part in energy.parts)]), energy.n_extended)
-        self.inner = (self.blocks.pairs < self.n).all(1)
 
     def direction(self, at: Sequence[Linearised], held: Tensor) -> Tensor:
         """Newton's direction, or a convex one where the Hessian is not positive definite. *Shape:* ``(3, 1, V)``."""
@@ -205,35 +200,25 @@ class _Assembly:
         return (part * by_volume - by_gradient)[:, None]
 
     def _matrix(self, at: Sequence[Linearised], held: Tensor, convex: bool) -> sparse.csc_matrix:
-        pairs = self._pairs(at, convex)[:, :, 0, self.inner]
-        first, second = self.blocks.pairs[self.inner].unbind(1)
-        both = torch.cat([pairs, pairs.transpose(0, 1)], -1)
-        start, end = torch.cat([first, second]), torch.cat([second, first])
-        diagonal = pairs.new_zeros(3, 3, self.n).index_add(-1, start, -both)
-        diagonal = 0.5 * (diagonal + diagonal.transpose(0, 1))
-        size = diagonal.diagonal().sum(-1).mean().abs() / 3
-        axes = torch.arange(3)
-        diagonal[axes, axes] += size * (RIDGE + HOLD * held.double())
-        own = torch.arange(self.n)
-        values = torch.cat([both, diagonal], -1)
-        row = (3 * torch.cat([start, own]) + axes[:, None, None]).expand_as(values)
-        column = (3 * torch.cat([end, own]) + axes[:, None]).expand_as(values)
-        entries = values.flatten().numpy(), (row.flatten().numpy(), column.flatten().numpy())
-        return sparse.csc_matrix(entries, (3 * self.n, 3 * self.n))
-
-    def _pairs(self, at: Sequence[Linearised], convex: bool) -> Tensor:
-        """The block of each pair, of the first with the second vertex. *Shape:* ``(3, 3, 1, P)``."""
-        parts, curved = [], []
+        axes, size = torch.arange(3), 3 * self.energy.n_extended
+        total = sparse.csc_matrix((size, size))
         for part, one in zip(self.energy.parts, at, strict=True):
+            n, gradients = len(part.corners), one.gradients
+            # Second derivatives of edges that pull are never negative.
+            curved = isinstance(part.term, Stretch) or not convex
+            slope = (one.slope.clamp_min(0) if convex else one.slope) * curved
+            local = slope * part.term.hessians(one.edge_vectors)
             if not part.term.total:
-                ends = part.to_corners(one.gradients).unflatten(-1, (len(part.corners), -1)).movedim(-2, 0)
-                n = len(ends)
-                parts += [one.curvature * ends[s][:, None] * ends[t] for s in range(n) for t in range(s + 1, n)]
-            own = torch.cat(
-                list(part.term.blocks(one.edge_vectors, one.slope.clamp_min(0) if convex else one.slope)), -1
-            )
-            curved.append(own if not convex or isinstance(part.term, Stretch) else torch.zeros_like(own))
-        return self.blocks(torch.cat([*parts, *curved], -1))
+                local = local + (one.curvature * gradients)[:, :, None, None] * gradients
+            ends = torch.cat([-torch.ones(1, n - 1), torch.eye(n - 1)]).to(local)
+            values = torch.einsum("si,tj,icjdm->sctdm", ends, ends, local[..., 0, :])
+            places = 3 * part.corners[:, None] + axes[:, None]
+            row, column = places[:, :, None, None].expand_as(values), places.expand_as(values)
+            entries = values.flatten().numpy(), (row.flatten().numpy(), column.flatten().numpy())
+            total = total + sparse.csc_matrix(entries, (size, size))
+        inner = total[: 3 * self.n, : 3 * self.n]
+        ridge = np.repeat(RIDGE + HOLD * held.double().numpy(), 3) * abs(inner.diagonal().sum()) / (3 * self.n)
+        return sparse.csc_matrix(inner + sparse.diags(ridge))
 
     @staticmethod
     def _solve(matrix: sparse.csc_matrix, right: Tensor) -> Tensor | None:

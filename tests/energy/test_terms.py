@@ -25,7 +25,7 @@ DOUBLE = torch.float64
 
 def by_torch_func(kind: type[Term]) -> type[Term]:
     """The same term without what it writes out."""
-    names = ("gradients", "pairs", "blocks")
+    names = ("gradients", "hessians")
     return type(f"Plain{kind.__name__}", (kind,), {name: getattr(Term, name) for name in names})
 
 
@@ -53,8 +53,7 @@ def test_closed_forms_agree_with_torch_func(surface: tuple[Mesh, Tensor], genera
         placement = space.place(x[1:3], reference)
         a = 0.1 * torch.ones(2, 6, dtype=DOUBLE)
         derivatives = space.derivatives(a, placement)
-        pulled = space.pull_back(a, a, placement)
-        found.append([*derivatives, pulled.base, *pulled.reference.measures, relax(energy, x[1:3], reference, 2, 4)])
+        found.append([*derivatives, space.gradient(a, placement), relax(energy, x[1:3], reference, 2, 4)])
     for mine, truth in zip(*found, strict=True):
         assert float((mine - truth).norm()) < 1e-10 * float(truth.norm())
 

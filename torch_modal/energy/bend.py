@@ -1,6 +1,5 @@
 """Dihedral angles, the second term of Eq. 5."""
 
-from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -52,14 +51,9 @@ class SquaredBend(Term):
         """In closed form: by ``torch.func``, an in-between in torch takes 1.2 to 1.4 times as long."""
         return dihedral_gradient(edge_vectors)
 
-    def pairs(self, mesh: Mesh) -> Tensor:
-        """Without that of the two tips, which have no mixed derivative."""
-        i, j, k, m = mesh.hinges.unbind(1)
-        return torch.cat([torch.stack(pair, 1) for pair in ((i, j), (k, i), (k, j), (m, i), (m, j))])
-
-    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
+    def hessians(self, edge_vectors: Tensor) -> Tensor:
         """In closed form: ``torch.func`` knows neither checkpoints, whose tensors have hooks, nor ``torch.export``."""
-        return (slope * dihedral_hessian(edge_vectors)).unbind()
+        return dihedral_hessian(edge_vectors)
 
 
 class Bend(PeriodicTerm, SquaredBend):
@@ -67,20 +61,6 @@ class Bend(PeriodicTerm, SquaredBend):
 
     :class:`~torch_modal.energy.term.PeriodicTerm` has the function ``f``, which is the square of Eq. 5 below a radian.
     """
-
-    def pairs(self, mesh: Mesh) -> Tensor:
-        """With that of the two tips."""
-        return torch.cat([super().pairs(mesh), mesh.hinges[:, 2:]])
-
-    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
-        """In closed form, as in the base class."""
-        found = torch.nn.functional.pad(slope * dihedral_hessian(edge_vectors), (0, 0) * 4 + (0, 1))
-        if beyond is not None:
-            j, k, m = dihedral_gradient(edge_vectors)
-            i = -(j + k + m)
-            ends = (i, j), (k, i), (k, j), (m, i), (m, j), (k, m)
-            found = found + torch.stack([(beyond * a)[:, None] * b for a, b in ends])
-        return found.unbind()
 
 
 def dihedral_angle(edge_vectors: Tensor) -> Tensor:
@@ -124,20 +104,18 @@ def dihedral_gradient(edge_vectors: Tensor) -> Tensor:
 
 
 def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
-    r"""Hessian of :func:`dihedral_angle` in closed form, as its blocks between different vertices.
+    r"""Hessian of :func:`dihedral_angle` in closed form.
 
     Each triangle of the hinge has a part of its own, made of the edge ``e``, its unit normal ``n``, its altitude ``h``
     and ``w = n x e``: with :math:`S = (n w^T + w n^T)\, |e| / |n_1|^2` and :math:`U = e n^T / (|e| |n_1|)`, a tip
-    whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with ``j``. The edge's own,
-    between ``e`` and ``e``, is :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)`. The two tips have none. What is left
-    follows because translations change nothing.
+    whose foot divides the edge at ``r`` has the blocks ``S`` with itself and ``U - r S`` with the edge, which has
+    :math:`(r^2 + h^2 / 2 |e|^2) S - r (U + U^T)` with itself. The two tips have none.
 
     Args:
         edge_vectors: As above. *Shape:* ``(3, 3, ...)``.
 
     Returns:
-        The blocks of the vertices ``ij, ki, kj, li, lj`` of a hinge, indexed by row, then column; zero where a triangle
-        is collapsed. *Shape:* ``(5, 3, 3, ...)``.
+        Zero where a triangle is collapsed. *Shape:* ``(3, 3, 3, 3, ...)``.
     """
     e, a, b = edge_vectors
     n1, n2 = cross(e, a), cross(b, e)
@@ -145,7 +123,7 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
     length = norm(e)
     per_length = inverse(length, flat)
     own = e.new_zeros(())
-    blocks = []
+    with_itself, with_edge = [], []
     for normal, tip, w in ((n1, a, cross(n1, e)), (n2, b, cross(e, n2))):
         area = (normal * normal).sum(0)
         per_area = inverse(area, flat)
@@ -154,10 +132,12 @@ def dihedral_hessian(edge_vectors: Tensor) -> Tensor:
         s = half + half.transpose(0, 1)
         u = e[:, None] * (normal * (per_length * per_area))
         r = (tip * e).sum(0) * per_length * per_length
-        across = u - r * s
-        own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1)) + across
-        blocks += [-s - across, across]
-    return torch.stack([-own, *blocks])
+        own = own + (r * r + 0.5 * area * per_length**4) * s - r * (u + u.transpose(0, 1))
+        with_itself.append(s)
+        with_edge.append(u - r * s)
+    (a_a, b_b), (a_e, b_e), none = with_itself, with_edge, torch.zeros_like(own)
+    rows = (own, a_e.transpose(0, 1), b_e.transpose(0, 1)), (a_e, a_a, none), (b_e, none, b_b)
+    return torch.stack([torch.stack(row, 1) for row in rows])
 
 
 def fullness(edge_vectors: Tensor) -> Tensor:

@@ -71,7 +71,6 @@ class OnMesh(nn.Module):
     """
 
     corners: Tensor
-    pairs: Tensor
 
     def __init__(self, term: Term, mesh: Mesh, numbers: Tensor | None = None) -> None:
         super().__init__()
@@ -82,11 +81,8 @@ class OnMesh(nn.Module):
                 f"{type(term).__name__}.elements gave {tuple(elements.shape)} of {elements.dtype}; they are rows of "
                 "two vertex indices or more, (M, n)"
             )
-        pairs = term.pairs(mesh)
-        if numbers is not None:
-            elements, pairs = numbers[elements], numbers[pairs]
+        elements = elements if numbers is None else numbers[elements]
         self.register_buffer("corners", elements.T.contiguous(), persistent=False)
-        self.register_buffer("pairs", pairs, persistent=False)
 
     @property
     def term(self) -> Term:

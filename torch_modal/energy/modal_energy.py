@@ -5,7 +5,7 @@ which are the same for a whole batch.
 """
 
 from collections.abc import Sequence
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -13,10 +13,9 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import traced, transformed
-from torch_modal.energy.assembly import Curvature
-from torch_modal.energy.congruence import Congruence
 from torch_modal.energy.energy import Energy, Linearised, Reference
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.energy.term import Term
 
 
 class Derivatives(NamedTuple):
@@ -46,24 +45,6 @@ class Placement(NamedTuple):
     reference: Reference
 
 
-class _Tables(nn.Module):
-    """The columns as elements and as pairs of vertices see them. *Shape:* ``(P, 2), (n, 3, V)``."""
-
-    def __init__(self, energy: Energy, pairs: Tensor, columns: Tensor) -> None:
-        super().__init__()
-        self.congruence = Congruence(pairs, columns.transpose(0, 1))
-        of_vertices = columns.permute(2, 1, 0).contiguous()
-        self.n_terms = len(energy.parts)
-        for i, part in enumerate(energy.parts):
-            edge_vectors = None if part.term.total else _edge_vectors_of_rows(of_vertices, part.corners)
-            self.register_buffer(f"edge_vectors_{i}", edge_vectors, persistent=False)
-
-    @property
-    def edge_vectors(self) -> list[Tensor | None]:
-        """Edge vectors of the terms in each direction; None of a total. *Shape of each:* ``(M, 3(n-1), n)``."""
-        return [getattr(self, f"edge_vectors_{i}") for i in range(self.n_terms)]
-
-
 class ModalEnergy(nn.Module):
     """An energy in the amplitudes of an affine space.
 
@@ -75,6 +56,8 @@ class ModalEnergy(nn.Module):
     """
 
     columns: Tensor
+    tabulated = True
+    """Whether the edge vectors of elements along all columns are kept, or computed at each use."""
 
     def __init__(self, energy: Energy | ShellEnergy, columns: Tensor) -> None:
         super().__init__()
@@ -82,20 +65,18 @@ class ModalEnergy(nn.Module):
         self.unscaled = isinstance(energy, ShellEnergy)
         self.energy = energy.energy if isinstance(energy, ShellEnergy) else energy
         rows = self.energy.extend(columns.movedim(-1, 0))
-        self.curvature = Curvature(self.energy)
         self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
-        self._prepare()
+        for i in range(len(self.energy.parts)):
+            self.register_buffer(
+                f"edge_vectors_{i}", self._edge_vectors(i) if self.tabulated else None, persistent=False
+            )
 
-    def _prepare(self) -> None:
-        self._tables = self._made_tables()
-
-    def _made_tables(self) -> "_Tables":
-        return _Tables(self.energy, self.curvature.pairs, self.columns)
-
-    @property
-    def tables(self) -> "_Tables":
-        """The tables through which derivatives are gathered."""
-        return self._tables
+    def _edge_vectors(self, i: int) -> Tensor:
+        """Edge vectors of the elements of a term along each column. *Shape:* ``(M, 3 (c-1), n)``."""
+        corners = self.energy.parts[i].corners
+        values = self.columns.permute(2, 1, 0).contiguous()  # rows that lie together in memory
+        first, *others = (values.index_select(0, corner) for corner in corners)
+        return torch.cat([other - first for other in others], 1)
 
     @property
     def n_amplitudes(self) -> int:
@@ -133,19 +114,23 @@ class ModalEnergy(nn.Module):
             placement: The space of each sample and its reference.
             second_order: Whether the term beyond Gauss-Newton is wanted.
         """
-        energy = self.energy
         x = self.rows(a, placement)
-        at = energy.linearise(x, placement.reference)
-        each = [
-            self._of_total(one) if columns is None else _normal_equations(one, columns)
-            for one, columns in zip(at, self.tables.edge_vectors, strict=True)
-        ]
-        gradient, inner = (reduce(torch.add, parts) for parts in zip(*each, strict=True))
+        at = self.energy.linearise(x, placement.reference)
+        gradients, inner, curved = [], [], []
+        for i, (part, one) in enumerate(zip(self.energy.parts, at, strict=True)):
+            columns = getattr(self, f"edge_vectors_{i}") if self.tabulated else self._edge_vectors(i)
+            gradient, own = self._of_total(one) if part.term.total else _normal_equations(one, columns)
+            gradients.append(gradient)
+            inner.append(own)
+            if second_order:
+                curved.append(_second_order(part.term, one, columns))
+        gauss_newton = reduce(torch.add, inner)
         stiffness = sum(one.curvature.sum(-1) for one in at)
-        stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
+        stiffest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((0, -1))
-        curved = self.tables.congruence(self.curvature.of(energy, at)) if second_order else None
-        return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
+        resolution = rounding * (stiffest * stiffness).sqrt()
+        beyond = reduce(torch.add, curved) if second_order else None
+        return Derivatives(reduce(torch.add, gradients), gauss_newton, beyond, resolution)
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
@@ -153,53 +138,26 @@ class ModalEnergy(nn.Module):
         given = a, *trees.leaves(placement)
         if torch.is_inference_mode_enabled() or traced(a) or any(transformed(x) or x.is_inference() for x in given):
             at = self.energy.linearise(self.rows(a, placement), placement.reference)
-            gradient = self.energy.gradient(at).transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
-            return self.energy.value_at(at, placement.reference), gradient
+            return self.energy.value_at(at, placement.reference), self._along_columns(self.energy.gradient(at))
         with torch.enable_grad():
             leaf = a.detach().requires_grad_()
             value = self.value(leaf, placement)
             (gradient,) = torch.autograd.grad(value.sum(), leaf)
         return value.detach(), gradient
 
-    def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
-        """Gradient of ``direction . dE/da`` in all that the placement holds, at amplitudes that stay.
+    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
+        """Gradient at ``a``, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
+        at = self.energy.linearise(self.rows(a, placement), placement.reference)
+        return self._along_columns(self.energy.gradient(at))
 
-        Args:
-            a: Amplitudes. *Shape:* ``(B, n)``.
-            direction: In the amplitudes, of each sample. *Shape:* ``(B, n)``.
-            placement: The space of each sample and its reference.
-
-        Returns:
-            One gradient in the place of each tensor.
-        """
-        energy = self.energy
-        at = energy.linearise(self.rows(a, placement), placement.reference)
-        moved = self.rows(direction, placement._replace(base=torch.zeros_like(placement.base)))
-        rates = energy.rates(at, moved)
-        pushed = energy.gather(at, [one.curvature * rate for one, rate in zip(at, rates, strict=True)])
-        pushed = pushed + self.curvature.push(self.curvature.of(energy, at), moved)
-        to_measures, to_weights = [], []
-        measures, weights, constant = placement.reference
-        for part, one, rest, weight, rate in zip(energy.parts, at, measures, weights, rates, strict=True):
-            pulled = torch.func.vjp(partial(part.term.slopes, one.measures), rest, weight)[1](rate)
-            to_measures.append(pulled[0])
-            to_weights.append(pulled[1])
-        to_constant = torch.zeros_like(constant) if isinstance(constant, Tensor) else constant
-        return Placement(pushed.transpose(0, 1), Reference(tuple(to_measures), tuple(to_weights), to_constant))
+    def _along_columns(self, extended: Tensor) -> Tensor:
+        """From gradients in the vertices to those in the amplitudes. *Shape:* ``(3, B, V) -> (B, n)``."""
+        return extended.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
 
     def _of_total(self, one: Linearised) -> tuple[Tensor, Tensor]:
         """Contribution of a total to the gradient and to Gauss-Newton's Hessian."""
-        row = one.gradients.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
+        row = self._along_columns(one.gradients)
         return one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
-
-
-def _edge_vectors_of_rows(values: Tensor, corners: Tensor) -> Tensor:
-    """:meth:`torch_modal.energy.energy.OnMesh.edge_vectors` of rows that lie together in memory.
-
-    *Shape:* ``(V, 3, n), (c, M) -> (M, 3 (c-1), n)``.
-    """
-    first, *others = (values.index_select(0, corner) for corner in corners)
-    return torch.cat([other - first for other in others], 1)
 
 
 def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]:
@@ -207,7 +165,7 @@ def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]
 
     Args:
         one: The term.
-        columns: Edge vectors in each direction of the space. *Shape:* ``(M, c, n)``.
+        columns: Edge vectors in each direction of the space. *Shape:* ``(M, c, n)``, with ``c = 3 (n-1)``.
 
     Returns:
         *Shape:* ``(B, n)``, ``(B, n, n)``.
@@ -218,6 +176,17 @@ def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]
     # Products of tiny matrices are fast in one dense block only: any other layout is copied matrix by matrix.
     jacobian = (local.permute(2, 1, 0).contiguous() @ columns).transpose(0, 1)
     return (jacobian.mT @ (one.slope / root)[..., None]).squeeze(-1), jacobian.mT @ jacobian
+
+
+def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:
+    """Contribution of one term to the second-order term of the Hessian. Arguments as above. *Shape:* ``(B, n, n)``."""
+    curved = one.slope * term.hessians(one.edge_vectors).flatten(2, 3).flatten(0, 1)
+    if one.beyond is not None:
+        gradients = one.gradients.flatten(0, 1)
+        curved = curved + (one.beyond * gradients)[:, None] * gradients
+    # (B, M, c, c) by (M, c, n).
+    pushed = curved.permute(2, 3, 0, 1).contiguous() @ columns
+    return columns.flatten(0, 1).mT @ pushed.flatten(1, 2)
 
 
 class SumOfEnergies(nn.Module):
@@ -258,12 +227,10 @@ class SumOfEnergies(nn.Module):
         value = reduce(torch.add, values) + 0.5 * self.anchor * a.square().sum(-1)
         return value, reduce(torch.add, gradients) + self.anchor * a
 
-    def pull_back(self, a: Tensor, direction: Tensor, placement: Sequence[Placement]) -> list[Placement]:
-        """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
-        return [
-            part.pull_back(a.to(own.base.dtype), direction.to(own.base.dtype), own)
-            for part, own in self._each(placement)
-        ]
+    def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
+        """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
+        found = [part.gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        return reduce(torch.add, found) + self.anchor * a
 
     def _each(self, placement: Sequence[Placement]) -> list[tuple[ModalEnergy, Placement]]:
         return list(zip(self.parts, placement, strict=True))  # an iterator, torch 2.8 cannot compile

@@ -1,7 +1,5 @@
 """Edge lengths, the first term of Eq. 5."""
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -37,14 +35,14 @@ class Stretch(Term):
         squared = (edge_vectors * edge_vectors).sum(1, keepdim=True)
         return edge_vectors * inverse(squared.sqrt(), squared <= tiny(edge_vectors))
 
-    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
-        """The length's Hessian with the other sign, between both ends; 0 where there is no length."""
+    def hessians(self, edge_vectors: Tensor) -> Tensor:
+        """The projector across the edge over the length, 0 where there is none."""
         edge = edge_vectors[0]
         squared = (edge * edge).sum(0)
         per_length = inverse(squared.sqrt(), squared <= tiny(edge))
         unit = edge * per_length
         eye = torch.eye(3, dtype=edge.dtype, device=edge.device).reshape(3, 3, *[1] * (edge.dim() - 1))
-        return [-slope * (eye - unit[:, None] * unit) * per_length]
+        return ((eye - unit[:, None] * unit) * per_length)[None, :, None]
 
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor:
         """Transverse stiffness of a stretched string; smoothly near zero under compression."""

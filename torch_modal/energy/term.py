@@ -7,7 +7,6 @@ Eq. 5 write theirs out. Angles take a smooth periodic function in the place of t
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -195,32 +194,9 @@ class Term(nn.Module):
         """Gradients of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, ..., M)``."""
         return self._each(jacrev(self.measure), edge_vectors)
 
-    def pairs(self, mesh: Mesh) -> Tensor:
-        """Pairs of vertices that the second derivatives couple. *Shape:* ``(N, 2)``."""
-        corners = self.elements(mesh).unbind(1)
-        n = len(corners)
-        return torch.cat([torch.stack([corners[s], corners[t]], 1) for s in range(n) for t in range(s + 1, n)])
-
-    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
-        r"""The blocks of :math:`\sum_m s_m \nabla^2 q_m + c_m \nabla q_m \nabla q_m^T` between :meth:`pairs`.
-
-        Args:
-            edge_vectors: *Shape:* ``(n-1, 3, B, M)``.
-            slope: ``s``. *Shape:* ``(B, M)``, or ``(B, 1)``.
-            beyond: ``c``, of :meth:`curvatures`. *Shape:* ``(B, M)``.
-
-        Returns:
-            By row and column, in parts that together have all pairs in their order. *Shape of each:* ``(3, 3, B, ·)``.
-        """
-        hessian = slope * self._each(jacrev(jacrev(self.measure)), edge_vectors)
-        if beyond is not None:
-            gradients = self.gradients(edge_vectors)
-            hessian = hessian + (beyond * gradients)[:, :, None, None] * gradients
-        # Translations change nothing: the first vertex has what is left.
-        first = -hessian.sum(0).movedim(1, 0)
-        n = len(edge_vectors)
-        others = [hessian[s, :, t] for s in range(n) for t in range(s + 1, n)]
-        return [*first, *others]
+    def hessians(self, edge_vectors: Tensor) -> Tensor:
+        """Hessians of the measures in the edge vectors. *Shape:* ``(n-1, 3, ..., M) -> (n-1, 3, n-1, 3, ..., M)``."""
+        return self._each(jacrev(jacrev(self.measure)), edge_vectors)
 
     def tension(self, edge_vectors: Tensor, slope: Tensor, curvature: Tensor) -> Tensor | None:
         """Stiffness that stretched elements of two vertices have across; None for elements of more.

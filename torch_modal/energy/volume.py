@@ -1,7 +1,5 @@
 """The enclosed volume, the third term of Eq. 5."""
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -48,17 +46,15 @@ class Volume(Term):
         p, q, r = edge_vectors
         return torch.stack([cross(q, r), cross(r, p), cross(p, q)]) / 6
 
-    def pairs(self, mesh: Mesh) -> Tensor:
-        """The sides of all faces; on a closed surface, the centre's blocks cancel."""
-        i, j, k = self.elements(mesh)[:, 1:].unbind(1)
-        return torch.cat([torch.stack(side, 1) for side in ((i, j), (j, k), (k, i))])
-
-    def blocks(self, edge_vectors: Tensor, slope: Tensor, beyond: Tensor | None = None) -> Sequence[Tensor]:
+    def hessians(self, edge_vectors: Tensor) -> Tensor:
         """``p.(q x r)`` has the block ``-[r]`` between ``p`` and ``q``."""
-        p, q, r = edge_vectors
-        x, y, z = torch.cat([r, p, q], -1) * (slope / 6)
-        zero = torch.zeros_like(x)
-        return [torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3))]
+        zero = torch.zeros_like(edge_vectors[0, 0])
+        p, q, r = (
+            torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3)) for x, y, z in edge_vectors / 6
+        )
+        none = torch.zeros_like(p)
+        rows = (none, r, -q), (-r, none, p), (q, -p, none)
+        return torch.stack([torch.stack(row, 1) for row in rows])
 
 
 def encloses(x: Tensor, mesh: Connectivity) -> bool:

@@ -80,15 +80,10 @@ class PairedEnergy(nn.Module):
         value = first[0] + second[0] + placement.mu * similarity
         return value, torch.cat([first[1], second[1]], -1) + 2 * placement.mu[:, None] * similar
 
-    def pull_back(self, a: Tensor, direction: Tensor, placement: PairedPlacement) -> PairedPlacement:
-        """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
-        first, second = (
-            tuple(energy.pull_back(part, along, place))
-            for (energy, part, place), along in zip(self._ends(a, placement), self.split(direction), strict=True)
-        )
-        to_mu = 2 * (direction * (a @ self.gap_gram + placement.linear)).sum(-1)
-        to_linear = 2 * placement.mu[:, None] * direction
-        return PairedPlacement(first, second, to_linear, torch.zeros_like(placement.constant), to_mu)
+    def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
+        """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
+        ends = [energy.gradient(part, place) for energy, part, place in self._ends(a, placement)]
+        return torch.cat(ends, -1) + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
 
     def _ends(
         self, a: Tensor, placement: PairedPlacement

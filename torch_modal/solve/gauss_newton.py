@@ -31,8 +31,8 @@ class AmplitudeEnergy(Protocol):
     def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
         """Energy and gradient. *Shape:* ``(B, n) -> (B,), (B, n)``."""
 
-    def pull_back(self, a: Tensor, direction: Tensor, placement: Any) -> Any:
-        """Gradient of ``direction . dE/da`` in all that the placement holds. *Shape:* ``(B, n), (B, n)``."""
+    def gradient(self, a: Tensor, placement: Any) -> Tensor:
+        """Gradient, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
 
 
 class Step(NamedTuple):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.autograd import applied, flattened, transposed
+from torch_modal.autograd import applied, flattened, recorded, transposed
 from torch_modal.solve.gauss_newton import AmplitudeEnergy, GaussNewtonStep, gradient_floor, ridged
 from torch_modal.solve.minimise import Solution, Status, minimise
 
@@ -89,13 +89,19 @@ def _adjoint(
     eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
     matrix = torch.where(converged[..., None], hessian, eye)
 
+    def slope(*tensors: Tensor) -> Tensor:
+        return energy.gradient(amplitudes, trees.filled(tree, tensors))
+
     def pull_back(to_amplitudes: Tensor) -> tuple[Tensor, ...]:
         adjoint, info = torch.linalg.solve_ex(matrix, to_amplitudes)
         singular = (info != 0)[:, None]
         _warn_of_singular(singular)
         adjoint = torch.where(converged & ~singular, adjoint, 0)
-        to_placement = energy.pull_back(amplitudes, adjoint, placement)
-        return tuple(-gradient for gradient in trees.leaves(to_placement))
+        if recorded(adjoint, *tensors):
+            return tuple(torch.func.vjp(slope, *tensors)[1](-adjoint))
+        with torch.enable_grad():
+            leaves = [x.detach().requires_grad_() for x in tensors]
+            return torch.autograd.grad(slope(*leaves), leaves, -adjoint, allow_unused=True, materialize_grads=True)
 
     return pull_back
 

@@ -22,11 +22,11 @@ class WarpCoarseEnergy(CoarseEnergy):
 
     def __init__(self, energy: Energy, mesh: Mesh) -> None:
         super().__init__(energy)
-        self.mesh, self.shell = mesh, WarpShell(energy, mesh)
+        self.shell = WarpShell(energy, mesh)
 
     def modal(self, columns: Tensor) -> WarpModalEnergy:
         """Overrides the base class."""
-        return WarpModalEnergy(self.shell, self.mesh, columns)
+        return WarpModalEnergy(self.shell, columns)
 
     def reference(self, rests: RestShapes) -> Any:
         """Overrides the base class."""

@@ -1,17 +1,17 @@
 """Eq. 5 in the amplitudes of a modal space by kernels of NVIDIA Warp, where that is installed."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torch_modal import trees
-from torch_modal.autograd import made_outside, traced, transformed
-from torch_modal.backends.warp.launch import Constants, kernels, launch
+from torch_modal.autograd import traced, transformed
+from torch_modal.backends.warp.function import fused
+from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
-from torch_modal.energy.term import Mesh
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8
@@ -31,54 +31,21 @@ class WarpModalEnergy(ModalEnergy):
 
     Args:
         shell: The energy on the mesh that the columns live on.
-        mesh: That mesh.
         columns: Directions of the space. *Shape:* ``(n, V, 3)``.
     """
 
     flat: Tensor
     blocks: Tensor
+    tabulated = False  # kernels have their own tables
 
-    def __init__(self, shell: WarpShell, mesh: Mesh, columns: Tensor) -> None:
+    def __init__(self, shell: WarpShell, columns: Tensor) -> None:
         super().__init__(shell.energy, columns)
         self._shell = (shell,)
-        places = self.curvature.places.int().cpu()
-        on_edges, on_hinges, on_faces = places.split([shell.n_edges, 6 * shell.n_hinges, 3 * shell.n_faces])
-        edges = places.new_zeros(shell.n_edges, 7)
-        edges[:, 0] = on_edges
-        edges[shell.interior.cpu(), 1:] = on_hinges.view(6, -1).T
-        arrays = {
-            "edges": edges,
-            "faces": on_faces.view(3, -1).T.contiguous(),
-            "pairs": self.curvature.pairs.int().cpu(),
-        }
-        #: Places of second derivatives, as an argument of kernels.
-        self.slots = Constants("modal", "Slots", **arrays)
         self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
         rows = self.columns.permute(2, 1, 0).flatten(0, 1)
         blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()
         #: Columns of each component of each vertex and of the centre, with room for two more, and zeros.
         self.register_buffer("blocks", blocks, persistent=False)
-
-    def _prepare(self) -> None:
-        """Do nothing: kernels have their own tables, and torch's are built on first use."""
-        self._kept: tuple[Tensor, Any] | None = None
-
-    @property
-    def tables(self) -> Any:
-        """As in the base class, for the present columns, which functional_call may have replaced."""
-        if self._kept is None or self._kept[0] is not self.columns:
-            self._kept = self.columns, made_outside(self._made_tables)
-        return self._kept[1]
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "WarpModalEnergy":
-        """Nothing is made in a lower precision, or on another device, than the columns came in."""
-        after = fn(self.columns)
-        if (after.dtype, after.device) == (self.columns.dtype, self.columns.device):
-            return super()._apply(fn, recurse)
-        tables = self.tables
-        super()._apply(fn, recurse)
-        self._kept = self.columns, tables._apply(fn)
-        return self
 
     @property
     def shell(self) -> WarpShell:
@@ -91,15 +58,19 @@ class WarpModalEnergy(ModalEnergy):
             return super().place(base, reference, anchors)
         return Placement(base.double(), reference)  # type: ignore[arg-type]
 
-    def _plain(self, placement: Placement, direction: Tensor | None = None) -> Placement | None:
-        """The placement for torch; None where it, and a direction in the amplitudes, are for kernels."""
+    def _plain(self, placement: Placement) -> Placement | None:
+        """The placement for torch; None where it is for kernels."""
         if not isinstance(placement.reference, ShellReference):
             return placement
-        values = placement.base, *placement.reference, direction
-        if torch.is_grad_enabled() or any(x is not None and (traced(x) or transformed(x)) for x in values):
-            base, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
-            return super().place(base, self.shell.unpacked(reference))
+        values = placement.base, *placement.reference
+        if torch.is_grad_enabled() or any(traced(x) or transformed(x) for x in values):
+            return self.unpacked(placement)
         return None
+
+    def unpacked(self, placement: Placement) -> Placement:
+        """A placement for kernels as one for torch."""
+        base, reference = trees.mapped(placement, lambda value: value.to(self.columns.dtype))
+        return super().place(base, self.shell.unpacked(reference))
 
     # ------------------------------------------------------------------------------------------------------- the shapes
     def _shapes(self, a: Tensor, base: Tensor) -> Tensor:
@@ -142,7 +113,7 @@ class WarpModalEnergy(ModalEnergy):
         """Samples whose derivatives are taken at a time."""
         shell, width = self.shell, self.blocks.shape[1]
         rows = shell.n_edges + shell.n_hinges + 1, len(self.blocks)
-        most = max(1, MOST_NUMBERS // max(width * max(rows), 18 * len(self.curvature.pairs)))
+        most = max(1, MOST_NUMBERS // (width * max(rows)))
         if len(a) <= most:
             return [(a, placement)]
         every = [slice(i, i + most) for i in range(0, len(a), most)]
@@ -167,7 +138,7 @@ class WarpModalEnergy(ModalEnergy):
         gradient, inner = products[:, :n, n], products[:, :n, :n]
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
-        curved = self._second(x, to.stiffness * off, placement) if second_order else None
+        curved = self._second(x, to.stiffness * off, to) if second_order else None
         return Derivatives(gradient, inner, curved, rounding * (stiffest * stiffness).sqrt())
 
     def value_and_gradient(self, a: Tensor, placement: Placement) -> tuple[Tensor, Tensor]:
@@ -180,43 +151,50 @@ class WarpModalEnergy(ModalEnergy):
         value, x = self.shell.value_and_gradient(self._shapes(a, placement.base), to)
         return value + to.constant, x.flatten(1) @ self.flat.double().mT
 
-    def _second(self, x: Tensor, moment: Tensor, placement: Placement) -> Tensor:
-        to: Any = placement.reference
-        shell, n_pairs = self.shell, len(self.curvature.pairs)
-        found = x.new_zeros(len(x), 2 * n_pairs, 3, 3)
-        given = [shell.constants, self.slots, x, to.elements, shell.centre(x), moment, found]
-        launch(kernels("modal").curvature, (len(x), max(shell.n_edges, shell.n_faces)), given)
-        columns, n = self.blocks.double(), len(self.columns)
+    def _second(self, x: Tensor, moment: Tensor, to: ShellReference) -> Tensor:
+        shell, columns, n = self.shell, self.blocks.double(), len(self.columns)
         pushed = x.new_zeros(len(x), *columns.shape)
-        given = [self.slots, found, columns, len(columns) // 3, columns.shape[1] // _BLOCK, pushed]
-        launch(kernels("modal").curved_columns, (len(x), n_pairs), given)
+        given = [shell.constants, x, to.elements, shell.centre(x), moment, columns, columns.shape[1] // _BLOCK, pushed]
+        launch(kernels("modal").curved_columns, (len(x), max(shell.n_edges, shell.n_faces)), given)
         return (columns.mT @ pushed)[:, :n, :n]
 
-    def pull_back(self, a: Tensor, direction: Tensor, placement: Placement) -> Placement:
+    def gradient(self, a: Tensor, placement: Placement) -> Tensor:
         """As in the base class."""
         to: Any = placement.reference
         if not isinstance(to, ShellReference):
-            return super().pull_back(a, direction, placement)
-        plain = self._plain(placement, direction)
-        if plain is not None:
-            pulled = super().pull_back(a.to(plain.base), direction.to(plain.base), plain)
-            return self._repacked(pulled, placement)
-        base, shell = placement.base, self.shell
-        x, moved = self._shapes(a, base), self._shapes(direction, torch.zeros_like(base))
-        at = shell.at(x, to)
-        to_base, to_reference = torch.zeros_like(x), ShellReference(*(torch.zeros_like(value) for value in to))
-        shell.from_point(x, at, to, moved, to_base, to_reference)
-        return Placement(to_base, to_reference)  # type: ignore[arg-type]
+            return super().gradient(a, placement)
+        return fused(_Gradient(self), a, placement.base, *to[:3])[0].to(placement.base)
 
-    def _repacked(self, found: Placement, placement: Placement) -> Placement:
-        """Gradients in a placement for torch as those in the one for kernels that it was made of."""
-        given, skeleton = trees.leaves(placement), trees.skeleton(placement)
 
-        def run(*values: Tensor) -> tuple[Tensor, ...]:
-            return tuple(trees.leaves(self._plain(trees.filled(skeleton, values))))
+class _Gradient:
+    """Gradient in the amplitudes, from these, the base, and the tensors of a reference but for its constant."""
 
-        pulled = torch.func.vjp(run, *given)[1](tuple(trees.leaves(found)))
-        return trees.filled(skeleton, pulled)  # type: ignore[no-any-return]
+    n_results = n_differentiable = 1
+
+    def __init__(self, modal: WarpModalEnergy) -> None:
+        self.modal = modal
+
+    def run(self, kept: list[Any] | None, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        return (self.modal.value_and_gradient(a, self._placement(*place))[1],)
+
+    def back(self, kept: list[Any], grads: Sequence[Tensor], a: Tensor, *place: Tensor) -> tuple[Tensor | None, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        modal, (base, to) = self.modal, self._placement(*place)
+        x, moved = modal._shapes(a, base), modal._shapes(grads[0], torch.zeros_like(base))
+        to_base, to_reference = torch.zeros_like(x), ShellReference(*map(torch.zeros_like, to))
+        modal.shell.from_point(x, modal.shell.at(x, to), to, moved, to_base, to_reference)
+        return to_base.flatten(1) @ modal.flat.double().mT, to_base, *to_reference[:3]
+
+    def by_torch(self, a: Tensor, *place: Tensor) -> tuple[Tensor, ...]:
+        """See :class:`~torch_modal.backends.warp.function.Operation`."""
+        plain = self.modal.unpacked(self._placement(*place))
+        return (ModalEnergy.gradient(self.modal, a.to(plain.base), plain).to(a),)
+
+    @staticmethod
+    def _placement(base: Tensor, elements: Tensor, stiffness: Tensor, volume: Tensor) -> Any:
+        to: Any = ShellReference(elements, stiffness, volume, torch.zeros_like(volume))
+        return Placement(base, to)
 
 
 def gram(x: Tensor) -> Tensor:

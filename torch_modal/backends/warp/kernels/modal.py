@@ -23,15 +23,8 @@ from torch_modal.backends.warp.kernels.elements import (
 
 wide = wp.types.vector(length=8, dtype=real)
 """A row's entries of eight columns."""
-seven = wp.types.vector(length=7, dtype=wp.int32)
-"""Places of the block of an edge, and of the six of its hinge."""
-
-
-@wp.struct
-class Slots:
-    edges: wp.array(dtype=seven)
-    faces: wp.array(dtype=wp.vec3i)
-    pairs: wp.array(dtype=wp.vec2i)
+three = wp.types.matrix(shape=(3, 8), dtype=real)
+"""The three components of a vertex, or of an edge vector, along eight columns."""
 
 
 @wp.func
@@ -113,6 +106,19 @@ def jacobian(
 
 
 @wp.func
+def of_vertex(columns: wp.array(dtype=wide), v: int, n_blocks: int, c: int):
+    at = place(3 * n_blocks * v, c)
+    return wp.matrix_from_rows(columns[at], columns[place(at, n_blocks)], columns[place(at, 2 * n_blocks)])
+
+
+@wp.func
+def add(out: wp.array(dtype=wide), v: int, n_blocks: int, c: int, value: three):
+    at = place(3 * n_blocks * v, c)
+    for r in range(3):
+        wp.atomic_add(out, place(at, r * n_blocks), value[r])
+
+
+@wp.func
 def half_of_hinge(e: vec3, tip: vec3, normal: vec3, w: vec3, length: real):
     """One triangle's part of the dihedral angle's Hessian: bend.dihedral_hessian."""
     area = wp.dot(normal, normal)
@@ -120,93 +126,98 @@ def half_of_hinge(e: vec3, tip: vec3, normal: vec3, w: vec3, length: real):
     s = half + wp.transpose(half)
     u = wp.outer(e, normal / (length * area))
     r = wp.dot(tip, e) / (length * length)
-    across = u - r * s
     base = length * length
-    own = (r * r + HALF * area / (base * base)) * s - r * (u + wp.transpose(u)) + across
-    return own, across, s + across
-
-
-@wp.kernel(enable_backward=False)
-def curvature(
-    mesh: Elements,
-    slots: Slots,
-    x: wp.array(dtype=vec3),
-    rests: wp.array(dtype=rested),
-    centre: wp.array(dtype=vec3),
-    moment: wp.array(dtype=real),
-    out: wp.array(dtype=wp.mat33d),
-    threads: int,
-):
-    """The second-order term between pairs of vertices: assembly.Curvature. The moment is the volume's."""
-    i = wp.tid()
-    s = i // threads
-    v = s * mesh.n_vertices
-    to = 2 * s * slots.pairs.shape[0]
-    for k in range(i - s * threads, mesh.record.shape[0], threads):
-        q = mesh.record[place(k, 0)]
-        w = rests[place(s * mesh.record.shape[0], k)]
-        slot = slots.edges[place(k, 0)]
-        e = x[place(v, q[1])] - x[place(v, q[0])]
-        length = length_of(e)
-        if wp.dot(e, e) > TINY:
-            unit = e / length
-            slope = w[0] * (length - w[1]) / length
-            wp.atomic_add(out, place(to, slot[0]), slope * (wp.outer(unit, unit) - wp.identity(3, dtype=real)))
-        if q[2] >= 0:
-            h = hinge_of(x, v, q)
-            if not h.flat:
-                phase = phase_of(h)
-                slope = bend_slope(phase, w)
-                beyond = bend_beyond(phase, w)
-                ge, ga, gb = angle_gradients(h)
-                gi = -(ga + gb + ge)
-                own1, across1, rest1 = half_of_hinge(e, h.a, h.n1, wp.cross(h.n1, e), length)
-                own2, across2, rest2 = half_of_hinge(e, h.b, h.n2, wp.cross(e, h.n2), length)
-                wp.atomic_add(out, place(to, slot[1]), beyond * wp.outer(gi, ge) - slope * (own1 + own2))
-                wp.atomic_add(out, place(to, slot[2]), beyond * wp.outer(ga, gi) - slope * rest1)
-                wp.atomic_add(out, place(to, slot[3]), beyond * wp.outer(ga, ge) + slope * across1)
-                wp.atomic_add(out, place(to, slot[4]), beyond * wp.outer(gb, gi) - slope * rest2)
-                wp.atomic_add(out, place(to, slot[5]), beyond * wp.outer(gb, ge) + slope * across2)
-                wp.atomic_add(out, place(to, slot[6]), beyond * wp.outer(ga, gb))
-    middle = middle_of(mesh, x, centre, s)
-    sixth = SIXTH * moment[s]
-    for k in range(i - s * threads, mesh.capped_faces.shape[0], threads):
-        face = mesh.capped_faces[place(k, 0)]
-        places = slots.faces[place(k, 0)]
-        wp.atomic_add(out, place(to, places[0]), -wp.skew(sixth * (corner(x, middle, v, face[2]) - middle)))
-        wp.atomic_add(out, place(to, places[1]), -wp.skew(sixth * (x[place(v, face[0])] - middle)))
-        wp.atomic_add(out, place(to, places[2]), -wp.skew(sixth * (x[place(v, face[1])] - middle)))
+    own = (r * r + HALF * area / (base * base)) * s - r * (u + wp.transpose(u))
+    return own, u - r * s, s
 
 
 @wp.kernel(enable_backward=False)
 def curved_columns(
-    slots: Slots,
-    blocks: wp.array(dtype=wp.mat33d),
+    mesh: Elements,
+    x: wp.array(dtype=vec3),
+    rests: wp.array(dtype=rested),
+    centre: wp.array(dtype=vec3),
+    moment: wp.array(dtype=real),
     columns: wp.array(dtype=wide),
-    n: int,
     n_blocks: int,
     out: wp.array(dtype=wide),
     threads: int,
 ):
-    """The operator of pairs of vertices on all columns: assembly.PairBlocks.push.
-
-    The blocks of pairs in descending order follow the others.
-    """
+    """The second-order term on all columns: modal_energy._second_order. The moment is the volume's."""
     i = wp.tid()
     s = i // threads
-    n_pairs = slots.pairs.shape[0]
-    for k in range(i - s * threads, n_pairs, threads):
-        first = slots.pairs[place(k, 0)][0]
-        second = slots.pairs[place(k, 0)][1]
-        b = blocks[place(2 * s * n_pairs, k)] + wp.transpose(blocks[place((2 * s + 1) * n_pairs, k)])
-        to_i = 3 * n_blocks * (s * n + first)
-        to_j = 3 * n_blocks * (s * n + second)
+    v = s * mesh.n_vertices
+    to = s * (mesh.n_vertices + 1)
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        w = rests[place(s * mesh.record.shape[0], k)]
+        e = x[place(v, q[1])] - x[place(v, q[0])]
+        length = length_of(e)
+        ee = wp.mat33d()
+        if wp.dot(e, e) > TINY:
+            unit = e / length
+            ee = (w[0] * (length - w[1]) / length) * (wp.identity(3, dtype=real) - wp.outer(unit, unit))
+        bent = q[2] >= 0
+        ab = wp.mat33d()
+        ae = wp.mat33d()
+        aa = wp.mat33d()
+        be = wp.mat33d()
+        bb = wp.mat33d()
+        if bent:
+            h = hinge_of(x, v, q)
+            bent = not h.flat
+            if bent:
+                phase = phase_of(h)
+                slope = bend_slope(phase, w)
+                beyond = bend_beyond(phase, w)
+                ge, ga, gb = angle_gradients(h)
+                own1, ae, aa = half_of_hinge(e, h.a, h.n1, wp.cross(h.n1, e), length)
+                own2, be, bb = half_of_hinge(e, h.b, h.n2, wp.cross(e, h.n2), length)
+                ee += slope * (own1 + own2) + wp.outer(beyond * ge, ge)
+                ae = slope * ae + wp.outer(beyond * ga, ge)
+                aa = slope * aa + wp.outer(beyond * ga, ga)
+                be = slope * be + wp.outer(beyond * gb, ge)
+                bb = slope * bb + wp.outer(beyond * gb, gb)
+                ab = wp.outer(beyond * ga, gb)
+        ea = wp.transpose(ae)
+        eb = wp.transpose(be)
+        ba = wp.transpose(ab)
         for c in range(n_blocks):
-            from_i = place(3 * n_blocks * first, c)
-            from_j = place(3 * n_blocks * second, c)
-            dx = columns[from_j] - columns[from_i]
-            dy = columns[place(from_j, n_blocks)] - columns[place(from_i, n_blocks)]
-            dz = columns[place(from_j, 2 * n_blocks)] - columns[place(from_i, 2 * n_blocks)]
-            for r in range(3):
-                wp.atomic_add(out, place(to_i + r * n_blocks, c), b[r, 0] * dx + b[r, 1] * dy + b[r, 2] * dz)
-                wp.atomic_add(out, place(to_j + r * n_blocks, c), -b[0, r] * dx - b[1, r] * dy - b[2, r] * dz)
+            origin = of_vertex(columns, q[0], n_blocks, c)
+            de = of_vertex(columns, q[1], n_blocks, c) - origin
+            to_e = ee * de
+            whole = to_e
+            if bent:
+                da = of_vertex(columns, q[2], n_blocks, c) - origin
+                db = of_vertex(columns, q[3], n_blocks, c) - origin
+                to_a = ae * de + aa * da + ab * db
+                to_b = be * de + ba * da + bb * db
+                to_e += ea * da + eb * db
+                add(out, to + q[2], n_blocks, c, to_a)
+                add(out, to + q[3], n_blocks, c, to_b)
+                whole = to_e + to_a + to_b
+            add(out, to + q[1], n_blocks, c, to_e)
+            add(out, to + q[0], n_blocks, c, -whole)
+    middle = middle_of(mesh, x, centre, s)
+    sixth = SIXTH * moment[s]
+    n = mesh.n_vertices  # the row of the centre
+    for k in range(i - s * threads, mesh.capped_faces.shape[0], threads):
+        face = mesh.capped_faces[place(k, 0)]
+        last = face[2]
+        if last < 0:
+            last = n
+        of_p = wp.skew(sixth * (x[place(v, face[0])] - middle))
+        of_q = wp.skew(sixth * (x[place(v, face[1])] - middle))
+        of_r = wp.skew(sixth * (corner(x, middle, v, face[2]) - middle))
+        for c in range(n_blocks):
+            origin = of_vertex(columns, n, n_blocks, c)
+            dp = of_vertex(columns, face[0], n_blocks, c) - origin
+            dq = of_vertex(columns, face[1], n_blocks, c) - origin
+            dr = of_vertex(columns, last, n_blocks, c) - origin
+            to_p = of_q * dr - of_r * dq
+            to_q = of_r * dp - of_p * dr
+            to_r = of_p * dq - of_q * dp
+            add(out, to + face[0], n_blocks, c, to_p)
+            add(out, to + face[1], n_blocks, c, to_q)
+            add(out, to + last, n_blocks, c, to_r)
+            add(out, to + n, n_blocks, c, -(to_p + to_q + to_r))
