@@ -133,8 +133,8 @@ def halves(layer: tm.MidShape, x_a: Tensor, x_b: Tensor) -> Halves:
         amplitudes = layer.solve(x_a, x_b).solution.amplitudes[None]
         space, alignment = layer.space, layer.in_between.core.alignment
         placed, pose, _ = alignment(torch.stack([x_a, x_b])[None], torch.full((1, 2), 0.5, dtype=x_a.dtype))
-        ends = zip(space.ends, placed.unbind(1), space.energy.split(amplitudes), strict=True)
-        return Halves(*(alignment.restore(end.added(x, a), pose)[0] for end, x, a in ends))
+        ends = zip((space.first, space.second), space.split(amplitudes), placed.unbind(1), strict=True)
+        return Halves(*(alignment.restore(end.lift(a, x), pose)[0] for end, a, x in ends))
 
 
 def interpolated(x: Tensor, other: Tensor, faces: Tensor, region: NDArray[np.bool_], rings: int = 2) -> Tensor:

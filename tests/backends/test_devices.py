@@ -19,10 +19,9 @@ from torch.overrides import TorchFunctionMode
 
 import torch_modal as tm
 from torch_modal import trees
-from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.torch.fine_steps import ConvexHessian, _solved
 from torch_modal.contact.active import ContactEnergy, Contacts
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.settings import PRESETS
 
@@ -119,9 +118,9 @@ def steps(energy: Energy, x: Tensor, reference: Any) -> None:
 def assert_core_runs(core: Any, x: Tensor, stiffness: list[Tensor]) -> None:
     """An in-between but for its base and its loops: one step, the way back."""
     rests = RestShapes(torch.stack([x, x + 1], 1), blank(2, 2), stiffness)
-    placement, a = core.space.place(x, rests, blank(2)), blank(2, core.space.energy.n_amplitudes)
+    placement, a = core.space.place(x, rests, blank(2)), blank(2, core.space.n_amplitudes)
     pose, shapes = Pose(blank(2, 3, 3), blank(2, 3)), core.space.lift(a, x)
-    assert_there([placement, core.space.energy.derivatives(a, placement), shapes])
+    assert_there([placement, core.space.derivatives(a, placement), shapes])
     assert_there([core.alignment.restore(shapes, pose), core.alignment.bring(shapes, pose)])
     reference = rests.reference(core.fine.energy)
     assert_there(reference)

@@ -21,17 +21,15 @@ import torch_modal as tm
 from torch_modal import trees
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.energies import FineEnergy, RestShapes
-from torch_modal.backends.torch.fine_steps import relax
+from torch_modal.backends.torch.fine_steps import FineEnergy, relax
 from torch_modal.backends.warp import backend, launch
 from torch_modal.backends.warp import modal_energy as fused_modal
-from torch_modal.backends.warp.energies import WarpFineEnergy
-from torch_modal.backends.warp.fine_steps import WarpSteps
+from torch_modal.backends.warp.fine_steps import WarpFineEnergy, WarpSteps
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
 from torch_modal.energy.bend import Bend
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.modal_energy import ModalEnergy, Placement
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
@@ -156,7 +154,7 @@ class TestModal:
         start, generator = case.given[0], torch.Generator().manual_seed(2)
         columns = torch.randn(5, *start.shape[1:], dtype=DOUBLE, generator=generator)
         shell = WarpShell(case.energy, case.mesh)
-        modals = WarpModalEnergy(shell, columns), ModalEnergy(case.energy, columns)
+        modals = WarpModalEnergy(case.energy, case.mesh, columns), ModalEnergy(case.energy, columns)
         rests = case.rests(*case.given[1:])
         return [
             (modals[0], modals[0].place(start, shell.reference(rests))),

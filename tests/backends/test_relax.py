@@ -9,10 +9,10 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd, vmap
 
-from torch_modal.backends.torch.energies import chunk_of
 from torch_modal.backends.torch.fine_steps import (
     RIDGE,
     ConvexHessian,
+    chunk_of,
     inverse_of_symmetric,
     relax,
     step_length,

@@ -90,7 +90,7 @@ def speed(arguments: argparse.Namespace, modes: int, dtype_name: str) -> None:
     device, batches = arguments.device, sorted(arguments.batches)
     case = Case(modes, batches[-1], DTYPES[dtype_name], arguments)
     layer, n_single = case.layer, min(batches[-1], arguments.singles)
-    energy: Any = layer.core.space.energy
+    energy: Any = layer.core.space
     solution = layer.solve(*case.samples).solution
     lost = int((~solution.usable).sum())
     mean_steps = float(solution.n_steps.double().mean())

@@ -11,7 +11,6 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.cli import main as cli
 from torch_modal.contact import in_between as contact_layer
 from torch_modal.contact import modal, separate
@@ -20,6 +19,7 @@ from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, P
 from torch_modal.contact.detect import _nearest_faces
 from torch_modal.contact.separate import Timeline, through
 from torch_modal.data.samples import load_sample, sample_files
+from torch_modal.energy.energy import RestShapes
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.crossings import Crossings

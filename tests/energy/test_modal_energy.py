@@ -8,7 +8,7 @@ from torch.func import hessian, jacfwd
 
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
-from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, SumOfEnergies
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy
 from torch_modal.energy.shell import ALPHA, BETA, GAMMA, ShellEnergy
 from torch_modal.energy.term import Mesh
 
@@ -130,18 +130,6 @@ def test_a_periodic_function_of_angles_agrees_with_autograd(surface_of: tuple[Te
     assert torch.linalg.eigvalsh(got.gauss_newton).amin() > 0
     assert relative(got.hessian, truth) < 1e-11
     torch.testing.assert_close(case.modal.gradient(case.a, case.placement), got.gradient)
-
-
-def test_the_anchor_is_part_of_the_energy(small_bars: Shapes) -> None:
-    case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
-    anchored, place = SumOfEnergies(case.modal, anchor=7.0), [case.placement]
-    gain = 3.5 * case.a.square().sum(-1)
-    torch.testing.assert_close(anchored.value(case.a, place), case.energy_by_hand(case.a) + gain)
-    free, held = case.derivatives(), anchored.derivatives(case.a, place)
-    torch.testing.assert_close(held.gradient, free.gradient + 7 * case.a)
-    torch.testing.assert_close(held.gauss_newton, free.gauss_newton + 7 * torch.eye(N, dtype=torch.float64))
-    value, gradient = anchored.value_and_gradient(case.a, place)
-    torch.testing.assert_close((value, gradient), (anchored.value(case.a, place), held.gradient))
 
 
 def require_true_hessian(case: Case) -> None:

@@ -18,7 +18,7 @@ from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 from torch_modal.energy.volume import Volume
-from torch_modal.inbetween.multilevel import coarse_values
+from torch_modal.inbetween.joint import coarse_values
 
 DOUBLE = torch.float64
 

@@ -241,9 +241,9 @@ def test_starts_near_the_end_on_a_hand(ends: tuple[int, int], bound: float, hand
     pair = hands.pick(*ends)
     layer, half = MidShape(pair.bases, pair.faces, **modal()), torch.full((1, 2), 0.5, dtype=torch.float64)
     core = layer.in_between.core
-    zeros = half.new_zeros(1, core.space.energy.n_amplitudes)
+    zeros = half.new_zeros(1, core.space.n_amplitudes)
     energies = [
-        float(core.space.energy.value(zeros, placement_of(core, pair.keyframes[None], half, linear)))
+        float(core.space.value(zeros, placement_of(core, pair.keyframes[None], half, linear)))
         for linear in (False, True)
     ]
     least = float(layer.solve(*pair.keyframes).solution.energy)

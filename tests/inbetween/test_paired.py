@@ -22,8 +22,8 @@ class Setting:
     def __init__(self, bars: Shapes, coarse_faces: int) -> None:
         layer = MidShape(bars.bases[:2], bars.faces, **modal(space="paired", coarse_faces=coarse_faces))
         core = layer.in_between.core
-        self.ends, self.energy = core.space.ends, core.space.energy
-        self.coarse = core.space.levels.coarse
+        self.energy, self.ends = core.space, [core.space.first.basis, core.space.second.basis]
+        self.coarse = core.space.first.coarse
         self.shell = ShellEnergy(self.coarse.faces)
         pairs, half = torch.stack([bars.keyframes[:2], bars.keyframes[1:3]]), torch.full((2, 2), 0.5).double()
         self.shapes = core.alignment(pairs, half)[0].unbind(1)
@@ -67,6 +67,23 @@ def test_derivatives_agree_with_autograd(setting: Setting) -> None:
     assert float((got.gauss_newton - truth).norm()) > 1e-3 * float(truth.norm())
     assert torch.linalg.eigvalsh(got.gauss_newton).amin() > 0
     assert setting.energy.derivatives(setting.a, setting.placement, False).second_order is None
+
+
+def test_the_anchor_of_the_joint_space_is_part_of_its_energy(bars: Shapes) -> None:
+    pairs, half = bars.keyframes[None, 1:], torch.full((1, 2), 0.5, dtype=torch.float64)
+    free, held = (
+        MidShape(bars.bases[1:], bars.faces, **modal(anchor=anchor, backend="torch")).in_between.core
+        for anchor in (0.0, 7.0)
+    )
+    placement, a = placement_of(free, pairs, half), 0.1 * torch.ones(1, free.space.n_amplitudes, dtype=torch.float64)
+    gain = 3.5 * a.square().sum(-1)
+    torch.testing.assert_close(held.space.value(a, placement), free.space.value(a, placement) + gain)
+    without, found = (core.space.derivatives(a, placement) for core in (free, held))
+    torch.testing.assert_close(found.gradient, without.gradient + 7 * a)
+    torch.testing.assert_close(found.gauss_newton, without.gauss_newton + 7 * torch.eye(a.shape[1]).to(a))
+    torch.testing.assert_close(held.space.gradient(a, placement), found.gradient)
+    value, gradient = held.space.value_and_gradient(a, placement)
+    torch.testing.assert_close((value, gradient), (held.space.value(a, placement), found.gradient))
 
 
 def test_small_mu_is_linear_interpolation(bars: Shapes) -> None:

@@ -19,8 +19,9 @@ from torch.func import functional_call, grad, vmap
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
-from torch_modal.energy.modal_energy import Derivatives, SumOfEnergies
+from torch_modal.energy.modal_energy import Derivatives
 from torch_modal.energy.shell import ShellEnergy
+from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
@@ -239,8 +240,8 @@ class TestGradients:
             assert found.second_order is not None, "backward needs it"
             return found._replace(second_order=torch.zeros_like(found.second_order))
 
-        whole = SumOfEnergies.derivatives
-        monkeypatch.setattr(SumOfEnergies, "derivatives", without)
+        whole = JointSpace.derivatives
+        monkeypatch.setattr(JointSpace, "derivatives", without)
         (wrong,) = torch.autograd.grad(y, x_a)
         assert float((wrong - exact).norm() / exact.norm()) > 1e-2
 
@@ -398,7 +399,7 @@ class TestSingleSamples:
         with pytest.warns(ConvergenceWarning, match="1 of 2 .* in 1 steps .*1 OUT_OF_STEPS"):
             shapes = layer(x_a, x_b, 0.5)
         # Of the sample that did not converge only the part moves that does not go through the amplitudes.
-        adjoints, whole = [], SumOfEnergies.gradient
+        adjoints, whole = [], JointSpace.gradient
 
         class Seen(torch.autograd.Function):
             @staticmethod
@@ -414,7 +415,7 @@ class TestSingleSamples:
                 adjoints.append(adjoint)
                 return adjoint
 
-        monkeypatch.setattr(SumOfEnergies, "gradient", lambda *given: Seen.apply(whole(*given)))
+        monkeypatch.setattr(JointSpace, "gradient", lambda *given: Seen.apply(whole(*given)))
         (gradient,) = torch.autograd.grad((shapes * torch.cos(9 * x_b.detach())).sum(), x_b)
         assert bool(gradient.isfinite().all())
         unconverged = layer.solve(x_a, x_b, 0.5).solution.status != Status.CONVERGED

@@ -11,8 +11,8 @@ from torch import Tensor
 
 import torch_modal as tm
 from torch_modal.backends.torch.distortion import Distortion, _weights
-from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.warp.backend import WarpBackend
+from torch_modal.energy.energy import RestShapes
 from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.solve.implicit import ConvergenceWarning

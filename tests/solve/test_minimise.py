@@ -11,7 +11,7 @@ from test_gauss_newton import LeastSquares, Rosenbrock, Uphill, start
 from torch import Tensor
 from torch.func import jacfwd
 
-from torch_modal.backends.torch.energies import CoarseEnergy
+from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import periodic_square
 from torch_modal.inbetween.results import ConvergenceError, report
@@ -108,7 +108,7 @@ def problem(layer: MidShape, bars: Shapes, bends: list[float]) -> tuple[Any, Ten
     """Energy, zeros and placement between the bent and the twisted bar, both pulled away from the straight one."""
     straight, ends = bars.keyframes[0], bars.keyframes[1:]
     keyframes = torch.stack([straight + b * (ends - straight) for b in bends])
-    energy = layer.space.energy
+    energy = layer.space
     placement = placement_of(layer.in_between.core, keyframes, torch.full((len(bends), 2), 0.5, dtype=torch.float64))
     return energy, keyframes.new_zeros(len(bends), energy.n_amplitudes), placement
 
@@ -119,12 +119,12 @@ def solve(layer: MidShape, bars: Shapes, bends: list[float], tolerance: float = 
 
 @pytest.mark.parametrize("ends", [(0, 1), (1, 2)])
 def test_agrees_with_scipy(ends: tuple[int, int], small_bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CoarseEnergy, "softened", lambda energy, reference, base: reference)
+    monkeypatch.setattr(ModalEnergy, "softened", lambda energy, reference, base: reference)
     bars = small_bars.pick(*ends)
     layer = MidShape(bars.bases, bars.faces, **modal(anchor=0.0, backend="torch"))
-    core, energy, half = layer.in_between.core, layer.space.energy, torch.full((1, 2), 0.5, dtype=torch.float64)
+    core, energy, half = layer.in_between.core, layer.space, torch.full((1, 2), 0.5, dtype=torch.float64)
     placement = placement_of(core, bars.keyframes[None], half, linear=True)
-    a, coarse = torch.zeros(1, energy.n_amplitudes, dtype=torch.float64), layer.space.levels.coarse
+    a, coarse = torch.zeros(1, energy.n_amplitudes, dtype=torch.float64), layer.space.coarse
     rests = [coarse.restrict(x) for x in core.alignment(bars.keyframes[None], half)[0].unbind(1)]
     shell = ShellEnergy(coarse.faces)
 

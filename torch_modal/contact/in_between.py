@@ -6,11 +6,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.energies import Beside, RestShapes
+from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactSearch, refuse_transforms
 from torch_modal.contact.modal import ModalModel
 from torch_modal.contact.separate import Timeline, separate, through
+from torch_modal.energy.energy import RestShapes
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.joint import JointSpace
@@ -112,9 +113,9 @@ def push_apart(
     def model(some: Tensor) -> ModalModel:
         space = core.space
         placement = space.place(x[some], rests.rows(some), u[some])
-        zeros = x.new_zeros(len(some), space.energy.n_amplitudes)
-        found = space.energy.derivatives(zeros, placement, second_order=False)
-        stiffness = found.gauss_newton - space.energy.anchor * torch.eye(zeros.shape[1]).to(found.gauss_newton)
+        zeros = x.new_zeros(len(some), space.n_amplitudes)
+        found = space.derivatives(zeros, placement, second_order=False)
+        stiffness = found.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(found.gauss_newton)
         return ModalModel(space.basis.fine, core.alignment.weights, found.gradient.to(u), stiffness.to(u))
 
     search = contact_search(core, ends[0], len(u))

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.backends.torch.energies import Beside
+from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
 from torch_modal.contact.modal import ModalModel, modal_displacement

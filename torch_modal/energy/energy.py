@@ -310,3 +310,25 @@ class Energy(nn.Module):
     def gradient(self, at: Sequence[Linearised]) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
         return self.gather(at, [one.slope for one in at])
+
+
+class RestShapes(NamedTuple):
+    """K rest shapes of each sample with their weights, and the stiffnesses of the terms."""
+
+    shapes: Tensor
+    """*Shape:* ``(B, K, V, 3)``."""
+    weights: Tensor
+    """*Shape:* ``(B, K)``."""
+    stiffness: Sequence[Tensor]
+    """One of each term. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+    anchors: Tensor | None = None
+    """Fixed points of the terms, where they have some. *Shape:* ``(B, P, 3)``."""
+
+    def rows(self, some: slice | Tensor) -> "RestShapes":
+        """Rest shapes of some of the samples."""
+        anchors = None if self.anchors is None else self.anchors[some]
+        return RestShapes(self.shapes[some], self.weights[some], [each[some] for each in self.stiffness], anchors)
+
+    def reference(self, energy: Energy) -> Reference:
+        """Merge the rest shapes into one reference of an energy, of the terms that the stiffnesses belong to."""
+        return energy.among([energy.rest_of(x) for x in self.shapes.unbind(1)], self.weights, self.stiffness)

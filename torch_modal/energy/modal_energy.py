@@ -4,7 +4,6 @@ First derivatives are local (3 numbers of an edge, 9 of a hinge) and are gathere
 which are the same for a whole batch.
 """
 
-from collections.abc import Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -13,7 +12,8 @@ from torch import Tensor, nn
 
 from torch_modal import trees
 from torch_modal.autograd import traced, transformed
-from torch_modal.energy.energy import Energy, Linearised, Reference
+from torch_modal.energy.bend import Bend, fullness
+from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import Term
 
@@ -82,6 +82,25 @@ class ModalEnergy(nn.Module):
     def n_amplitudes(self) -> int:
         """Number of amplitudes, n."""
         return len(self.columns)
+
+    def reference(self, rests: RestShapes) -> Any:
+        """Merge rest shapes into the reference of a :class:`Placement`."""
+        return rests.reference(self.energy)
+
+    def softened(self, reference: Any, base: Tensor) -> Any:
+        """A reference with less bending stiffness at hinges with a needle.
+
+        The minimiser would turn their normals over, at little cost, and end at the kink where they collapse.
+
+        Args:
+            reference: Of :meth:`reference`.
+            base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
+        """
+        rows, weights = base.movedim(-1, 0), list(reference.weights)
+        for i, part in enumerate(self.energy.parts):
+            if isinstance(part.term, Bend):
+                weights[i] = fullness(part.edge_vectors(rows)) * weights[i]
+        return reference._replace(weights=tuple(weights))
 
     def place(self, base: Tensor, reference: Reference, anchors: Tensor | None = None) -> Placement:
         """The space of each sample.
@@ -187,50 +206,3 @@ def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:
     # (B, M, c, c) by (M, c, n).
     pushed = curved.permute(2, 3, 0, 1).contiguous() @ columns
     return columns.flatten(0, 1).mT @ pushed.flatten(1, 2)
-
-
-class SumOfEnergies(nn.Module):
-    r"""Several energies of the same amplitudes, and an anchor at zeros: :math:`E(a) + \tfrac{1}{2} \rho |a|^2`.
-
-    Args:
-        parts: The energies, of one precision or several; a placement of the sum has one of each.
-        anchor: ``rho``.
-    """
-
-    def __init__(self, *parts: ModalEnergy, anchor: float = 0.0) -> None:
-        super().__init__()
-        self.parts: Any = nn.ModuleList(parts)
-        self.anchor = anchor
-
-    @property
-    def n_amplitudes(self) -> int:
-        """Number of amplitudes, n."""
-        return self.parts[0].n_amplitudes  # type: ignore[no-any-return]
-
-    def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
-        """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
-        energies = [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)]
-        return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
-
-    def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
-        """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
-        found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
-        sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True)]
-        gradient, gauss_newton, *others = sums
-        eye = torch.eye(a.shape[-1]).to(gauss_newton)
-        return Derivatives(gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
-
-    def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
-        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        found = [part.value_and_gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
-        values, gradients = zip(*found, strict=True)
-        value = reduce(torch.add, values) + 0.5 * self.anchor * a.square().sum(-1)
-        return value, reduce(torch.add, gradients) + self.anchor * a
-
-    def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
-        """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
-        found = [part.gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
-        return reduce(torch.add, found) + self.anchor * a
-
-    def _each(self, placement: Sequence[Placement]) -> list[tuple[ModalEnergy, Placement]]:
-        return list(zip(self.parts, placement, strict=True))  # an iterator, torch 2.8 cannot compile

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.backends.torch.energies import RestShapes
+from torch_modal.energy.energy import RestShapes
 from torch_modal.solve.minimise import Solution, Status
 
 # A shape has at most this many times the distortion of its starts. Below, the volume error, which is not measured and

@@ -1,10 +1,19 @@
 """The joint space: one unknown shape in the sum of the modal spaces of all bases."""
 
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import torch
 from torch import Tensor, nn
 
-from torch_modal.backends.torch.energies import RestShapes
-from torch_modal.energy.modal_energy import Placement
-from torch_modal.inbetween.multilevel import MultilevelEnergy
+from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.fine_steps import FineEnergy
+from torch_modal.energy.energy import Energy, OnMesh, RestShapes
+from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.term import Mesh
+from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.subspace import SubspaceBasis
 
 
@@ -14,27 +23,130 @@ class JointSpace(nn.Module):
     The basis is orthonormal under vertex weights that add up to one, so that the anchor ``rho`` holds the mean squared
     distance from the base: without it, the minimiser jumps between far minima of almost the same energy.
 
+    The terms of Eq. 5 are evaluated on the coarse mesh, and so are others, but for those that name vertices of the
+    caller's mesh. A placement has one part for each of these kinds that there is.
+
     Args:
-        levels: The energy of the modal solve.
+        coarse: The coarse mesh.
+        fine: All terms on the caller's mesh.
+        backend: Makes the energies in the amplitudes.
         basis: The basis of the subspace, ``U``.
         anchor: ``rho``.
     """
 
-    def __init__(self, levels: MultilevelEnergy, basis: SubspaceBasis, anchor: float) -> None:
+    def __init__(
+        self, coarse: CoarseMesh, fine: FineEnergy, backend: TorchBackend, basis: SubspaceBasis, anchor: float = 0.0
+    ) -> None:
         super().__init__()
-        self.levels, self.basis = levels, basis
-        self.energy = levels.modal(basis, anchor)
+        mesh, terms = Mesh.of(coarse.faces, coarse.n_vertices), fine.terms
+        kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
+        members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
+        #: The terms of each part.
+        self.members = [own for own in members if own]
+        self.n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
+        parts = []
+        for own in self.members:
+            sampled = terms[own[0]].sampled
+            energy = Energy(fine.mesh if sampled else mesh, [terms[i] for i in own], sampled)
+            columns = basis.fine[:, energy.vertices] if sampled else basis.coarse
+            parts.append(backend.modal_energy(energy, mesh, columns))
+        self.parts: Any = nn.ModuleList(parts)
+        self.coarse, self.basis, self.anchor, self._fine = coarse, basis, anchor, (fine,)
 
-    def place(self, base: Tensor, rests: RestShapes, mu: Tensor) -> tuple[Placement, ...]:
-        """The affine space and the reference of each sample.
+    # ----------------------------------------------------------------------------------------------- the affine space
+    def place(self, base: Tensor, rests: RestShapes, mu: Tensor | None = None, soften: bool = True) -> list[Placement]:
+        """The affine space of each sample, as each energy sees it, and the reference there.
 
         Args:
-            base: *Shape:* ``(B, V, 3)``.
+            base: The shape at amplitudes of zero. *Shape:* ``(B, V, 3)``.
             rests: The key-frames, or other rest shapes. *Shape:* ``(B, K, V, 3)``.
             mu: Plays no part.
+            soften: True for less bending stiffness at needles of the base.
         """
-        return self.levels.place(self.energy, base, rests, soften=True)
+        restrict = self.coarse.restrict
+        bases, shapes = self._seen(base, restrict(base)), self._seen(rests.shapes, restrict(rests.shapes))
+        placed = []
+        for part, members, own, seen in zip(self.parts, self.members, bases, shapes, strict=True):
+            anchors = rests.anchors
+            if anchors is not None:
+                each = anchors.split(self.n_anchors, 1)
+                anchors = torch.cat([each[i] for i in members], 1)
+            stiffness = self._stiffness(part.energy, members, rests.stiffness)
+            reference = part.reference(RestShapes(seen, rests.weights, stiffness))
+            reference = part.softened(reference, own) if soften else reference
+            placed.append(part.place(own, reference, anchors))
+        return placed
 
     def lift(self, a: Tensor, base: Tensor) -> Tensor:
         """The fine shape of amplitudes. *Shape:* ``(B, n), (B, V, 3) -> (B, V, 3)``."""
         return self.basis.added(base, a)
+
+    def _seen(self, x: Tensor, coarse: Tensor) -> list[Tensor]:
+        """Fine and coarse shapes as each energy sees them. *Shape:* ``(..., V, 3)``."""
+        return [x[..., part.energy.vertices, :] if part.energy.sampled else coarse for part in self.parts]
+
+    def _stiffness(self, energy: Energy, members: Sequence[int], values: Sequence[Tensor]) -> list[Tensor]:
+        """Stiffnesses of the elements of the fine mesh on those of a part. *Shape of each:* ``(B, M)``, ``(B, 1)``."""
+        own = [values[i] for i in members]
+        if energy.sampled:
+            return own
+        fine, coarse = self._fine[0].energy.parts, self.coarse
+        parts = zip(own, members, energy.parts, strict=True)
+        return [coarse_values(value, fine[i], part, coarse.clusters, coarse.n_vertices) for value, i, part in parts]
+
+    # ------------------------------------------------------------------------------------ the energy in the amplitudes
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes, n."""
+        return len(self.basis)
+
+    def value(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
+        """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
+        energies = [part.value(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        return reduce(torch.add, energies) + 0.5 * self.anchor * a.square().sum(-1)
+
+    def derivatives(self, a: Tensor, placement: Sequence[Placement], second_order: bool = True) -> Derivatives:
+        """Gradient and Hessians at ``a``. *Shape:* ``(B, n)``."""
+        found = [part.derivatives(a.to(own.base.dtype), own, second_order) for part, own in self._each(placement)]
+        sums: list[Any] = [None if each[0] is None else reduce(torch.add, each) for each in zip(*found, strict=True)]
+        gradient, gauss_newton, *others = sums
+        eye = torch.eye(a.shape[-1]).to(gauss_newton)
+        return Derivatives(gradient + self.anchor * a, gauss_newton + self.anchor * eye, *others)
+
+    def value_and_gradient(self, a: Tensor, placement: Sequence[Placement]) -> tuple[Tensor, Tensor]:
+        """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+        found = [part.value_and_gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        values, gradients = zip(*found, strict=True)
+        value = reduce(torch.add, values) + 0.5 * self.anchor * a.square().sum(-1)
+        return value, reduce(torch.add, gradients) + self.anchor * a
+
+    def gradient(self, a: Tensor, placement: Sequence[Placement]) -> Tensor:
+        """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
+        found = [part.gradient(a.to(own.base.dtype), own) for part, own in self._each(placement)]
+        return reduce(torch.add, found) + self.anchor * a
+
+    def _each(self, placement: Sequence[Placement]) -> list[tuple[ModalEnergy, Placement]]:
+        return list(zip(self.parts, placement, strict=True))  # an iterator, torch 2.8 cannot compile
+
+
+def coarse_values(values: Tensor, fine: OnMesh, coarse: OnMesh, clusters: Tensor, n: int) -> Tensor:
+    """Values of the elements of the fine mesh on those of the coarse one: means over clusters, then over corners.
+
+    Args:
+        values: *Shape:* ``(B, M)``, or ``(B, 1)``, which stays.
+        fine: The term on the fine mesh.
+        coarse: The same term on the coarse mesh.
+        clusters: The coarse vertex of each fine one. *Shape:* ``(V,)``.
+        n: Number of coarse vertices.
+
+    Returns:
+        *Shape:* ``(B, M_coarse)``.
+    """
+    if values.shape[-1] == 1:
+        return values
+    owners = clusters[fine.corners].flatten()
+    sums = values.new_zeros(len(values), n).index_add(1, owners, values.repeat(1, len(fine.corners)))
+    counts = values.new_zeros(n).index_add(0, owners, values.new_ones(len(owners)))
+    # A cluster without elements of its own knows the mean only.
+    means = torch.where(counts > 0, sums / counts.clamp_min(1), values.mean(1, keepdim=True))
+    return means[:, coarse.corners].mean(1)

@@ -1,15 +1,14 @@
 """The paired space of the paper (Eq. 4): one shape near each key-frame, pulled together."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from torch_modal.backends.torch.energies import RestShapes
-from torch_modal.energy.modal_energy import Derivatives, Placement, SumOfEnergies
-from torch_modal.inbetween.multilevel import MultilevelEnergy
-from torch_modal.inbetween.subspace import SubspaceBasis
+from torch_modal.energy.energy import RestShapes
+from torch_modal.energy.modal_energy import Derivatives, Placement
+from torch_modal.inbetween.joint import JointSpace
 
 
 class PairedPlacement(NamedTuple):
@@ -25,25 +24,53 @@ class PairedPlacement(NamedTuple):
     """Weight of the similarity. *Shape:* ``(B,)``."""
 
 
-class PairedEnergy(nn.Module):
-    r"""Eq. 4: :math:`d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)` in the amplitudes of both shapes.
+class PairedSpace(nn.Module):
+    r"""Mid-shapes as the mean of ``x_1 = x_a + Phi_a a_1`` and ``x_2 = x_b + Phi_b a_2`` that minimise Eq. 4.
+
+    .. math:: d(\bar x_1, x_1) + \mu \|x_1 - x_2\|^2 + d(\bar x_2, x_2)
+
+    The two spaces barely meet, so that a small ``mu`` returns the linear mean and a large one distorts: this is the
+    paper's method, kept for comparison; the joint space is the better choice.
 
     Args:
-        energies: The energy of either shape in its own amplitudes.
-        ends: Bases of both subspaces.
-        used: The fine vertices that the similarity is taken over. *Shape:* ``(V,)``, bool.
+        first: The space of the first shape.
+        second: The space of the second.
+        used: The vertices of faces, which the similarity is taken over. *Shape:* ``(V,)``, bool.
     """
 
+    used: Tensor
     gap: Tensor
     gap_gram: Tensor
 
-    def __init__(self, energies: Sequence[SumOfEnergies], ends: Sequence[SubspaceBasis], used: Tensor) -> None:
+    def __init__(self, first: JointSpace, second: JointSpace, used: Tensor) -> None:
         super().__init__()
-        self.first, self.second = energies
-        gap = (torch.cat([ends[0].fine, -ends[1].fine]) * used[:, None]).flatten(1)
+        self.first, self.second = first, second
+        gap = (torch.cat([first.basis.fine, -second.basis.fine]) * used[:, None]).flatten(1)
+        self.register_buffer("used", used, persistent=False)
         self.register_buffer("gap", gap, persistent=False)
         self.register_buffer("gap_gram", gap @ gap.mT, persistent=False)
 
+    def place(self, base: Tensor, rests: RestShapes, mu: Tensor) -> PairedPlacement:
+        """The two shapes of each sample, each with its key-frame as base and as rest shape.
+
+        Args:
+            base: Plays no part.
+            rests: The key-frames. *Shape:* ``(B, 2, V, 3)``.
+            mu: *Shape:* ``(B,)``.
+        """
+        placed = []
+        for k, space in enumerate((self.first, self.second)):
+            own = rests._replace(shapes=rests.shapes[:, k : k + 1], weights=torch.ones_like(rests.weights[:, :1]))
+            placed.append(tuple(space.place(rests.shapes[:, k], own, soften=False)))
+        difference = ((rests.shapes[:, 0] - rests.shapes[:, 1]) * self.used[:, None]).flatten(1)
+        return PairedPlacement(placed[0], placed[1], difference @ self.gap.mT, (difference**2).sum(-1), mu)
+
+    def lift(self, a: Tensor, base: Tensor) -> Tensor:
+        """The fine mid-shape of amplitudes; the base is the linear one. *Shape:* ``(B, n) -> (B, V, 3)``."""
+        a1, a2 = self.split(a)
+        return self.second.lift(0.5 * a2, self.first.lift(0.5 * a1, base))
+
+    # ------------------------------------------------------------------------------------ the energy in the amplitudes
     @property
     def n_amplitudes(self) -> int:
         """Number of amplitudes of both."""
@@ -64,9 +91,8 @@ class PairedEnergy(nn.Module):
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
         ends = self._ends(a, placement)
-        first, second = (energy.derivatives(part, place, second_order) for energy, part, place in ends)
-        gradient = torch.cat([first.gradient, second.gradient], -1)
-        gradient = gradient + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
+        first, second = (space.derivatives(part, place, second_order) for space, part, place in ends)
+        gradient = torch.cat([first.gradient, second.gradient], -1) + self._pull(a, placement)
         similar = 2 * placement.mu[:, None, None] * self.gap_gram
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
         curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
@@ -74,64 +100,24 @@ class PairedEnergy(nn.Module):
 
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
-        first, second = (energy.value_and_gradient(part, place) for energy, part, place in self._ends(a, placement))
-        similar = a @ self.gap_gram + placement.linear
-        similarity = (a * (similar + placement.linear)).sum(-1) + placement.constant
+        first, second = (space.value_and_gradient(part, place) for space, part, place in self._ends(a, placement))
+        similarity = (a * (a @ self.gap_gram + 2 * placement.linear)).sum(-1) + placement.constant
         value = first[0] + second[0] + placement.mu * similarity
-        return value, torch.cat([first[1], second[1]], -1) + 2 * placement.mu[:, None] * similar
+        return value, torch.cat([first[1], second[1]], -1) + self._pull(a, placement)
 
     def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
-        ends = [energy.gradient(part, place) for energy, part, place in self._ends(a, placement)]
-        return torch.cat(ends, -1) + 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
+        ends = [space.gradient(part, place) for space, part, place in self._ends(a, placement)]
+        return torch.cat(ends, -1) + self._pull(a, placement)
+
+    def _pull(self, a: Tensor, placement: PairedPlacement) -> Tensor:
+        """Gradient of the similarity."""
+        return 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
 
     def _ends(
         self, a: Tensor, placement: PairedPlacement
-    ) -> Iterator[tuple[SumOfEnergies, Tensor, tuple[Placement, ...]]]:
+    ) -> Iterator[tuple[JointSpace, Tensor, tuple[Placement, ...]]]:
         return zip((self.first, self.second), self.split(a), (placement.first, placement.second), strict=True)
-
-
-class PairedSpace(nn.Module):
-    """Mid-shapes as the mean of ``x_1 = x_a + Phi_a a_1`` and ``x_2 = x_b + Phi_b a_2`` that minimise Eq. 4.
-
-    The two spaces barely meet, so that a small ``mu`` returns the linear mean and a large one distorts: this is the
-    paper's method, kept for comparison; the joint space is the better choice.
-
-    Args:
-        levels: The energy of the modal solve.
-        ends: Bases of both subspaces.
-        used: The vertices of faces. *Shape:* ``(V,)``, bool.
-    """
-
-    used: Tensor
-
-    def __init__(self, levels: MultilevelEnergy, ends: Sequence[SubspaceBasis], used: Tensor) -> None:
-        super().__init__()
-        self.levels = levels
-        self.ends: Any = nn.ModuleList(ends)
-        self.register_buffer("used", used, persistent=False)
-        self.energy = PairedEnergy([levels.modal(end) for end in ends], ends, used)
-
-    def place(self, base: Tensor, rests: RestShapes, mu: Tensor) -> PairedPlacement:
-        """The two shapes of each sample, each with its key-frame as base and as rest shape.
-
-        Args:
-            base: Plays no part.
-            rests: The key-frames. *Shape:* ``(B, 2, V, 3)``.
-            mu: *Shape:* ``(B,)``.
-        """
-        placed = []
-        for k, energy in enumerate((self.energy.first, self.energy.second)):
-            own = rests._replace(shapes=rests.shapes[:, k : k + 1], weights=torch.ones_like(rests.weights[:, :1]))
-            placed.append(self.levels.place(energy, rests.shapes[:, k], own, soften=False))
-        difference = ((rests.shapes[:, 0] - rests.shapes[:, 1]) * self.used[:, None]).flatten(1)
-        return PairedPlacement(placed[0], placed[1], difference @ self.energy.gap.mT, (difference**2).sum(-1), mu)
-
-    def lift(self, a: Tensor, base: Tensor) -> Tensor:
-        """The fine mid-shape of amplitudes; the base is the linear one. *Shape:* ``(B, n) -> (B, V, 3)``."""
-        for end, own in zip(self.ends, self.energy.split(a), strict=True):
-            base = end.added(base, 0.5 * own)
-        return base
 
 
 def _block_diagonal(first: Any, second: Any) -> Tensor:

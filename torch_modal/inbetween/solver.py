@@ -8,8 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.energies import RestShapes
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.inbetween.alignment import KeyframeAlignment
@@ -17,7 +16,6 @@ from torch_modal.inbetween.blend import RotationBlend
 from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.comparison import SLACK, no_worse
 from torch_modal.inbetween.joint import JointSpace
-from torch_modal.inbetween.multilevel import MultilevelEnergy
 from torch_modal.inbetween.paired import PairedSpace
 from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised, warn_of_starts
 from torch_modal.inbetween.settings import Objective, Solver
@@ -73,11 +71,11 @@ class InBetweenSolver(nn.Module):
         coarse = CoarseMesh(alignment.references, self.mesh.faces, objective.coarse_faces, alignment.weights, turned)
         # The paired space, and steps that are unrolled, are differentiated like any other expression: by torch.
         by_kernels = objective.space == "joint" and self.solver.gradient == "implicit"
-        levels = MultilevelEnergy(coarse, self.fine, self.backend if by_kernels else TorchBackend())
+        given = coarse, self.fine, self.backend if by_kernels else TorchBackend()
         if objective.space == "joint":
-            return JointSpace(levels, elastic_subspace(turned, alignment, coarse), objective.anchor)
-        ends = [elastic_subspace([own], alignment, coarse) for own in turned]
-        return PairedSpace(levels, ends, alignment.weights > 0)
+            return JointSpace(*given, elastic_subspace(turned, alignment, coarse), objective.anchor)
+        first, second = (JointSpace(*given, elastic_subspace([own], alignment, coarse)) for own in turned)
+        return PairedSpace(first, second, alignment.weights > 0)
 
     def forward(self, samples: Samples, report: Report | None) -> InBetweenResult:
         """Solve.
@@ -115,7 +113,7 @@ class InBetweenSolver(nn.Module):
         solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         placement = self.space.place(base, rests, mu)
         limits = self.solver.max_steps, self.solver.tolerance
-        solution = solve(self.space.energy, placement, usable, *limits, report)
+        solution = solve(self.space, placement, usable, *limits, report)
         # Kernels compute in float64, whatever goes in and comes out.
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
         solution = Solution(*values)

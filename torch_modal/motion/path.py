@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import broadcast_shapes, full_precision, in_use, lasting, mapped, require_numbers
 from torch_modal.backends.choice import choose
-from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.contact.active import refuse_transforms
 from torch_modal.contact.in_between import push_apart
+from torch_modal.energy.energy import RestShapes
 from torch_modal.energy.shell import ALPHA, BETA
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import require_contact

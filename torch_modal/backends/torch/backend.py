@@ -6,8 +6,9 @@ from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.backends.torch.energies import CoarseEnergy, FineEnergy
+from torch_modal.backends.torch.fine_steps import FineEnergy
 from torch_modal.energy.energy import Energy
+from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
@@ -32,9 +33,9 @@ class TorchBackend:
         """Shapes from edge vectors. *Shape:* ``(E,)``."""
         return Poisson(mesh, weights)
 
-    def coarse_energy(self, energy: Energy, mesh: Mesh) -> CoarseEnergy:
-        """The terms of Eq. 5 on the coarse mesh, for the modal solve."""
-        return CoarseEnergy(energy)
+    def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
+        """Terms in the amplitudes of columns, for the modal solve. *Shape:* ``(n, V, 3)``."""
+        return ModalEnergy(energy, columns)
 
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """All terms on the caller's mesh, for steps of all vertices. Those of Eq. 5 come first."""

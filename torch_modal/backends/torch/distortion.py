@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torch_modal.backends.torch.energies import FurtherTerms, RestShapes
+from torch_modal.backends.torch.fine_steps import FurtherTerms
 from torch_modal.energy.bend import collapsed, dihedral_angle
-from torch_modal.energy.energy import Energy
+from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.term import Mesh, periodic_square
 from torch_modal.geometry.vectors import cross, inverse, norm, pick
 

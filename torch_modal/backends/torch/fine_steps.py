@@ -1,12 +1,14 @@
-"""An energy with every vertex free: a convex Hessian that is applied without being assembled, and steps with it."""
+"""The energy on the caller's mesh with every vertex free: a convex Hessian, never assembled, and steps with it."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from torch_modal.energy.energy import Energy, Linearised, Reference
+from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes
+from torch_modal.energy.shell import N_SHELL_TERMS
+from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 
 # Added to the diagonal blocks, relative to their trace: a vertex in a flat fan has no stiffness along its normal.
@@ -20,6 +22,11 @@ SLIGHT = 1e-5 * CANONICAL_SIZE
 
 # Roundings of an energy, relative to it, that make no step shorter.
 ENERGY_ROUNDING = 64.0
+
+# Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into
+# its memory (6 KB a vertex where gradients are recorded).
+CHUNK = 20_000
+CHUNK_OF_GPU = 1_000_000
 
 
 class FurtherDerivatives(NamedTuple):
@@ -233,3 +240,102 @@ def conjugate_gradients(
         previous, size = size, dot(residual, preconditioned)
         direction = preconditioned + quotient(size, previous) * direction
     return solution
+
+
+class FurtherTerms(FurtherEnergy):
+    """The terms beyond Eq. 5 as an energy beside it.
+
+    Args:
+        energy: Their energy.
+        rests: The rest shapes of all terms.
+    """
+
+    def __init__(self, energy: Energy, rests: RestShapes) -> None:
+        own = rests._replace(stiffness=rests.stiffness[N_SHELL_TERMS:])
+        self.energy, self.reference = energy, own.reference(energy)
+        self.anchors = None if rests.anchors is None else rests.anchors.movedim(-1, 0)
+
+    def _extended(self, x: Tensor) -> Tensor:
+        return self.energy.extend(x.movedim(-1, 0).contiguous(), self.anchors)
+
+    def value(self, x: Tensor) -> Tensor:
+        """*Shape:* ``(B, V, 3) -> (B,)``."""
+        return self.energy.value(self._extended(x), self.reference)
+
+    def at(self, x: Tensor) -> FurtherDerivatives:
+        """*Shape:* ``(B, V, 3)``."""
+        energy, n = self.energy, x.shape[1]
+        at = energy.linearise(self._extended(x), self.reference)
+        hessian = ConvexHessian(energy, at)
+        packed = hessian.diagonal().flatten(0, 1)[[0, 1, 2, 4, 5, 8], ..., :n].movedim(0, -1)
+
+        def product(field: Tensor) -> Tensor:
+            rows = energy.extend(field.movedim(-1, 0).contiguous())
+            return energy.fold(hessian(rows)).movedim(0, -1)
+
+        gradient = energy.fold(energy.gradient(at)).movedim(0, -1)
+        return FurtherDerivatives(energy.value_at(at, self.reference), gradient, packed, product)
+
+
+Beside = Callable[[slice, Tensor], Sequence[FurtherEnergy]]
+"""Makes energies beside that of the terms, for some of the samples, in the dtype of a tensor."""
+
+
+class FineEnergy(nn.Module):
+    """All terms on the caller's mesh.
+
+    Args:
+        mesh: The mesh.
+        terms: The terms; those of Eq. 5 come first.
+    """
+
+    def __init__(self, mesh: Mesh, terms: Sequence[Term]) -> None:
+        super().__init__()
+        self.mesh = mesh
+        self.energy = Energy(mesh, terms)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The terms; the layer owns them."""
+        return tuple(part.term for part in self.energy.parts)
+
+    def relax(
+        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Beside | None = None
+    ) -> Tensor:
+        """Steps of all vertices, never uphill (:func:`~torch_modal.backends.torch.fine_steps.relax`).
+
+        Args:
+            x: Initial shapes. *Shape:* ``(B, V, 3)``.
+            rests: The rest shapes.
+            stages: Newton steps, and iterations of conjugate gradients in each.
+            beside: Energies beside that of the terms.
+
+        Returns:
+            *Shape:* ``(B, V, 3)``.
+        """
+        size, parts = chunk_of(x.shape[1], x.device), []
+        for i in range(0, len(x), size):
+            some = slice(i, i + size)
+            own = x[some]
+            parts.append(self.relax_chunk(own, rests.rows(some), stages, () if beside is None else beside(some, own)))
+        return torch.cat(parts)
+
+    def relax_chunk(
+        self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Sequence[FurtherEnergy]
+    ) -> Tensor:
+        """:meth:`relax` of samples that fit into the caches, with their own further energies."""
+        reference = rests.reference(self.energy)
+        for n_steps, n_products in stages:
+            x = relax(self.energy, x, reference, n_steps, n_products, rests.anchors, beside)
+        return x
+
+    def towards(
+        self, x: Tensor, reference: Reference, n_steps: int, n_products: int, beside: Sequence[FurtherEnergy] = ()
+    ) -> Tensor:
+        """Steps of all vertices towards a reference that is known. *Shape:* ``(B, V, 3)``."""
+        return relax(self.energy, x, reference, n_steps, n_products, None, beside)
+
+
+def chunk_of(n_vertices: int, device: torch.device) -> int:
+    """Number of samples of so many vertices that are relaxed at a time."""
+    return max(1, (CHUNK if device.type == "cpu" else CHUNK_OF_GPU) // n_vertices)

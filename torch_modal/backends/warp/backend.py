@@ -9,13 +9,15 @@ from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.backends.torch.backend import TorchBackend
-from torch_modal.backends.torch.energies import CoarseEnergy, FineEnergy
+from torch_modal.backends.torch.fine_steps import FineEnergy
 from torch_modal.backends.warp.crossings import WarpPairs
-from torch_modal.backends.warp.energies import WarpCoarseEnergy, WarpFineEnergy
+from torch_modal.backends.warp.fine_steps import WarpFineEnergy
 from torch_modal.backends.warp.launch import kernels, load_kernels
+from torch_modal.backends.warp.modal_energy import WarpModalEnergy
 from torch_modal.backends.warp.rotations import WarpRotations
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
+from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, Term
@@ -48,10 +50,10 @@ class WarpBackend(TorchBackend):
         """Overrides the base class."""
         return WarpRotations(mesh, references)
 
-    def coarse_energy(self, energy: Energy, mesh: Mesh) -> CoarseEnergy:
+    def modal_energy(self, energy: Energy, mesh: Mesh, columns: Tensor) -> ModalEnergy:
         """Overrides the base class."""
         serves = _are_of_shell([part.term for part in energy.parts])
-        return WarpCoarseEnergy(energy, mesh) if serves else super().coarse_energy(energy, mesh)
+        return WarpModalEnergy(energy, mesh, columns) if serves else super().modal_energy(energy, mesh, columns)
 
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """Overrides the base class."""

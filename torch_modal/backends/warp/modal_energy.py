@@ -11,7 +11,10 @@ from torch_modal.autograd import traced, transformed
 from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import kernels, launch
 from torch_modal.backends.warp.shell import ShellReference, WarpShell
+from torch_modal.energy.bend import fullness
+from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
+from torch_modal.energy.term import Mesh
 
 # Columns that a kernel takes at a time.
 _BLOCK = 8
@@ -30,7 +33,8 @@ class WarpModalEnergy(ModalEnergy):
     differentiated once more, are torch's.
 
     Args:
-        shell: The energy on the mesh that the columns live on.
+        energy: Of stretch, bend and volume, in this order.
+        mesh: Its mesh.
         columns: Directions of the space. *Shape:* ``(n, V, 3)``.
     """
 
@@ -38,19 +42,25 @@ class WarpModalEnergy(ModalEnergy):
     blocks: Tensor
     tabulated = False  # kernels have their own tables
 
-    def __init__(self, shell: WarpShell, columns: Tensor) -> None:
-        super().__init__(shell.energy, columns)
-        self._shell = (shell,)
+    def __init__(self, energy: Energy, mesh: Mesh, columns: Tensor) -> None:
+        super().__init__(energy, columns)
+        self.shell = WarpShell(energy, mesh)
         self.register_buffer("flat", columns.flatten(1).contiguous(), persistent=False)
         rows = self.columns.permute(2, 1, 0).flatten(0, 1)
         blocks = nn.functional.pad(rows, (0, -(len(columns) + 2) % _BLOCK + 2)).contiguous()
         #: Columns of each component of each vertex and of the centre, with room for two more, and zeros.
         self.register_buffer("blocks", blocks, persistent=False)
 
-    @property
-    def shell(self) -> WarpShell:
-        """The kernels."""
-        return self._shell[0]
+    def reference(self, rests: RestShapes) -> ShellReference:
+        """As in the base class."""
+        return self.shell.reference(rests)
+
+    def softened(self, reference: Any, base: Tensor) -> Any:
+        """As in the base class."""
+        edges, hinges = reference.elements.split([2, 5], -1)
+        full = fullness(self.energy.parts[1].edge_vectors(base.movedim(-1, 0))).to(hinges)
+        factors = torch.ones_like(hinges[..., 0]).index_copy(1, self.shell.interior, full)
+        return reference._replace(elements=torch.cat([edges, factors[..., None] * hinges], -1))
 
     def place(self, base: Tensor, reference: Any, anchors: Tensor | None = None) -> Placement:
         """As in the base class."""

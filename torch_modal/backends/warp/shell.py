@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_modal.backends.torch.energies import RestShapes
 from torch_modal.backends.warp.function import fused
 from torch_modal.backends.warp.launch import Constants, kernels, launch
-from torch_modal.energy.energy import Energy, Reference
+from torch_modal.energy.energy import Energy, Reference, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.stretch import MIN_RELATIVE_LENGTH
 from torch_modal.energy.term import Mesh
