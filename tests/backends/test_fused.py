@@ -21,9 +21,11 @@ import torch_modal as tm
 from torch_modal import trees
 from torch_modal.backends.choice import choose
 from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.torch.fine_steps import FineEnergy, relax
 from torch_modal.backends.warp import backend, launch
 from torch_modal.backends.warp import modal_energy as fused_modal
+from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.backends.warp.fine_steps import WarpFineEnergy, WarpSteps
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy
 from torch_modal.backends.warp.rotations import WarpRotations
@@ -114,6 +116,13 @@ def test_local_steps(case: Case) -> None:
     assert_alike(gradients(case.by_warp, case.given), gradients(case.by_torch, case.given), 1e-6)
     if case.fused.closed:
         assert_alike(gradients(case.by_warp, case.given, True), gradients(case.by_torch, case.given, True), 1e-7)
+
+
+@torch.no_grad()
+def test_distortion(case: Case) -> None:
+    shapes, rests = case.given[:3], case.rests(*case.given[1:])
+    found, wanted = (kind(case.mesh, None)(shapes, rests) for kind in (WarpDistortion, Distortion))
+    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=0)
 
 
 def test_edges_that_are_points_at_rest_weigh_nothing(small_bars: Shapes) -> None:

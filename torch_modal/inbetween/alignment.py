@@ -46,6 +46,8 @@ class KeyframeAlignment(nn.Module):
     weights: Tensor
     references: Tensor
     turns: Tensor
+    roots: Tensor
+    rooted: Tensor
     faces: Tensor
 
     def __init__(self, references: Tensor, mesh: Connectivity) -> None:
@@ -63,6 +65,9 @@ class KeyframeAlignment(nn.Module):
         self.register_buffer("turns", turns, persistent=False)
         #: The references in the frame, turned on to the first. *Shape:* ``(K, V, 3)``.
         self.register_buffer("references", centred @ turns.mT * scale, persistent=False)
+        #: Roots of the weights, and the first reference times these. *Shape:* ``(V, 1), (3, V)``.
+        self.register_buffer("roots", weights.sqrt()[:, None], persistent=False)
+        self.register_buffer("rooted", (self.reference * self.roots).mT.contiguous(), persistent=False)
         self.register_buffer("faces", faces, persistent=False)
         self.closed = len(mesh.boundary_edges) == 0
         self.size_warned = False
@@ -112,10 +117,9 @@ class KeyframeAlignment(nn.Module):
         """
         centres = centroid(keyframes, self.weights)
         centred = (keyframes - centres[..., None, :]) * self.scale
-        reference = self.reference.expand(len(keyframes), 1, -1, -1)
-        rows = (torch.cat([reference, centred], 1) * self.weights.sqrt()[:, None]).mT.flatten(1, 2)
-        products = (rows @ rows.mT).unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)
-        to_reference, among = products[:, 0, 1:], products[:, 1:, 1:]  # (B, K, 3, 3), (B, K, K, 3, 3)
+        rows = (centred * self.roots).mT.flatten(1, 2)
+        to_reference = (self.rooted @ rows.mT).unflatten(2, (-1, 3)).transpose(1, 2)  # (B, K, 3, 3)
+        among = (rows @ rows.mT).unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)  # (B, K, K, 3, 3)
         pulls = weights[..., None, None]
         if weights.shape[1] > 2:
             with torch.no_grad():

@@ -79,14 +79,16 @@ class Distortion(nn.Module):
         rows = self._rows(*shapes, *rests.shapes.unbind(1))
         hinges = _edge_vectors(rows, self.hinges)
         n, lengths, angles = len(shapes), norm(_edge_vectors(rows, self.edges)[0]), dihedral_angle(hinges)
-        alpha, beta = (
-            values if values.shape[-1] == 1 else values[:, own]
-            for values, own in zip(rests.stiffness[:2], (self.edge, self.hinge), strict=True)
-        )
+        alpha, beta = self.on_elements(rests.stiffness)
         off = (lengths[:n, None] - lengths[n:]).abs()
         stretching = (alpha * off * (off / lengths[n:]).clamp_max(LARGEST_STRAIN)).sum(-1)
         bending = (beta * _weights(hinges[:, :, n:]) * periodic_square(angles[:n, None] - angles[n:])).sum(-1)
         return (rests.weights.mT * (self.shares[0] * stretching + self.shares[1] * bending)).sum(1)
+
+    def on_elements(self, stiffness: Sequence[Tensor]) -> list[Tensor]:
+        """Stiffnesses of the edges and hinges that are looked at. *Shape of each:* ``(B, M)`` or ``(B, 1)``."""
+        pairs = zip(stiffness, (self.edge, self.hinge), strict=False)
+        return [values if values.shape[-1] == 1 else values[:, own] for values, own in pairs]
 
     def slight(self, stiffness: Sequence[Tensor], like: Tensor) -> Tensor:
         """The distortion of a shape whose edges are all strained by :data:`SLIGHT`. *Shape:* ``(B,)``."""

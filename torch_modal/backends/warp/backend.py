@@ -9,8 +9,10 @@ from torch import Tensor
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.backends.torch.distortion import Distortion
 from torch_modal.backends.torch.fine_steps import FineEnergy
 from torch_modal.backends.warp.crossings import WarpPairs
+from torch_modal.backends.warp.distortion import WarpDistortion
 from torch_modal.backends.warp.fine_steps import WarpFineEnergy
 from torch_modal.backends.warp.launch import kernels, load_kernels
 from torch_modal.backends.warp.modal_energy import WarpModalEnergy
@@ -58,6 +60,10 @@ class WarpBackend(TorchBackend):
     def fine_energy(self, mesh: Mesh, terms: Sequence[Term]) -> FineEnergy:
         """Overrides the base class."""
         return WarpFineEnergy(mesh, terms) if _are_of_shell(terms) else super().fine_energy(mesh, terms)
+
+    def distortion(self, mesh: Mesh, further: Energy | None) -> Distortion:
+        """Overrides the base class."""
+        return WarpDistortion(mesh, further)
 
     def crossings(self, mesh: Connectivity, shape: FloatArray) -> Callable[[FloatArray], IntArray]:
         """Overrides the base class."""

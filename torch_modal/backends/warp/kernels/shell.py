@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from torch_modal.backends.torch.distortion import LARGEST_STRAIN, LARGEST_WEIGHT
 from torch_modal.backends.warp.kernels.elements import (
     HALF,
     SIXTH,
@@ -26,12 +27,15 @@ from torch_modal.backends.warp.kernels.elements import (
     squared,
     symmetric,
     vec3,
+    vec4,
 )
 from torch_modal.energy.bend import MAX_BENDING_RATIO
 from torch_modal.energy.stretch import SLACK
 
 SLACKNESS = wp.constant(real(SLACK))
 RATIO = wp.constant(real(MAX_BENDING_RATIO))
+STRAIN = wp.constant(real(LARGEST_STRAIN))
+WEIGHT = wp.constant(real(LARGEST_WEIGHT))
 summed = wp.types.vector(length=8, dtype=real)
 """Sums over rest shapes: weights of an edge, then those times its length and its square; then the moments."""
 
@@ -320,3 +324,58 @@ def product(
             wp.atomic_add(out, q1, to_j)
     if scalars:
         wp.atomic_add(scalars, first + s, vec3(real(0.0), real(0.0), total))
+
+
+# --------------------------------------------------------------------------------------------------------- distortion
+@wp.func
+def measured(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
+    """Length, cosine and sine of the dihedral angle, and its bounded weight; 0 without a hinge."""
+    found = vec4(length_of(x[place(at, q[1])] - x[place(at, q[0])]), real(1.0), real(0.0), real(0.0))
+    if q[2] >= 0:
+        h = hinge_of(x, at, q)
+        if not h.flat:
+            phase = phase_of(h)
+            weight = real(2.0) * wp.dot(h.e, h.e) / (wp.length(h.n1) + wp.length(h.n2))
+            found = vec4(found[0], phase[0], phase[1], wp.min(weight, WEIGHT))
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def distortion(
+    mesh: Elements,
+    x: wp.array(dtype=vec3),
+    rests: wp.array(dtype=vec3),
+    weights: wp.array(dtype=real),
+    alpha: wp.array(dtype=real),
+    beta: wp.array(dtype=real),
+    n_shapes: int,
+    n_samples: int,
+    n_rests: int,
+    n_alpha: int,
+    n_beta: int,
+    out: wp.array(dtype=wp.vec2d),
+    threads: int,
+):
+    """Bounded stretching and bending of several shapes of each sample against its rest shapes."""
+    i = wp.tid()
+    s = i // threads
+    for k in range(i - s * threads, mesh.record.shape[0], threads):
+        q = mesh.record[place(k, 0)]
+        for r in range(s * n_rests, (s + 1) * n_rests):
+            rest = measured(rests, r * mesh.n_vertices, q)
+            stretching = weights[place(r, 0)] * alpha[place(s * n_alpha, wp.min(k, n_alpha - 1))]
+            bending = real(0.0)
+            if q[2] >= 0:
+                bending = (
+                    weights[place(r, 0)]
+                    * rest[3]
+                    * beta[place(s * n_beta, wp.min(mesh.hinge[place(k, 0)], n_beta - 1))]
+                )
+            for j in range(n_shapes):
+                found = measured(x, (j * n_samples + s) * mesh.n_vertices, q)
+                off = wp.abs(found[0] - rest[0])
+                turn = wp.vec2d(found[1] - rest[1], found[2] - rest[2])
+                versine = HALF * wp.dot(turn, turn)
+                bent = bending * versine * (real(2.0) + versine / real(3.0))
+                stretched = stretching * off * wp.min(off / rest[0], STRAIN)
+                wp.atomic_add(out, place(j * n_samples, s), wp.vec2d(stretched, bent))

@@ -1,0 +1,48 @@
+"""The distortion of shapes by a Warp kernel."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torch_modal.autograd import traced, transformed
+from torch_modal.backends.torch.distortion import Distortion
+from torch_modal.backends.warp.launch import Constants, kernels, launch
+from torch_modal.energy.energy import Energy, RestShapes
+from torch_modal.energy.term import Mesh
+
+
+class WarpDistortion(Distortion):
+    """:class:`Distortion` without gradients in one kernel, in float64; with them it is the base class."""
+
+    def __init__(self, mesh: Mesh, further: Energy | None) -> None:
+        super().__init__(mesh, further)
+        interior = torch.tensor(mesh.connectivity.counts == 2)[self.edge]
+        record = torch.cat([mesh.edges[self.edge], torch.full((len(self.edge), 2), -1)], 1)
+        record[interior] = mesh.hinges[self.hinge]
+        #: The elements as the first argument of the kernel.
+        self.constants = Constants(
+            "shell",
+            "Elements",
+            record=record.int(),
+            hinge=(interior.cumsum(0) - 1).int(),
+            capped_faces=mesh.faces[:0].int(),
+            n_vertices=mesh.n_vertices,
+        )
+
+    def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
+        """Overrides the base class."""
+        values = *shapes, rests.shapes, rests.weights, *rests.stiffness[:2]
+        if torch.is_grad_enabled() or any(traced(x) or transformed(x) for x in values):
+            return super().of_shell(shapes, rests)
+        given = [x.double().contiguous() for x in (torch.stack([*shapes]), rests.shapes, rests.weights)]
+        stiffness = [x.double().contiguous() for x in self.on_elements(rests.stiffness)]
+        n_samples, n_rests = rests.weights.shape
+        found = given[0].new_zeros(len(shapes), n_samples, 2)
+        sizes = [len(shapes), n_samples, n_rests, *(x.shape[-1] for x in stiffness)]
+        launch(
+            kernels("shell").distortion,
+            (n_samples, len(self.edge)),
+            [self.constants, *given, *stiffness, *sizes, found],
+        )
+        return (found @ found.new_tensor(self.shares)).to(rests.weights)
