@@ -27,7 +27,7 @@ def test_one_closed_manifold_surface_wound_outwards(name: str) -> None:
     assert np.array_equal(np.unique(faces), np.arange(n_vertices))  # every vertex is used
     assert n_vertices - len(edges) + len(faces) == 2  # Euler: one sphere, so also one fan of faces a vertex
     assert not degenerate_faces(faces).any() and not repeated_faces(faces).any()
-    assert len(consistent_winding(mesh).flipped) == 0
+    assert len(consistent_winding(mesh)[1]) == 0
     for shape in torch.cat([sample.keyframes, sample.truth]).numpy():
         assert signed_volume(shape, faces) > 0
         assert not flat_faces(shape, faces, 1e-6).any()

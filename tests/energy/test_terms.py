@@ -63,21 +63,21 @@ def test_angles_of_any_number_of_shapes_are_one_reference(generator: torch.Gener
     angles, weights = (torch.rand(5, 40, dtype=DOUBLE, generator=generator) for _ in range(2))
     angles = 20 * angles - 10
     term, at = PeriodicTerm(), torch.linspace(-4, 4, 40, dtype=DOUBLE)
-    merged = term.merged(angles, weights)
+    rows, whole, _ = term.merged(angles, weights)
     versine = 1 - (at - angles).cos()
     truth = (weights * (2 * versine + versine**2 / 3)).sum(0)
-    torch.testing.assert_close(term.energies(at, merged.measures, merged.weights), truth)
-    slope = lambda x: term.slopes(x, merged.measures, merged.weights)  # noqa: E731
-    rate = lambda x: term.energies(x, merged.measures, merged.weights).sum()  # noqa: E731
+    torch.testing.assert_close(term.energies(at, rows, whole), truth)
+    slope = lambda x: term.slopes(x, rows, whole)  # noqa: E731
+    rate = lambda x: term.energies(x, rows, whole).sum()  # noqa: E731
     torch.testing.assert_close(slope(at), torch.func.grad(rate)(at))
-    bound, beyond = term.curvatures(at, merged.measures, merged.weights)
+    bound, beyond = term.curvatures(at, rows, whole)
     torch.testing.assert_close(bound + beyond, torch.func.grad(lambda x: slope(x).sum())(at))
     assert bool((beyond <= 1e-12).all())
-    alone = term.merged(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
+    alone, of_one, _ = term.merged(torch.zeros(1, 3, dtype=DOUBLE), torch.ones(1, 3, dtype=DOUBLE))
     half_a_turn = math.pi + torch.tensor([-1e-9, 0, 1e-9], dtype=DOUBLE)
-    assert float(term.slopes(half_a_turn, alone.measures, alone.weights).abs().max()) < 1e-8
+    assert float(term.slopes(half_a_turn, alone, of_one).abs().max()) < 1e-8
     small = torch.tensor([1e-5, 0.1, math.radians(60)], dtype=DOUBLE)
-    assert float((term.energies(small, alone.measures, alone.weights) / small**2 - 1).abs().max()) < 0.013
+    assert float((term.energies(small, alone, of_one) / small**2 - 1).abs().max()) < 0.013
 
 
 @pytest.mark.parametrize("kind", ["area", "spring"])

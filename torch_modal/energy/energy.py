@@ -32,7 +32,7 @@ class Reference(NamedTuple):
     """``Q``, of :meth:`torch_modal.energy.term.Term.merged`. *Shape of each:* ``(..., R, M)``."""
     weights: tuple[Tensor, ...]
     """``W``, the stiffness included. *Shape of each:* ``(..., M)``."""
-    constant: Tensor | float
+    constant: Tensor
     """``c``. *Shape:* ``(...)``."""
 
 
@@ -205,10 +205,10 @@ class Energy(nn.Module):
         for i, (part, factor) in enumerate(zip(self.parts, stiffness, strict=True)):
             values = torch.stack([rest.measures[i] for rest in rests], -2)
             pulls = weights[..., None] * torch.stack([rest.weights[i] for rest in rests], -2).expand_as(values)
-            own = part.term.merged(values, pulls)
-            measures.append(own.measures)
-            wholes.append(factor * own.weights)
-            constant = constant + (factor * own.constant).sum(-1)
+            value, whole, left = part.term.merged(values, pulls)
+            measures.append(value)
+            wholes.append(factor * whole)
+            constant = constant + (factor * left).sum(-1)
         return Reference(tuple(measures), tuple(wholes), constant)
 
     def mixed(self, rest: Rest, weights: Tensor) -> Rest:
@@ -229,12 +229,7 @@ class Energy(nn.Module):
 
     def against(self, rest: Rest, stiffness: Sequence[float | Tensor]) -> Reference:
         """One rest shape as the reference."""
-        merged = [
-            part.term.merged(measures[..., None, :], weight.expand_as(measures)[..., None, :])
-            for part, measures, weight in zip(self.parts, *rest, strict=True)
-        ]
-        weights = tuple(factor * own.weights for factor, own in zip(stiffness, merged, strict=True))
-        return Reference(tuple(own.measures for own in merged), weights, 0.0)
+        return self.among([rest], torch.ones_like(rest.measures[0][..., :1]), stiffness)
 
     # --------------------------------------------------------------------------------------------------------- values
     def value(self, extended: Tensor, reference: Reference) -> Tensor:

@@ -182,10 +182,10 @@ def bending_between(own: Frames, other: Frames, turns: Tensor) -> BentTriangles:
         other: Frames of the other.
         turns: Quaternions from the first frames to the others; their signs tell the way round. *Shape:* ``(4, B, F)``.
     """
-    polar = _polar(own, other)
-    half = 0.5 * torch.atan2(polar.sin, polar.cos)
+    cos, sin, *stretch = _polar(own, other)
+    half = 0.5 * torch.atan2(sin, cos)
     turn = turn_of(product(turns, torch.cat([half.cos()[None], half.sin() * own.normal])))
-    return BentTriangles(turn, _logarithm(polar.xx, polar.xy, polar.yy))
+    return BentTriangles(turn, _logarithm(*stretch))
 
 
 def mirrored_sides(centre: Frames, other: Frames) -> Sides:
@@ -212,21 +212,12 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(0)
 
 
-class _Polar(NamedTuple):
-    """The map of a triangle's plane to another's, as a rotation after a stretch. *Shape of each:* ``(B, F)``."""
-
-    cos: Tensor
-    sin: Tensor
-    xx: Tensor
-    xy: Tensor
-    yy: Tensor
-
-
-def _polar(own: Frames, other: Frames) -> _Polar:
+def _polar(own: Frames, other: Frames) -> tuple[Tensor, ...]:
+    """The map of a triangle's plane to another's: cosine and sine of a rotation after a stretch, by entries."""
     xx, xy, yx, yy = _product(other[3:], _inverse(own))
     trace = torch.hypot(xx + yy, yx - xy)  # of the stretch; never 0, as both determinants are above 0
     cos, sin = (xx + yy) / trace, (yx - xy) / trace
-    return _Polar(cos, sin, cos * xx + sin * yx, cos * xy + sin * yy, cos * yy - sin * xy)
+    return cos, sin, cos * xx + sin * yx, cos * xy + sin * yy, cos * yy - sin * xy
 
 
 def _inverse(own: Frames) -> tuple[Tensor, Tensor, Tensor]:

@@ -186,23 +186,23 @@ def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> 
         if len(kept) == 0:
             raise MeshError("all faces use a vertex twice, so none is a triangle")
     mesh = Connectivity(faces[kept], n_vertices)
-    winding = inspect.consistent_winding(mesh)
-    if len(winding.flipped):
-        first = kept[winding.flipped[0]]
+    wound, flipped, non_orientable = inspect.consistent_winding(mesh)
+    if len(flipped):
+        first = kept[flipped[0]]
         note(
-            f"{len(winding.flipped)} faces wind against their neighbours and were turned over; the first is "
+            f"{len(flipped)} faces wind against their neighbours and were turned over; the first is "
             f"face {first}, {faces[first].tolist()}"
         )
-    if len(winding.non_orientable):
-        first = kept[winding.non_orientable[0]]
+    if len(non_orientable):
+        first = kept[non_orientable[0]]
         note(
-            f"{len(winding.non_orientable)} faces belong to a surface that has no consistent winding (like a "
+            f"{len(non_orientable)} faces belong to a surface that has no consistent winding (like a "
             "Moebius strip) and were left as they are, so some dihedral angles have the wrong sign and the "
             f"volume means nothing; the first is face {first}, {faces[first].tolist()}"
         )
-    if len(winding.flipped):
-        mesh = Connectivity(winding.faces, n_vertices)
-    return mesh, not len(winding.non_orientable)
+    if len(flipped):
+        mesh = Connectivity(wound, n_vertices)
+    return mesh, not len(non_orientable)
 
 
 def _check_sizes(

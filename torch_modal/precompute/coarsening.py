@@ -141,7 +141,7 @@ def _compact(faces: IntArray, n: int) -> IntArray:
 
 def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
     """Representative vertex of each cluster. *Shape:* ``(V,)``."""
-    collapses = decimate(points, faces, n_faces).collapses
+    collapses = decimate(points, faces, n_faces)[2]
     root = np.arange(len(points))
     root[collapses[:, 1]] = collapses[:, 0]
     while not np.array_equal(root[root], root):
