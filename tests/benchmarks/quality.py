@@ -21,7 +21,7 @@ import torch
 from cases import HALF, Case
 from measures import Row, Yardstick
 from methods import METHODS, Method, UnavailableError
-from sheet import draw_bars, draw_sheet
+from sheet import draw_sheet
 from tables import case_table, load_rows, markdown, save_rows
 from threads import limit_threads
 from timing import untimed
@@ -97,7 +97,6 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--peer-python", type=Path, metavar="FILE", help="a Python that has morphomatics")
     parser.add_argument("--results", type=Path, metavar="FILE.json", help="keep results, and go on from those there")
     parser.add_argument("--markdown", type=Path, metavar="FILE.md", help="write all tables")
-    parser.add_argument("--bars", type=Path, metavar="FILE.png", help="draw the errors as bars")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
     arguments = parser.parse_args(words)
     named = ("folders", "shared", "samples", "bodies", "irregular", "body")
@@ -133,8 +132,6 @@ def main(words: Sequence[str] | None = None) -> None:
     print(text)
     if arguments.markdown:
         arguments.markdown.write_text(text)
-    if arguments.bars:
-        draw_bars(shown, arguments.bars)
     if arguments.sheet:
         draw_sheet(drawn, arguments.sheet)
 
