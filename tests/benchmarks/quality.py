@@ -23,8 +23,7 @@ from measures import Row, Yardstick
 from methods import METHODS, Method, UnavailableError
 from sheet import draw_sheet
 from tables import case_table, load_rows, markdown, save_rows
-from threads import limit_threads
-from timing import untimed
+from timing import limit_threads, untimed
 
 REFERENCE = "full"
 """The method whose optimum tells which way faces look where there is no truth; it comes first."""

@@ -8,6 +8,8 @@ import torch
 from cases import HALF, Case
 from measures import Yardstick
 
+from torch_modal.geometry.connectivity import Connectivity
+
 WORST = 0.2  # relative edge error at the end of the colour scale
 
 
@@ -35,7 +37,7 @@ def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) ->
             x = yardstick.laid(shapes[name], guide)
             error = (yardstick.lengths(x) - wanted).abs() / wanted
             polygons = pyvista.PolyData.from_regular_faces(x.numpy(), case.faces.numpy())
-            polygons["error"] = around_vertices(error, yardstick.edges, len(x))
+            polygons["error"] = around_vertices(error, Connectivity(case.faces.numpy()).edges, len(x))
             plotter.add_mesh(polygons, clim=(0, WORST), cmap="YlOrRd", show_scalar_bar=False, smooth_shading=False)
             text = f"{name}  {100 * float(error.mean()):.1f} %\n{case.name}"
             plotter.add_text(text, position=(6, 206), font_size=6)
@@ -44,10 +46,10 @@ def draw_sheet(drawn: list[tuple[Case, dict[str, torch.Tensor]]], path: Path) ->
     plotter.close()
 
 
-def around_vertices(error: torch.Tensor, edges: torch.Tensor, n_vertices: int) -> np.ndarray:
+def around_vertices(error: torch.Tensor, edges: np.ndarray, n_vertices: int) -> np.ndarray:
     """Mean over the edges of each vertex. *Shape:* ``(E,), (E, 2) -> (V,)``."""
     total, count = torch.zeros(2, n_vertices, dtype=error.dtype)
-    for end in edges.T:
+    for end in torch.tensor(edges).T:
         total.index_add_(0, end, error)
         count.index_add_(0, end, torch.ones_like(error))
     return (total / count.clamp_min(1)).numpy()

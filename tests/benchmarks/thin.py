@@ -34,8 +34,7 @@ from methods import METHODS, UnavailableError
 from sheet import look
 from sheets import SHEETS, sheet
 from tables import geometric_mean, number
-from threads import limit_threads
-from timing import timed, untimed
+from timing import limit_threads, timed, untimed
 
 import torch_modal as tm
 

@@ -6,13 +6,15 @@ data that is kept beside the project is absent, its bodies are left out, with a 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pyvista
 import wild_solids  # noqa: F401 - its bodies enter the list
 import wild_surfaces  # noqa: F401
-from cases import DATA
+from cases import DATA, animal, keyframes_of
 from pyvista import examples
 from trimesh import creation
 from wild_making import (
@@ -38,9 +40,6 @@ from wild_making import (
     tube,
     turned,
 )
-
-from torch_modal.data.samples import load_sample
-from torch_modal.io.read import read_mesh
 
 ANGLE = np.radians(60.0)
 
@@ -195,33 +194,20 @@ def _data() -> None:
     body = partial(add, "data")
     body("ant", lambda: of_vtk(pyvista.read(f"{examples.dir_path}/ant.ply")), contact=True)
     for name in ("creature", "hand"):
-        body(f"sample {name}", partial(_sample, name), contact=True)
+        body(f"sample {name}", partial(_first, keyframes_of, name), contact=True)
     if not DATA.is_dir():
         print(f"(without animals, hands and faces: the folder {DATA} is not there)")
         return
     for file in sorted((DATA / "animals").glob("*.npz")):
-        body(file.stem, partial(_animal, file.stem), contact=file.stem == "fox")
-    for folder, name in (
-        ("mh-hand", "00-open"),
-        ("mh-woman", "00-rest"),
-        ("ict-face", "00-neutral"),
-        ("hyper-cube", "cube-1"),
-    ):
-        body(folder, partial(_file, folder, name))
+        body(file.stem, partial(_first, animal, file.stem), contact=file.stem == "fox")
+    for folder in ("mh-hand", "mh-woman", "ict-face", "hyper-cube"):
+        body(folder, partial(_first, keyframes_of, folder))
 
 
-def _sample(name: str) -> Surface:
-    sample = load_sample(name)
-    return sample.keyframes[0].numpy().astype(np.float64), sample.faces.numpy()
-
-
-def _animal(name: str) -> Surface:
-    stored = np.load(DATA / "animals" / f"{name}.npz")
-    return stored["frames"][0].astype(np.float64), stored["faces"].astype(np.int64)
-
-
-def _file(folder: str, name: str) -> Surface:
-    return read_mesh(DATA / folder / f"{name}.obj")
+def _first(load: Callable[[str], Any], name: str) -> Surface:
+    """The first shape of a sample, of a folder beside the project, or of an animal."""
+    keyframes, faces = load(name)[:2]
+    return keyframes[0].double().numpy(), faces.numpy()
 
 
 for _make in (_sizes, _slivers, _data):

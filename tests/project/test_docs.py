@@ -57,7 +57,7 @@ def test_every_page_is_in_a_list(extension: ModuleType) -> None:
 def test_every_command_and_benchmark_is_shown(extension: ModuleType) -> None:
     assert {"subdivide", "view", "demo"} <= set(extension.command_helps())
     shown = extension.benchmarks()
-    assert {"quality.py", "layer.py", "motion.py"} <= set(shown)
+    assert {"quality.py", "speed.py", "motion.py"} <= set(shown)
     for name in re.findall(r"`(\w+\.py)`", (DOCS / "benchmarks.md").read_text()):
         assert name in shown, name
 
