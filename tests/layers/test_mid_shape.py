@@ -8,7 +8,6 @@ import torch
 from conftest import Shapes, modal, random_rotation
 from shapes import diagonal, edge_error, largest
 from torch import Tensor
-from torch.func import functional_call
 
 from torch_modal.backends.torch.energies import CoarseEnergy
 from torch_modal.energy.shell import ShellEnergy
@@ -97,23 +96,6 @@ def test_a_vertex_of_no_face_has_no_say(middle: Tensor, bent: Shapes, space: str
 # ------------------------------------------------------------------------------------- shapes, dtypes, borders
 
 
-def test_state_dict_and_functional_call(layer: MidShape, middle: Tensor, bent: Shapes, space: str) -> None:
-    """What is saved are the bases; what follows from them is made anew when others are loaded."""
-    before = [basis.reference.clone() for basis in bent.bases]
-    bases = [replace(basis, modes=basis.modes.roll(1, 1)) for basis in bent.bases]
-    other = MidShape(bases, bent.faces, space, **modal(coarse_faces=200))
-    buffers, own = dict(layer.named_buffers()), other(*bent.keyframes)
-    assert largest(own - middle) > 1e-6
-    torch.testing.assert_close(functional_call(other, buffers, tuple(bent.keyframes)), middle, rtol=0, atol=1e-9)
-    state = layer.state_dict()
-    assert sorted(state) == sorted(f"in_between.bases.{i}.{name}" for i in range(2) for name in ("reference", "modes"))
-    other.load_state_dict(state)
-    assert torch.equal(other(*bent.keyframes), middle)
-    assert all(torch.equal(a, b.reference) for a, b in zip(before, bent.bases, strict=True))
-    with pytest.raises(ValueError, match="zero size"):
-        other.load_state_dict({name: torch.zeros_like(tensor) for name, tensor in state.items()})
-
-
 def test_stiffnesses_count(bent: Shapes, middle: Tensor, space: str) -> None:
     """A large volume stiffness keeps the volume; a common factor of all changes nothing."""
     x_a, x_b = bent.keyframes
@@ -129,13 +111,6 @@ def test_stiffnesses_count(bent: Shapes, middle: Tensor, space: str) -> None:
     options.update(anchor=10 * Objective().anchor, coarse_faces=200)
     factor = MidShape(bent.bases, bent.faces, space, **modal(**options))(x_a, x_b)
     assert largest(factor - middle) < 1e-7 * diagonal(x_a)
-
-
-def test_exception(bent: Shapes) -> None:
-    with pytest.raises(ValueError, match="space is one of 'joint', 'paired'; got 'both'"):
-        MidShape(bent.bases, bent.faces, "both", **modal())
-    with pytest.raises(ValueError, match="between two bases, got 1"):
-        MidShape(bent.bases[:1], bent.faces, **modal())
 
 
 def test_coincident_vertices_are_survived(bars: Shapes) -> None:
@@ -173,18 +148,6 @@ def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands
         assert found.solution.n_steps <= 30
     assert edge_error(found.shapes, wanted, hands.faces) <= bound
     assert float(shell.measure(found.shapes).volume) == pytest.approx(float(shell.measure(wanted).volume), rel=0.03)
-
-
-def test_hand_without_its_rigid_motion(hands: Shapes, generator: torch.Generator) -> None:
-    """On a real mesh, through coarsening, with the second key-frame turned away from the first."""
-    pair = hands.pick(0, 2)
-    turn, move = random_rotation(generator), torch.tensor([9.0, 8.0, 7.0], dtype=torch.float64)
-    layer = MidShape(pair.bases, pair.faces, **modal())
-    x_a, x_b = pair.keyframes
-    here, away = layer.solve(x_a, x_b), layer.solve(x_a, x_b @ turn.mT + move)
-    assert float(away.solution.energy) == pytest.approx(float(here.solution.energy), rel=1e-9)
-    lengths = [ShellEnergy(pair.faces).measure(x.shapes).length for x in (here, away)]
-    torch.testing.assert_close(*lengths, rtol=1e-7, atol=0)
 
 
 @pytest.mark.slow
