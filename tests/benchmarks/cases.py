@@ -16,7 +16,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.io.read import SUFFIXES
 
 sys.path.append(str(Path(__file__).parents[1]))  # beside the tests
-from bodies import BODIES, SLENDER, body
+from bodies import BODIES, body
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 HALF = 0.5
@@ -170,16 +170,11 @@ def samples() -> Iterator[Case]:
             yield Case(f"sample {name} {i}/{(i + 1) % n}", shapes, i, (i + 1) % n, truths)
 
 
-def bodies(names: Iterable[str] = BODIES, jittered: bool = False) -> Iterator[Case]:
+def bodies(names: Iterable[str] = BODIES) -> Iterator[Case]:
     """Synthetic bodies that bend far, and thin and hollow ones."""
     for name in names:
-        shape = body(name, jittered)
+        shape = body(name)
         first, half, last = (torch.from_numpy(shape.pose(t)) for t in (0.0, HALF, 1.0))
         shapes = KeyframeSet(torch.stack([first, last]), torch.from_numpy(np.array(shape.faces)))
         quarters = {t: torch.from_numpy(shape.pose(t)) for t in (0.25, 0.75)}
-        yield Case(name + (", irregular" if jittered else ""), shapes, 0, 1, {HALF: half, **quarters})
-
-
-def slender() -> Iterator[Case]:
-    """Bodies that are hard to fill with tetrahedra."""
-    yield from bodies(SLENDER)
+        yield Case(name, shapes, 0, 1, {HALF: half, **quarters})

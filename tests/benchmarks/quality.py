@@ -1,6 +1,6 @@
 """How good in-betweens are: the methods of this package, linear interpolation, and peers, side by side.
 
-    python tests/benchmarks/quality.py [FOLDER ...] [--shared] [--samples] [--bodies] [--irregular]
+    python tests/benchmarks/quality.py [FOLDER ...] [--shared] [--samples] [--bodies]
 
 A folder holds the frames of a motion, in the order of their names: the first and the last are the key-frames, those
 between are the truth at their places. Two frames alone have no truth, and then only energies, drift and volumes are
@@ -77,8 +77,6 @@ def chosen_cases(arguments: argparse.Namespace) -> Iterator[Case]:
         yield from cases.samples()
     if arguments.bodies:
         yield from cases.bodies()
-    if arguments.irregular:
-        yield from cases.bodies(jittered=True)
     yield from cases.bodies(arguments.body)
 
 
@@ -89,7 +87,6 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--shared", action="store_true", help="all data sets that are kept beside the project")
     parser.add_argument("--samples", action="store_true", help="the samples that come with the package")
     parser.add_argument("--bodies", action="store_true", help="bars, hollow and slender bodies, a sheet")
-    parser.add_argument("--irregular", action="store_true", help="the same with irregular triangles")
     parser.add_argument("--body", nargs="+", default=[], metavar="NAME", help="others, such as 'bar bent 270'")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="only cases with one of these in them")
@@ -98,9 +95,9 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--markdown", type=Path, metavar="FILE.md", help="write all tables")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw the shapes, coloured by their edge errors")
     arguments = parser.parse_args(words)
-    named = ("folders", "shared", "samples", "bodies", "irregular", "body")
+    named = ("folders", "shared", "samples", "bodies", "body")
     if not any(getattr(arguments, name) for name in named):
-        parser.error("name a folder of frames, or --shared, --samples, --bodies, --irregular or --body")
+        parser.error("name a folder of frames, or --shared, --samples, --bodies or --body")
     return arguments
 
 
