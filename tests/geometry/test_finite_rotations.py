@@ -133,19 +133,3 @@ def test_third_derivatives_are_those_of_the_matrix_exponential(w: list[float]) -
 
 
 # ------------------------------------------------------------------------------------------------------- transforms
-@pytest.mark.parametrize("function", [exp, lambda w: log(exp(w)), through_quaternions], ids=["exp", "log", "all"])
-def test_vmap_and_its_gradients(function: Callable[[Tensor], Tensor]) -> None:
-    w = torch.cat([turns(angle, 2) for angle in ANGLES]).reshape(-1, 2, 3)
-    torch.testing.assert_close(torch.func.vmap(function)(w), torch.stack([function(one) for one in w]))
-    slopes = torch.func.vmap(torch.func.grad(lambda w: function(w).square().sum()))(w)
-    copy = w.clone().requires_grad_()
-    (truth,) = torch.autograd.grad(function(copy).square().sum(), copy)
-    torch.testing.assert_close(slopes, truth)
-
-
-@pytest.mark.slow
-def test_dynamo() -> None:
-    w = torch.cat([turns(angle, 2) for angle in ANGLES])
-    for function in (exp, lambda w: log(exp(w)), through_quaternions):
-        compiled = torch.compile(function, backend="aot_eager", fullgraph=True)
-        torch.testing.assert_close(compiled(w), function(w))
