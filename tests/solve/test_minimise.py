@@ -210,11 +210,6 @@ def test_gives_up_and_says_so(layer: MidShape, bars: Shapes) -> None:
     assert 1e-8 < float(one.gradient_norm[0]) < 1
 
 
-def test_equal_key_frames_need_no_deformation(layer: MidShape, bars: Shapes) -> None:
-    solution = solve(layer, bars, [0.0])
-    assert solution.converged.all() and solution.amplitudes.abs().max() < 1e-9
-
-
 def test_damped_steps_never_go_uphill(layer: MidShape, bars: Shapes, generator: torch.Generator) -> None:
     """Also from a start far away, where shapes pass through themselves."""
     energy, a, placement = problem(layer, bars, [1.0] * 8)
