@@ -108,9 +108,7 @@ def assert_alike(found: tuple[Tensor, ...], truth: tuple[Tensor, ...], to: float
         torch.testing.assert_close(got, wanted, rtol=0, atol=to * max(float(wanted.abs().max()), 0.01))
 
 
-def assert_kernels(
-    by_warp: Any, by_torch: Any, given: list[Tensor], atol: float, to: float, second: bool = True
-) -> None:
+def assert_kernels(run: Any, truth: Any, given: list[Tensor], atol: float, to: float, second: bool = True) -> None:
     """Kernels have the values of torch, its gradients and its second ones."""
     torch.testing.assert_close(run(*given), truth(*given), rtol=0, atol=atol)
     assert_alike(gradients(run, given), gradients(truth, given), to)

@@ -113,14 +113,6 @@ def test_gradcheck(function: Callable[[Tensor], Tensor], angle: float) -> None:
     assert gradgradcheck(function, start)
 
 
-@pytest.mark.parametrize("axis", [[1, 0, 0], [0, -1, 0], [1, -2, 0.5]])
-def test_gradients_at_half_a_turn_are_those_of_one_side(axis: list[float]) -> None:
-    side = sum(a * b for a, b in zip(axis, HALF_TURN_SIDE, strict=True))
-    w = torch.tensor(axis, dtype=F64) * math.copysign(math.pi, side) / math.hypot(*axis)
-    jacobian = torch.func.jacrev(lambda w: log(exp(w)))(w)
-    torch.testing.assert_close(jacobian, torch.eye(3, dtype=F64), rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("w", [[0.0, 0, 0], [1e-5, -2e-5, 0], [BORDER, 1e-3, 0], [0.2, 1.0, -0.4]])
 def test_third_derivatives_are_those_of_the_matrix_exponential(w: list[float]) -> None:
     def third(function: Callable[[Tensor], Tensor]) -> Tensor:

@@ -1,6 +1,5 @@
 """Rotations and strains of triangles against truth by hand, and the Poisson problem against known shapes."""
 
-import copy as copy_module
 import pickle
 
 import numpy as np
@@ -257,39 +256,6 @@ def test_poisson_gives_shapes_back(two_pieces: tuple[Connectivity, torch.Tensor]
             torch.testing.assert_close(found[..., own] @ share[own], near[..., own] @ share[own])
     lone = mesh.n_vertices // 2
     assert torch.equal(found[..., lone], near[..., lone])  # bit for bit
-
-
-def test_poisson_keeps_to_the_weights_that_are_there(two_pieces: tuple[Connectivity, torch.Tensor]) -> None:
-    """Replaced, as by functional_call; copied; of another dtype; and none of them in the state."""
-    mesh, x = two_pieces
-    weights = torch.ones(len(mesh.edges), dtype=F64)
-    other = torch.linspace(1, 2, len(weights), dtype=F64)
-    solver, truth = Poisson(mesh, weights), Poisson(mesh, other)
-    wanted = torch.randn(3, 1, len(weights), dtype=F64, generator=torch.Generator().manual_seed(0))
-    first = solver(wanted, x[:, :1])
-    factor = solver.solver
-    assert solver.solver is factor
-    found = torch.func.functional_call(solver, {"weights": other}, (wanted, x[:, :1]))
-    torch.testing.assert_close(found, truth(wanted, x[:, :1]))
-    assert float((found - first).abs().max()) > 1e-3
-    torch.testing.assert_close(solver(wanted, x[:, :1]), first)
-    for copy in (copy_module.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
-        torch.testing.assert_close(copy(wanted, x[:, :1]), first)
-    single = solver.float()(wanted.float(), x[:, :1].float())
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), first, rtol=0, atol=1e-4)
-    assert not solver.state_dict()
-
-
-def test_poisson_derivatives(small_bars: Shapes) -> None:
-    mesh = Connectivity(small_bars.faces.numpy())
-    solver = Poisson(mesh, torch.ones(len(mesh.edges), dtype=F64))
-    x = small_bars.keyframes[:2].movedim(-1, 0)
-    inputs = [part.contiguous().requires_grad_() for part in (edges_of(x, mesh), x.roll(1, 1))]
-    assert torch.autograd.gradcheck(solver, inputs)
-    assert torch.autograd.gradgradcheck(solver, inputs, fast_mode=True)
-    both = torch.func.vmap(solver, in_dims=1, out_dims=1)(*(part.detach() for part in inputs))
-    torch.testing.assert_close(both, solver(*inputs).detach())
 
 
 # -------------------------------------------------------------------------------------------------------- mirror

@@ -8,7 +8,6 @@ import pytest
 import torch
 from conftest import Shapes, modal, random_rotation
 from shapes import apart
-from terms import Spring
 from torch import Tensor
 
 import torch_modal as tm
@@ -189,13 +188,6 @@ class TestResults:
         found = best_fit(found, truth, torch.ones(300, dtype=DOUBLE)).apply(found)
         assert apart(found, truth) < 1e-3
 
-    def test_terms_with_anchors_pull(self, bars: Shapes) -> None:
-        x, w = bars.keyframes, pulls(0.4, 0.3, 0.3)
-        plain = Blend(bars.bases, bars.faces)(x, w)
-        goal = plain[5] + 0.2
-        pulled = Blend(bars.bases, bars.faces, objective=tm.Objective(terms=(Spring([5], goal[None], 1e3),)))(x, w)
-        assert float((pulled[5] - goal).norm()) < 0.3 * float((plain[5] - goal).norm())
-
     @pytest.mark.parametrize("name", ["hand", pytest.param("creature", marks=pytest.mark.slow)])
     def test_no_triangle_folds_over(self, name: str) -> None:
         sample = load_sample(name)
@@ -208,16 +200,6 @@ class TestResults:
         opposite = lambda x: turned_over(x, sample.faces)  # noqa: E731
         worst = max(opposite(x) for x in sample.keyframes)
         assert max(opposite(x) for x in result.shapes) <= worst + 0.001
-
-    def test_what_is_worse_than_its_start_falls_back(
-        self, bars: Shapes, layer: Blend, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(layer.core, "relaxed", lambda x, rests: 1.5 * x)
-        with pytest.warns(tm.ConvergenceWarning, match="came out worse"):
-            x = layer(bars.keyframes, pulls(0.5, 0.2, 0.3))
-        assert int(layer.solve(bars.keyframes, pulls(0.5, 0.2, 0.3)).solution.status) == Status.FELL_BACK
-        monkeypatch.undo()
-        assert apart(layer(bars.keyframes, pulls(0.5, 0.2, 0.3)), x) < 0.1
 
     def test_of_two_neither(self, bars: Shapes, poses: Tensor) -> None:
         two = Blend(bars.bases[:2], bars.faces, **modal(coarse_faces=200, local=True))
