@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from bodies import sheet_surface
 from conftest import Shapes
 from terms import Area, Spring
 from torch import Tensor
@@ -80,15 +81,9 @@ class Case:
 @pytest.fixture(params=["closed", "open", "flat"])
 def case(request: pytest.FixtureRequest, small_bars: Shapes) -> Case:
     if request.param == "flat":  # no volume: its weight is bounded by the area
-        line = torch.linspace(0, 1, 6, dtype=DOUBLE)
-        grid = torch.stack([*torch.meshgrid(line, line, indexing="ij"), torch.zeros(6, 6, dtype=DOUBLE)], -1)
-        bent = grid + torch.stack([torch.zeros(6, 6), torch.zeros(6, 6), 0.3 * grid[..., 0] ** 2], -1)
-        shapes = torch.stack([grid, bent, 1.1 * bent]).flatten(1, 2)
-        corner = (6 * torch.arange(5)[:, None] + torch.arange(5)).flatten()
-        faces = torch.cat(
-            [torch.stack([corner, corner + 6, corner + 1], 1), torch.stack([corner + 1, corner + 6, corner + 7], 1)]
-        )
-        return Case(Shapes(shapes, faces, []), faces, 0.1)
+        grid, faces = map(torch.from_numpy, sheet_surface((5, 5), (1.0, 1.0)))
+        bent = grid + 0.3 * torch.stack([0 * grid[:, 0], grid[:, 0] ** 2, 0 * grid[:, 0]], -1)
+        return Case(Shapes(torch.stack([grid, bent, 1.1 * bent]), faces, []), faces, 0.1)
     faces = small_bars.faces[6:] if request.param == "open" else small_bars.faces
     return Case(small_bars, faces, 0.3)
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
 from conftest import Shapes
 from solids import box, surface
 from torch import Tensor
@@ -107,17 +106,6 @@ def test_convex_edges_have_positive_angles(brick: tuple[Tensor, Tensor]) -> None
     torch.testing.assert_close(angle[bent], torch.full_like(angle[bent], math.pi / 2), atol=1e-13, rtol=0)
     assert int(bent.sum()) == 24  # two on each of the box's 12 edges
     assert angle[~bent].abs().max() < 1e-13
-
-
-def test_measures_agree_with_trimesh(pair: tuple[Tensor, Tensor, Tensor]) -> None:
-    x, _, faces = pair
-    truth = trimesh.Trimesh(x.numpy(), faces.numpy(), process=False)
-    measures = ShellEnergy(faces).measure(x)
-    assert float(measures.volume) == pytest.approx(truth.volume, rel=1e-12)
-    convex = np.where(truth.face_adjacency_convex, 1, -1)
-    signed = np.sort(truth.face_adjacency_angles * convex)
-    np.testing.assert_allclose(measures.angle.sort().values.numpy(), signed, atol=1e-7)
-    np.testing.assert_allclose(measures.length.sort().values.numpy(), np.sort(truth.edges_unique_length), rtol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------- invariances
