@@ -200,12 +200,6 @@ class TestResults:
         worst = max(opposite(x) for x in sample.keyframes)
         assert max(opposite(x) for x in result.shapes) <= worst + 0.001
 
-    def test_of_two_neither(self, bars: Shapes, poses: Tensor) -> None:
-        two = Blend(bars.bases[:2], bars.faces, **modal(coarse_faces=200, local=True))
-        x = torch.stack([poses[0] * torch.nan, poses[1]])
-        result = two.solve(x, pulls(0, 1))
-        assert torch.equal(result.shapes, poses[1]) and result.solution.status == Status.CONVERGED
-
     @pytest.mark.parametrize("place", [0, 2])
     def test_a_key_frame_without_weight_is_not_looked_at(self, layer: Blend, poses: Tensor, place: int) -> None:
         w, others = pulls(0.35, 0.3, 0.35), [i for i in range(3) if i != place]
