@@ -123,7 +123,7 @@ def test_coincident_vertices_are_survived(bars: Shapes) -> None:
     ("ends", "truth", "bound"), [((0, 4), 2, 0.05), ((0, 2), 1, 0.011), ((2, 4), 3, 0.018)], ids=["0-8", "0-4", "4-8"]
 )
 def test_hand_that_closes(ends: tuple[int, int], truth: int, bound: float, hands: Shapes) -> None:
-    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %, measured here: 4.0 %, 0.90 %, 1.5 %; the paper's space lies between."""
+    """Linear interpolation: 27.5 %, 6.2 %, 8.2 %; measured here: 4.0 %, 0.90 %, 1.5 %. The paper lies between."""
     pair = hands.pick(*ends)
     found = MidShape(pair.bases, pair.faces, **modal()).solve(*pair.keyframes)
     wanted = hands.keyframes[truth]
