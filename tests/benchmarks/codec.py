@@ -21,6 +21,7 @@ import torch
 from cases import divided, keyframes_of
 from measures import edge_lengths, mean_ratio
 from motions import OPENED, closed_part, sculpted
+from tables import head
 from timing import limit_threads
 from torch import Tensor
 
@@ -147,24 +148,17 @@ def print_long() -> None:
     seconds = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     own = frames.numel() * 8 / 2**20
-    print(
-        "| frames | vertices | key-frames | mean distance, worst, % | seconds | frames, MB | peak before, after, MB |"
-    )
-    print("|---|---|---|---|---|---|---|")
+    columns = "frames", "vertices", "key-frames", "mean distance, worst, %", "seconds", "frames, MB"
+    print(head(*columns, "peak before, after, MB"))
     print(
         f"| {LONG} | {frames.shape[1]} | {len(found.keyframes)} | {100 * float(found.errors.mean()):.2g}, "
         f"{100 * float(found.errors.max()):.2g} | {seconds:.0f} | {own:.0f} | {before / 1024:.0f}, {peak / 1024:.0f} |"
     )
 
 
-TABLES = {
-    "floats": (
-        "| motion | key-frames | floats / 3V | path: distance, edges | + 60 amplitudes "
-        "| PCA, components: distance, edges = ours over it | PCA of more floats |",
-        print_floats,
-    ),
-    "decode": ("| decoding on one core | speed |", print_decode),
-}
+FLOATS = ("motion", "key-frames", "floats / 3V", "path: distance, edges", "+ 60 amplitudes")
+PCA = ("PCA, components: distance, edges = ours over it", "PCA of more floats")
+TABLES = {"floats": ((*FLOATS, *PCA), print_floats), "decode": (("decoding on one core", "speed"), print_decode)}
 
 
 def main() -> None:
@@ -178,9 +172,8 @@ def main() -> None:
         if name == "long":
             print_long()
             continue
-        head, row = TABLES[name]
-        print(head)
-        print("|---" * (head.count("|") - 1) + "|")
+        columns, row = TABLES[name]
+        print(head(*columns))
         for sequence in chosen(args.motions):
             row(sequence)
 

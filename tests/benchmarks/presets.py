@@ -20,7 +20,7 @@ import torch
 from cases import Case
 from measures import Yardstick
 from methods import linear
-from tables import geometric_mean, number, percent
+from tables import geometric_mean, head, number, percent
 from timing import limit_threads, timed
 from torch import Tensor
 
@@ -71,8 +71,8 @@ def with_gradient(layer: tm.InBetween, case: Case) -> Callable[[], tuple[Tensor,
 def compare(only: list[str], compared: dict[str, tuple[int, dict[str, Any]]]) -> None:
     """Print a line for each of them on each case, and their means."""
     found: dict[str, list[tuple[float, ...]]] = {name: [] for name in compared}
-    print("| | preset | edge error | energy over linear | ms | over first | with gradient | over first | MiB |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    columns = "", "preset", "edge error", "energy over linear", "ms", "over first", "with gradient", "over first", "MiB"
+    print(head(*columns))
     for case in chosen(only):
         yardstick = Yardstick(case)
         straight = linear(case).frames[0]
@@ -94,8 +94,8 @@ def compare(only: list[str], compared: dict[str, tuple[int, dict[str, Any]]]) ->
                 f"{1e3 * both:.0f} | {both / first[1]:.2f} | {held:.1f} |",
                 flush=True,
             )
-    print("\n| geometric means | edge error over linear | energy over linear | time over first | with gradient |")
-    print("|---|---|---|---|---|")
+    columns = "geometric means", "edge error over linear", "energy over linear", "time over first", "with gradient"
+    print(f"\n{head(*columns)}")
     for name, rows in found.items():
         means = [geometric_mean(list(column)) for column in zip(*rows, strict=True)]
         print(f"| {name} | " + " | ".join(number(mean, ".3f") for mean in means) + " |")

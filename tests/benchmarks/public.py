@@ -40,6 +40,7 @@ import torch
 from cases import DATA, Case, KeyframeSet, animal
 from methods import Outcome, UnavailableError, by_peer, peer_python
 from scipy.interpolate import CubicHermiteSpline
+from tables import head
 from timing import limit_threads
 from torch import Tensor
 
@@ -278,7 +279,7 @@ def export(folder: Path, given: Iterable[Clip]) -> None:
 def table(title: str, rows: dict[str, list[dict[str, float]]]) -> None:
     """Means over clips."""
     names = list(next(iter(rows.values()))[0])
-    print(f"\n| {title} | {' | '.join(names)} |\n|---{'|---' * len(names)}|")
+    print(f"\n{head(title, *names)}")
     for method, values in rows.items():
         means = (np.mean([value[name] for value in values]) for name in names)
         print(f"| {method} | {' | '.join(f'{mean:.3g}' for mean in means)} |", flush=True)
