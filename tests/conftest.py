@@ -16,7 +16,7 @@ import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from solids import as_it_is, box, element_hessian, lumped_mass, surface
-from threads import limit_threads
+from timing import limit_threads
 
 from torch_modal.energy.energy import RestShapes
 from torch_modal.inbetween.settings import Objective, Solver

@@ -7,7 +7,7 @@ import pytest
 import torch
 from conftest import Shapes
 from torch import Tensor
-from torch.func import hessian, jacfwd, vmap
+from torch.func import hessian, jacfwd
 
 from torch_modal.backends.torch.fine_steps import (
     RIDGE,
@@ -144,17 +144,6 @@ def test_a_minimum_stays(small_bars: Shapes) -> None:
     case = Case(small_bars)
     rest = case.rests[0]
     assert torch.equal(relax(case.core, rest, case.shell.against(rest), 2, 5), rest)
-
-
-def test_under_vmap(small_bars: Shapes) -> None:
-    """The line search looks at numbers, and vmap must not mind."""
-    case = Case(small_bars, roughness=0.05)
-
-    def relaxed(x: Tensor) -> Tensor:
-        return relax(case.core, x, case.reference, 2, 4)
-
-    shifted = torch.stack([case.x, case.x + 0.5])
-    torch.testing.assert_close(vmap(relaxed)(shifted), torch.stack([relaxed(x) for x in shifted]))
 
 
 def test_chunks_fit_into_caches_or_the_memory_of_a_gpu() -> None:

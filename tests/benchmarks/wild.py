@@ -53,7 +53,7 @@ from typing import Any
 import numpy as np
 import torch
 from tables import geometric_mean, number
-from threads import limit_threads
+from timing import limit_threads
 from tqdm import tqdm
 from wild_bodies import bent_and_twisted
 from wild_making import BODIES, WildBody

@@ -80,39 +80,6 @@ def test_angles_of_any_number_of_shapes_are_one_reference(generator: torch.Gener
     assert float((term.energies(small, alone, of_one) / small**2 - 1).abs().max()) < 0.013
 
 
-@pytest.mark.parametrize("kind", ["area", "spring"])
-@pytest.mark.parametrize("local_steps", [0, 2])
-def test_a_term_of_ones_own_against_central_differences(kind: str, local_steps: int, bars: Shapes) -> None:
-    """It changes the result, and gradients reach its stiffness, the key-frames and the time through all steps."""
-    x_a, x_b = bars.keyframes[1:]
-    weights = torch.randn(x_a.shape, dtype=DOUBLE, generator=torch.Generator().manual_seed(4))
-    point = x_a[[7]] + torch.tensor([0.1, 0.2, -0.1], dtype=DOUBLE)
-
-    def layer_of(stiffness: Any) -> tm.InBetween:
-        term = Area(stiffness) if kind == "area" else Spring([7], point, stiffness)
-        chosen: Any = modal(coarse_faces=200, tolerance=1e-13)
-        objective = replace(chosen["objective"], terms=(term,))
-        return tm.InBetween(
-            bars.bases[1:], bars.faces, objective=objective, solver=replace(chosen["solver"], local_steps=local_steps)
-        )
-
-    values = {"stiffness": torch.tensor(40.0, dtype=DOUBLE), "x_a": x_a, "t": torch.tensor(0.4, dtype=DOUBLE)}
-
-    def value(stiffness: Tensor, x_a: Tensor, t: Tensor) -> Tensor:
-        return (layer_of(stiffness)(x_a, x_b, t) * weights).sum()
-
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in values.items()}
-    gradients = dict(zip(leaves, torch.autograd.grad(value(**leaves), list(leaves.values())), strict=True))
-    with torch.no_grad():
-        assert float((layer_of(40.0)(x_a, x_b, 0.4) - layer_of(0.0)(x_a, x_b, 0.4)).abs().max()) > 1e-4
-        generator = torch.Generator().manual_seed(1)
-        for name, step in (("stiffness", 1e-2), ("x_a", 1e-5), ("t", 1e-5)):
-            along = torch.randn(values[name].shape, dtype=DOUBLE, generator=generator)
-            ends = [value(**{**values, name: values[name] + s * step * along}) for s in (-2, -1, 1, 2)]
-            slope = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
-            assert float((gradients[name] * along).sum()) == pytest.approx(float(slope), rel=1e-5)
-
-
 def test_a_stiff_spring_holds_its_vertex(bars: Shapes, generator: torch.Generator) -> None:
     """In the caller's coordinates, wherever the key-frames are."""
     move = torch.tensor([30.0, -20.0, 10.0], dtype=DOUBLE)

@@ -1,6 +1,5 @@
 """Rotations and strains of triangles against truth by hand, and the Poisson problem against known shapes."""
 
-import copy as copy_module
 import pickle
 
 import numpy as np
@@ -16,7 +15,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Poisson, Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.sparse import SparseSolver, factorize, graph_laplacian
+from torch_modal.geometry.sparse import SparseSolver, graph_laplacian
 from torch_modal.geometry.triangle_frames import (
     BentTriangles,
     Sides,
@@ -182,19 +181,6 @@ def test_weights_are_cotangents_within_bounds(small_bars: Shapes) -> None:
     np.testing.assert_allclose(solver.weights, np.clip(0.5 / np.tan(across), 0.02, 20), rtol=1e-9)
 
 
-def test_gradients_go_through_the_solve(small_bars: Shapes) -> None:
-    solver = Reconstruction(small_bars.keyframes[0], small_bars.faces)
-
-    def shape(first: torch.Tensor, second: torch.Tensor, rest: torch.Tensor) -> torch.Tensor:
-        return solver(Sides(first, second), rest)
-
-    rest = small_bars.keyframes[:2].movedim(-1, 0).contiguous()
-    first, second = sides(rest, small_bars.faces)
-    inputs = [part.clone().requires_grad_() for part in (first, second, rest)]
-    assert torch.autograd.gradcheck(shape, inputs)
-    assert torch.autograd.gradgradcheck(shape, inputs)
-
-
 def test_a_loose_piece_goes_along_with_its_neighbourhood() -> None:
     """A ball in front of a bending bar keeps its place beside the bar's end, and a stray vertex stays."""
     bar = trimesh.creation.box((4.0, 1, 1))
@@ -272,48 +258,6 @@ def test_poisson_gives_shapes_back(two_pieces: tuple[Connectivity, torch.Tensor]
     assert torch.equal(found[..., lone], near[..., lone])  # bit for bit
 
 
-def test_poisson_keeps_to_the_weights_that_are_there(two_pieces: tuple[Connectivity, torch.Tensor]) -> None:
-    """Replaced, as by functional_call; copied; of another dtype; and none of them in the state."""
-    mesh, x = two_pieces
-    weights = torch.ones(len(mesh.edges), dtype=F64)
-    other = torch.linspace(1, 2, len(weights), dtype=F64)
-    solver, truth = Poisson(mesh, weights), Poisson(mesh, other)
-    wanted = torch.randn(3, 1, len(weights), dtype=F64, generator=torch.Generator().manual_seed(0))
-    first = solver(wanted, x[:, :1])
-    factor = solver.solver
-    assert solver.solver is factor
-    found = torch.func.functional_call(solver, {"weights": other}, (wanted, x[:, :1]))
-    torch.testing.assert_close(found, truth(wanted, x[:, :1]))
-    assert float((found - first).abs().max()) > 1e-3
-    torch.testing.assert_close(solver(wanted, x[:, :1]), first)
-    for copy in (copy_module.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
-        torch.testing.assert_close(copy(wanted, x[:, :1]), first)
-    single = solver.float()(wanted.float(), x[:, :1].float())
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), first, rtol=0, atol=1e-4)
-    assert not solver.state_dict()
-
-
-def test_poisson_derivatives(small_bars: Shapes) -> None:
-    mesh = Connectivity(small_bars.faces.numpy())
-    solver = Poisson(mesh, torch.ones(len(mesh.edges), dtype=F64))
-    x = small_bars.keyframes[:2].movedim(-1, 0)
-    inputs = [part.contiguous().requires_grad_() for part in (edges_of(x, mesh), x.roll(1, 1))]
-    assert torch.autograd.gradcheck(solver, inputs)
-    assert torch.autograd.gradgradcheck(solver, inputs, fast_mode=True)
-    both = torch.func.vmap(solver, in_dims=1, out_dims=1)(*(part.detach() for part in inputs))
-    torch.testing.assert_close(both, solver(*inputs).detach())
-
-
-def test_factors_of_a_definite_matrix() -> None:
-    rows = np.random.default_rng(0).standard_normal((30, 30))
-    dense = rows @ rows.T + np.eye(30)
-    for matrix in (sparse.csr_matrix(dense), sparse.coo_matrix(dense)):
-        for ordering in ("MMD_AT_PLUS_A", "NATURAL"):
-            solved = factorize(matrix, ordering).solve(np.arange(30.0))
-            np.testing.assert_allclose(dense @ solved, np.arange(30.0), atol=1e-9)
-
-
 # -------------------------------------------------------------------------------------------------------- mirror
 def test_mirror_continues_a_bend(generator: torch.Generator) -> None:
     """A thin bar bent by an angle, mirrored in the straight one, is bent by the opposite angle."""
@@ -355,21 +299,6 @@ def test_mirror_is_the_linear_one_for_small_steps(bars: Shapes) -> None:
     assert errors[1] == pytest.approx(errors[0] / 10, rel=0.1)
     assert errors[2] == pytest.approx(errors[1] / 10, rel=0.1)
     assert errors[2] < 1e-3
-
-
-def test_frames_have_gradients(small_bars: Shapes) -> None:
-    x = rows(small_bars.keyframes[1]).clone().requires_grad_()
-    faces = small_bars.faces[:6]
-    still = frames(sides(rows(small_bars.keyframes[0]), faces))
-
-    def wanted(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        own = frames(sides(x, faces))
-        bending = bend(sides(0.3 * x, faces), still)
-        first = bent_sides(bending, own)
-        second = mirrored_sides(still, own)
-        return first.first + second.first, first.second + second.second
-
-    assert torch.autograd.gradcheck(wanted, [x])
 
 
 @pytest.mark.parametrize("has_cholespy", [True, False])

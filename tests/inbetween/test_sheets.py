@@ -69,29 +69,6 @@ def test_a_strip_rolls_up(backend: str, dtype: torch.dtype, turns: float) -> Non
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_gradients_of_a_roll(backend: str) -> None:
-    """Against finite differences, in a random direction of both key-frames and the time."""
-    generator = torch.Generator().manual_seed(0)
-    ends = torch.stack([roll(0), roll(1)])
-    layer = tm.InBetween(bases(*ends), faces(), solver=tm.Solver(backend=backend, tolerance=1e-10))
-    ends = ends + 0.003 * torch.randn(ends.shape, dtype=torch.float64, generator=generator)
-    weights, move = (torch.randn(ends.shape, dtype=torch.float64, generator=generator) for _ in range(2))
-    t = torch.tensor(0.4, dtype=torch.float64)
-
-    def value(ends: Tensor, t: Tensor) -> Tensor:
-        return (weights[0] * layer(ends[0], ends[1], t)).sum()
-
-    given = [ends.requires_grad_(), t.requires_grad_()]
-    by_ends, by_time = torch.autograd.grad(value(*given), given)
-    step = 1e-6
-    with torch.no_grad():
-        found = (value(ends + step * move, t) - value(ends - step * move, t)) / (2 * step)
-        in_time = (value(ends, t + step) - value(ends, t - step)) / (2 * step)
-    torch.testing.assert_close((by_ends * move).sum(), found, rtol=1e-3, atol=1e-3 * float(by_ends.norm()))
-    torch.testing.assert_close(by_time, in_time, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_flat_key_frames_align_without_a_mirror_image(backend: str) -> None:
     """A flat sheet that was moved, and one turned over: no bend in between, and gradients that are finite."""
     flat = roll(0)

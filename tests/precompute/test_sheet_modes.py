@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from bodies import irregular, sheet_surface
+from bodies import sheet_surface
+from sheets import rectangle
 
 import torch_modal as tm
 from torch_modal.data.samples import load_sample
@@ -28,10 +29,9 @@ Mesh = tuple[np.ndarray, np.ndarray]
 pytestmark = pytest.mark.filterwarnings("ignore::torch_modal.keyframes.check.MeshWarning")
 
 
-def strip(length: float = 10.0, width: float = 1.0, cells: tuple[int, int] = (80, 8)) -> Mesh:
+def strip(length: float = 10.0, width: float = 1.0, spacing: float = 0.125) -> Mesh:
     """A flat rectangle of irregular triangles in the plane z = 0."""
-    vertices, faces = irregular(*sheet_surface(cells, (length, width)))
-    return vertices[:, [0, 2, 1]], faces
+    return rectangle(length, width, spacing)
 
 
 def lens(thickness: float) -> Mesh:
@@ -98,7 +98,7 @@ def test_rigid_motions_and_strains_are_carried_exactly() -> None:
     turn = turn - turn.T
     coarse = (sheet.points @ turn.T + shift)[..., None]
     np.testing.assert_allclose(sheet.to_surface(coarse)[..., 0], surface.points @ turn.T + shift, atol=1e-9)
-    surface = CanonicalSurface.of(*strip(cells=(200, 40)))
+    surface = CanonicalSurface.of(*strip(spacing=0.035))
     flat = sheet_body(surface, 30)
     plane = np.diag([0.3, -0.1, 0.0])  # the normal turns with the faces, and has no strain of its own
     assert len(flat.points) < 0.6 * len(surface.points)
@@ -134,7 +134,7 @@ def test_edges_of_three_faces_are_stiff() -> None:
 
 def test_two_sheets_have_the_modes_of_each() -> None:
     """Their motions against each other have no energy, and are no modes."""
-    vertices, faces = strip(2.0, 1.0, (20, 10))
+    vertices, faces = strip(2.0, 1.0, 0.1)
     both = np.concatenate([vertices, vertices + np.array([0.0, 0.0, 1.0])])
     with pytest.warns(MeshWarning, match="has 2 loose pieces"):
         basis = extract_modes(both, np.concatenate([faces, faces + len(vertices)]), 8, method="shell", cache=False)
@@ -146,7 +146,7 @@ def test_two_sheets_have_the_modes_of_each() -> None:
 
 def test_parts_that_hang_on_a_vertex_turn_about_it() -> None:
     """That has no energy either, but deforms the piece: such motions are modes."""
-    first, faces = strip(2.0, 1.0, (20, 10))
+    first, faces = strip(2.0, 1.0, 0.1)
     joint = int(np.argmin(np.linalg.norm(first - first.max(axis=0), axis=1)))
     second = first - first.min(axis=0) + first[joint]
     own = int(np.argmin(np.linalg.norm(second - first[joint], axis=1)))
@@ -157,7 +157,7 @@ def test_parts_that_hang_on_a_vertex_turn_about_it() -> None:
 
 
 def test_small_pieces_follow_and_unused_vertices_stay() -> None:
-    vertices, faces = strip(cells=(160, 16))
+    vertices, faces = strip(spacing=0.0625)
     button = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
     place = vertices.mean(axis=0) + np.array([2.0, 0.0, 0.1])
     whole = np.concatenate([[[9.0, 9.0, 9.0]], vertices, button.vertices + place])
@@ -260,7 +260,7 @@ def test_the_cache_knows_the_method(capsule: Mesh, tmp_path: Path, monkeypatch: 
 
 def test_coincident_vertices_are_one() -> None:
     """An edge without a length has no stiffness: its ends would move against each other."""
-    vertices, faces = strip(2.0, 1.0, (20, 10))
+    vertices, faces = sheet_surface((20, 10), (2.0, 1.0))
     split = int(np.argmin(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)))
     around = np.flatnonzero((faces == split).any(axis=1))
     new = len(vertices)

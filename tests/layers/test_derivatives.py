@@ -1,4 +1,4 @@
-"""Forward mode with respect to times, weights, amplitudes and stiffnesses; within other transforms; what has none."""
+"""Derivatives in times, weights, amplitudes, terms and stiffnesses, backward and forward; what has none."""
 
 import warnings
 from collections.abc import Callable
@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from conftest import Shapes
+from conftest import Shapes, bent_bar, random_rotation
+from terms import Area, Spring
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jacfwd, jvp
@@ -40,9 +41,55 @@ def in_between(bars: Shapes, **options: Any) -> Case:
     return Case(tm.InBetween(bars.bases[:2], bars.faces, **options), (x_a, x_b, t), (like(x_a), like(x_b, 1), like(t)))
 
 
-def blend(bars: Shapes, **options: Any) -> Case:
+def with_state(layer: torch.nn.Module, *given: Tensor | float) -> Case:
+    """Of a layer in its stiffnesses and other parameters, too."""
+    names = [name for name in layer.state_dict() if "bases" not in name and not name.endswith("points")]
+    own = tuple(layer.state_dict()[name] for name in names)
+    shapes = tuple(x for x in given if isinstance(x, Tensor))
+    rest = given[len(shapes) :]
+
+    def run(*values: Tensor) -> Tensor:
+        state = dict(zip(names, values[len(shapes) :], strict=True))
+        found: Tensor = functional_call(layer, state, (*values[: len(shapes)], *rest))
+        return found
+
+    return Case(run, (*shapes, *own), (*map(like, shapes), *(x * (1 + i) for i, x in enumerate(own))))
+
+
+def strained(bars: Shapes, **options: Any) -> Case:
+    """Stretched, squeezed and roughened: lengths that no shape can have at once leave a large residual."""
+    x_a, x_b = bars.keyframes[1:]
+    x_b = x_b * numbers(1.5, 0.7, 1.2) + 0.1 * like(x_b, 5)
+    x_b = x_b @ random_rotation(torch.Generator().manual_seed(0)).mT + 1
+    objective = tm.Objective(coarse_faces=200, alpha=numbers(400.0)[0], beta=numbers(20.0)[0], gamma=numbers(5e4)[0])
+    layer = tm.InBetween(bars.bases[1:], bars.faces, objective=objective, solver=tm.Solver(tolerance=1e-13, **options))
+    return with_state(layer, x_a, x_b, numbers(0.37))
+
+
+def own_terms(bars: Shapes) -> Case:
+    """A term on the coarse mesh, and one on the fine mesh."""
+    x_a, x_b = bars.keyframes[1:]
+    point = x_a[[7]] + numbers(0.1, 0.2, -0.1)
+    terms = Area(torch.tensor(40.0, dtype=DOUBLE)), Spring([7], point, torch.tensor(40.0, dtype=DOUBLE))
+    objective, solver = tm.Objective(terms=terms), tm.Solver(tolerance=1e-13)
+    layer = tm.InBetween(bars.bases[1:], bars.faces, objective=objective, solver=solver)
+    assert float((layer(x_a, x_b, 0.4) - tm.InBetween(bars.bases[1:], bars.faces)(x_a, x_b, 0.4)).abs().max()) > 1e-4
+    return with_state(layer, x_a, x_b, numbers(0.4))
+
+
+def paper(bars: Shapes) -> Case:
+    objective = tm.Objective(
+        space="paired", mu=torch.tensor(2.0, dtype=DOUBLE), alpha=torch.tensor(400.0, dtype=DOUBLE)
+    )
+    solver = tm.Solver(local_steps=0, tolerance=1e-13)
+    layer = tm.InBetween(bars.bases[:2], bars.faces, objective=objective, solver=solver)
+    return with_state(layer, *bars.keyframes[:2], 0.5)
+
+
+def blend(bars: Shapes, *weights: float, backend: Any = "auto") -> Case:
     tangents = like(bars.keyframes), numbers(1, -3, 2)
-    return Case(tm.Blend(bars.bases, bars.faces, **options), (bars.keyframes, numbers(0.3, 0.5, 0.2)), tangents)
+    layer = tm.Blend(bars.bases, bars.faces, solver=tm.Solver(tolerance=1e-12, backend=backend))
+    return Case(layer, (bars.keyframes + 0.02 * like(bars.keyframes, 4), numbers(*weights)), tangents)
 
 
 def decoder(bars: Shapes) -> Case:
@@ -64,8 +111,16 @@ def path(bars: Shapes, **options: Any) -> Case:
 CASES: dict[str, Callable[[Shapes], Case]] = {
     "in_between": in_between,
     "in_between, torch": lambda bars: in_between(bars, solver=tm.Solver(backend="torch")),
-    "blend": blend,
-    "blend, torch": lambda bars: blend(bars, solver=tm.Solver(backend="torch")),
+    "strained": lambda bars: strained(bars, local_steps=0),
+    "strained, torch": lambda bars: strained(bars, local_steps=0, backend="torch"),
+    "strained, all vertices": strained,
+    "strained, polished": lambda _: strained(bent_bar((12, 3, 3), 8), polish=1),
+    "own terms": own_terms,
+    "paper": paper,
+    "blend": lambda bars: blend(bars, 0.3, 0.5, 0.2),
+    "blend, torch": lambda bars: blend(bars, 0.3, 0.5, 0.2, backend="torch"),
+    "blend, one without weight": lambda bars: blend(bars, 0.6, 0.4, 0.0),
+    "blend, one below zero": lambda bars: blend(bars, 0.7, 0.4, -0.1),
     "decoder": decoder,
     "path": path,
     "path of pairs": lambda bars: path(bars, smooth=False, preset="fast"),
@@ -119,6 +174,21 @@ def test_forward_is_the_transpose_of_backward(name: str, run: Any, small_bars: S
         require_transposed(Case(of_one, (own,), (tangent,)), run)
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_backward_is_the_limit_of_differences(name: str, small_bars: Shapes) -> None:
+    """Of fourth order; in each argument. The Hessian of steps of all vertices has kinks: changes are small."""
+    case, h = CASES[name](small_bars), 3e-6
+    weights = like(case.layer(*case.given), 2)
+    gradients = backward(case.layer, case.given, weights)
+    for i, (gradient, tangent) in enumerate(zip(gradients, case.tangents, strict=True)):
+        values = []
+        for k in (-2, -1, 1, 2):
+            given = [x + k * h * tangent if i == j else x for j, x in enumerate(case.given)]
+            values.append(float((weights * case.layer(*given)).sum()))
+        expected = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
+        assert float((gradient * tangent).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-6), (name, i)
+
+
 @pytest.mark.parametrize("name", ["in_between", "blend", "decoder", "path"])
 def test_jacfwd_of_a_layer_that_nothing_has_used_before(small_bars: Shapes, name: str) -> None:
     """Of a decoder of two numbers: what layers keep is made within the transforms, and is good outside of them."""
@@ -132,23 +202,6 @@ def test_jacfwd_of_a_layer_that_nothing_has_used_before(small_bars: Shapes, name
     weights = like(jacobian[..., 0], 2)
     (gradient,) = backward(decode, (z,), weights)
     torch.testing.assert_close((weights[..., None] * jacobian).flatten(0, -2).sum(0), gradient, rtol=1e-8, atol=1e-10)
-
-
-def test_stiffness_and_mu(small_bars: Shapes) -> None:
-    for preset, objective, t in (
-        ("fast", tm.Objective(coarse_faces=300, alpha=numbers(500.0), beta=numbers(10.0)), 0.3),
-        ("paper", tm.Objective(space="paired", mu=torch.tensor(2.0, dtype=DOUBLE)), 0.5),
-    ):
-        layer = tm.InBetween(small_bars.bases[:2], small_bars.faces, preset, objective=objective)
-        names = [name for name in layer.state_dict() if "bases" not in name]
-        given = tuple(layer.state_dict()[name] for name in names)
-
-        def run(*values: Tensor, layer: Any = layer, names: list[str] = names, t: float = t) -> Tensor:
-            ends = small_bars.keyframes[:2]
-            found: Tensor = functional_call(layer, dict(zip(names, values, strict=True)), (*ends, t))
-            return found
-
-        require_transposed(Case(run, given, tuple(x * (1 + i) for i, x in enumerate(given))))
 
 
 @either
