@@ -27,9 +27,6 @@ from torch_modal.io.cache import (
     content_digest,
     default_cache_dir,
     entry_name,
-    parse_size,
-    shrink_cache,
-    size_limit,
 )
 
 POINTS = np.arange(6.0).reshape(2, 3)
@@ -133,13 +130,10 @@ def test_default_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_MODAL_CACHE", os.path.join("~", "there"))
     assert default_cache_dir() == Path.home() / "there"
     monkeypatch.delenv("TORCH_MODAL_CACHE")
-    monkeypatch.setattr(cache_module.sys, "platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", os.path.join(os.sep, "xdg"))
     assert default_cache_dir() == Path(os.sep, "xdg", "torch_modal")
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert default_cache_dir() == Path.home() / ".cache" / "torch_modal"
-    monkeypatch.setattr(cache_module.sys, "platform", "darwin")
-    assert default_cache_dir() == Path.home() / "Library" / "Caches" / "torch_modal"
 
 
 def test_content_and_clearing(tmp_path: Path) -> None:
@@ -187,16 +181,10 @@ def test_the_least_recently_used_make_room(tmp_path: Path) -> None:
     assert cache_content(tmp_path).n_bytes <= cache.limit
 
 
-def test_an_entry_above_the_limit_is_kept_alone(tmp_path: Path) -> None:
-    cache = Cache(tmp_path, limit=1000)
-    for i in range(3):
-        keep(cache, i)
-        assert kept(cache, 3) == [i]
-
-
-def test_files_of_others_and_half_written_ones_stay(tmp_path: Path) -> None:
+def test_an_entry_above_the_limit_is_kept_alone_beside_files_of_others(tmp_path: Path) -> None:
     cache = Cache(tmp_path, limit=1000)
     keep(cache, 0)
+    assert kept(cache, 1) == [0]
     (entry,) = tmp_path.iterdir()
     written, abandoned = (tmp_path / f".{entry.name}.{name}.tmp" for name in ("1-a", "2-b"))
     for path in (written, abandoned, tmp_path / "mine.safetensors"):
@@ -235,35 +223,20 @@ def test_several_processes_share_the_limit(tmp_path: Path) -> None:
     assert 0 < cache_content(tmp_path).n_bytes <= 5 * 2**17
 
 
-def test_shrinking(tmp_path: Path) -> None:
-    cache = Cache(tmp_path)
-    for i in range(4):
-        keep(cache, i)
-    before = cache_content(tmp_path)
-    removed = shrink_cache(before.n_bytes // 2, tmp_path)
-    assert removed.n_entries == 2
-    assert kept(cache, 4) == [2, 3]
-    assert shrink_cache(before.n_bytes, tmp_path) == CacheContent(0, 0)
-
-
 @pytest.mark.parametrize(
     ("text", "size"),
     [("1000", 1000), ("2k", 2048), ("500M", 500 * 2**20), ("1.5 GiB", 3 * 2**29), ("4GB", 2**32), ("1T", 2**40)],
 )
 def test_sizes(text: str, size: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert parse_size(text) == size
     monkeypatch.setenv("TORCH_MODAL_CACHE_LIMIT", text)
-    assert Cache.at(tmp_path).limit == size_limit() == size
+    assert Cache.at(tmp_path).limit == size
 
 
-@pytest.mark.parametrize("text", ["", "much", "-1", "4 G 5", "1e9", "nan"])
+@pytest.mark.parametrize("text", ["much", "-1", "4 G 5", "1e9", "nan"])
 def test_no_sizes(text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="is no size; give"):
-        parse_size(text)
-    if text:
-        monkeypatch.setenv("TORCH_MODAL_CACHE_LIMIT", text)
-        with pytest.raises(ValueError, match="variable TORCH_MODAL_CACHE_LIMIT: "):
-            Cache.at(tmp_path)
+    monkeypatch.setenv("TORCH_MODAL_CACHE_LIMIT", text)
+    with pytest.raises(ValueError, match=r"variable TORCH_MODAL_CACHE_LIMIT: .* is no size; give"):
+        Cache.at(tmp_path)
 
 
 # --------------------------------------------------------------------------------------------------------- digests
@@ -311,7 +284,6 @@ DIFFERENT: dict[str, tuple[Any, Any]] = {
 def test_what_differs_has_another_digest(what: str) -> None:
     first, second = (content_digest(value) for value in DIFFERENT[what])
     assert first != second
-    assert first == content_digest(DIFFERENT[what][0])
 
 
 def test_what_is_equal_has_the_same() -> None:
