@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from torch_modal.autograd import lasting
-from torch_modal.io.files import write_atomically
+from torch_modal.io.files import temporary_beside
 
 DIGESTS = "digests"
 ENTRY = "torch_modal"
@@ -27,17 +27,14 @@ ENTRY = "torch_modal"
 def write_tensors(
     path: Path, format: str, version: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a whole file or nothing.
+    """Write a whole file or nothing, into a folder that exists.
 
     Args:
-        path: The file; its folder must exist.
+        path: The file.
         format: Name of the format.
         version: Version of the format.
         tensors: On any device; copied where they share memory, which safetensors refuses.
         metadata: Further entries of the header, which JSON can hold.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     header = json.dumps({"format": format, "version": version, **(metadata or {})}, sort_keys=True)
     parts = {
@@ -47,7 +44,8 @@ def write_tensors(
     table = bytearray(b"".join([_header_digest(header, sorted(parts), rows), *rows]))
     parts[DIGESTS] = torch.frombuffer(table, dtype=torch.uint8).reshape(-1, 32)
     # Not safetensors' save_file: its files can be read by their owner alone, whatever the umask says.
-    write_atomically(path, save(parts, {ENTRY: header}))
+    with temporary_beside(path) as temporary:
+        temporary.write_bytes(save(parts, {ENTRY: header}))
 
 
 class TensorFile:
@@ -79,7 +77,10 @@ class TensorFile:
             digests = _bytes(self._file.get_tensor(DIGESTS)) if DIGESTS in names else b""
         except SafetensorError as error:
             raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
-        self.metadata = _parsed(header)
+        try:
+            self.metadata: dict[str, Any] = dict(json.loads(header))
+        except (TypeError, ValueError, RecursionError):  # not of this package
+            self.metadata = {}
         if self.metadata.get("format") != format:
             raise ValueError(f"{path} holds no {format}: its format is {self.metadata.get('format')!r}")
         if self.metadata.get("version") != version:
@@ -126,11 +127,3 @@ def _bytes(tensor: Tensor) -> bytes:
 
 def _header_digest(header: str, names: Sequence[str], rows: Sequence[bytes]) -> bytes:
     return hashlib.sha256(json.dumps([header, list(names)]).encode() + b"".join(rows)).digest()
-
-
-def _parsed(header: str) -> dict[str, Any]:
-    try:
-        found = json.loads(header)
-    except (ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
