@@ -17,6 +17,7 @@ from textured import BLUE, RED, bend, png, textured_glb, textured_obj, triangles
 
 import torch_modal as tm
 from torch_modal.errors import MeshError, MeshWarning
+from torch_modal.io.asset import as_png_or_jpeg
 from torch_modal.io.obj import ObjAsset
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -229,18 +230,19 @@ def test_ply_quads_and_texture_stay(tmp_path):
     assert mesh.visual.material.baseColorTexture.convert("RGB").getpixel((4, 4)) == RED
 
 
-def test_off_keeps_colours_and_polygons(tmp_path):
+def test_off_keeps_the_triangles_alone(tmp_path):
     x, quads, _ = tube()
     lines = ["COFF # by hand", f"{len(x)} {len(quads)} 0"]
     lines += [f"{a!r} {b!r} {c!r} {i % 256} 20 30 255" for i, (a, b, c) in enumerate(x.tolist())]
     lines += ["4 " + " ".join(map(str, quad)) + " 255 0 0" for quad in quads.tolist()]
     (tmp_path / "a.off").write_text("\n".join(lines) + "\n")
     asset = tm.open_asset(tmp_path / "a.off")
-    assert set(asset.carries) == {"polygons", "colors"}
-    out = asset.write(tmp_path / "b.off", bend(x)).read_text().splitlines()
-    assert out[:2] == lines[:2] and out[2 + len(x) :] == lines[2 + len(x) :]
-    assert [line.split()[3:] for line in out[2 : 2 + len(x)]] == [line.split()[3:] for line in lines[2 : 2 + len(x)]]
-    np.testing.assert_array_equal([[float(w) for w in line.split()[:3]] for line in out[2 : 2 + len(x)]], bend(x))
+    with pytest.warns(MeshWarning, match=r"without the further numbers of vertices and polygons of a\.off"):
+        (out,) = tm.save_frames(bend(x)[None], asset.faces, tmp_path / "out", asset=asset)
+    again = tm.open_asset(out)
+    np.testing.assert_array_equal(again.positions, bend(x))
+    np.testing.assert_array_equal(again.faces, asset.faces)
+    assert not again.carries
 
 
 # --------------------------------------------------------------------------------------------------------------- GLB
@@ -321,12 +323,12 @@ def test_gltf_with_files_beside_it_becomes_a_whole_glb(tmp_path):
 
 
 def accessor_document() -> tuple[dict, bytes]:
-    """One triangle strip with interleaved attributes, sparse positions, tangents, and a mirrored second node."""
+    """Two triangles with interleaved attributes, sparse positions, tangents, and a mirrored second node."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]], "<f4")
     normals = np.tile(np.array([0, 0, 1], "<f4"), (4, 1))
     rows = np.concatenate([points, normals], axis=1).tobytes()
     tangents = np.tile(np.array([1, 0, 0, -1], "<f4"), (4, 1)).tobytes()
-    indices, sparse_at = np.arange(4, dtype="<u2").tobytes(), np.array([3, 0], "<u2").tobytes()
+    indices, sparse_at = np.array([0, 1, 2, 1, 3, 2], "<u2").tobytes(), np.array([3, 0], "<u2").tobytes()
     sparse_values = np.array([1, 1, 0.5], "<f4").tobytes()
     weights = bytes(range(0, 96, 8))
     views, binary = [], b""
@@ -352,11 +354,11 @@ def accessor_document() -> tuple[dict, bytes]:
              "sparse": {"count": 1, "indices": {"bufferView": 3, "componentType": 5123}, "values": {"bufferView": 4}}},
             {"bufferView": 0, "byteOffset": 12, "componentType": 5126, "count": 4, "type": "VEC3"},
             {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC4"},
-            {"bufferView": 2, "componentType": 5123, "count": 4, "type": "SCALAR"},
+            {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
             {"bufferView": 5, "componentType": 5121, "normalized": True, "count": 3, "type": "VEC3"},
         ],
         "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TANGENT": 2}, "indices": 3, "mode": 5}]},
+            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TANGENT": 2}, "indices": 3}]},
         ],
         "nodes": [{"mesh": 0, "translation": [5, 0, 0], "children": [1]}, {"mesh": 0, "scale": [-1, 1, 1]}],
         "scenes": [{"nodes": [0]}],
@@ -365,7 +367,7 @@ def accessor_document() -> tuple[dict, bytes]:
 
 
 def test_glb_accessors_of_all_kinds(tmp_path):
-    """Interleaved and sparse accessors, a strip, a mesh in two nodes of which one mirrors, tangents."""
+    """Interleaved and sparse accessors, a mesh in two nodes of which one mirrors, tangents."""
     root, binary = accessor_document()
     (tmp_path / "mesh.bin").write_bytes(binary)
     (tmp_path / "a.gltf").write_text(json.dumps(root))
@@ -427,6 +429,7 @@ def test_glb_vertex_attributes_of_three_bytes_are_padded(tmp_path):
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "compressed"),
         ({"asset": {"version": "1.0"}}, "not glTF 2"),
         ({"nodes": [{"mesh": -1}]}, "an index -1"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}]}, "strips or fans"),
         ({"nodes": [{"mesh": 0, "scale": [0, 1, 1]}]}, None),
     ],
 )
@@ -490,11 +493,9 @@ def test_frames_as_glb(tmp_path):
 
 
 def test_pictures_of_other_formats_become_png():
-    from torch_modal.io.asset import as_image
-
     stream = io.BytesIO()
     Image.new("RGB", (4, 4), RED).save(stream, format="BMP")
-    image = as_image(stream.getvalue())
-    assert image is not None and image.mime == "image/png"
-    assert Image.open(io.BytesIO(image.data)).getpixel((1, 1)) == RED
-    assert as_image(b"no picture") is None
+    data = as_png_or_jpeg(stream.getvalue())
+    assert data is not None and data.startswith(b"\x89PNG")
+    assert Image.open(io.BytesIO(data)).getpixel((1, 1)) == RED
+    assert as_png_or_jpeg(b"no picture") is None

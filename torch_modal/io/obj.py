@@ -9,8 +9,8 @@ import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
-from torch_modal.io.asset import Asset, Material, Part, Polygons, linear
-from torch_modal.io.mtl import Libraries, read_libraries
+from torch_modal.io.asset import Asset, Material, Part, linear
+from torch_modal.io.mtl import read_libraries
 from torch_modal.io.normals import CarriedNormals
 
 
@@ -138,20 +138,20 @@ class ObjAsset(Asset):
             lines[number] = " ".join([kind, *words])
 
     @cached_property
-    def _read(self) -> Libraries:
+    def _read(self) -> tuple[dict[str, Material], dict[str, bytes]]:
         return read_libraries(self.path, self._libraries)
 
-    @cached_property
+    @property
     def companions(self) -> dict[str, bytes]:
         """Material libraries and their textures."""
-        return self._read.files
+        return self._read[1]
 
     # --------------------------------------------------------------------------------------------- for other formats
-    def polygons(self) -> Polygons:
+    def polygons(self) -> tuple[IntArray, IntArray, FloatArray | None]:
         """The faces with their texture coordinates."""
         texcoords = self._corners[:, 1]
         known = (texcoords >= 0).all()
-        return Polygons(self._sizes, self._corners[:, 0], self._texcoords[texcoords] if known else None)
+        return self._sizes, self._corners[:, 0], self._texcoords[texcoords] if known else None
 
     def parts(self) -> list[Part]:
         """One part for each material that faces use."""
@@ -162,7 +162,7 @@ class ObjAsset(Asset):
             points, triangles = np.unique(corners, axis=0, return_inverse=True)
             vertices, texcoords, normals = points.T
             name = self._materials[number] if number >= 0 else ""
-            material = self._read.materials.get(name)
+            material = self._read[0].get(name)
             if material is None:
                 material = Material(name) if name else Material()
                 if colors is not None:

@@ -46,7 +46,7 @@ class PointFile:
             self.positions = self._file.columns("x", "y", "z")
         except (ValueError, KeyError, IndexError) as error:
             raise ValueError(f"{path} is no PLY file of points with x, y and z: {error}") from error
-        self._names = self._file.vertex.properties.keys()
+        self._names = self._file.properties.keys()
         self.is_splats = {*_QUATERNION, *_SCALES} <= self._names
         #: Properties of the harmonics above degree 0, one channel after the other.
         self._harmonics = sorted(
