@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import io
-import os
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshWarning
-from torch_modal.io.files import write_files
-from torch_modal.io.write import check_frames, refuse_existing, to_numpy
 
 FEATURES = ("polygons", "texcoords", "normals", "colors", "materials", "groups", "properties", "posing")
 """Content of mesh files besides positions and triangles."""
@@ -75,11 +72,7 @@ class Part(NamedTuple):
 
 
 class Asset(ABC):
-    """A mesh file: positions and triangles for the solve, the rest for writing it with other positions.
-
-    Args:
-        path: The file.
-    """
+    """A mesh file: positions and triangles for the solve, the rest for writing it with other positions."""
 
     positions: FloatArray
     """In the file's units, transforms of a scene applied. *Shape:* ``(V, 3)``."""
@@ -91,7 +84,7 @@ class Asset(ABC):
     """Features that :meth:`with_positions` keeps."""
 
     suffix: str
-    """Ending of the files that :meth:`write` makes: ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``."""
+    """Ending of such a file, ``".obj"``, ``".ply"``, ``".off"`` or ``".glb"``; it is GLB of a GLTF file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -99,11 +92,7 @@ class Asset(ABC):
 
     @abstractmethod
     def with_positions(self, positions: FloatArray) -> bytes:
-        """The file with other positions. Its normals rotate with the surface; everything else stays.
-
-        Args:
-            positions: *Shape:* ``(V, 3)``.
-        """
+        """The file with other positions ``(V, 3)``. Its normals rotate with the surface; everything else stays."""
 
     def parts(self) -> list[Part]:
         """The surface with its materials, for other formats."""
@@ -122,45 +111,6 @@ class Asset(ABC):
     def companions(self) -> dict[str, bytes]:
         """Files that must lie beside a copy, by their names there: material libraries, textures."""
         return {}
-
-    def write(self, path: str | os.PathLike[str], positions: Any, overwrite: bool = False) -> Path:
-        """Write the file with other positions, and its material libraries and textures beside it.
-
-        Args:
-            path: Of the file's own suffix; ``.glb`` for ``.gltf``.
-            positions: A tensor or array. *Shape:* ``(V, 3)``.
-            overwrite: Replace files that exist. Files of equal content need no overwriting.
-
-        Returns:
-            The file.
-
-        Raises:
-            ValueError: The positions or the ending do not fit.
-            FileExistsError: A file exists and ``overwrite`` is off; then none is written.
-
-        Warns:
-            MeshWarning: The format cannot hold all of the file.
-        """
-        path = Path(path)
-        if path.suffix.lower() != self.suffix:
-            raise ValueError(f"{self.path.name} is written as {self.suffix}, got {path.name!r}.")
-        shapes, _ = check_frames(to_numpy(positions)[None], self.faces, "positions[None]")
-        self.check(shapes)
-        refuse_existing(path, overwrite)
-        self.warn_lost(path.name, self.keeps)
-        write_files([*self.missing_companions(path.parent, overwrite), (path, self.with_positions(shapes[0]))])
-        return path
-
-    def missing_companions(self, folder: Path, overwrite: bool = False) -> list[tuple[Path, bytes]]:
-        """The companions that a copy in this folder lacks; raises if another file is there, unless ``overwrite``."""
-        missing = []
-        for name, data in self.companions.items():
-            path = folder / name
-            if path.is_file() and path.read_bytes() == data:
-                continue
-            refuse_existing(path, overwrite)
-            missing.append((path, data))
-        return missing
 
     def check(self, shapes: FloatArray) -> None:
         """Raise unless shapes are of this mesh. *Shape:* ``(N, V, 3)``."""

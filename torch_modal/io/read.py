@@ -35,8 +35,8 @@ def open_asset(path: str | os.PathLike[str]) -> Asset:
         path: An OBJ, PLY, OFF, GLB or GLTF file.
 
     Returns:
-        The asset: ``positions`` and ``faces`` are those of :func:`torch_modal.load_keyframes`; ``write`` makes the
-        same file with other positions.
+        The asset: ``positions`` and ``faces`` are those of :func:`torch_modal.load_keyframes`;
+        :func:`torch_modal.save_mesh` makes the same file with other positions.
 
     Raises:
         FileNotFoundError: There is no such file.
