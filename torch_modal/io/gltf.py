@@ -29,13 +29,7 @@ LARGEST_ACCESSOR = 2**31
 
 
 class Document:
-    """A glTF document in memory.
-
-    Args:
-        root: The JSON.
-        folder: Folder that its URIs are relative to.
-        binary: The binary part of a GLB file.
-    """
+    """A glTF document in memory: its JSON and the binary part of a GLB file. URIs are relative to the folder."""
 
     def __init__(self, root: Json | None = None, folder: Path = Path(), binary: bytes = b"") -> None:
         self.root: Json = {"asset": {"version": "2.0", "generator": "torch_modal"}} if root is None else root
@@ -47,11 +41,7 @@ class Document:
 
     @classmethod
     def read(cls, path: Path) -> Document:
-        """Read a GLB or GLTF file.
-
-        Raises:
-            ValueError: It is none, or of another version.
-        """
+        """Read a GLB or GLTF file; raises ValueError if it is none, or of another version."""
         data = path.read_bytes()
         binary = b""
         if data[:4] == b"glTF":
@@ -102,26 +92,23 @@ class Document:
     def accessor(self, index: int) -> NDArray[Any]:
         """The numbers of an accessor, in its component type. *Shape:* ``(count, width)``."""
         accessor = self.get("accessors", index)
-        dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
-        count = accessor["count"]
+        kind, width, count = accessor["componentType"], WIDTHS[accessor["type"]], accessor["count"]
         if not 0 <= count * width < LARGEST_ACCESSOR:
             raise ValueError(f"an accessor of {count} elements")
-        if "bufferView" in accessor:
-            stride = self.get("bufferViews", accessor["bufferView"]).get("byteStride")
-            array = self._rows(accessor, dtype, count, width, stride)
-        else:
-            array = np.zeros((count, width), dtype)
+        array = self._rows(accessor, kind, count, width)
         if "sparse" in accessor:
             n, indices, values = (accessor["sparse"][key] for key in ("count", "indices", "values"))
-            at = self._rows(indices, np.dtype(COMPONENTS[indices["componentType"]]), n, 1)
             array = array.copy()
-            array[at[:, 0]] = self._rows(values, dtype, n, width)
+            array[self._rows(indices, indices["componentType"], n, 1)[:, 0]] = self._rows(values, kind, n, width)
         return array
 
-    def _rows(self, place: Json, dtype: np.dtype, count: int, width: int, stride: int | None = None) -> NDArray[Any]:
-        """Numbers in a buffer view. *Shape:* ``(count, width)``."""
+    def _rows(self, place: Json, kind: int, count: int, width: int) -> NDArray[Any]:
+        """Numbers in a buffer view, zeros without one. *Shape:* ``(count, width)``."""
+        dtype = np.dtype(COMPONENTS[kind])
+        if "bufferView" not in place:
+            return np.zeros((count, width), dtype)
         data, offset, size = self.view(place["bufferView"]), place.get("byteOffset", 0), dtype.itemsize * width
-        stride = stride or size
+        stride = self.get("bufferViews", place["bufferView"]).get("byteStride") or size
         if offset < 0 or stride < size:
             raise ValueError("an accessor with a wrong offset or stride")
         if count and offset + (count - 1) * stride + size > len(data):
@@ -166,14 +153,9 @@ class Document:
         bounds: bool = False,
         normalized: bool = False,
     ) -> int:
-        """Add numbers as an accessor with a view of its own; its number.
+        """Add numbers ``(count,)`` or ``(count, width)`` as an accessor with a view of its own; its number.
 
-        Args:
-            array: In one of the component types. *Shape:* ``(count,)`` or ``(count, width)``.
-            kind: ``"SCALAR"``, ``"VEC3"``, ...
-            target: Use of the view.
-            bounds: Whether least and greatest numbers are written; positions and times need them.
-            normalized: Whether integers stand for fractions.
+        Positions and times need bounds. Normalized integers stand for fractions.
         """
         rows = np.ascontiguousarray(array).reshape(len(array), -1)
         size = rows.dtype.itemsize * rows.shape[1]
