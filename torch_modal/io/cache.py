@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_modal.io.tensors import TensorFile, write_tensors
+from torch_modal.io.tensors import TensorFile, bytes_of, write_tensors
 from torch_modal.version import __version__
 
 CACHE_VERSION = 6
@@ -77,9 +77,8 @@ def size_limit() -> int:
 class Cache:
     """A folder of files, one per result, each with digests that every read verifies.
 
-    Damaged, truncated or foreign entries are computed again and replaced. Several processes may share the
-    folder: entries are moved into place whole. When they take more than the limit, the least recently used are
-    removed.
+    Damaged or foreign entries are computed again and replaced. Several processes may share the folder: entries are
+    moved into place whole. When they take more than the limit, the least recently used are removed.
 
     Attributes:
         folder: Of the entries; it is made when the first is written. None: nothing is cached.
@@ -105,14 +104,8 @@ class Cache:
     ) -> Arrays:
         """The cached result; computed and cached if there is none.
 
-        Args:
-            kind: Of result; the first part of the file's name.
-            inputs: Arrays that the result depends on.
-            parameters: Numbers and strings that it depends on.
-            compute: Computes the result.
-
-        Warns:
-            CacheWarning: The folder cannot be written.
+        It depends on arrays, and on parameters that are numbers or strings. The kind is the first part of the file's
+        name. A :class:`CacheWarning` says that the folder cannot be written.
         """
         found = self.find(kind, inputs, parameters)
         return self.keep(kind, inputs, parameters, compute()) if found is None else found
@@ -255,21 +248,19 @@ def _digest(value: Any) -> bytes:
     if kind in (set, frozenset):
         return _joined(kind.__name__, sorted(map(_digest, value)))
     if kind in (Tensor, torch.nn.Parameter):
-        return _joined("tensor", [str(value.dtype).encode(), str(tuple(value.shape)).encode(), _bytes_of(value)])
+        x = value.detach()
+        if x.layout is not torch.strided or x.is_meta or torch.func.debug_unwrap(x, recurse=False) is not x:
+            raise ContentError(
+                f"a tensor of {x.layout} on {x.device}, or inside a transform of torch.func, has no numbers"
+            )
+        numbers = bytes_of(x.cpu().resolve_conj().resolve_neg())
+        return _joined("tensor", [str(x.dtype).encode(), str(tuple(x.shape)).encode(), numbers])
     if isinstance(value, (np.ndarray, np.generic)) and not value.dtype.hasobject:
         return _joined("array", [str(value.dtype.descr).encode(), str(value.shape).encode(), value.tobytes()])
     if _is_of_package(kind):
         content = tuple(value) if isinstance(value, tuple) else dict(vars(value))
         return _joined(f"{kind.__module__}.{kind.__qualname__}", [_digest(content)])
     raise ContentError(f"a {kind.__qualname__} is neither plain data nor of a class of torch_modal")
-
-
-def _bytes_of(x: Tensor) -> bytes:
-    plain = x.detach()
-    if plain.layout is not torch.strided or plain.is_meta or torch.func.debug_unwrap(plain, recurse=False) is not plain:
-        raise ContentError(f"a tensor of {x.layout} on {x.device}, or inside a transform of torch.func, has no numbers")
-    numbers = plain.cpu().resolve_conj().resolve_neg().contiguous().flatten().view(torch.uint8)
-    return numbers.numpy().tobytes()
 
 
 def _is_of_package(kind: type) -> bool:

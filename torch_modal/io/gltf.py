@@ -67,7 +67,11 @@ class Document:
     def get(self, kind: str, index: int | None = None) -> Any:
         """A list of the document, empty where there is none; or one of its members."""
         items = self.root.get(kind, [])
-        return items if index is None else items[_index(index)]
+        if index is None:
+            return items
+        if not isinstance(index, int) or index < 0:  # in damaged files; Python accepts negative ones
+            raise ValueError(f"an index {index!r}")
+        return items[index]
 
     def resource(self, uri: str) -> bytes:
         """The data in a URI, or of the file that it names."""
@@ -78,9 +82,9 @@ class Document:
     def view(self, index: int) -> bytes:
         """The bytes of a buffer view."""
         view = self.get("bufferViews", index)
-        start = view.get("byteOffset", 0)
-        data = self.buffers[_index(view["buffer"])][start : start + view["byteLength"]]
-        if start < 0 or len(data) < view["byteLength"]:
+        start, number = view.get("byteOffset", 0), view["buffer"]
+        data = self.buffers[number][start : start + view["byteLength"]]
+        if min(start, number) < 0 or len(data) < view["byteLength"]:
             raise ValueError("a buffer is too short")
         return bytes(data)
 
@@ -198,13 +202,6 @@ class Document:
         return b"".join(
             [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
         )
-
-
-def _index(number: Any) -> int:
-    """A checked index; damaged files may have negative ones, which Python accepts."""
-    if not isinstance(number, int) or number < 0:
-        raise ValueError(f"an index {number!r}")
-    return number
 
 
 def world_transforms(document: Document) -> dict[int, FloatArray]:

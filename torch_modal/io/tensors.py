@@ -74,7 +74,7 @@ class TensorFile:
             self._file = safe_open(path, framework="pt", device="cpu")
             header = (self._file.metadata() or {}).get(ENTRY, "")
             names = sorted(self._file.keys())
-            digests = _bytes(self._file.get_tensor(DIGESTS)) if DIGESTS in names else b""
+            digests = bytes_of(self._file.get_tensor(DIGESTS)) if DIGESTS in names else b""
         except SafetensorError as error:
             raise ValueError(f"{path} is no safetensors file, or a damaged one: {error}") from error
         try:
@@ -117,11 +117,12 @@ class TensorFile:
 
 def _digest(name: str, tensor: Tensor) -> bytes:
     total = hashlib.sha256(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode())
-    total.update(_bytes(tensor))
+    total.update(bytes_of(tensor))
     return total.digest()
 
 
-def _bytes(tensor: Tensor) -> bytes:
+def bytes_of(tensor: Tensor) -> bytes:
+    """The numbers of a tensor in main memory."""
     return tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
 
 
