@@ -47,11 +47,7 @@ class CarriedNormals:
         return np.stack([normals, second, np.cross(normals, second)], axis=2)[self.group]
 
     def at(self, positions: FloatArray) -> FloatArray:
-        """The normals of the surface with other positions; bit for bit those of the file where it has not moved.
-
-        Args:
-            positions: *Shape:* ``(P, 3)``.
-        """
+        """The normals of the surface with other positions; bit for bit those of the file where it has not moved."""
         after = self._frames(positions)
         turned = np.einsum("nij,nkj,nk->ni", after, self.before, self.normals)
         return np.where((self.before == after).all(axis=(1, 2))[:, None], self.normals, turned)
@@ -60,14 +56,9 @@ class CarriedNormals:
 def carry_together(
     parts: Sequence[tuple[FloatArray | None, FloatArray, IntArray]], frames: Sequence[FloatArray]
 ) -> list[FloatArray | None]:
-    """Normals of several parts of a surface in each frame; where parts meet, equal normals stay equal.
+    """Normals of several parts of a surface in each frame, None for those without; where parts meet, they stay equal.
 
-    Args:
-        parts: Arguments of :class:`CarriedNormals` for each; the normals may be missing.
-        frames: Positions of each part's points. *Shape of each:* ``(N, P, 3)``.
-
-    Returns:
-        Those of each part, None without normals. *Shape of each:* ``(N, P, 3)``.
+    Parts are arguments of :class:`CarriedNormals`. *Shape of each in the frames, and of the results:* ``(N, P, 3)``.
     """
     found: list[FloatArray | None] = [None] * len(parts)
     own = [k for k, (normals, _, _) in enumerate(parts) if normals is not None]

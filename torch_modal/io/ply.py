@@ -46,6 +46,7 @@ class PlyFile:
         self._start = match.end()
         self._order, self.textures = "", []
         self.elements: dict[str, tuple[int, dict[str, list[str]]]] = {}
+        properties: dict[str, list[str]] = {}
         for line in re.split(r"\r\n|\n|\r", self.data[: self._start].decode("utf-8", errors="replace")):
             words = line.split()
             if line.lower().startswith("comment texturefile"):
@@ -53,7 +54,7 @@ class PlyFile:
             elif words[:1] == ["format"]:
                 self._order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
             elif words[:1] == ["element"]:
-                properties: dict[str, list[str]] = {}
+                properties = {}
                 self.elements[words[1]] = int(words[2]), properties
             elif words[:1] == ["property"]:
                 properties[words[-1]] = [_TYPES[word] for word in words[1:-1] if word != "list"]
@@ -63,10 +64,7 @@ class PlyFile:
 
     @cached_property
     def _content(self) -> tuple[bytes, NDArray[Any], bytes]:
-        """The vertices with all their properties, and the bytes before and after them.
-
-        *Shape:* ``(V,)``, structured; of text ``(V, n)`` words.
-        """
+        """The vertices with all their properties, of text its words, and the bytes before and after them."""
         if any(len(types) > 1 for types in self.properties.values()):
             raise ValueError("vertices with properties that are lists")
         before = [*takewhile(lambda element: element[1] is not self.properties, self.elements.values())]
@@ -74,18 +72,19 @@ class PlyFile:
             lines = self.data[self._start :].splitlines(keepends=True)
             first = sum(length for length, _ in before)
             last = first + self.n_vertices
-            words = np.array([line.split() for line in lines[first:last]], dtype=object)
-            head = self.data[: self._start] + b"".join(lines[:first])
-            return head, words.reshape(-1, len(self.properties)), b"".join(lines[last:])
+            row = np.dtype([(name, object) for name in self.properties])
+            words = np.array([tuple(line.split()) for line in lines[first:last]], row)
+            return self.data[: self._start] + b"".join(lines[:first]), words, b"".join(lines[last:])
         place = self._start
         for length, properties in before:
-            for *count, kind in [*properties.values()] * length:
-                repeat = 1
-                if count:
-                    count_type = np.dtype(self._order + count[0])
-                    repeat = int(np.frombuffer(self.data, count_type, 1, place)[0])
-                    place += count_type.itemsize
-                place += repeat * np.dtype(kind).itemsize
+            for _ in range(length):
+                for *of_list, kind in properties.values():
+                    repeat = 1
+                    if of_list:
+                        count = np.dtype(self._order + of_list[0])
+                        repeat = int(np.frombuffer(self.data, count, 1, place)[0])
+                        place += count.itemsize
+                    place += repeat * np.dtype(kind).itemsize
         row = np.dtype([(name, self._order + kind) for name, (kind,) in self.properties.items()])
         rows = np.frombuffer(self.data, row, self.n_vertices, place)
         return self.data[:place], rows, self.data[place + rows.nbytes :]
@@ -93,23 +92,20 @@ class PlyFile:
     def columns(self, *names: str) -> FloatArray:
         """Properties of the vertices. *Shape:* ``(V, n)``."""
         _, rows, _ = self._content
-        at = list(self.properties)
-        found = [rows[name] if self._order else rows[:, at.index(name)] for name in names]
-        return np.stack([column.astype(np.float64) for column in found], axis=1)
+        return np.stack([rows[name].astype(np.float64) for name in names], axis=1)
 
     def with_columns(self, new: Mapping[str, FloatArray]) -> bytes:
         """The file with other values of some properties of the vertices. *Shape of each:* ``(V,)``."""
         before, rows, after = self._content
         rows = rows.copy()
-        if self._order:
-            for name, column in new.items():
-                rows[name] = column
-            return before + rows.tobytes() + after
         for name, column in new.items():
-            # The fewest digits that read back as the same number of the file's type.
-            numbers = column.astype(np.float32) if self.properties[name] == ["f4"] else column.tolist()
-            rows[:, list(self.properties).index(name)] = [str(number).encode() for number in numbers]
-        return before + b"".join(b" ".join(row) + b"\n" for row in rows.tolist()) + after
+            if self._order:
+                rows[name] = column
+            else:  # the fewest digits that read back as the same number of the file's type
+                numbers = column.astype(np.float32) if self.properties[name] == ["f4"] else column.tolist()
+                rows[name] = [str(number).encode() for number in numbers]
+        body = rows.tobytes() if self._order else b"".join(b" ".join(row) + b"\n" for row in rows.tolist())
+        return before + body + after
 
 
 class PlyAsset(Asset):

@@ -27,16 +27,9 @@ ENTRY = "torch_modal"
 def write_tensors(
     path: Path, format: str, version: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a whole file or nothing, into a folder that exists.
-
-    Args:
-        path: The file.
-        format: Name of the format.
-        version: Version of the format.
-        tensors: On any device; copied where they share memory, which safetensors refuses.
-        metadata: Further entries of the header, which JSON can hold.
-    """
+    """Write a whole file or nothing, into a folder that exists. JSON must be able to hold the metadata."""
     header = json.dumps({"format": format, "version": version, **(metadata or {})}, sort_keys=True)
+    # Copies, as safetensors refuses tensors that share memory.
     parts = {
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
     }
@@ -51,15 +44,11 @@ def write_tensors(
 class TensorFile:
     """A file that is open for reading and mapped into memory: tensors are read when they are used, and outlive it.
 
+    It must have the format, the version and the tensors that are named.
+
     Attributes:
         metadata: Entries of the header.
         shapes: Shape of each tensor.
-
-    Args:
-        path: The file.
-        format: Format that it must have.
-        version: Version that it must have.
-        needs: Tensors that it must have.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -99,11 +88,7 @@ class TensorFile:
 
     @lasting
     def tensor(self, name: str) -> Tensor:
-        """One of the tensors, compared with its digest.
-
-        Raises:
-            ValueError: It is not what was written.
-        """
+        """One of the tensors; raises ValueError if it is not what was written."""
         found: Tensor = self._file.get_tensor(name)
         if self._digests[name] != _digest(name, found):
             raise ValueError(f"{self.path} is damaged: its tensor {name!r} is not what was written")
