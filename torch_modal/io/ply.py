@@ -186,7 +186,7 @@ class OffAsset(Asset):
         counts, *rows = [line.split() for line in content.splitlines() if line.strip()]
         n_vertices, n_faces = map(int, counts[:2])
         self.positions, self.faces = read_triangles(path, n_vertices, n_faces)
-        if len(rows[0]) > 3:
+        if rows and len(rows[0]) > 3:
             self.carries["properties"] = "further numbers of vertices"
         if len(self.faces) > n_faces:
             self.carries["polygons"] = "polygons"
