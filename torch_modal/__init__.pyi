@@ -37,9 +37,8 @@ from .inbetween.settings import Objective as Objective
 from .inbetween.settings import Solver as Solver
 from .io.asset import Asset as Asset
 from .io.formats import Animation as Animation
-from .io.formats import animation_format as animation_format
-from .io.formats import mesh_format as mesh_format
 from .io.frames import save_frames as save_frames
+from .io.frames import save_mesh as save_mesh
 from .io.read import open_asset as open_asset
 from .keyframes.arrays import weld_seams as weld_seams
 from .keyframes.check import check_keyframes as check_keyframes

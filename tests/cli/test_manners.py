@@ -12,7 +12,7 @@ from solids import box, surface
 
 import torch_modal as tm
 from torch_modal.cli import main as cli
-from torch_modal.io.files import temporary_beside, write_atomically
+from torch_modal.io.files import temporary_beside, write_file
 from torch_modal.progress import ProgressReport
 
 
@@ -52,8 +52,8 @@ def test_verbose_says_what_is_written(
 # ------------------------------------------------------------------------------------------------------ errors of files
 def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = tmp_path / "missing" / "a.glb"
-    with pytest.raises(FileNotFoundError) as caught:
-        write_atomically(wanted, b"x")
+    with pytest.raises(FileNotFoundError) as caught, temporary_beside(wanted):
+        pass
     assert caught.value.filename == str(wanted) and ".tmp" not in str(caught.value)
 
     def full(self: Path, data: bytes) -> int:
@@ -61,7 +61,7 @@ def test_write_errors_name_the_users_path(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match=r"No space left on device: '[^']*/b\.glb'") as caught_again:
-        write_atomically(tmp_path / "b.glb", b"x")
+        write_file(tmp_path / "b.glb", b"x")
     assert caught_again.value.errno == errno.ENOSPC and list(tmp_path.iterdir()) == []
     with pytest.raises(PermissionError) as other, temporary_beside(tmp_path / "c.glb"):
         raise PermissionError(errno.EACCES, "of another file", "/elsewhere")

@@ -254,13 +254,7 @@ def modes(args: argparse.Namespace) -> None:
 
 def add_cache(sub: argparse.ArgumentParser) -> None:
     """Arguments of ``cache``."""
-    which = sub.add_mutually_exclusive_group()
-    which.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
-    which.add_argument(
-        "--shrink",
-        metavar="SIZE",
-        help="remove what was not used for the longest, until the rest is no larger than SIZE (500M, 4G)",
-    )
+    sub.add_argument("--clear", action="store_true", help="remove what is in it; other files in the folder stay")
     sub.add_argument("--cache-dir", metavar="DIR", help=CACHE_DIR)
 
 
@@ -273,18 +267,12 @@ def cache(args: argparse.Namespace) -> None:
     says (500M, 10G): what was not used for the longest makes room for what is new.
 
     Examples:
-      torch-modal cache --shrink 1G
       torch-modal cache --clear
     """
     from torch_modal.io import cache as cached
 
     folder = args.cache_dir or cached.default_cache_dir()
-    removed = None
-    if args.clear:
-        removed = cached.clear_cache(folder)
-    elif args.shrink is not None:
-        removed = cached.shrink_cache(cached.parse_size(args.shrink), folder)
-    n_entries, n_bytes = removed or cached.cache_content(folder)
+    n_entries, n_bytes = cached.clear_cache(folder) if args.clear else cached.cache_content(folder)
     size = f"{n_entries} entries, {n_bytes / 2**20:.1f} MiB"
     limit = f"{cached.size_limit() / 2**20:g} MiB"
-    print(f"{size} removed from {folder}" if removed else f"{size} in {folder} (limit: {limit})")
+    print(f"{size} removed from {folder}" if args.clear else f"{size} in {folder} (limit: {limit})")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,6 @@ from torch_modal.progress import Progress
 
 if TYPE_CHECKING:
     from torch_modal.io.asset import Asset
-
-Writer = TypeVar("Writer", bound=Callable[..., Any])
 
 SECONDS_OF_A_PAIR = 2.0
 SECONDS_OF_A_CYCLE = 1.0
@@ -27,9 +25,14 @@ FPS = 24.0
 class OutputFormat:
     """A function that writes, and what is known of it before it is imported.
 
+    In :data:`MESH_FORMATS`, for :func:`torch_modal.save_frames`, it takes vertices ``(V, 3)``, faces ``(F, 3)`` and the
+    :class:`torch_modal.Asset` that they come from, or None, and returns the bytes of a file. In
+    :data:`ANIMATION_FORMATS`, for :func:`torch_modal.save_animation`, it takes a :class:`torch_modal.Animation` and the
+    path of a new file, which is renamed when the function returns.
+
     Attributes:
         function: The function; of built-in formats its place, ``module:name``.
-        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from an asset.
+        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from an asset; a warning names the others.
         modules: Modules that must be installed.
         extra: The extra of torch_modal that installs them.
     """
@@ -47,13 +50,13 @@ class OutputFormat:
 
 GLB_HOLDS = ("texcoords", "normals", "colors", "materials")
 """From a file of another format; of materials, colour, roughness and the texture of the colour."""
-MESH_FORMATS = {
+MESH_FORMATS: dict[str, OutputFormat] = {
     ".ply": OutputFormat("torch_modal.io.ply:ply_bytes"),
     ".obj": OutputFormat("torch_modal.io.obj:obj_bytes"),
     ".off": OutputFormat("torch_modal.io.ply:off_bytes"),
     ".glb": OutputFormat("torch_modal.io.glb:glb_bytes", GLB_HOLDS),
 }
-ANIMATION_FORMATS = {
+ANIMATION_FORMATS: dict[str, OutputFormat] = {
     ".glb": OutputFormat("torch_modal.io.glb:write_glb", GLB_HOLDS),
     ".mp4": OutputFormat("torch_modal.view.animation:write_mp4", (), ("imageio", "imageio_ffmpeg"), "video"),
     ".gif": OutputFormat("torch_modal.view.animation:write_gif"),
@@ -67,43 +70,6 @@ ANIMATION_FORMATS = {
 }
 PICTURES = (".png", ".pdf")
 PAGES = (".html", ".htm")
-
-
-def mesh_format(*suffixes: str, holds: Collection[str] = ()) -> Callable[[Writer], Writer]:
-    """Register a function that writes one shape, for :func:`torch_modal.save_frames`.
-
-    The function takes vertices ``(V, 3)``, faces ``(F, 3)`` and the :class:`torch_modal.Asset` that they come from, or
-    None, and returns the bytes of the file.
-
-    Args:
-        suffixes: In small letters with their dots, such as ``".xyz"``.
-        holds: Which of :data:`torch_modal.io.asset.FEATURES` it takes from the asset; a warning names the others.
-    """
-
-    def register(write: Writer) -> Writer:
-        MESH_FORMATS.update(dict.fromkeys(suffixes, OutputFormat(write, holds)))
-        return write
-
-    return register
-
-
-def animation_format(*suffixes: str, modules: Collection[str] = (), extra: str = "") -> Callable[[Writer], Writer]:
-    """Register a function that writes a sequence, for :func:`torch_modal.save_animation`.
-
-    The function takes an :class:`torch_modal.Animation` and the path of a new file, which is renamed when the
-    function returns.
-
-    Args:
-        suffixes: In small letters with their dots, such as ``".csv"``.
-        modules: Modules that must be installed.
-        extra: The extra of torch_modal that installs them.
-    """
-
-    def register(write: Writer) -> Writer:
-        ANIMATION_FORMATS.update(dict.fromkeys(suffixes, OutputFormat(write, (), modules, extra)))
-        return write
-
-    return register
 
 
 class Timing(NamedTuple):
@@ -171,18 +137,7 @@ def make_timing(
     ease: bool = False,
     times: Sequence[float] | FloatArray | None = None,
 ) -> Timing:
-    """Check and complete the settings of an animation.
-
-    Args:
-        n_frames: Of the sequence.
-        n_keyframes: Of the sequence.
-        duration: In seconds. Default: of ``fps`` frames a second where that is given; otherwise 1 s for a cycle, 2 s
-            for two key-frames, and 1 s for each interval of more.
-        fps: Frames a second. With a duration, only formats of a fixed rate (videos, point caches) depend on it.
-        cyclic: The last frame leads on to the first.
-        ping_pong: There and back again.
-        ease: Slow at both ends.
-        times: Of the frames, in any unit; of a cycle, also when it begins again. Default: evenly spaced.
+    """Check and complete the settings of an animation, which are those of :func:`torch_modal.save_animation`.
 
     Raises:
         ValueError: A number is not positive, a cycle is to turn back or to slow down, or times do not fit.

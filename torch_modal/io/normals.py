@@ -1,6 +1,6 @@
 """Normals of a file, rotated with the surface."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -47,30 +47,27 @@ class CarriedNormals:
         return np.stack([normals, second, np.cross(normals, second)], axis=2)[self.group]
 
     def at(self, positions: FloatArray) -> FloatArray:
-        """The normals of the surface with other positions; bit for bit those of the file where it has not moved.
-
-        Args:
-            positions: *Shape:* ``(P, 3)``.
-        """
+        """The normals of the surface with other positions; bit for bit those of the file where it has not moved."""
         after = self._frames(positions)
         turned = np.einsum("nij,nkj,nk->ni", after, self.before, self.normals)
         return np.where((self.before == after).all(axis=(1, 2))[:, None], self.normals, turned)
 
 
 def carry_together(
-    parts: Sequence[tuple[FloatArray, FloatArray, IntArray]], frames: Iterable[FloatArray]
-) -> list[FloatArray]:
-    """Normals of several parts of a surface in each frame; where parts meet, equal normals stay equal.
+    parts: Sequence[tuple[FloatArray | None, FloatArray, IntArray]], frames: Sequence[FloatArray]
+) -> list[FloatArray | None]:
+    """Normals of several parts of a surface in each frame, None for those without; where parts meet, they stay equal.
 
-    Args:
-        parts: Arguments of :class:`CarriedNormals` for each.
-        frames: Positions of the points of all parts, one part after the other. *Shape of each:* ``(P, 3)``.
-
-    Returns:
-        *Shape of each:* ``(N, P of the part, 3)``.
+    Parts are arguments of :class:`CarriedNormals`. *Shape of each in the frames, and of the results:* ``(N, P, 3)``.
     """
-    normals, positions, triangles = zip(*parts, strict=True)
-    ends = np.cumsum([len(part) for part in normals])
-    shifted = [part + end - len(own) for part, end, own in zip(triangles, ends, normals, strict=True)]
-    carried = CarriedNormals(np.concatenate(normals), np.concatenate(positions), np.concatenate(shifted))
-    return np.split(np.stack([carried.at(x) for x in frames]), ends[:-1], axis=1)
+    found: list[FloatArray | None] = [None] * len(parts)
+    own = [k for k, (normals, _, _) in enumerate(parts) if normals is not None]
+    if own:
+        normals, positions, triangles = zip(*(parts[k] for k in own), strict=True)
+        ends = np.cumsum([len(part) for part in positions])
+        shifted = [part + end - len(place) for part, end, place in zip(triangles, ends, positions, strict=True)]
+        carried = CarriedNormals(np.concatenate(normals), np.concatenate(positions), np.concatenate(shifted))
+        turned = np.stack([carried.at(x) for x in np.concatenate([frames[k] for k in own], axis=1)])
+        for k, part in zip(own, np.split(turned, ends[:-1], axis=1), strict=True):
+            found[k] = part
+    return found
