@@ -91,33 +91,15 @@ def subdivide(
         MeshWarning: With ``contact``, which key-frames pass through themselves, and how many frames still do that no
             key-frame does.
     """
-    keyframes, working_faces = check_keyframes(keyframes, faces, min_keyframes=2)
-    n_keys = len(keyframes)
+    keyframes, faces = check_keyframes(keyframes, faces, min_keyframes=2)
+    n_keys, given = len(keyframes), keyframes
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    if bases is not None:
-        if proxy:
-            raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
-        proxy = 0
-    n_proxy = proxy_size(proxy, keyframes.shape[1])
-    if n_proxy:
-        carrier = Proxy(keyframes, working_faces, n_proxy)
-        shapes = subdivide(
-            carrier.keyframes,
-            carrier.faces,
-            levels,
-            n_modes=n_modes,
-            cyclic=cyclic,
-            n_frames=n_frames,
-            times=times,
-            smooth=smooth,
-            preset=preset,
-            objective=objective,
-            solver=solver,
-            contact=contact,
-            proxy=0,
-            progress=progress,
-        )
-        return carrier.carried(shapes, places, keyframes)
+    if bases is not None and proxy:
+        raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
+    n_proxy = proxy_size(0 if bases is not None else proxy, keyframes.shape[1])
+    carrier = Proxy(keyframes, faces, n_proxy) if n_proxy else None
+    if carrier:
+        keyframes, faces = check_keyframes(carrier.keyframes, carrier.faces)
     chosen = settings(preset, objective, solver, contact)
     if smooth is None:
         smooth = n_keys > 2 and chosen.objective.space == "joint"
@@ -127,9 +109,8 @@ def subdivide(
         require_contact()
     needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
     if bases is None and n_modes and needs_modes:
-        bases = bases_of_checked(
-            keyframes, working_faces, n_modes, progress=progress, meanwhile=choose(chosen.solver.backend).load
-        )
+        backend = choose(chosen.solver.backend)
+        bases = bases_of_checked(keyframes, faces, n_modes, progress=progress, meanwhile=backend.load)
     bases = keyframes.detach() if bases is None else bases
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
@@ -139,14 +120,15 @@ def subdivide(
     total = (len(places) - 1) * (1 if by_path else levels)
     with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
         if by_path:
-            parts = _along_path(keyframes, working_faces, bases, places, times, cyclic, smooth, chosen)
+            parts = _along_path(keyframes, faces, bases, places, times, cyclic, smooth, chosen)
         else:
-            parts = _by_recursion(keyframes, working_faces, bases, places, levels, n_frames, chosen, bar)
+            parts = _by_recursion(keyframes, faces, bases, places, levels, n_frames, chosen, bar)
         for i, shapes in enumerate(parts):
             sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
             bar.update(int(by_path))
         sequence[-1] = keyframes[-1]
-    return sequence[:-1] if cyclic else sequence
+    sequence = sequence[:-1] if cyclic else sequence
+    return carrier.carried(sequence, places, given) if carrier else sequence
 
 
 def _along_path(
@@ -161,19 +143,17 @@ def _along_path(
 ) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval."""
     path = Path(bases, faces.cpu(), times, cyclic, smooth, objective=chosen.objective, solver=chosen.solver)
-    path.to(keyframes.device)
-    knots, left, total = path.knots(keyframes[None]), 0, 0
-    for when in _times_of_intervals(path.times, places):
-        path.n_searched = len(when) - 2
-        result = path.solve(keyframes, when[1:-1], knots)
+    motion = keyframes[None].to(path.to(keyframes.device).dtype)
+    knots, left = path.spline.knots(motion) if path.smooth else None, 0
+    for i, n in enumerate(b - a for a, b in pairwise(places)):
+        u = torch.arange(1, n).to(motion) / n
+        result = path.within(knots, motion, i, torch.zeros_like(u, dtype=torch.int64), u, n_searched=n - 1)
         warn_of_starts(result.solution)
-        if chosen.objective.contact:
-            total += len(when) - 2
-            assert result.solution.n_crossing is not None
+        if result.solution.n_crossing is not None:
             left += int((result.solution.n_crossing > 0).sum())
         yield result.shapes
-    if chosen.objective.contact:
-        _report_contacts(keyframes, faces, left, total)
+    if path.contact:
+        _report_contacts(keyframes, faces, left, places[-1] - len(places) + 1)
 
 
 def _by_recursion(
@@ -269,14 +249,9 @@ def frame_times(
     """
     when = checked_times(times, n_keyframes, cyclic)
     places = keyframe_places(n_keyframes, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    parts = [times[:-1] for times in _times_of_intervals(when, places)]
+    each = zip(pairwise(when.tolist()), pairwise(places), strict=True)
+    parts = [torch.linspace(*ends, b - a + 1, dtype=torch.float64)[:-1] for ends, (a, b) in each]
     return torch.cat(parts if cyclic else [*parts, when[-1:]])
-
-
-def _times_of_intervals(when: Tensor, places: Sequence[int]) -> Iterator[Tensor]:
-    """Even times of each interval, both ends among them. *Shape:* ``(K,) -> (n + 1,)``."""
-    for (start, end), (a, b) in zip(pairwise(when.tolist()), pairwise(places), strict=True):
-        yield torch.linspace(start, end, b - a + 1, dtype=torch.float64, device=when.device)
 
 
 def linear_sequence(keyframes: Tensor, places: Sequence[int]) -> Tensor:
