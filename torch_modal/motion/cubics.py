@@ -49,14 +49,9 @@ class Cubics(NamedTuple):
 def cubics(
     steps: Tensor, durations: Tensor, cyclic: bool, squared: Squared = torch.square, scheme: Scheme | None = None
 ) -> Cubics:
-    """The cubics of given steps.
+    """The cubics of given steps and durations, by :func:`limited_spline` unless there is another scheme.
 
-    Args:
-        steps: *Shape:* ``(N, ...)``.
-        durations: *Shape:* ``(N,)``.
-        cyclic: True where the last step leads back to the first key-frame.
-        squared: The squared size of a quantity.
-        scheme: The path scheme. Default: :func:`limited_spline`.
+    *Shape:* ``(N, ...), (N,)``. A cycle's last step leads back to its first key-frame.
     """
     h = durations.to(steps).view(-1, *[1] * (steps.dim() - 1))
     velocities = (scheme or limited_spline)(steps / h, durations, cyclic, squared)
@@ -106,7 +101,7 @@ def offset(first: Tensor, last: Tensor, u: Tensor) -> Tensor:
 
 
 def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tuple[Tensor, Tensor]:
-    """The interval between key-frames that each time lies in, and how far along it is.
+    """The interval between key-frames that each time lies in, and how far along it is. *Shape of each:* ``(B,)``.
 
     Args:
         t: *Shape:* ``(B,)``.
@@ -114,9 +109,6 @@ def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tu
         cyclic: True where times are taken modulo the period.
         rounding: Relative. Times so near to a key-frame are taken for its own: 0.3 in float32 is beside 0.3 in float64,
             and would miss the key-frame, or lie after the last.
-
-    Returns:
-        *Shape of each:* ``(B,)``.
 
     Raises:
         ValueError: A time is before the first or after the last.
@@ -135,12 +127,10 @@ def located(t: Tensor, times: Tensor, cyclic: bool, rounding: float = 0.0) -> tu
 
 
 def _check_times(t: Tensor, times: Tensor) -> None:
-    outside = ~((t >= times[0]) & (t <= times[-1]))
-    if bool(outside.any()):
-        raise ValueError(
-            f"t lies between the times of the first and the last key-frame, {float(times[0]):g} and "
-            f"{float(times[-1]):g}; got {float(t[outside][0]):g}"
-        )
+    outside = t[~((t >= times[0]) & (t <= times[-1]))].tolist()
+    if outside:
+        ends = f"{float(times[0]):g} and {float(times[-1]):g}"
+        raise ValueError(f"t lies between the times of the first and the last key-frame, {ends}; got {outside[0]:g}")
 
 
 def wrapped(t: Tensor, times: Tensor) -> Tensor:

@@ -126,11 +126,6 @@ class ModalDecoder(nn.Module):
         return other
 
     @property
-    def n_intervals(self) -> int:
-        """Between key-frames."""
-        return len(self.times) - 1
-
-    @property
     def n_modes(self) -> int:
         """Number of amplitudes, k."""
         return len(self.columns)
@@ -173,7 +168,7 @@ class ModalDecoder(nn.Module):
                 return self._shapes(knots, i, trajectory, a, u)
             return torch.cat([self._shapes(knots, i, trajectory, a[own], u[own]) for own in rows.split(size)])
 
-        parts, order = by_interval(segment, self.n_intervals, shapes, traced(segment))
+        parts, order = by_interval(segment, len(self.times) - 1, shapes, traced(segment))
         x = torch.cat(parts)[order]
         if motions is not None:
             x = moved(x, motions.expand(*lead, 6).reshape(-1, 6), self.size)

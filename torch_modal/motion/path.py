@@ -282,19 +282,15 @@ class Path(PreciseModule):
         """Motions, *shape* ``(L, K, V, 3)``; of each shape the motion, the interval, and the time there; dimensions."""
         require_numbers("Path", keyframes)
         reference = self.spline.alignment.reference
-        if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point():
-            got = keyframes.dtype if isinstance(keyframes, Tensor) else type(keyframes).__name__
-            raise ValueError(f"keyframes are a floating-point tensor; got {got}")
         wanted = (self.n_keyframes, *reference.shape)
-        if keyframes.shape[-3:] != wanted:
+        if not isinstance(keyframes, Tensor) or not keyframes.is_floating_point() or keyframes.shape[-3:] != wanted:
+            is_tensor = isinstance(keyframes, Tensor)
+            got = f"{tuple(keyframes.shape)} of {keyframes.dtype}" if is_tensor else type(keyframes).__name__
             raise ValueError(
-                f"keyframes of this path have the shape (..., {', '.join(map(str, wanted))}); got "
-                f"{tuple(keyframes.shape)}"
+                f"keyframes of this path are floating-point of shape (..., {', '.join(map(str, wanted))}); got {got}"
             )
         if keyframes.device != reference.device:
-            raise ValueError(
-                f"keyframes are on {keyframes.device}, the path on {reference.device}; move one with .to()"
-            )
+            raise ValueError(f"keyframes are on {keyframes.device}, the path on {reference.device}; move one")
         rounding = torch.finfo(t.dtype).eps if isinstance(t, Tensor) and t.is_floating_point() else 0.0
         t = torch.as_tensor(t, dtype=self.times.dtype, device=keyframes.device)
         own = keyframes.shape[:-3]

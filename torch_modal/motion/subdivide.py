@@ -167,8 +167,9 @@ def _by_recursion(
     bar: ProgressReport,
 ) -> Iterator[Tensor]:
     """Shapes between the key-frames of each interval, of the pair alone."""
-    weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), faces.cpu().numpy())).to(keyframes)
-    edges = torch.tensor(Connectivity(faces.cpu().numpy(), keyframes.shape[1]).edges, device=keyframes.device)
+    mesh = Connectivity(faces.cpu().numpy(), keyframes.shape[1])
+    weights = torch.from_numpy(vertex_areas(keyframes[0].cpu().double().numpy(), mesh.faces)).to(keyframes)
+    edges = torch.tensor(mesh.edges, device=keyframes.device)
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         ends = (i, (i + 1) % len(keyframes))
         layers: dict[tuple[int, int], MidShape] = {}
