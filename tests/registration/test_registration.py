@@ -151,7 +151,7 @@ def test_the_second_time_is_from_the_cache(
     assert len(again(there + 1e-9).positions) == len(rest) and calls == [0, 1]
     marks = np.array([[3, 5], [40, 70]])
     again(there, marks)
-    again(there, (rest.astype(np.float32)[marks[:, 0]].astype(np.float64), there[marks[:, 1]]))
+    again(there, np.stack([rest.astype(np.float32)[marks[:, 0]].astype(np.float64), there[marks[:, 1]]], axis=1))
     assert calls == [0, 1, 2]
     register(rest, faces, there, there_faces, cache=False, progress=False)
     assert calls == [0, 1, 2, 3]
@@ -231,7 +231,7 @@ def test_a_stray_sphere_beside_the_target_changes_nothing(
 def test_across_shapes_with_landmarks(pair: tuple[Mesh, Mesh, np.ndarray]) -> None:
     (rest, faces), (there, there_faces), truth = pair
     stout = there * [1.0, 1.25, 0.9]
-    marks = (rest[::80], (truth * [1.0, 1.25, 0.9])[::80])
+    marks = np.stack([rest[::80], (truth * [1.0, 1.25, 0.9])[::80]], axis=1)
     result = register(rest, faces, stout, there_faces, landmarks=marks, same_subject=False, progress=False)
     assert errors(result, truth * [1.0, 1.25, 0.9]).mean() < 2.0
     assert result.to_target.mean < 0.12 and result.flipped_area < 0.02
@@ -254,10 +254,10 @@ def test_attributes_are_sampled(pair: tuple[Mesh, Mesh, np.ndarray], found: tm.R
 def test_bad_input_is_refused(pair: tuple[Mesh, Mesh, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
     (rest, faces), target, _ = pair
     for marks, what in (
-        ([[0, 1, 2]], "pairs of vertex indices"),
-        ([[0, 10**6]], "names vertex 1000000 of the target"),
-        ([[0.5, 1.0]], "pairs of vertex indices"),
-        ((np.zeros((2, 3)), np.zeros((3, 3))), "two arrays of finite points"),
+        ([[0, 1, 2]], r"vertex numbers \(n, 2\) or finite points"),
+        ([[0, 10**6]], "names vertex 1000000 of mesh 1"),
+        ([[0.5, 1.0]], "vertex numbers"),
+        (np.full((2, 2, 3), np.nan), "finite points"),
     ):
         with pytest.raises(tm.MeshError, match=what):
             register(rest, faces, *target, landmarks=marks, progress=False)

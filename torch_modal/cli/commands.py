@@ -53,20 +53,15 @@ def register(args: argparse.Namespace) -> None:
 
     import torch_modal as tm
     from torch_modal.io.frames import save_mesh
-    from torch_modal.registration.landmarks import landmark_table
     from torch_modal.registration.load import ADVICE
 
     template, target = map(tm.open_asset, args.meshes)
-    marks = None
-    if args.landmarks is not None:
-        table = landmark_table(args.landmarks, [template.positions, target.positions])
-        marks = table[:, 0], table[:, 1]
     found = tm.register(
         template.positions,
         template.faces,
         target.positions,
         target.faces,
-        landmarks=marks,
+        landmarks=args.landmarks,
         same_subject=not args.across,
         **caching(args),
     )
