@@ -128,8 +128,8 @@ def test_options_arrive(
 
     monkeypatch.setattr(tm, "subdivide", subdivide)
     argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
-    assert cli.main([*argv, "--preset", "paper", "--quiet"]) == 0
-    assert seen["preset"] == "paper"
+    assert cli.main([*argv, "--preset", "fast", "--contact", "--quiet"]) == 0
+    assert seen["preset"] == "fast" and seen["contact"]
     assert len(seen["bases"]) == 2 and seen["bases"][0].n_modes == 6  # type: ignore[arg-type, index]
     assert capsys.readouterr() == ("", "")
 
@@ -172,19 +172,14 @@ def test_overwrite_replaces_and_names_what_is_left_over(
     assert "warning: " in said.err and "1 frames of an earlier run, from frame-009.obj" in said.err
 
 
-def test_key_frames_are_never_overwritten(
-    capsule: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_work: None
-) -> None:
-    files = [str(file) for file in save_frames(np.stack([capsule[0]] * 2), capsule[1], tmp_path)]
-    message = fails(capsys, "subdivide", *files, "--out", str(tmp_path), "--overwrite", "--no-cache")
-    assert "frame-000.ply is one of the meshes" in message
-
-
 def test_output_that_cannot_be_written_is_refused_before_the_work(
     meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_work: None
 ) -> None:
     (tmp_path / "file").write_text("")
     base = ["subdivide", *meshes, "--no-cache"]
+    (tmp_path / "frame-000.obj").write_bytes(Path(meshes[0]).read_bytes())
+    own = ["subdivide", str(tmp_path / "frame-000.obj"), meshes[1], "--out", str(tmp_path), "--overwrite"]
+    assert "frame-000.obj is one of the meshes" in fails(capsys, *own)
     assert "is a file" in fails(capsys, *base, "--out", str(tmp_path / "file" / "a.glb"))
     assert "is a file" in fails(capsys, *base, "--out", str(tmp_path / "file"))
     (tmp_path / "b.glb").mkdir()

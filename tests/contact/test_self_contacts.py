@@ -213,7 +213,8 @@ def test_batches_keep_their_shape(generator: torch.Generator) -> None:
     found = tm.self_contacts(batch, faces)
     assert found.number.shape == (2, 3) and found.depth.shape == batch.shape[:-1] and found.depth.dtype == torch.float32
     assert (found.number > 0).tolist() == [[True, False, True], [False, False, True]]
-    assert torch.equal(found.of(0), found.of(2)) and len(found.of(0)) == int(found.number[0, 0])
+    first, third = (found.pairs[found.shape == i] for i in (0, 2))
+    assert torch.equal(first, third) and len(first) == int(found.number[0, 0])
     assert tm.self_contacts(batch[:0], faces).pairs.shape == (0, 2)
 
 

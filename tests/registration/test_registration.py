@@ -388,16 +388,6 @@ def test_measures_of_a_turned_flap() -> None:
 
 
 # --------------------------------------------------------------------------------------------------- landmarks, files
-def test_suggestions_are_the_tips() -> None:
-    rest, faces = limbs(4)
-    chosen = tm.suggest_landmarks(rest, faces, 8)
-    assert len(set(chosen.tolist())) == 8
-    bumps = np.array([[1, 0.2, 0.1], [-0.3, 1, 0.2], [-0.2, -1, 0.5], [0.1, 0.3, 1], [-1, 0, -0.6]])
-    directions = rest[chosen] / np.linalg.norm(rest[chosen], axis=1, keepdims=True)
-    cosines = directions @ (bumps / np.linalg.norm(bumps, axis=1, keepdims=True)).T
-    assert (cosines.max(0) > 0.95).all(), "each bump has a landmark"
-
-
 def test_landmark_files(tmp_path: Path) -> None:
     file = tmp_path / "pairs.txt"
     file.write_text("# nose\n1 2\n\n3, 4  # tail\n")

@@ -1,4 +1,4 @@
-"""Landmarks: corresponding points, their files, and suggestions."""
+"""Landmarks: corresponding points of meshes, and their files."""
 
 import os
 from collections.abc import Sequence
@@ -11,13 +11,6 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.io.write import to_numpy
-from torch_modal.keyframes.check import check_keyframes
-from torch_modal.registration.maps import SpectralShape
-from torch_modal.registration.surface import referenced
-
-N_SUGGESTED = 14
-# A tip has the largest mean geodesic distance within this radius, for a surface of unit area.
-_TIP_RADIUS = 0.12
 
 
 def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
@@ -107,32 +100,3 @@ def landmark_vertices(path: str | os.PathLike[str], shapes: Sequence[FloatArray]
     if table.ndim == 2:
         return np.asarray(table, dtype=np.int64)
     return np.stack([cKDTree(shape).query(points[:, k])[1] for k, shape in enumerate(shapes)], axis=1)
-
-
-def suggest_landmarks(vertices: Any, faces: Any, n: int = N_SUGGESTED) -> IntArray:
-    """Suggest vertices that are easy to identify on another mesh: tips first, then farthest points.
-
-    Tips are local maxima of the mean geodesic distance: the ends of limbs, ears, noses.
-
-    Args:
-        vertices: Vertex positions. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n: Number of landmarks.
-
-    Returns:
-        Vertex indices. *Shape:* ``(n,)``, fewer on a mesh with fewer vertices.
-
-    Raises:
-        MeshError: The mesh cannot work.
-        MissingPackageError: The extra ``register`` is not installed.
-    """
-    checked = check_keyframes([vertices], faces, warn=False)
-    points = checked.keyframes[0].detach().cpu().double().numpy()
-    surface, used = referenced(points, checked.faces.cpu().numpy())
-    shape = SpectralShape(surface)
-    eccentricity = shape.farthest_points(4 * n)[1].mean(1)
-    highest = np.where(shape.neighbourhoods(_TIP_RADIUS), eccentricity, -np.inf).max(1)
-    tips = np.flatnonzero(eccentricity >= highest)
-    tips = tips[np.argsort(-eccentricity[tips])][:n]
-    chosen = shape.farthest_points(n, start=tips)[0]
-    return used[surface.nearest_alike(shape.placed.vertices[chosen], shape.coarse.vertex_normals[chosen])]

@@ -120,16 +120,10 @@ class SpectralShape:
     def _tree(self) -> cKDTree:
         return cKDTree(self.placed.vertices)
 
-    def farthest_points(self, n: int, start: IntArray | None = None) -> tuple[IntArray, FloatArray]:
-        """Farthest-point samples and the distances to them. *Shape:* ``(m,), (n, m)``.
-
-        Args:
-            n: Number of samples; fewer on a shape with fewer vertices.
-            start: The first samples; by default the vertex farthest from the first vertex.
-        """
-        if start is None:
-            start = self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax(0)
-        chosen, distances = list(start), self.geodesics_from(start)
+    def farthest_points(self, n: int) -> tuple[IntArray, FloatArray]:
+        """Farthest-point samples, ``n`` or all vertices, and the distances to them. *Shape:* ``(m,), (n, m)``."""
+        chosen = [int(self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax())]
+        distances = self.geodesics_from(np.array(chosen))
         while len(chosen) < min(n, len(self)):
             chosen.append(int(distances.min(1).argmax()))
             distances = np.hstack([distances, self.geodesics_from(np.array(chosen[-1:]))])
