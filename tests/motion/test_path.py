@@ -192,8 +192,9 @@ def test_no_modes_are_needed(bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> N
     found = path(x, at)
     assert torch.equal(found[::2], x)
     torch.testing.assert_close(found, Path(bars.bases, faces)(x, at), rtol=0, atol=1e-12)
-    frames = tm.subdivide(x, faces, 2, progress=False)
-    torch.testing.assert_close(frames, path(x, torch.linspace(0, 2, 9, dtype=DOUBLE)), rtol=0, atol=1e-12)
+    for bases in (None, lambda *_: pytest.fail("modes are made")):
+        frames = tm.subdivide(x, faces, 2, bases=bases, progress=False)
+        torch.testing.assert_close(frames, path(x, torch.linspace(0, 2, 9, dtype=DOUBLE)), rtol=0, atol=1e-12)
     pairs = tm.subdivide(x, faces, 1, n_modes=0, smooth=False, progress=False)
     for i in (0, 1):
         truth = tm.MidShape(x[i : i + 2], faces)(x[i], x[i + 1])

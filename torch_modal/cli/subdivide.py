@@ -2,6 +2,7 @@
 
 import argparse
 import warnings
+from functools import partial
 from pathlib import Path
 
 from torch_modal.cli.arguments import (
@@ -105,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
     check_output([animation, *([args.picture] if args.picture else []), *earlier], args.meshes, args.overwrite)
 
     import torch_modal as tm
-    from torch_modal.passengers.proxy import Proxy, proxy_size
+    from torch_modal.passengers.proxy import proxy_size
     from torch_modal.view.animation import require_packages
 
     require_packages(animation)
@@ -118,23 +119,21 @@ def run(args: argparse.Namespace) -> None:
     asset = tm.open_asset(args.meshes[0])
     welded = tm.weld_seams(keyframes, faces)
     progress = False if args.quiet else None
-    n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
-    carrier = Proxy(welded.keyframes, welded.faces, n_proxy) if n_proxy else None
-    moving = (carrier.keyframes, carrier.faces) if carrier else (welded.keyframes, welded.faces)
-    bases = tm.extract_bases(*moving, **mode_options(args))
     solved = tm.subdivide(
-        *moving,
+        welded.keyframes,
+        welded.faces,
         args.levels,
-        bases=bases,
+        bases=partial(tm.extract_bases, **mode_options(args)),
         **spread,
         smooth=args.smooth,
         progress=progress,
         preset=args.preset,
         contact=args.contact,
+        proxy=args.proxy,
     )
-    if carrier:
-        report(f"moved by a proxy of {carrier.keyframes.shape[1]} vertices (--proxy 0: by the whole mesh)")
-        solved = carrier.carried(solved, places, welded.keyframes)
+    n_proxy = proxy_size(args.proxy, welded.keyframes.shape[1])
+    if n_proxy:
+        report(f"moved by a proxy of about {n_proxy} vertices (--proxy 0: by the whole mesh)")
     frames = welded.scatter(solved)
     keys = [place for place in places if place < len(frames)]
     frames[keys] = keyframes

@@ -1,7 +1,7 @@
 """From key-frames to a dense sequence: recursive subdivision (section 3.3 of the paper) and linear fill."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -32,7 +32,7 @@ def subdivide(
     faces: Any,
     levels: int = 3,
     *,
-    bases: Sequence[ModalBasis] | None = None,
+    bases: Sequence[ModalBasis] | Callable[[Tensor, Tensor], Sequence[ModalBasis]] | None = None,
     n_modes: int = 30,
     cyclic: bool = False,
     n_frames: int | None = None,
@@ -56,8 +56,8 @@ def subdivide(
         keyframes: Vertex positions, two key-frames or more, in any units. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         levels: How often the number of intervals doubles.
-        bases: The basis of each key-frame. Default: :func:`torch_modal.extract_bases`, cached on disk, where modes are
-            needed.
+        bases: The basis of each key-frame; or a function that makes them of key-frames and faces, where modes are
+            needed. Default: :func:`torch_modal.extract_bases`, cached on disk.
         n_modes: Modes of each key-frame where the bases are not given. 0: none; mid-shapes are then the blend by local
             rotations, with the steps of all vertices alone.
         cyclic: True where the last key-frame leads on to the first. The sequence then ends one frame before it would
@@ -94,9 +94,10 @@ def subdivide(
     keyframes, faces = check_keyframes(keyframes, faces, min_keyframes=2)
     n_keys, given = len(keyframes), keyframes
     places = keyframe_places(n_keys, levels, cyclic=cyclic, n_frames=n_frames, times=times)
-    if bases is not None and proxy:
+    made = None if callable(bases) else bases
+    if made is not None and proxy:
         raise ValueError("the bases belong to the whole mesh, and a proxy has its own: leave out bases, or proxy")
-    n_proxy = proxy_size(0 if bases is not None else proxy, keyframes.shape[1])
+    n_proxy = proxy_size(proxy if made is None else 0, keyframes.shape[1])
     carrier = Proxy(keyframes, faces, n_proxy) if n_proxy else None
     if carrier:
         keyframes, faces = check_keyframes(carrier.keyframes, carrier.faces)
@@ -108,21 +109,24 @@ def subdivide(
     if chosen.objective.contact:
         require_contact()
     needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
-    if bases is None and n_modes and needs_modes:
-        backend = choose(chosen.solver.backend)
-        bases = bases_of_checked(keyframes, faces, n_modes, progress=progress, meanwhile=backend.load)
-    bases = keyframes.detach() if bases is None else bases
-    if len(bases) != n_keys:
-        raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")
+    if made is None and n_modes and needs_modes:
+        if callable(bases):
+            made = bases(keyframes, faces)
+        else:
+            load = choose(chosen.solver.backend).load
+            made = bases_of_checked(keyframes, faces, n_modes, progress=progress, meanwhile=load)
+    made = keyframes.detach() if made is None else made
+    if len(made) != n_keys:
+        raise ValueError(f"each key-frame needs its basis: got {len(made)} bases for {n_keys} key-frames")
     # With contact, pairs are not subdivided either: what was done at one time would not fit what was done at the next.
     by_path = smooth or chosen.objective.contact
     sequence = keyframes.new_empty(places[-1] + 1, *keyframes.shape[1:])
     total = (len(places) - 1) * (1 if by_path else levels)
     with ProgressReport(total, "in-between shapes", progress) as bar, torch.no_grad():
         if by_path:
-            parts = _along_path(keyframes, faces, bases, places, times, cyclic, smooth, chosen)
+            parts = _along_path(keyframes, faces, made, places, times, cyclic, smooth, chosen)
         else:
-            parts = _by_recursion(keyframes, faces, bases, places, levels, n_frames, chosen, bar)
+            parts = _by_recursion(keyframes, faces, made, places, levels, n_frames, chosen, bar)
         for i, shapes in enumerate(parts):
             sequence[places[i]], sequence[places[i] + 1 : places[i + 1]] = keyframes[i], shapes
             bar.update(int(by_path))
