@@ -471,9 +471,9 @@ def test_skin_that_stretches_is_found_with_landmarks() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flaw", ["none", "sphere", "severed", "mirrored", "mirrored pose"])
+@pytest.mark.parametrize("flaw", ["none", "severed", "mirrored", "mirrored pose"])
 def test_confidence_in_a_hand(data_dir: Path, flaw: str) -> None:
-    """A piece of the target is severed by a plane, it is a left hand, or there is a sphere beside it."""
+    """A piece of the target is severed by a plane, or it is a left hand."""
     keyframes, triangles = tm.load_keyframes(sorted((data_dir / "mh-hand").glob("*.obj")))
     shapes, faces = keyframes.numpy(), triangles.numpy()
     rest, there = shapes[0], shapes[0 if flaw == "mirrored" else 1]
@@ -486,13 +486,8 @@ def test_confidence_in_a_hand(data_dir: Path, flaw: str) -> None:
         target_faces = target_faces[~gone[target_faces].any(1)]
     elif flaw.startswith("mirrored"):
         target, target_faces = target * [-1, 1, 1], target_faces[:, ::-1]
-    elif flaw == "sphere":
-        size = np.linalg.norm(np.ptp(there, axis=0))
-        ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1 * size)
-        target_faces = np.concatenate([target_faces, np.array(ball.faces) + len(target)])
-        target = np.concatenate([target, np.array(ball.vertices) + there.mean(0) + [size, 0, 0]])
     result = register(rest, faces, target, target_faces, progress=False)
-    if flaw in ("none", "sphere"):
+    if flaw == "none":
         assert result.confidence > 0.9 and not result.warnings
         assert errors(result, there).mean() < 0.6
     else:
