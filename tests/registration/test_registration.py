@@ -378,13 +378,13 @@ def test_elastic_surface_follows_a_rigid_motion_exactly() -> None:
 def test_measures_of_a_turned_flap() -> None:
     rest, faces = limbs(3)
     surface = MeshSurface(rest, faces)
-    same = measure(surface, rest, surface)
+    same, support = measure(surface, rest, surface)
+    assert (support == 1).all()
     assert same.to_target.max < 1e-9 and same.flipped_area == 0 and same.folds == 0 and same.stretch == 0
-    assert measure(surface, 2 * rest, MeshSurface(2 * rest, faces)).stretch < 1e-12, (
-        "the scale of the whole is no stretch"
-    )
+    twice = MeshSurface(2 * rest, faces)
+    assert measure(surface, 2 * rest, twice)[0].stretch < 1e-12, "the scale of the whole is no stretch"
     inside_out = MeshSurface(rest, faces[:, ::-1])
-    assert measure(surface, rest, inside_out).flipped_area > 0.9
+    assert measure(surface, rest, inside_out)[0].flipped_area > 0.9
 
 
 # --------------------------------------------------------------------------------------------------- landmarks, files

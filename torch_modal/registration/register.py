@@ -26,7 +26,7 @@ from torch_modal.registration.maps import (
     Map,
     SpectralShape,
 )
-from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp, support
+from torch_modal.registration.report import TRUSTED, Quality, Registration, judge, measure, ramp
 from torch_modal.registration.surface import MeshSurface, main_part, outward, referenced
 
 VERSION = 5
@@ -227,7 +227,7 @@ class _RegistrationProblem:
                 placed = best_fit(rest, goal, areas).apply(rest).numpy()
             x = fit.follow_map(placed, places)
         x = fit.run(x, COARSE_STAGES, releases=2)
-        return _Candidate(found, distortion, scale, x, fit, measure(template, x, back))
+        return _Candidate(found, distortion, scale, x, fit, measure(template, x, back)[0])
 
     def _fit(self, template: MeshSurface, back: MeshSurface, images: IntArray, scale: float) -> TemplateFit:
         landmarks = None
@@ -292,7 +292,7 @@ class _RegistrationProblem:
 
     # ----------------------------------------------------------------------------------------------------------- report
     def _report(self, x: FloatArray, everything: FloatArray, best: _Candidate) -> Registration:
-        quality = measure(self.template, x, self.target)
+        quality, supported = measure(self.template, x, self.target)
         coarse = best.fit.template.moved(best.x)
         images = self.second.placed.nearest_alike(coarse.vertices, coarse.vertex_normals)
         score = self.pair.rated(images).score
@@ -303,7 +303,6 @@ class _RegistrationProblem:
             rows = self.template.rows(self.template.closest(self.marks))
             errors = np.linalg.norm(rows @ x - self.mark_places, axis=1)
         lead = float(self.mirrored - (score - distortion))
-        supported = support(self.template, x, self.target)
         if self.same_subject:
             # Of a vertex in a wrong place, many distances are wrong; of the others, the few to such vertices.
             misplaced = np.quantile(self.pair.errors(images), _MOST, axis=1)
