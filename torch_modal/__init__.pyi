@@ -60,7 +60,6 @@ from .precompute.extract import extract_modes as extract_modes
 from .precompute.lattice import Lattice as Lattice
 from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
 from .precompute.tetwild import TetWild as TetWild
-from .registration.landmarks import suggest_landmarks as suggest_landmarks
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register
 from .registration.report import Registration as Registration

@@ -61,7 +61,7 @@ def test_no_amplitudes_are_the_path(bars: Shapes, cyclic: bool) -> None:
 def test_what_does_not_fit_is_said(bars: Shapes, place: int, value: Any, said: str) -> None:
     basis = bars.bases[0]
     given = [bars.keyframes, bars.faces, [0.0, 1.0, 3.0], basis.reference, basis.modes]
-    assert tm.ModalDecoder(*given).n_intervals == 2
+    assert len(tm.ModalDecoder(*given).times) == 3
     given[place] = value
     with pytest.raises(ValueError, match=said):
         tm.ModalDecoder(*given)

@@ -11,14 +11,14 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.cli import main as cli
+from torch_modal import extras
 from torch_modal.contact import in_between as contact_layer
 from torch_modal.contact import modal, separate
 from torch_modal.contact.acceleration import AccelerationLimit
 from torch_modal.contact.active import ContactEnergy, Contacts, ContactSearch, Pull
 from torch_modal.contact.detect import _nearest_faces
 from torch_modal.contact.separate import Timeline, through
-from torch_modal.data.samples import load_sample, sample_files
+from torch_modal.data.samples import load_sample
 from torch_modal.energy.energy import RestShapes
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity
@@ -356,14 +356,9 @@ def test_no_shape_of_a_path_is_made_worse(frogs: Shapes) -> None:
     assert solution.n_crossing.tolist() in (after.tolist(), [0] * 9)
 
 
-def test_contact_needs_one_shape() -> None:
+def test_what_contact_needs_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="joint"):
         tm.Objective(space="paired", contact=True)
-
-
-def test_missing_extra_is_said_before_any_work(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
-    from torch_modal import extras
-
     real = extras.importlib.util.find_spec
     monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None if name == "ipctk" else real(name))
     for make in (
@@ -427,13 +422,18 @@ def test_values_in_time_lie_on_a_curve_through_them() -> None:
     assert float(slope) == pytest.approx(float((line[301] - line[299]) * 500), rel=1e-4)
 
 
-def test_trajectory_is_free_of_crossings_and_does_not_pop(hand: Shapes) -> None:
-    options = {"bases": hand.bases, "progress": False}
-    plain = tm.subdivide(hand.keyframes, hand.faces, 5, **options)
-    frames = tm.subdivide(hand.keyframes, hand.faces, 5, contact=True, **options)
-    assert int((far(plain, hand) > 0).sum()) >= 6
+@pytest.mark.parametrize(("keys", "levels", "least"), [((0, 1), 5, 6), ((0, 1, 0), 3, 4)], ids=["pair", "smooth"])
+def test_trajectory_is_free_of_crossings_and_does_not_pop(
+    hand: Shapes, keys: tuple[int, ...], levels: int, least: int
+) -> None:
+    own = hand.pick(*keys)
+    plain, frames = (
+        tm.subdivide(own.keyframes, hand.faces, levels, contact=contact, bases=own.bases, progress=False)
+        for contact in (False, True)
+    )
+    assert int((far(plain, hand) > 0).sum()) >= least
     assert int(far(frames, hand).sum()) == 0
-    assert torch.equal(frames[[0, -1]], hand.keyframes)
+    assert torch.equal(frames[[0, -1]], own.keyframes[[0, -1]])
     assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
 
 
@@ -496,16 +496,6 @@ def test_limit_keeps_a_trajectory_from_popping(hand: Shapes, monkeypatch: pytest
     assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
 
 
-def test_smooth_path_through_three_keyframes(hand: Shapes) -> None:
-    there_and_back = hand.pick(0, 1, 0)
-    options = {"bases": there_and_back.bases, "progress": False}
-    plain = tm.subdivide(there_and_back.keyframes, hand.faces, 3, **options)
-    frames = tm.subdivide(there_and_back.keyframes, hand.faces, 3, contact=True, **options)
-    assert int((far(plain, hand) > 0).sum()) >= 4
-    assert int(far(frames, hand).sum()) == 0
-    assert peak_acceleration(frames) < 1.3 * peak_acceleration(plain)
-
-
 def test_nothing_changes_where_nothing_touches(bars: Shapes) -> None:
     pair = bars.pick(0, 1)
     found = tm.subdivide(pair.keyframes, pair.faces, 2, bases=pair.bases, contact=True, progress=False)
@@ -530,15 +520,6 @@ def test_crossings_of_keyframes_are_said_and_stay(hand: Shapes) -> None:
 def test_space_draws_from_tables_without_crossings(hand: Shapes) -> None:
     space = tm.ShapeSpace(hand.bases, hand.faces, contact=True, times=9)
     assert int(far(space.in_betweens.table(0, 1).double(), hand).sum()) == 0
-
-
-@pytest.mark.slow
-def test_command_line(tmp_path: Path) -> None:
-    keys = [str(file) for file in sample_files("hand")]
-    out = tmp_path / "frames"
-    assert cli.main(["subdivide", *keys, "--out", str(out), "--levels", "3", "--contact", "--quiet"]) == 0
-    files = sorted(map(str, out.glob("frame-*.ply")))
-    assert cli.main(["check", *files, "--keyframes", *keys]) == 0
 
 
 @pytest.mark.slow

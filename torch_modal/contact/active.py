@@ -53,15 +53,11 @@ class Contacts(NamedTuple):
 
     def beside(self, former: "Contacts") -> "Contacts":
         """Add the former contacts of vertices that have none now: without them, what was pushed out falls back."""
-        own, before = (each.shapes * (1 + _last(self, former)) + each.elements[:, 3] for each in (self, former))
+        n = 1 + max(int(each.elements.max()) if len(each.elements) else 0 for each in (self, former))
+        own, before = (each.shapes * n + each.elements[:, 3] for each in (self, former))
         kept = ~torch.isin(before, own)
         shapes = torch.cat([self.shapes, former.shapes[kept]])
         return Contacts(shapes, torch.cat([self.elements, former.elements[kept]]))
-
-
-def _last(*contacts: Contacts) -> int:
-    """Largest vertex index."""
-    return max(int(each.elements.max()) if len(each.elements) else 0 for each in contacts)
 
 
 class ContactSearch:
@@ -98,12 +94,11 @@ class ContactSearch:
             if not bool(x[i].isfinite().all()):
                 n_far.append(0)
                 continue
-            found = self.search(_numbers(x[i]), self.watched[i])
-            self.watched[i] = found.watched
-            vertices, faces = torch.from_numpy(found.vertices), torch.from_numpy(found.faces)
+            *found, n = self.search(_numbers(x[i]), self.watched[i])
+            vertices, faces = map(torch.from_numpy, found)
             shapes.append(torch.full_like(vertices, i))
             elements.append(torch.cat([self.faces[faces], vertices[:, None]], 1))
-            n_far.append(found.n_far)
+            n_far.append(n)
         every = torch.cat([torch.zeros(0, dtype=torch.int64), *shapes]).to(x.device)
         corners = torch.cat([torch.zeros(0, 4, dtype=torch.int64), *elements]).to(x.device)
         return Contacts(every, corners), torch.tensor(n_far, dtype=torch.int64, device=x.device)

@@ -4,7 +4,7 @@ A contact pairs a vertex with a face where parts pass through each other, or nea
 pairs a vertex with a face that it was behind in a known shape: a self-intersection of a key-frame stays as it is there.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -33,19 +33,6 @@ _NEAREST = 64
 """Number of faces, by their centres, among which the nearest is searched; four times as many from inside."""
 
 
-class FoundContacts(NamedTuple):
-    """Vertices and faces that face each other in one shape."""
-
-    vertices: IntArray
-    """*Shape:* ``(n,)``."""
-    faces: IntArray
-    """*Shape:* ``(n,)``."""
-    n_far: int
-    """Number of far pairs of triangles."""
-    watched: BoolArray
-    """Vertices beside intersections of this and of earlier searches. *Shape:* ``(V,)``."""
-
-
 class Search:
     """Search for active contacts.
 
@@ -59,28 +46,30 @@ class Search:
         self._edge = float(np.linalg.norm(crossings.like[i] - crossings.like[j], axis=1).mean())
         self._known = [Surface(crossings, x) for x in crossings.known]
 
-    def __call__(self, x: FloatArray, watched: BoolArray) -> FoundContacts:
+    def __call__(self, x: FloatArray, watched: BoolArray) -> tuple[IntArray, IntArray, int]:
         """Find the contacts of a shape; none where no parts pass through each other.
 
         Args:
             x: *Shape:* ``(V, 3)``.
-            watched: Vertices of earlier searches. *Shape:* ``(V,)``.
+            watched: Vertices beside intersections of earlier searches; those of this one are added. *Shape:* ``(V,)``.
+
+        Returns:
+            Vertices and faces that face each other, *shape* ``(n,), (n,)``, and the number of far pairs of triangles.
         """
         crossings = self.crossings
         pairs = crossings.far_pairs(x)
         if not len(pairs):
             none = np.zeros(0, np.int64)
-            return FoundContacts(none, none, 0, watched)
+            return none, none, 0
         corners = np.zeros(len(x), dtype=bool)
         corners[crossings.mesh.faces[pairs.reshape(-1)]] = True
         before = crossings.known_inside
         surface = Surface(crossings, x)
         winds = crossings.winds(surface, crossings.within(corners, DEEP) | (watched & before))
         inside = crossings.hanging(winds & ~before, corners)
-        seeds = watched | crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
+        watched |= crossings.grown(np.flatnonzero(corners), 2) | crossings.grown(np.flatnonzero(inside))
         # What was inside in a key-frame is not to go in elsewhere.
-        stuck = winds & before & seeds
-        return FoundContacts(*self.opposite(surface, seeds, inside, stuck), len(pairs), seeds)
+        return *self.opposite(surface, watched, inside, winds & before & watched), len(pairs)
 
     def opposite(
         self, surface: Surface, seeds: BoolArray, inside: BoolArray, stuck: BoolArray
@@ -149,9 +138,8 @@ class Search:
         of_face = np.where((patch[faces] == patch[faces[:, :1]]).all(1), patch[faces[:, 0]], -1)
         surface = Surface(crossings, x)
         n = min(_NEAREST, len(faces))
-        near = np.asarray(cKDTree(surface.centres).query(x[own], n)[1]).reshape(-1)
         v: Any = np.repeat(own, n)
-        f: Any = near
+        f: Any = np.asarray(cKDTree(surface.centres).query(x[own], n)[1]).reshape(-1)
         facing = dot(surface.vertex_normals[v], surface.normals[f]) < FACING
         v, f = _kept(facing & (of_face[f] != patch[v]), v, f)
         v, f = _kept(_heights(surface, v, f) < 0, v, f)
@@ -177,12 +165,6 @@ def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: Float
 
     Several faces may share the nearest point, and rounding would choose among them: the face whose plane is farthest
     is used, and the first of those in one plane.
-
-    Args:
-        v: Vertices. *Shape:* ``(n,)``.
-        f: Faces. *Shape:* ``(n,)``.
-        distance: Distances from the faces. *Shape:* ``(n,)``.
-        height: Heights over their planes. *Shape:* ``(n,)``.
     """
     chosen = np.arange(len(v))
     for lengths, sign in ((distance, 1), (np.abs(height), -1)):

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torch_modal.backends.torch.fine_steps import Beside
 from torch_modal.contact.acceleration import AccelerationLimit
-from torch_modal.contact.active import ContactSearch, refuse_transforms
-from torch_modal.contact.modal import ModalModel
+from torch_modal.contact.active import ContactEnergy, ContactSearch, refuse_transforms
+from torch_modal.contact.modal import modal_displacement
 from torch_modal.contact.separate import Timeline, separate, through
 from torch_modal.energy.energy import RestShapes
 from torch_modal.geometry.connectivity import vertex_areas
@@ -51,7 +51,7 @@ class ContactSolver(InBetweenSolver):
         refuse_transforms(x)
         searches = [contact_search(self, own, 1) for own in rests.shapes]
         if len(x) == 1:
-            x, _, n_crossing = separate(x, _steps(self, rests), searches[0])
+            x, n_crossing = separate(x, _steps(self, rests), searches[0])
         else:
             counts = [search.count(own[None]) for search, own in zip(searches, x, strict=True)]
             n_crossing = torch.cat([torch.zeros_like(solution.status[:0]), *counts])
@@ -110,19 +110,20 @@ def push_apart(
     seen = torch.cat([ends[1, :1], core.alignment.restore(x, pose), ends[1, 1:]]) * scale
     limit = AccelerationLimit(seen, pose.rotation, goes_on)
 
-    def model(some: Tensor) -> ModalModel:
+    def in_modes(some: Tensor, contact: ContactEnergy, accelerations: Tensor) -> Tensor:
         space = core.space
         placement = space.place(x[some], rests.rows(some), u[some])
         zeros = x.new_zeros(len(some), space.n_amplitudes)
-        found = space.derivatives(zeros, placement, second_order=False)
-        stiffness = found.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(found.gauss_newton)
-        return ModalModel(space.basis.fine, core.alignment.weights, found.gradient.to(u), stiffness.to(u))
+        at = space.derivatives(zeros, placement, second_order=False)
+        stiffness = at.gauss_newton - space.anchor * torch.eye(zeros.shape[1]).to(at.gauss_newton)
+        basis = space.basis.fine, core.alignment.weights, at.gradient.to(u), stiffness.to(u)
+        return modal_displacement(*basis, x[some], contact, accelerations)
 
     search = contact_search(core, ends[0], len(u))
-    timeline = Timeline(u, limit, model if isinstance(core.space, JointSpace) else None)
-    found = separate(x, _steps(core, rests), search, timeline)
-    field = None if found.x is x else found.x - x
-    return Displacement(field, u, found.n_crossing, contact_search(core, ends[0], 1))
+    timeline = Timeline(u, limit, in_modes if isinstance(core.space, JointSpace) else None)
+    pushed, n_crossing = separate(x, _steps(core, rests), search, timeline)
+    field = None if pushed is x else pushed - x
+    return Displacement(field, u, n_crossing, contact_search(core, ends[0], 1))
 
 
 def contact_search(core: InBetweenSolver, ends: Tensor, n_shapes: int) -> ContactSearch:

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.closest import dot
@@ -44,7 +43,6 @@ _MAP_SHARE = 0.05  # weight of the map relative to closest points
 _LANDMARK_WEIGHT = 5.0
 _FIXING_WEIGHT = 1e-5  # fixes pieces without a counterpart
 _ALIKE = 0.4  # smallest cosine between the normals of closest points
-_NEAR_MAP = 0.12  # largest geodesic distance of closest points from the image of the map, for a surface of unit area
 
 
 class PointTargets(NamedTuple):
@@ -117,22 +115,6 @@ class ElasticSurface:
         return x
 
 
-class Gate:
-    """Accepts closest points near the image of a map along the surface: touching fingers do not mix.
-
-    Args:
-        target: The target's coarse shape.
-    """
-
-    def __init__(self, target: SpectralShape) -> None:
-        self._near = target.neighbourhoods(_NEAR_MAP)
-        self._tree = cKDTree(target.placed.vertices)
-
-    def accepts(self, images: IntArray, points: FloatArray) -> BoolArray:
-        """Points of the target near coarse vertices, as a mask. *Shape:* ``(n,), (n, 3) -> (n,)``."""
-        return self._near[images, self._tree.query(points)[1]]
-
-
 class TemplateFit:
     """Iterative fit of a template to a target.
 
@@ -140,8 +122,9 @@ class TemplateFit:
         template: The rest shape, in the target's scale.
         target: The target, with a diagonal of 100.
         back: The target or a coarse copy, whose vertices are matched to the template.
-        gate: Accepts or rejects closest points.
-        images: Coarse vertex of the target for each template vertex. *Shape:* ``(V,)``.
+        coarse: The target's coarse shape.
+        images: Vertex of that for each template vertex; closest points must be near, so that touching fingers do not
+            mix. *Shape:* ``(V,)``.
         landmarks: Points of the template and their target positions.
         stretchable: Allow parts to grow and shrink.
         tick: Called after each step.
@@ -152,7 +135,7 @@ class TemplateFit:
         template: MeshSurface,
         target: MeshSurface,
         back: MeshSurface,
-        gate: Gate,
+        coarse: SpectralShape,
         images: IntArray,
         landmarks: tuple[sparse.csr_matrix, FloatArray] | None,
         *,
@@ -161,27 +144,22 @@ class TemplateFit:
     ) -> None:
         self.template, self.target, self.back, self.tick = template, target, back, tick
         self.elastic = ElasticSurface(template, stretchable=stretchable)
-        self._gate, self._images = gate, images
+        self._coarse, self._images = coarse, images
         self._everywhere = sparse.identity(len(images), format="csr")
         self._share = template.vertex_areas / template.vertex_areas.mean()
         self._back_share = back.vertex_areas / back.vertex_areas.mean() * (len(images) / len(back.vertices))
-        self._landmarks: list[PointTargets] = []
+        self._landmarks = [] if landmarks is None else [self._pull(*landmarks, _LANDMARK_WEIGHT)]
         self._map: list[PointTargets] = []
-        if landmarks is not None:
-            self._landmarks = [self._pull(*landmarks, np.full(len(landmarks[1]), _LANDMARK_WEIGHT))]
 
-    def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray) -> PointTargets:
-        return PointTargets(points, places, self.elastic.stiffness * weights)
-
-    def _pull_all(self, places: FloatArray, weight: float) -> PointTargets:
-        return self._pull(self._everywhere, places, np.full(len(places), weight))
+    def _pull(self, points: sparse.csr_matrix, places: FloatArray, weights: FloatArray | float) -> PointTargets:
+        return PointTargets(points, places, self.elastic.stiffness * np.broadcast_to(weights, len(places)))
 
     def follow_map(self, x: FloatArray, places: FloatArray) -> FloatArray:
         """Fit to the positions of a map, which keep a small weight in later steps. *Shape:* ``(V, 3), (V, 3)``."""
         for weight in MAP_WEIGHTS:
-            x = self.elastic.follow(x, [self._pull_all(places, weight), *self._landmarks], _MAP_ROUNDS)
+            x = self.elastic.follow(x, [self._pull(self._everywhere, places, weight), *self._landmarks], _MAP_ROUNDS)
             self.tick()
-        self._map = [self._pull_all(places, _MAP_SHARE)]
+        self._map = [self._pull(self._everywhere, places, _MAP_SHARE)]
         return x
 
     def run(self, x: FloatArray, stages: Sequence[Stage], releases: int) -> FloatArray:
@@ -206,7 +184,7 @@ class TemplateFit:
             shape = self.template.moved(x)
             pulls = [self._to_target(shape, stage, released), self._from_target(shape, stage, released)]
             pulls += [pull._replace(weights=pull.weights * stage.weight) for pull in self._map]
-            x = self.elastic.follow(x, [*pulls, *self._landmarks, self._pull_all(x, _FIXING_WEIGHT)])
+            x = self.elastic.follow(x, [*pulls, *self._landmarks, self._pull(self._everywhere, x, _FIXING_WEIGHT)])
             self.tick()
         return x
 
@@ -215,13 +193,13 @@ class TemplateFit:
         closest = self.target.closest(shape.vertices)
         places, normals = closest.points.copy(), shape.vertex_normals
         used = dot(normals, self.target.face_normals[closest.faces]) > _ALIKE
-        used &= self._gate.accepts(self._images, places)
+        used &= self._coarse.is_near(self._images, places)
         # If another sheet is closer, take the nearest vertex with a similar normal.
         hidden = np.flatnonzero(~used)
         beside = self.target.nearest_alike(shape.vertices[hidden], normals[hidden])
         places[hidden] = self.target.vertices[beside]
         used[hidden] = dot(normals[hidden], self.target.vertex_normals[beside]) > _ALIKE
-        used[hidden] &= self._gate.accepts(self._images[hidden], places[hidden])
+        used[hidden] &= self._coarse.is_near(self._images[hidden], places[hidden])
         used &= np.linalg.norm(places - shape.vertices, axis=1) < stage.reach
         used &= shape.on_boundary | ~self.target.on_open_edge(closest)
         if released is not None:
@@ -236,7 +214,7 @@ class TemplateFit:
         used = dot(self.back.vertex_normals, shape.face_normals[closest.faces]) > _ALIKE
         used &= closest.distances < stage.reach
         used &= self.back.on_boundary | ~shape.on_open_edge(closest)
-        used &= self._gate.accepts(self._images[corners[:, 0]], self.back.vertices)
+        used &= self._coarse.is_near(self._images[corners[:, 0]], self.back.vertices)
         if released is not None:
             used &= ~released[corners].any(1)
         kept = np.flatnonzero(used)

@@ -7,12 +7,14 @@ square roots of the area.
 
 import itertools
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
+from scipy.spatial import cKDTree
 
 from torch_modal import extras
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
@@ -36,6 +38,7 @@ N_REFINED = 4
 N_SAMPLES = 40
 """Number of samples between which distances are compared."""
 _STEP = 3
+_NEAR = 0.12  # largest geodesic distance of closest points from the image of a map, for a surface of unit area
 
 # Weight of the round-trip error relative to the oriented area.
 _ROUND_TRIP = 3.0
@@ -105,16 +108,22 @@ class SpectralShape:
         near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=radius) <= radius
         return near
 
-    def farthest_points(self, n: int, start: IntArray | None = None) -> tuple[IntArray, FloatArray]:
-        """Farthest-point samples and the distances to them. *Shape:* ``(m,), (n, m)``.
+    def is_near(self, vertices: IntArray, points: FloatArray) -> BoolArray:
+        """Points in space whose nearest coarse vertices are near given ones, as a mask. *Shape:* ``(n,), (n, 3)``."""
+        return self._near[vertices, self._tree.query(points)[1]]  # type: ignore[no-any-return]
 
-        Args:
-            n: Number of samples; fewer on a shape with fewer vertices.
-            start: The first samples; by default the vertex farthest from the first vertex.
-        """
-        if start is None:
-            start = self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax(0)
-        chosen, distances = list(start), self.geodesics_from(start)
+    @cached_property
+    def _near(self) -> BoolArray:
+        return self.neighbourhoods(_NEAR)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.placed.vertices)
+
+    def farthest_points(self, n: int) -> tuple[IntArray, FloatArray]:
+        """Farthest-point samples, ``n`` or all vertices, and the distances to them. *Shape:* ``(m,), (n, m)``."""
+        chosen = [int(self.geodesics_from(np.zeros(1, dtype=np.int64)).argmax())]
+        distances = self.geodesics_from(np.array(chosen))
         while len(chosen) < min(n, len(self)):
             chosen.append(int(distances.min(1).argmax()))
             distances = np.hstack([distances, self.geodesics_from(np.array(chosen[-1:]))])
@@ -134,12 +143,7 @@ class Map(NamedTuple):
 
 
 class CoarsePair:
-    """Maps from one coarse shape to another.
-
-    Args:
-        first: *n_first vertices.*
-        second: *n_second vertices.*
-    """
+    """Maps from one coarse shape, of n_first vertices, to another."""
 
     def __init__(self, first: SpectralShape, second: SpectralShape) -> None:
         self.first, self.second = first, second
@@ -175,13 +179,7 @@ class CoarsePair:
         return found
 
     def refined(self, vertices: IntArray, start: int, stop: int = FINE_FUNCTIONS) -> Map:
-        """Refine a map with an increasing number of eigenfunctions (ZoomOut, Melzi et al. 2019).
-
-        Args:
-            vertices: The map. *Shape:* ``(n_first,)``.
-            start: Initial number of eigenfunctions.
-            stop: Final number of eigenfunctions.
-        """
+        """Refine a map with from ``start`` to ``stop`` eigenfunctions (ZoomOut, Melzi et al. 2019)."""
         most = min(stop, self.first.functions.shape[1], self.second.functions.shape[1])
         for k in [*range(min(start, most), most, _STEP), most]:
             rows = self.second.functions[:, :k] @ self._functional(vertices, k).T
@@ -199,12 +197,8 @@ class CoarsePair:
     def from_spectra(self, n_signs: int, tick: Callable[[], None] = lambda: None) -> list[Map]:
         """The best maps from spectra, best first; the last is the best map to the mirrored target.
 
-        The initial maps are all sign patterns of the lowest eigenfunctions, wave kernel signatures and rigid alignments
-        of principal axes. All are refined with few eigenfunctions, the best with all.
-
-        Args:
-            n_signs: Number of eigenfunctions with both signs: ``2**n_signs`` initial maps.
-            tick: Called after each initial map.
+        The initial maps are all ``2**n_signs`` sign patterns of the lowest eigenfunctions, wave kernel signatures and
+        rigid alignments of principal axes. All are refined with few eigenfunctions, the best with all.
         """
         coarse = []
         for vertices, k in self._starts(n_signs):

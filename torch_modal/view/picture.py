@@ -35,16 +35,7 @@ def check_view(view: tuple[float, float] | None, up: str | None) -> None:
 
 
 def check_sequences(sequences: Mapping[str, Array], faces: Array, name: str) -> tuple[dict[str, FloatArray], IntArray]:
-    """Sequences of shapes that are shown together, and their faces, as NumPy arrays.
-
-    Args:
-        sequences: *Shape of each:* ``(N, V, 3)``, the same for all.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        name: Of ``sequences``, for messages.
-
-    Raises:
-        ValueError: There are none, their shapes differ, or :func:`check_frames` refuses one.
-    """
+    """Sequences of shapes that are shown together, and their faces, as NumPy arrays; ``name`` is for messages."""
     if not sequences:
         raise ValueError(f"{name} is empty; it needs at least one sequence of shapes.")
     checked: dict[str, FloatArray] = {}
