@@ -19,42 +19,6 @@ def spaces(bars: Shapes, small_bars: Shapes) -> tuple[tm.ShapeSpace, tm.ShapeSpa
     )
 
 
-def test_packed_shapes_are_transformed_as_batches(
-    bars: Shapes, small_bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]
-) -> None:
-    large, small = spaces
-    shapes = [bars.keyframes[0], small_bars.keyframes[1], bars.keyframes[2], small_bars.keyframes[0]]
-    counts = torch.tensor([len(x) for x in shapes])
-
-    def make() -> tm.AugmentationSequential:
-        return tm.AugmentationSequential(
-            tm.RandomInBetween(p=1.0), tm.RandomModalDeformation(p=1.0), generator=torch.Generator().manual_seed(0)
-        )
-
-    packed = tm.augment_packed(make(), torch.cat(shapes), counts, [large, small, large, small])
-    found = packed.split(counts.tolist())
-    augment = make()
-    expected = augment(torch.stack(shapes[::2]), space=large), augment(torch.stack(shapes[1::2]), space=small)
-    for place in range(4):
-        assert torch.equal(found[place], expected[place % 2][place // 2])
-
-
-def test_packed_shapes_of_one_space(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
-    augment = tm.RandomRigidMotion(p=1.0, generator=torch.Generator().manual_seed(0))
-    x = bars.keyframes.clone().requires_grad_()
-    out = tm.augment_packed(augment, x.flatten(0, 1), [164] * 3, spaces[0])
-    torch.testing.assert_close(out.unflatten(0, (3, 164)), augment(x, augment.params))
-    out.square().sum().backward()
-    assert x.grad is not None
-    for wrong, message in (
-        (([164] * 2, spaces[0]), "need"),
-        (([164] * 3, [spaces[0]] * 2), "as many spaces"),
-        (([164] * 3, spaces[1]), "do not belong"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            tm.augment_packed(augment, x.flatten(0, 1), *wrong)
-
-
 def test_samples_of_all_sizes_pack_into_one_batch(bars: Shapes, small_bars: Shapes, tmp_path: Path) -> None:
     tm.write_set(tmp_path / "a", *bars, ["0", "1", "2"])
     tm.write_set(tmp_path / "b", *small_bars, ["0", "1", "2"])

@@ -13,10 +13,10 @@ from safetensors.torch import save_file
 from torch.utils.data import DataLoader, default_collate
 
 import torch_modal as tm
-from torch_modal.data.in_betweens import FORMAT, VERSION, write_table
+from torch_modal.data.in_betweens import FORMAT, VERSION
 from torch_modal.energy.bend import Bend
 from torch_modal.io.cache import CacheWarning
-from torch_modal.io.tensors import TensorFile
+from torch_modal.io.tensors import TensorFile, write_tensors
 
 N_SETS, PER_SET = 3, 8
 
@@ -255,7 +255,7 @@ def test_tables_of_other_modes_faces_settings_or_versions_are_not_read(
     key = TensorFile(path, FORMAT, VERSION).metadata
 
     def plant() -> None:
-        write_table(path, torch.zeros_like(right), key)
+        write_tensors(path, FORMAT, VERSION, {"shapes": torch.zeros_like(right)}, key)
 
     plant()
     assert float(table().abs().max()) == 0

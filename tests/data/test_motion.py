@@ -79,9 +79,8 @@ def test_neighbours_are_joined_by_the_path_and_others_by_the_pair(bar_motion: Sh
         torch.testing.assert_close(space.in_betweens.of_keyframes(j, i, 1 - u), found, rtol=0, atol=1e-6)
     assert torch.equal(space.in_betweens.of_keyframes(0, 2, u), pairs.in_betweens.of_keyframes(0, 2, u))
     x = shapes.keyframes[:2] + 0.01 * torch.sin(shapes.keyframes[:2])
-    half = u[2:3]
-    found = space.in_betweens.of_shapes(x[:1], x[1:], half, 0, 1)
-    assert torch.equal(found, pairs.in_betweens.of_shapes(x[:1], x[1:], half, 0, 1))
+    given = x[:1], x[1:], u[2:3], *torch.tensor([[0], [1]]), torch.tensor([False])
+    assert torch.equal(space.in_betweens(*given), pairs.in_betweens(*given))
 
 
 def test_tables_hold_the_path_and_follow_from_times_and_key_frames(bar_motion: Shapes, tmp_path: Path) -> None:
@@ -131,15 +130,14 @@ def test_other_shapes_are_solved_with_their_partner_alone(bar_motion: Shapes) ->
     params = {name: torch.tensor([value] * 2) for name, value in (("batch_prob", True), ("partner", 0.7), ("t", 0.4))}
     augment = tm.RandomInBetween(p=1.0)
     # Of a batch: as without times.
-    assert torch.equal(augment(x, params, space=space), augment(x, params, space=pairs))
+    assert torch.equal(augment(x, params=params, space=space), augment(x, params=params, space=pairs))
     # Of the key-frames: the one after the nearest.
     pool = tm.ShapeBatch.of_keyframes(space, x)
-    found = augment(x, params, space=space, pool=pool)
+    found = augment(x, params=params, space=space, pool=pool)
     nearest = space.nearest(x)
     for row, i in enumerate(nearest.tolist()):
-        expected = pairs.in_betweens.of_shapes(
-            x[row : row + 1], bar_motion.keyframes[i + 1 : i + 2], params["t"][:1], i, i + 1
-        )
+        ends = x[row : row + 1], bar_motion.keyframes[i + 1 : i + 2]
+        expected = pairs.in_betweens(*ends, params["t"][:1], *torch.tensor([[i], [i + 1]]), torch.tensor([False]))
         torch.testing.assert_close(found[row : row + 1], expected, rtol=0, atol=1e-6)
 
 

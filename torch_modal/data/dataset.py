@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from torch_modal.autograd import Recent, one_thread
-from torch_modal.data.augmentation import ShapeAugmentation, ShapeBatch
-from torch_modal.data.random_in_between import RandomInBetween
-from torch_modal.data.sequential import AugmentationSequential, check_labels
+from torch_modal.data.augmentation import AugmentationSequential, ShapeAugmentation
+from torch_modal.data.random_transforms import RandomInBetween
+from torch_modal.data.shape_batch import ShapeBatch, check_labels
 from torch_modal.data.space import ShapeSpace
-from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets, open_set
+from torch_modal.data.stored import LABELS_FILE, StoredSet, find_sets
 from torch_modal.geometry.vectors import vertex_normals
 
 Labels = Mapping[str, Tensor]
@@ -61,7 +61,7 @@ class ShapeDataset(Dataset[Sample]):
     def __init__(
         self,
         root: str | os.PathLike[str],
-        transform: AugmentationSequential | ShapeAugmentation | None = None,
+        transform: ShapeAugmentation | None = None,
         *,
         samples_per_set: int = 16,
         labels: Callable[[StoredSet], Labels] = stored_labels,
@@ -78,9 +78,8 @@ class ShapeDataset(Dataset[Sample]):
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
         transform = RandomInBetween(p=1.0) if transform is None else transform
-        if not isinstance(transform, AugmentationSequential):
-            transform = AugmentationSequential(transform)
-        self.transform = transform
+        chained = isinstance(transform, AugmentationSequential)
+        self.transform = transform if chained else AugmentationSequential(transform)
         self.samples_per_set = samples_per_set
         self.labels = labels
         self.seed = seed
@@ -135,7 +134,11 @@ class ShapeDataset(Dataset[Sample]):
         space, pool = self._open(number)
         turn = self.epoch * self.samples_per_set
         start = torch.tensor([(index % self.samples_per_set + turn) % len(space) for index in indices])
-        drawn = [self.transform.forward_parameters(1, space, self._generator(index)) for index in indices]
+        drawn = []
+        for index in indices:
+            state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
+            generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+            drawn.append(self.transform.forward_parameters(1, space, generator))
         params = [
             {name: torch.cat([row[name] for row in rows]) for name in rows[0]} for rows in zip(*drawn, strict=True)
         ]
@@ -143,19 +146,14 @@ class ShapeDataset(Dataset[Sample]):
         parts = {"vertices": batch.shapes, "vertex_labels": batch.vertex_labels, "shape_labels": batch.shape_labels}
         if self.with_normals:
             parts["normals"] = vertex_normals(batch.shapes, space.faces)
-        samples: list[Sample] = []
-        for row in range(len(indices)):
-            # Copies: a view would carry the whole batch to another process.
-            sample: Sample = {name: part[row].clone() for name, part in parts.items() if part is not None}
-            sample |= {"set": number, "keyframe": int(start[row])}
-            if self.with_faces:
-                sample["faces"] = space.faces
-            samples.append(sample)
+        # Copies: a view would carry the whole batch to another process.
+        samples: list[Sample] = [
+            {name: part[row].clone() for name, part in parts.items() if part is not None}
+            | {"set": number, "keyframe": int(start[row])}
+            | ({"faces": space.faces} if self.with_faces else {})
+            for row in range(len(indices))
+        ]
         return samples
-
-    def _generator(self, index: int) -> torch.Generator:
-        state = np.random.SeedSequence([self.seed, self.epoch, index]).generate_state(1, np.uint64)
-        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
     def _open(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
         """The space of a set, and its key-frames with their labels."""
@@ -163,7 +161,7 @@ class ShapeDataset(Dataset[Sample]):
         return found
 
     def _read(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
-        stored = open_set(self.sets[number])
+        stored = StoredSet(self.sets[number])
         space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
         labels = dict(self.labels(stored))
         k, v = len(space), space.n_vertices
@@ -214,3 +212,31 @@ class SetBatchSampler(Sampler[list[int]]):
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
             yield batches[place]
+
+
+def collate_packed(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Samples of any sizes as one packed batch, in the layout of PyTorch3D: for a loader's ``collate_fn``.
+
+    Args:
+        samples: Made with ``faces=True``.
+
+    Returns:
+        ``verts_packed`` (N, 3), ``faces_packed`` (M, 3) with indices into them, ``num_verts_per_mesh`` and
+        ``num_faces_per_mesh`` (B,), ``mesh_to_verts_packed_first_idx`` (B,); data of vertices is packed
+        too, and all else is stacked.
+    """
+    counts = torch.tensor([len(sample["vertices"]) for sample in samples])
+    first = counts.cumsum(0) - counts
+    batch: dict[str, Any] = {
+        "verts_packed": torch.cat([sample["vertices"] for sample in samples]),
+        "faces_packed": torch.cat(
+            [sample["faces"] + offset for sample, offset in zip(samples, first.tolist(), strict=True)]
+        ),
+        "num_verts_per_mesh": counts,
+        "num_faces_per_mesh": torch.tensor([len(sample["faces"]) for sample in samples]),
+        "mesh_to_verts_packed_first_idx": first,
+    }
+    for name in samples[0].keys() - {"vertices", "faces"}:
+        values = [torch.as_tensor(sample[name]) for sample in samples]
+        batch[name] = torch.cat(values) if name in ("normals", "vertex_labels") else torch.stack(values)
+    return batch

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
-from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, normal, uniform
 from torch_modal.data.in_betweens import by_kind
+from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
@@ -65,8 +66,7 @@ class RandomModalDeformation(ShapeAugmentation):
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``noise``, a standard normal number for each mode, and the ``strain``."""
-        strain = self.strain[0] + (self.strain[1] - self.strain[0]) * uniform(n, generator)
-        return {"strain": strain, "noise": normal(n, generator, space.n_modes)}
+        return {"strain": uniform(n, generator, self.strain), "noise": normal(n, generator, space.n_modes)}
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None

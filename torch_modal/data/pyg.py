@@ -4,10 +4,11 @@ from typing import Any
 
 import torch
 
-from torch_modal.data.augmentation import ShapeAugmentation, ShapeBatch
-from torch_modal.data.sequential import AugmentationSequential
+from torch_modal.data.augmentation import ShapeAugmentation
+from torch_modal.data.shape_batch import ShapeBatch, check_shapes
 from torch_modal.data.space import ShapeSpace
 from torch_modal.extras import require_installed
+from torch_modal.geometry.vectors import vertex_normals
 
 require_installed(("torch_geometric",), "pyg", "torch_modal.data.pyg")
 from torch_geometric.data import Batch, Data  # noqa: E402
@@ -31,21 +32,12 @@ class RandomShape(BaseTransform):
     """
 
     def __init__(
-        self,
-        augmentation: ShapeAugmentation | AugmentationSequential,
-        space: ShapeSpace | None = None,
-        y: torch.Tensor | None = None,
+        self, augmentation: ShapeAugmentation, space: ShapeSpace | None = None, y: torch.Tensor | None = None
     ) -> None:
         found = augmentation.space if space is None else space
         if found is None:
             raise ValueError("RandomShape needs key-frames and modes: pass space=ShapeSpace(bases, faces)")
-        self.space = found
-        self.y = y
-        transforms = [augmentation] if isinstance(augmentation, ShapeAugmentation) else augmentation.each()
-        keys = ("shapes", "normals", "shape_labels")
-        self.augmentation = AugmentationSequential(
-            *transforms, data_keys=keys, generator=augmentation.generator, space=found
-        )
+        self.augmentation, self.space, self.y = augmentation, found, y
 
     def forward(self, data: Data) -> Data:
         """Transform a graph or a ``Batch`` of graphs, in place (``BaseTransform`` passes a copy).
@@ -66,18 +58,19 @@ class RandomShape(BaseTransform):
         if self.y is not None and data.y is not None:
             given = self.y.to(pos.device)
             rows = data.y.reshape(n, *given.shape[1:])  # of a single graph, the row may be missing
+        batch = ShapeBatch(pos.unflatten(0, (n, n_vertices)), shape_labels=rows)
         pool = ShapeBatch.of_keyframes(self.space, pos, shape_labels=given)
-        shapes, normals, labels = self.augmentation(pos.unflatten(0, (n, n_vertices)), None, rows, pool=pool)
-        data.pos = shapes.flatten(0, 1)
+        check_shapes(batch.shapes, self.space)
+        out = self.augmentation.drawn(batch, self.space, pool)
+        data.pos = out.shapes.flatten(0, 1)
         if "normal" in data:
-            data.normal = normals.flatten(0, 1)
-        if rows is not None:
-            data.y = labels.reshape(data.y.shape)
+            data.normal = vertex_normals(out.shapes, self.space.faces).flatten(0, 1)
+        if out.shape_labels is not None:
+            data.y = out.shape_labels.reshape(data.y.shape)
         return data
 
     def __repr__(self) -> str:
-        inside = ", ".join(repr(each) for each in self.augmentation.transforms)
-        return f"{type(self).__name__}({inside})"
+        return f"{type(self).__name__}({self.augmentation})"
 
 
 def as_data(sample: dict[str, Any]) -> Data:

@@ -78,14 +78,6 @@ class StoredSet:
     def __reduce__(self) -> tuple[Any, ...]:
         return StoredSet, (self.folder,)
 
-    def __repr__(self) -> str:
-        return f"StoredSet({str(self.folder)!r}, {len(self)} key-frames, {self.n_vertices} vertices)"
-
-
-def open_set(folder: str | os.PathLike[str]) -> StoredSet:
-    """The key-frame set in a folder; see :class:`StoredSet`."""
-    return StoredSet(folder)
-
 
 def read_note(folder: Path) -> str:
     """The note of a stored set; reads the header of its file only.
