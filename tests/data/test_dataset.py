@@ -70,7 +70,7 @@ def test_samples(root: Path, bars: Shapes) -> None:
     assert sorted(sample) == ["faces", "keyframe", "normals", "set", "vertices"]
     assert (sample["vertices"].shape, sample["vertices"].dtype) == ((164, 3), torch.float32)
     assert torch.equal(sample["faces"], bars.faces)
-    assert torch.equal(data.faces(0), bars.faces)
+    assert torch.equal(data.space(0).faces, bars.faces)
     torch.testing.assert_close(sample["normals"], tm.vertex_normals(sample["vertices"][None], bars.faces)[0])
     assert data[-1]["set"] == 2
     assert data[-1]["vertices"].shape == (30, 3)
@@ -330,13 +330,15 @@ def test_sets_with_one_key_frame(bars: Shapes, tmp_path: Path) -> None:
     assert torch.equal(tm.ShapeDataset(tmp_path)[0]["vertices"], bars.keyframes[0].float())
 
 
-def test_only_the_last_sets_stay_open(root: Path) -> None:
+def test_only_the_last_sets_stay_open(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch_modal.data.dataset.OPEN_SETS", 2)
+
     def spaces() -> int:
         gc.collect()
         return sum(type(each) is tm.ShapeSpace for each in gc.get_objects())
 
     before = spaces()  # of other tests
-    data = dataset(root, open_sets=2)
+    data = dataset(root)
     for i in (0, PER_SET, 2 * PER_SET, 0):
         data[i]
         assert len(data._opened) <= 2

@@ -9,7 +9,7 @@ import torch
 from conftest import Shapes
 
 import torch_modal as tm
-from torch_modal.data.motion import Motion
+from torch_modal.data.stored import Motion
 
 F64 = torch.float64
 TIMES = (0.0, 0.5, 2.0, 3.0, 4.5)

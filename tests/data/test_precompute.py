@@ -164,17 +164,17 @@ def test_names_that_are_no_text(bench: Bench) -> None:
 
 
 def test_processes_have_one_thread_and_as_many_run_as_asked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    alive, most, wait = [], [], precompute_set._wait
+    alive, most, run = [], [], precompute_set._in_own_process
 
     def counting(*args: object) -> object:
         alive.append(1)
         most.append(len(alive))
         try:
-            return wait(*args)  # type: ignore[arg-type]
+            return run(*args)  # type: ignore[arg-type]
         finally:
             alive.pop()
 
-    monkeypatch.setattr(precompute_set, "_wait", counting)
+    monkeypatch.setattr(precompute_set, "_in_own_process", counting)
     bench.add(*(f"s{i}" for i in range(7)))
     assert bench.run("--workers", "3") == 0
     assert max(most) == 3

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import Shapes
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
-from torch_modal.data.dataset import stored_labels
 from torch_modal.data.space import ShapeSpace
 from torch_modal.data.stored import (
     FORMAT,
@@ -102,7 +101,7 @@ def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> No
     write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES, note="new")
     assert torch.equal(StoredSet(folder).keyframes, 2 * small_bars.keyframes)
     assert StoredSet(folder).note == read_note(folder) == "new"
-    assert torch.equal(stored_labels(StoredSet(folder))["vertex_labels"], torch.arange(30))
+    assert torch.equal(load_file(folder / LABELS_FILE)["vertex_labels"], torch.arange(30))
     assert (folder / "notes.txt").read_text() == "mine"
     assert sorted(path.name for path in folder.iterdir()) == [LABELS_FILE, "notes.txt", SET_FILE]
     with pytest.raises(OSError, match=r"notes\.txt"):

@@ -21,11 +21,8 @@ from torch_modal.geometry.vectors import vertex_normals
 Labels = Mapping[str, Tensor]
 Sample = dict[str, Any]
 
-
-def stored_labels(stored: StoredSet) -> Labels:
-    """The contents of ``labels.safetensors`` in a set's folder, if there is one."""
-    path = stored.folder / LABELS_FILE
-    return load_file(path) if path.is_file() else {}
+OPEN_SETS = 8
+"""How many sets each process keeps open."""
 
 
 class ShapeDataset(Dataset[Sample]):
@@ -44,18 +41,18 @@ class ShapeDataset(Dataset[Sample]):
         transform: Transforms the key-frames; in-betweens by default. Its ``same_on_batch`` has no effect here.
         samples_per_set: Samples of each set in an epoch.
         labels: Returns the labels of a set: ``vertex_labels`` (V, ...) or (K, V, ...), and ``shape_labels`` (K, ...),
-            each if there are any. A function of a module, if workers are spawned. By default those in the file
+            each if there are any. A function of a module, if workers are spawned. By default the tensors in the file
             ``labels.safetensors`` of the set's folder.
         seed: Of all random numbers.
         dtype: Of the vertices.
-        faces: Whether samples have their faces. A loader stacks them with the rest; :meth:`faces` gives them once.
+        faces: Whether samples have their faces. A loader stacks them with the rest; those of a :meth:`space` are there
+            once.
         normals: Whether samples have normals.
-        open_sets: How many sets are kept open, in each process.
         options: Of the spaces (:class:`ShapeSpace`), such as ``preset`` or ``times``.
 
     Raises:
         FileNotFoundError: There is no such folder, or no set in it.
-        ValueError: ``samples_per_set`` or ``open_sets`` is below 1.
+        ValueError: ``samples_per_set`` is below 1.
     """
 
     def __init__(
@@ -64,16 +61,15 @@ class ShapeDataset(Dataset[Sample]):
         transform: ShapeAugmentation | None = None,
         *,
         samples_per_set: int = 16,
-        labels: Callable[[StoredSet], Labels] = stored_labels,
+        labels: Callable[[StoredSet], Labels] | None = None,
         seed: int = 0,
         dtype: torch.dtype = torch.float32,
         faces: bool = False,
         normals: bool = False,
-        open_sets: int = 8,
         **options: Any,
     ) -> None:
-        if samples_per_set < 1 or open_sets < 1:
-            raise ValueError(f"samples_per_set and open_sets are 1 or more, got {samples_per_set} and {open_sets}")
+        if samples_per_set < 1:
+            raise ValueError(f"samples_per_set is 1 or more, got {samples_per_set}")
         self.sets = [str(path) for path in find_sets(root)]
         if not self.sets:
             raise FileNotFoundError(f"no stored key-frame set in {root}; torch-modal precompute makes them")
@@ -89,7 +85,7 @@ class ShapeDataset(Dataset[Sample]):
         self.options = options
         # In shared memory: workers that outlive an epoch see the next one.
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
-        self._opened = Recent(open_sets)
+        self._opened = Recent(OPEN_SETS)
 
     def __len__(self) -> int:
         """Samples in an epoch."""
@@ -107,10 +103,6 @@ class ShapeDataset(Dataset[Sample]):
     def space(self, number: int) -> ShapeSpace:
         """Key-frames and modes of a set."""
         return self._open(number)[0]
-
-    def faces(self, number: int) -> Tensor:
-        """Faces of a set. *Shape:* ``(F, 3)``."""
-        return self.space(number).faces
 
     def __getitem__(self, index: int) -> Sample:
         """One sample."""
@@ -163,7 +155,11 @@ class ShapeDataset(Dataset[Sample]):
     def _read(self, number: int) -> tuple[ShapeSpace, ShapeBatch]:
         stored = StoredSet(self.sets[number])
         space = ShapeSpace.open(stored, dtype=self.dtype, **self.options)
-        labels = dict(self.labels(stored))
+        path = stored.folder / LABELS_FILE
+        if self.labels is not None:
+            labels = dict(self.labels(stored))
+        else:
+            labels = load_file(path) if path.is_file() else {}
         k, v = len(space), space.n_vertices
         of_vertices = labels.get("vertex_labels")
         if of_vertices is not None and of_vertices.shape[:2] != (k, v) and of_vertices.shape[:1] == (v,):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import Recent
-from torch_modal.data.motion import Motion
+from torch_modal.data.stored import Motion
 from torch_modal.inbetween.results import InBetweenResult
 from torch_modal.inbetween.settings import Settings
 from torch_modal.io.cache import CacheWarning, ContentError, code_digest, content_digest

@@ -189,7 +189,7 @@ def _in_own_process(
     Returns:
         Why there is no result, None if it was stopped; and the end of its output.
     """
-    end = time.monotonic() + options.timeout
+    end, ended = time.monotonic() + options.timeout, False
     with tempfile.TemporaryDirectory(prefix="torch_modal-set-", ignore_cleanup_errors=True) as scratch:
         reason_file, log_file = Path(scratch) / "reason.txt", Path(scratch) / "log.txt"
         job = {"source": str(source), "target": str(target), "record": asdict(record), "options": asdict(options)}
@@ -208,40 +208,27 @@ def _in_own_process(
             with contextlib.suppress(BrokenPipeError):  # it ended at once; its exit status says more
                 process.stdin.write(json.dumps(job).encode() + b"\n")
                 process.stdin.flush()
-            in_time = _wait(process, end, stop)
+            while not ended and time.monotonic() < end and not (stop is not None and stop.is_set()):
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(min(POLL, max(end - time.monotonic(), 0.0)))
+                    ended = True
         finally:
-            _end(process)
+            # Interrupted first, so that it ends the mesher, whose session is another.
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(GRACE)
+            end_process(process)
+            with contextlib.suppress(OSError):
+                process.communicate()  # closes the pipe
         said, code = log_file.read_text(errors="replace")[-2000:], process.returncode
-        if in_time is None:
-            return None, said
-        if not in_time:
-            return f"no result after the timeout of {options.timeout:g} s", said
+        if not ended:
+            stopped = stop is not None and stop.is_set()
+            return None if stopped else f"no result after the timeout of {options.timeout:g} s", said
         if reason_file.is_file():
             return reason_file.read_text(), said
         hint = "perhaps memory ran out" if code == -signal.SIGKILL else last_line(said)
         return f"its process ended with {describe_exit(code)}" + (f" ({hint})" if hint else ""), said
-
-
-def _wait(process: subprocess.Popen[bytes], end: float, stop: threading.Event | None) -> bool | None:
-    """Wait for a process: True if it ended before a time, False if not, None if it was stopped."""
-    while stop is None or not stop.is_set():
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(min(POLL, max(end - time.monotonic(), 0.0)))
-            return True
-        if time.monotonic() >= end:
-            return False
-    return None
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Interrupt a process, so that it ends the mesher, whose session is another; kill it if that does not help."""
-    if process.poll() is None:
-        process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(GRACE)
-    end_process(process)
-    with contextlib.suppress(OSError):
-        process.communicate()  # closes the pipe
 
 
 # ------------------------------------------------------------------------------------------- in the set's process

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from torch_modal.autograd import Recent, lasting
 from torch_modal.data.in_betweens import InBetweens
-from torch_modal.data.motion import Motion
-from torch_modal.data.stored import StoredSet
+from torch_modal.data.stored import Motion, StoredSet
 from torch_modal.data.strain import mode_scales
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.crossings import require_contact
