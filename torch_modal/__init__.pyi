@@ -10,7 +10,6 @@ from .data.augmentation import AugmentationSequential as AugmentationSequential
 from .data.augmentation import ShapeAugmentation as ShapeAugmentation
 from .data.dataset import SetBatchSampler as SetBatchSampler
 from .data.dataset import ShapeDataset as ShapeDataset
-from .data.dataset import collate_packed as collate_packed
 from .data.deformation import RandomModalDeformation as RandomModalDeformation
 from .data.random_transforms import RandomBlend as RandomBlend
 from .data.random_transforms import RandomExtrapolation as RandomExtrapolation

@@ -1,11 +1,10 @@
-"""Packed batches and graphs: the same shapes as from plain tensors."""
+"""Graphs: the same shapes as from plain tensors."""
 
 from pathlib import Path
 
 import pytest
 import torch
 from conftest import Shapes
-from torch.utils.data import DataLoader
 
 import torch_modal as tm
 
@@ -13,35 +12,12 @@ F64 = torch.float64
 
 
 @pytest.fixture(scope="module")
-def spaces(bars: Shapes, small_bars: Shapes) -> tuple[tm.ShapeSpace, tm.ShapeSpace]:
-    return tm.ShapeSpace(bars.bases, bars.faces, dtype=F64), tm.ShapeSpace(
-        small_bars.bases, small_bars.faces, dtype=F64
-    )
+def space(bars: Shapes) -> tm.ShapeSpace:
+    return tm.ShapeSpace(bars.bases, bars.faces, dtype=F64)
 
 
-def test_samples_of_all_sizes_pack_into_one_batch(bars: Shapes, small_bars: Shapes, tmp_path: Path) -> None:
-    tm.write_set(tmp_path / "a", *bars, ["0", "1", "2"])
-    tm.write_set(tmp_path / "b", *small_bars, ["0", "1", "2"])
-    data = tm.ShapeDataset(tmp_path, samples_per_set=2, faces=True, normals=True, labels=number_vertices)
-    (batch,) = DataLoader(data, batch_size=4, collate_fn=tm.collate_packed)
-    assert batch["num_verts_per_mesh"].tolist() == [164, 164, 30, 30]
-    assert batch["num_faces_per_mesh"].tolist() == [324, 324, 56, 56]
-    assert batch["mesh_to_verts_packed_first_idx"].tolist() == [0, 164, 328, 358]
-    assert batch["set"].tolist() == [0, 0, 1, 1]
-    assert batch["verts_packed"].shape == batch["normals"].shape == (388, 3)
-    faces = batch["faces_packed"].split(batch["num_faces_per_mesh"].tolist())
-    for i, (mine, own) in enumerate(zip(faces, [bars.faces] * 2 + [small_bars.faces] * 2, strict=True)):
-        assert torch.equal(batch["verts_packed"][mine], data[i]["vertices"][own])
-    assert batch["vertex_labels"].tolist() == [*range(164)] * 2 + [*range(30)] * 2
-
-
-def number_vertices(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
-    return {"vertex_labels": torch.arange(stored.n_vertices)}
-
-
-# ------------------------------------------------------------------------------------------------ PyTorch Geometric
 @pytest.mark.parametrize("n", [1, 3])
-def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace], n: int) -> None:
+def test_graphs(bars: Shapes, space: tm.ShapeSpace, n: int) -> None:
     """A graph, and a batch of graphs, are transformed as their shapes would be; what came stays."""
     geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
     from torch_geometric.transforms import Compose, FaceToEdge
@@ -60,7 +36,7 @@ def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace], n: in
             tm.RandomInBetween(p=1.0, blend_labels=True),
             tm.RandomModalDeformation(p=1.0),
             generator=torch.Generator().manual_seed(2),
-            space=spaces[0],
+            space=space,
         )
 
     transform = RandomShape(make(), y=torch.eye(3))
@@ -68,24 +44,24 @@ def test_graphs(bars: Shapes, spaces: tuple[tm.ShapeSpace, tm.ShapeSpace], n: in
     assert torch.equal(data.pos, bars.keyframes[:n].flatten(0, 1)), "the graph that came has changed"
     assert found.edge_index.shape[0] == 2
     assert torch.equal(found.x, data.x) and torch.equal(found.face, data.face)
-    expected = make()(bars.keyframes[:n], pool=tm.ShapeBatch.of_keyframes(spaces[0], data.pos))
+    expected = make()(bars.keyframes[:n], pool=tm.ShapeBatch.of_keyframes(space, data.pos))
     torch.testing.assert_close(found.pos, expected.flatten(0, 1))
     torch.testing.assert_close(found.normal, tm.vertex_normals(expected, bars.faces).flatten(0, 1))
     assert found.y.shape == (n, 3)
     torch.testing.assert_close(found.y.diagonal(), 1 - transform.augmentation.params[0]["t"].float())
     assert "RandomInBetween" in repr(transform)
 
-    alone = RandomShape(tm.RandomModalDeformation(p=1.0), space=spaces[0])
+    alone = RandomShape(tm.RandomModalDeformation(p=1.0), space=space)
     moved = alone(data)
     assert torch.equal(moved.y, data.y)
     assert not torch.equal(moved.pos, data.pos)
 
 
-def test_graphs_that_do_not_fit(spaces: tuple[tm.ShapeSpace, tm.ShapeSpace]) -> None:
+def test_graphs_that_do_not_fit(space: tm.ShapeSpace) -> None:
     geometric = pytest.importorskip("torch_geometric", reason="PyTorch Geometric is not installed")
     from torch_modal.data.pyg import RandomShape
 
-    transform = RandomShape(tm.RandomModalDeformation(), space=spaces[0])
+    transform = RandomShape(tm.RandomModalDeformation(), space=space)
     one, *uneven = (geometric.data.Data(pos=torch.zeros(n, 3, dtype=F64)) for n in (30, 100, 228))
     for data, message in (
         (one, r"1 graphs of this space has the shape \(164, 3\).*; got \(30, 3\)"),
@@ -113,4 +89,4 @@ def test_graphs_from_the_dataset(bars: Shapes, tmp_path: Path) -> None:
 
 
 def graph_labels(stored: tm.StoredSet) -> dict[str, torch.Tensor]:
-    return {**number_vertices(stored), "shape_labels": torch.arange(len(stored))}
+    return {"vertex_labels": torch.arange(stored.n_vertices), "shape_labels": torch.arange(len(stored))}

@@ -99,8 +99,3 @@ class TestRandomBlend:
         torch.testing.assert_close(found.mean(1), given.mean(1), rtol=0, atol=0.2)
         assert torch.equal(transform(given, params=transform.params), found)
         assert min(far(found[0].double(), x) for x in bars.keyframes) > 1e-3
-
-    def test_leaves_others_alone(self, space: tm.ShapeSpace, bars: Shapes) -> None:
-        assert torch.equal(tm.RandomBlend(p=0.0, space=space)(bars.keyframes), bars.keyframes)
-        with pytest.raises(ValueError, match="needs key-frames and modes"):
-            tm.RandomBlend(p=1.0)(bars.keyframes)

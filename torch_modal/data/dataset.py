@@ -208,31 +208,3 @@ class SetBatchSampler(Sampler[list[int]]):
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
             yield batches[place]
-
-
-def collate_packed(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Samples of any sizes as one packed batch, in the layout of PyTorch3D: for a loader's ``collate_fn``.
-
-    Args:
-        samples: Made with ``faces=True``.
-
-    Returns:
-        ``verts_packed`` (N, 3), ``faces_packed`` (M, 3) with indices into them, ``num_verts_per_mesh`` and
-        ``num_faces_per_mesh`` (B,), ``mesh_to_verts_packed_first_idx`` (B,); data of vertices is packed
-        too, and all else is stacked.
-    """
-    counts = torch.tensor([len(sample["vertices"]) for sample in samples])
-    first = counts.cumsum(0) - counts
-    batch: dict[str, Any] = {
-        "verts_packed": torch.cat([sample["vertices"] for sample in samples]),
-        "faces_packed": torch.cat(
-            [sample["faces"] + offset for sample, offset in zip(samples, first.tolist(), strict=True)]
-        ),
-        "num_verts_per_mesh": counts,
-        "num_faces_per_mesh": torch.tensor([len(sample["faces"]) for sample in samples]),
-        "mesh_to_verts_packed_first_idx": first,
-    }
-    for name in samples[0].keys() - {"vertices", "faces"}:
-        values = [torch.as_tensor(sample[name]) for sample in samples]
-        batch[name] = torch.cat(values) if name in ("normals", "vertex_labels") else torch.stack(values)
-    return batch
