@@ -237,12 +237,7 @@ def test_changed_files_and_options_are_computed_again(bench: Bench) -> None:
     assert bench.run("--modes", "40") == 0 and bench.computed() == ["a", "b"]
     assert bench.record("b").reason == "its files or options changed"
     assert bench.run("--modes", "40", "--timeout", "5", "--workers", "1") == 0 and bench.computed() == []
-    times = bench.root / "a" / "times.txt"
-    times.write_text("0 1")
-    assert bench.run("--modes", "40") == 0 and bench.computed() == []  # nobody asked for them
     assert bench.run("--modes", "40", "--sequence") == 0 and bench.computed() == ["a", "b"]
-    times.write_text("0 2")
-    assert bench.run("--modes", "40", "--sequence") == 0 and bench.computed() == ["a"]
 
 
 def test_bases_of_earlier_files_are_named_when_the_new_ones_fail(bench: Bench) -> None:

@@ -1,7 +1,6 @@
 """Key-frame sets on disk: whole or absent, mapped into memory, the same after reading."""
 
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -106,33 +105,6 @@ def test_replaces_a_set_and_nothing_else(small_bars: Shapes, folder: Path) -> No
     assert sorted(path.name for path in folder.iterdir()) == [LABELS_FILE, "notes.txt", SET_FILE]
     with pytest.raises(OSError, match=r"notes\.txt"):
         write_set(folder / "notes.txt", *small_bars, NAMES)
-
-
-def test_several_may_write_one_set_at_once(small_bars: Shapes, folder: Path) -> None:
-    """The last one's set stays, whole; nobody fails, and no temporary file is left."""
-
-    def write(scale: int) -> None:
-        for _ in range(30):
-            write_set(folder, scale * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
-
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(write, range(1, 5)))
-    scale = float(StoredSet(folder).keyframes.abs().max() / small_bars.keyframes.abs().max())
-    assert scale in (1.0, 2.0, 3.0, 4.0)
-    assert len(StoredSet(folder).bases) == 3
-    assert [path.name for path in folder.iterdir()] == [SET_FILE]
-
-
-def test_a_failure_leaves_nothing_behind(small_bars: Shapes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = (folder / SET_FILE).read_bytes()
-
-    def full_disk(path: Path, data: bytes) -> int:
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full_disk)
-    with pytest.raises(OSError, match="No space"):
-        write_set(folder, 2 * small_bars.keyframes, small_bars.faces, small_bars.bases, NAMES)
-    assert [(path.name, path.read_bytes()) for path in folder.iterdir()] == [(SET_FILE, before)]
 
 
 def test_finds_sets_in_order(small_bars: Shapes, folder: Path) -> None:
