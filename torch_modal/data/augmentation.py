@@ -203,18 +203,12 @@ class ShapeAugmentation(nn.Module):
             named = {name: None if value is None else value[None] for name, value in named.items()}
         check_labels(named["shapes"].shape[:2], named)
         batch = ShapeBatch(**{name: value for name, value in named.items() if name != "normals"})
-        out = self.drawn(batch, space, pool, params)
+        self.params = self.forward_parameters(len(batch.shapes), space) if params is None else params
+        out = self.transform(batch, self.params, space, pool)
         found = [self._normals(out.shapes, space) if name == "normals" else getattr(out, name) for name in named]
         if single and self.keepdim:
             found = [None if value is None else value[0] for value in found]
         return found[0] if len(found) == 1 else tuple(found)
-
-    def drawn(
-        self, batch: ShapeBatch, space: ShapeSpace | None, pool: ShapeBatch | None, params: Any = None
-    ) -> ShapeBatch:
-        """Transform a batch with new parameters, or given ones, which :attr:`params` keeps."""
-        self.params = self.forward_parameters(len(batch.shapes), space) if params is None else params
-        return self.transform(batch, self.params, space, pool)
 
     def _space(self, space: ShapeSpace | None) -> Any:
         space = self.space if space is None else space
