@@ -28,7 +28,7 @@ from pathlib import Path
 from torch_modal.data.stored import SET_FILE, read_note, write_set
 from torch_modal.data.tree import mesh_files
 from torch_modal.errors import MeshError
-from torch_modal.io.cache import CACHE_VERSION
+from torch_modal.io.cache import CACHE_VERSION, content_digest
 from torch_modal.io.files import write_file
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.precompute.extract import Method, extract_bases
@@ -79,15 +79,12 @@ class Options:
         Raises:
             OSError: A file cannot be read.
         """
-        made = [self.n_modes, self.method, self.mesher, self.sequence, CACHE_VERSION]
-        total = hashlib.sha256(json.dumps(made).encode())
         beside = [files[0].parent / TIMES_FILE] if self.sequence else []
         if any(file.suffix.lower() == ".gltf" for file in files):
             beside += sorted(files[0].parent.glob("*.bin"))
-        for file in (*files, *filter(Path.is_file, beside)):
-            for part in (file.name.encode("utf-8", "surrogateescape"), file.read_bytes()):
-                total.update(hashlib.sha256(part).digest())
-        return total.hexdigest()
+        every = (*files, *filter(Path.is_file, beside))
+        contents = [(file.name, hashlib.sha256(file.read_bytes()).hexdigest()) for file in every]
+        return content_digest([self.n_modes, self.method, self.mesher, self.sequence, CACHE_VERSION, contents])
 
 
 @dataclass(frozen=True)

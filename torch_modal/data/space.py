@@ -156,8 +156,7 @@ class ShapeSpace:
 
     def mode_scales(self, index: int) -> Tensor:
         """Scales of the modes of a key-frame (:func:`~torch_modal.data.strain.mode_scales`). *Shape:* ``(k,)``."""
-        edges = self.reconstruction().edges
-        found: Tensor = self._made.get(index, lambda: mode_scales(self.bases[index], self.faces, edges))
+        found: Tensor = self._made.get(index, lambda: mode_scales(self.bases[index], self.faces))
         return found
 
     # ----------------------------------------------------------------------------------------------------- statistics
