@@ -102,13 +102,7 @@ class InBetweens:
     def of_keyframes(self, i: int, j: int, t: Tensor) -> Tensor:
         """Shapes between two key-frames, from their table if there are tables.
 
-        *Shape:* ``(B,) -> (B, V, 3)``, in the dtype and on the device of ``t``.
-
-        Raises:
-            ValueError: There are no in-betweens of the two.
-
-        Warns:
-            ConvergenceWarning: Some did not converge.
+        *Shape:* ``(B,) -> (B, V, 3)``, in the dtype and on the device of ``t``. Raises and warns as a call.
         """
         if i > j:
             return self.of_keyframes(j, i, 1 - t)  # one table serves both ways
@@ -126,9 +120,10 @@ class InBetweens:
             CacheWarning: The objective has a term of the user's own, so that each process computes its tables again.
             ConvergenceWarning: Some did not converge; the table is not stored, so that each run warns.
         """
-        if self.times is None:
+        times = self.times
+        if times is None:
             raise ValueError("a space of times=None solves each in-between: it has no tables")
-        found: Tensor = self._tables.get((i, j), lambda: self._stored_or_solved(i, j, int(self.times or 0)))
+        found: Tensor = self._tables.get((i, j), lambda: self._stored_or_solved(i, j, times))
         return found
 
     def _stored_or_solved(self, i: int, j: int, times: int) -> Tensor:
@@ -174,7 +169,7 @@ class InBetweens:
         return found
 
     def _key(self, i: int, j: int) -> dict[str, str] | None:
-        """Digest of all inputs of a table: bases, times, faces, settings and code; None, with a warning, if unknown."""
+        """Digest of all inputs of a table; None, with a warning, if the objective has terms of the user's own."""
         span = None if self.motion is None else self.motion.span(i, j)
         bases = self.bases if span else [self.bases[place] for place in (i, j)]
         tensors = [(basis.reference, basis.eigenvalues, basis.modes) for basis in bases]

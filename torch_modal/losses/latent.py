@@ -94,15 +94,21 @@ class LatentElasticity(nn.Module):
         steps = [row.expand_as(z) for row in directions]
         if self.step is not None:
             both = [(decoder(z + self.step * row), decoder(z - self.step * row)) for row in steps]
-            return checked_decoded(decoder(z), z), [(up - down) / (2 * self.step) for up, down in both]
-        try:
-            found: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
-        except (NotImplementedError, RuntimeError) as error:
-            decoder(z)  # a decoder that fails without derivatives too has an error of its own
-            raise NotImplementedError(
-                f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
-            ) from error
-        return checked_decoded(found[0][0], z), [tangent for _, tangent in found]
+            x, tangents = decoder(z), [(up - down) / (2 * self.step) for up, down in both]
+        else:
+            try:
+                found: list[Any] = [torch.func.jvp(decoder, (z,), (row,)) for row in steps]
+            except (NotImplementedError, RuntimeError) as error:
+                decoder(z)  # a decoder that fails without derivatives too has an error of its own
+                raise NotImplementedError(
+                    f"the decoder has no forward mode ({error}); pass LatentElasticity(..., step=1e-3) for differences"
+                ) from error
+            x, tangents = found[0][0], [tangent for _, tangent in found]
+        if x.dim() != 3 or x.shape[-1] != 3 or len(x) != len(z):
+            raise ValueError(
+                f"the decoder makes shapes ({len(z)}, V, 3) of latents {tuple(z.shape)}; got {tuple(x.shape)}"
+            )
+        return x.to(torch.promote_types(x.dtype, torch.float32)), tangents  # of an autocast decoder
 
     @full_precision
     def _gram(self, x: Tensor, along: list[Tensor]) -> Tensor:
@@ -116,14 +122,3 @@ class LatentElasticity(nn.Module):
             scaled = torch.stack(rates, 1) * weights.sqrt()[:, None]  # (B, k, M)
             gram = gram + scaled @ scaled.mT
         return gram
-
-
-def checked_decoded(x: Tensor, z: Tensor) -> Tensor:
-    """Decoded shapes, in float32 or more.
-
-    Raises:
-        ValueError: They are not ``(B, V, 3)``.
-    """
-    if x.dim() != 3 or x.shape[-1] != 3 or len(x) != len(z):
-        raise ValueError(f"the decoder makes shapes ({len(z)}, V, 3) of latents {tuple(z.shape)}; got {tuple(x.shape)}")
-    return x.to(torch.promote_types(x.dtype, torch.float32))  # of an autocast decoder
