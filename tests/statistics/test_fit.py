@@ -102,10 +102,7 @@ def test_gradients_are_those_of_weights_and_pose(
     found = space.fit(leaf, picked)
     assert torch.equal(found.shape.detach(), space.fit(points, picked).shape)
     # The elastic steps are carried along by the pose; without them the gradient is exact.
-    to = Observations(leaf, picked, torch.ones(len(points), dtype=DOUBLE))
-    given = LocalWeights(variation, to, about)
-    x = given.shape(given.solved(False)[0])
-    (best_fit(x[picked], leaf, to.weights).apply(x) * taken).sum().backward()
+    assembled(leaf).backward()
     assert leaf.grad is not None
     assert float((leaf.grad * move).sum()) == pytest.approx(expected, rel=1e-5)
     leaf.grad = None

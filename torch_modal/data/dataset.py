@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import BatchSampler, Dataset, Sampler
 
 from torch_modal.autograd import Recent, one_thread
 from torch_modal.data.augmentation import AugmentationSequential, ShapeAugmentation
@@ -200,11 +200,10 @@ class SetBatchSampler(Sampler[list[int]]):
     def __iter__(self) -> Iterator[list[int]]:
         size = self.dataset.samples_per_set
         random = np.random.default_rng([self.dataset.seed, self.dataset.epoch])
-        batches = []
+        batches: list[list[int]] = []
         for number in range(len(self.dataset.sets)):
             own = number * size + (random.permutation(size) if self.shuffle else np.arange(size))
-            parts = [own[start : start + self.batch_size].tolist() for start in range(0, size, self.batch_size)]
-            batches += [part for part in parts if len(part) == self.batch_size or not self.drop_last]
+            batches += BatchSampler(own.tolist(), self.batch_size, self.drop_last)
         order = random.permutation(len(batches)) if self.shuffle else np.arange(len(batches))
         for place in order:
             yield batches[place]
