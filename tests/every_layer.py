@@ -147,7 +147,6 @@ LAYERS: dict[str, Case] = {
     "ShellEnergy": Case(lambda s: tm.ShellEnergy(s.faces), pair, "other"),
     "ShellLoss": Case(lambda s: tm.losses.ShellLoss(s.faces), pair, "a ratio"),
     "LatentElasticity": Case(lambda s: tm.losses.LatentElasticity(s.faces), latent, "a ratio", batched=False),
-    "PathEnergy": Case(lambda s: tm.losses.PathEnergy(s.faces), latent, "a ratio", batched=False),
 }
 
 TRANSFORMS: dict[str, Case] = {

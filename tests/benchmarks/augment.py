@@ -75,7 +75,7 @@ def compare(name: str, folder: Path, arguments: argparse.Namespace) -> None:
             started = time.perf_counter()
             n = sum(len(batch["vertices"]) for batch in loader)
             rates[way].append(n / (time.perf_counter() - started))
-    n_vertices = tm.open_set(folder).n_vertices
+    n_vertices = tm.StoredSet(folder).n_vertices
     print(f"\n{name}, {n_vertices} vertices, {WORKERS} workers, batches of {BATCH}; first 16 shapes {cold:.1f} s")
     base = median(rates["linear"])
     print(f"{'':34s}{'shapes / s':>12s}{'of linear':>12s}")

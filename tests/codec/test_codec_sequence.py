@@ -263,7 +263,6 @@ def test_saved_and_loaded(encoded: tm.ModalSequence, tmp_path: Path) -> None:
         ("times", torch.arange(9).flip(0).double(), "ascend"),
         ("times", torch.arange(9).double() + 1, "within those of the key-frames"),
         ("motions", torch.full((9, 6), torch.nan).double(), "not finite"),
-        ("faces", torch.full((1, 3), 1000), "do not exist"),
         ("keyframe_times", torch.zeros(3).double(), "ascend"),
     ],
 )
@@ -281,8 +280,3 @@ def test_other_files_are_refused(bars: Shapes, tmp_path: Path) -> None:
     bars.bases[0].save(tmp_path / "basis.safetensors")
     with pytest.raises(ValueError, match=r"holds no torch_modal\.sequence: its format is 'torch_modal\.basis'"):
         tm.ModalSequence.load(tmp_path / "basis.safetensors")
-    (tmp_path / "text").write_text("no motion")
-    with pytest.raises(ValueError, match="no safetensors file"):
-        tm.ModalSequence.load(tmp_path / "text")
-    with pytest.raises(FileNotFoundError):
-        tm.ModalSequence.load(tmp_path / "none")

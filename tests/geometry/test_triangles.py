@@ -9,7 +9,7 @@ import trimesh
 from conftest import Shapes, random_rotation
 from scipy import sparse
 
-from torch_modal.data.random_in_between import mirror
+from torch_modal.data.random_transforms import mirror
 from torch_modal.geometry import sparse as sparse_systems
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Poisson, Reconstruction

@@ -239,7 +239,7 @@ def test_inference_mode_leaves_plain_bases_and_draws(small_bars: Shapes) -> None
         basis = tm.ModalBasis(own.reference.clone(), own.eigenvalues * 1, own.modes * 1, own.rigid_eigenvalues * 1)
         motion(small_bars.keyframes)
     assert not any(getattr(basis, name).is_inference() for name in ("reference", "modes", "eigenvalues"))
-    assert gradient(lambda x: motion(x, motion.params), small_bars.keyframes).any()
+    assert gradient(lambda x: motion(x, params=motion.params), small_bars.keyframes).any()
 
 
 @every_layer

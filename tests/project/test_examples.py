@@ -56,7 +56,7 @@ def test_autodecoder_interpolates_better_with_in_betweens() -> None:
     example = load_example("autodecoder")
     found = example.main(steps=200, arms=("plain", "in-betweens"))
     assert found["in-betweens"][2] < 0.85 * found["plain"][2]
-    found = example.main(steps=5, arms=("ShellLoss", "LatentElasticity", "PathEnergy"))
+    found = example.main(steps=5, arms=("ShellLoss", "LatentElasticity", "path"))
     assert len({tuple(errors) for errors in found.values()}) == 3  # each changes what is learned
     assert torch.tensor(list(found.values())).isfinite().all()
 

@@ -153,7 +153,7 @@ def printed(code: str) -> list[str]:
 
 
 def test_import_loads_nothing_heavy() -> None:
-    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch_geometric", "torch._dynamo"]
+    heavy = ["pyvista", "vtk", "matplotlib", "pygltflib", "pytetwild", "torch._dynamo"]
     heavy += ["scipy.interpolate", "sympy", "warp"]
     code = (
         "import sys, torch_modal; torch_modal.extract_bases, torch_modal.subdivide, torch_modal.InBetween; "

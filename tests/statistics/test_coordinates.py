@@ -12,7 +12,8 @@ from torch_modal.geometry.local_rotations import _turn_between
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import BentTriangles, bending_between, bent_sides, frames, sides
-from torch_modal.statistics.coordinates import BendingCoordinates, Components
+from torch_modal.statistics.components import Components
+from torch_modal.statistics.coordinates import BendingCoordinates
 from torch_modal.statistics.variation import Variation
 
 
@@ -48,8 +49,7 @@ def with_second_piece(shapes: torch.Tensor, faces: torch.Tensor) -> tuple[torch.
 def test_second_pieces_and_vertices_of_no_face(bars: Shapes) -> None:
     shapes, faces = with_second_piece(bars.keyframes, bars.faces)
     variation = Variation(shapes + 100, faces)
-    bending = variation.average + variation.deviations
-    components = Components(variation.coordinates, bending, 2, variation.origin)
+    components = Components(variation, 2)
     back = components.shapes(components.coordinates(shapes))
     assert max(far(x, y) for x, y in zip(back, shapes, strict=True)) < 1e-9
     assert components.coordinates(shapes[:0]).shape == (0, 2) and components.shapes(torch.zeros(0, 2)).shape[0] == 0

@@ -6,13 +6,14 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import transformed
-from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_range, normal, uniform
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, normal, uniform
 from torch_modal.data.in_betweens import by_kind
+from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.space import ShapeSpace
+from torch_modal.data.strain import edge_strains
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
 from torch_modal.geometry.triangle_frames import BentTriangles, bend, bent_sides, frames, sides
-from torch_modal.geometry.vectors import pick
 
 # A draw beyond the bound is scaled to this part of it; its largest strain is nearly linear in the scale.
 _INSIDE = 0.98
@@ -65,8 +66,7 @@ class RandomModalDeformation(ShapeAugmentation):
 
     def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
         """``noise``, a standard normal number for each mode, and the ``strain``."""
-        strain = self.strain[0] + (self.strain[1] - self.strain[0]) * uniform(n, generator)
-        return {"strain": strain, "noise": normal(n, generator, space.n_modes)}
+        return {"strain": uniform(n, generator, self.strain), "noise": normal(n, generator, space.n_modes)}
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
@@ -103,7 +103,7 @@ class RandomModalDeformation(ShapeAugmentation):
         """The scale of each draw within the bound, ``(B,)``, and the shapes; unchanged shapes if none is found."""
         reconstruction = space.reconstruction(x.device)
         bound = (1 - _ROUNDING) * self.max_strain
-        expected = linear_strain(displacement, keyframe, reconstruction.edges)
+        expected = edge_strains(displacement, keyframe, reconstruction.edges).abs().amax(1)
         scale = (_INSIDE * bound / expected.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
         shapes = x.clone()
         rows = torch.arange(len(x), device=x.device)
@@ -143,11 +143,3 @@ def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Re
     wanted = bent_sides(BentTriangles(turn, strain), frames(sides(rest, faces)))
     bent = reconstruction(wanted, rest).movedim(0, -1)
     return best_fit(bent, x, weights).apply(bent)
-
-
-def linear_strain(displacement: Tensor, keyframe: Tensor, edges: Tensor) -> Tensor:
-    """Largest edge strain of a linear displacement, that of the bent shape to first order. *Shape:* ``(B,)``."""
-    i, j = edges.unbind(1)
-    side = (keyframe[j] - keyframe[i]).mT[:, None]
-    along = ((pick(displacement, j) - pick(displacement, i)) * side).sum(0)
-    return (along / side.square().sum(0).clamp_min(torch.finfo(side.dtype).tiny)).abs().amax(1)

@@ -124,16 +124,37 @@ class Variation:
         return self.fine.towards(self.scale * x[None], reference, n_steps, n_products, beside)[0] / self.scale
 
     # ----------------------------------------------------------------------------------------------------- new members
-    def draw(self, concentration: float, locality: float, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Random weights, and factors of the fields over which their logarithms vary. *Shape:* ``(K,), (K, n - 1)``."""
+    def draw(
+        self, n: int, concentration: float, locality: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """Random weights, and factors of the fields over which their logarithms vary.
+
+        *Shape:* ``(n, K), (n, K, n_fields - 1)``.
+
+        Raises:
+            ValueError: An argument is out of range.
+        """
+        if n < 0:
+            raise ValueError(f"n is 0 or more, got {n}")
+        check_density(concentration, locality)
         device = torch.device("cpu") if generator is None else generator.device
         shape = torch.full((len(self),), concentration, dtype=torch.float64, device=device)
-        # Gamma variates by their logarithms: those of small concentrations underflow.
-        drawn = torch._standard_gamma(shape + 1, generator=generator).log()
-        drawn = drawn + torch.rand(len(self), dtype=torch.float64, generator=generator, device=device).log() / shape
-        size = len(self), len(self.fields) - 1
-        factors = torch.randn(size, dtype=torch.float64, generator=generator, device=device).cpu()
-        return torch.softmax(drawn, 0).cpu(), locality * factors
+        weights = torch.empty(n, len(self), dtype=torch.float64)
+        factors = torch.empty(n, len(self), len(self.fields) - 1, dtype=torch.float64)
+        for i in range(n):
+            # Gamma variates by their logarithms: those of small concentrations underflow.
+            drawn = torch._standard_gamma(shape + 1, generator=generator).log()
+            drawn = drawn + torch.rand(len(self), dtype=torch.float64, generator=generator, device=device).log() / shape
+            weights[i] = torch.softmax(drawn, 0)
+            factors[i] = torch.randn(factors.shape[1:], dtype=torch.float64, generator=generator, device=device)
+        return weights, locality * factors
+
+    def members(self, weights: Tensor, factors: Tensor) -> Tensor:
+        """Members of the set, in the pose of the mean. *Shape:* ``(n, K), (n, K, n_fields - 1) -> (n, V, 3)``."""
+        out = self.shapes.new_empty(len(weights), *self.shapes.shape[1:])
+        for i, drawn in enumerate(zip(weights, factors, strict=True)):
+            out[i] = self.member(*drawn)[0]
+        return out
 
     def member(self, weights: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
         """A member of the set, in the pose of the mean, and its local weights; less local, if it would fold.
@@ -143,7 +164,7 @@ class Variation:
 
         Args:
             weights: Weights of the given shapes. *Shape:* ``(K,)``.
-            factors: Factors from :meth:`draw`. *Shape:* ``(K, n - 1)``.
+            factors: Factors from :meth:`draw`. *Shape:* ``(K, n_fields - 1)``.
 
         Returns:
             *Shape:* ``(V, 3)``, ``(K, V)``.
@@ -280,3 +301,13 @@ def _graph(mean: Tensor, reconstruction: Reconstruction) -> sparse.csr_matrix:
     lengths = np.maximum(lengths, 1e-9 * lengths.mean())
     upper = sparse.coo_matrix((lengths, (starts, ends)), shape=(len(mean), len(mean)))
     return (upper + upper.T).tocsr()
+
+
+def check_density(concentration: float, locality: float) -> None:
+    """Check what new members are drawn with.
+
+    Raises:
+        ValueError: It is out of range.
+    """
+    if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
+        raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")

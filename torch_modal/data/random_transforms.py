@@ -1,15 +1,21 @@
-"""Shapes between two others, and a little beyond one of them."""
+"""Random in-betweens, extrapolations, members of the space, and rigid motions."""
 
+import math
 from typing import Any
 
 import torch
+from kornia.geometry.conversions import quaternion_to_axis_angle
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from torch_modal.data.augmentation import Parameters, ShapeAugmentation, ShapeBatch, check_range, uniform
+from torch_modal.data.augmentation import Parameters, ShapeAugmentation, check_range, normal, uniform
+from torch_modal.data.shape_batch import ShapeBatch
 from torch_modal.data.space import ShapeSpace
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
+from torch_modal.geometry.rotations import exp
 from torch_modal.geometry.triangle_frames import frames, mirrored_sides, sides
+from torch_modal.statistics.variation import check_density
 
 
 class RandomInBetween(ShapeAugmentation):
@@ -46,11 +52,7 @@ class RandomInBetween(ShapeAugmentation):
 
         In a motion these are the key-frame before (below 0.5) and the one after.
         """
-        return {"partner": uniform(n, generator), "t": self.draw_times(n, generator)}
-
-    def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
-        """Times, uniform in the range. *Shape:* ``(n,)``."""
-        return self.t[0] + (self.t[1] - self.t[0]) * uniform(n, generator)
+        return {"partner": uniform(n, generator), "t": uniform(n, generator, self.t)}
 
     def apply_transform(
         self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
@@ -112,11 +114,11 @@ class RandomExtrapolation(RandomInBetween):
         super().__init__(blend_labels=blend_labels, p=p, **options)
         self.beyond = check_range("beyond", beyond, 0, 1)
 
-    def draw_times(self, n: int, generator: torch.Generator | None) -> Tensor:
-        """Times below 0 or above 1, with the same probability. *Shape:* ``(n,)``."""
-        draw = uniform(n, generator, 2)
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``partner`` as for :class:`RandomInBetween`, and times ``t`` beyond one end or the other."""
+        partner, draw = uniform(n, generator), uniform(n, generator, (0.0, 1.0), 2)
         beyond = self.beyond[0] + (self.beyond[1] - self.beyond[0]) * draw[:, 0]
-        return torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)
+        return {"partner": partner, "t": torch.where(draw[:, 1] < 0.5, -beyond, 1 + beyond)}
 
     def shapes(self, batch: ShapeBatch, partners: ShapeBatch, t: Tensor, space: ShapeSpace) -> Tensor:
         """Mirror images of in-betweens. *Shape:* ``(B,) -> (B, V, 3)``."""
@@ -137,3 +139,102 @@ def mirror(centre: Tensor, other: Tensor, reconstruction: Reconstruction) -> Ten
     wanted = mirrored_sides(frames(sides(last, faces)), frames(sides(aligned, faces)))
     beyond = reconstruction(wanted, last).movedim(0, -1)
     return RigidMotion(motion.rotation.mT, motion.source, 2 * motion.source - motion.target).apply(beyond)
+
+
+class RandomBlend(ShapeAugmentation):
+    """Replaces shapes by random mixtures of all key-frames (:meth:`ShapeSpace.sample`), aligned with the given shapes.
+
+    Labels of the vertices stay, and so do those of shapes: give it shapes whose labels all key-frames share. Gradients
+    reach the given shapes through the alignment alone.
+
+    Args:
+        concentration: As for :meth:`ShapeSpace.sample`.
+        locality: Likewise.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: ``concentration`` or ``locality`` is out of range.
+    """
+
+    shown = ("concentration", "locality")
+
+    def __init__(self, concentration: float = 0.2, locality: float = 3.0, p: float = 0.5, **options: Any) -> None:
+        super().__init__(p, **options)
+        check_density(concentration, locality)
+        self.concentration, self.locality = concentration, locality
+
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``weights`` of the key-frames, and ``factors`` by which they vary over the surface."""
+        weights, factors = space.variation().draw(n, self.concentration, self.locality, generator)
+        return {"weights": weights, "factors": factors}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+    ) -> ShapeBatch:
+        """Draw a member for each shape; gradients reach the shapes through the rigid alignment with them alone."""
+        drawn = (params[name].detach().double().cpu() for name in ("weights", "factors"))
+        found = space.variation().members(*drawn).to(batch.shapes)
+        areas = space.reconstruction(found.device).areas.to(found)
+        shapes: Tensor = best_fit(found, batch.shapes, areas).apply(found)
+        return batch._replace(shapes=shapes, nearest=space.nearest(shapes))
+
+
+class RandomRigidMotion(ShapeAugmentation):
+    """Rotates shapes about the mean of their vertices, and translates them.
+
+    Args:
+        degrees: Range of the angle, drawn uniformly; a number is the range from it to its negative. With None,
+            rotations are uniform over SO(3) (``axis`` has no effect).
+        axis: Axis of rotation, such as ``(0, 1, 0)`` for shapes with y up; by default uniform directions.
+        translation: Largest move along each axis, in diagonals of the shape's bounding box.
+        p: Probability that a shape is transformed.
+        options: As for :class:`ShapeAugmentation`.
+
+    Raises:
+        ValueError: The angle is beyond 180 degrees, the axis has no length, or the translation is negative.
+    """
+
+    uses_keyframes = False
+    shown = ("degrees", "axis", "translation")
+
+    def __init__(
+        self,
+        degrees: float | tuple[float, float] | None = None,
+        axis: tuple[float, float, float] | None = None,
+        translation: float = 0.0,
+        p: float = 0.5,
+        **options: Any,
+    ) -> None:
+        super().__init__(p, **options)
+        if isinstance(degrees, (int, float)):
+            degrees = (-degrees, degrees)
+        self.degrees = None if degrees is None else check_range("degrees", degrees, -180, 180)
+        if axis is not None and not math.hypot(*axis) > 0:
+            raise ValueError(f"an axis has a length, got {axis}")
+        self.axis = axis
+        if translation < 0:
+            raise ValueError(f"translation is the largest move, 0 or more; got {translation}")
+        self.translation = translation
+
+    def generate_parameters(self, n: int, space: Any, generator: torch.Generator | None) -> Parameters:
+        """``rotation``, axis times angle in radians; and ``translation``, in diagonals."""
+        low, high = (math.radians(degree) for degree in self.degrees or (0.0, 0.0))
+        direction, angle = normal(n, generator, 4), uniform(n, generator, (low, high))
+        move = self.translation * uniform(n, generator, (-1.0, 1.0), 3)
+        if self.degrees is None:
+            # A normal vector of four has a uniform direction: a uniform quaternion.
+            return {"rotation": quaternion_to_axis_angle(normalize(direction, dim=1)), "translation": move}
+        axis = direction[:, 1:]
+        if self.axis is not None:
+            axis = torch.as_tensor(self.axis).to(axis).expand_as(axis)
+        return {"rotation": angle[:, None] * normalize(axis, dim=1), "translation": move}
+
+    def apply_transform(
+        self, batch: ShapeBatch, params: Parameters, space: Any, partners: ShapeBatch | None
+    ) -> ShapeBatch:
+        """Move each shape."""
+        x = batch.shapes
+        centre, diagonal = x.mean(1), (x.amax(1) - x.amin(1)).norm(dim=1, keepdim=True).detach()
+        motion = RigidMotion(exp(params["rotation"]), centre, centre + params["translation"] * diagonal)
+        return batch._replace(shapes=motion.apply(x))
