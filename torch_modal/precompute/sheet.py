@@ -14,7 +14,7 @@ from torch_modal.energy.rest_hessian import rest_hessian
 from torch_modal.energy.shell import BETA
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
-from torch_modal.precompute.coarsening import Coarsening, coarsen, collapsed
+from torch_modal.precompute.coarsening import Coarsening, coarsen, collapsed, joined
 from torch_modal.precompute.eigen import ElasticBody
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import small_pieces
@@ -94,7 +94,7 @@ def _coarse(surface: CanonicalSurface, fine: Connectivity, n_faces: int) -> Coar
     # Modes do not mind needles, for which `coarsen` would collapse several times.
     few = len(own) <= n_faces
     coarse = coarsen(points[None], own, n_faces) if few else collapsed(points, own, n_faces)
-    return coarse.joined(points, SHORTEST)
+    return joined(points, own, coarse, SHORTEST)
 
 
 def _cluster_weights(
