@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import scipy.sparse as sp
 
+from torch_modal.precompute.eigen import ElasticBody, ElasticModes, lowest_modes
 from torch_modal.precompute.embedding import find_neighbours, fit_weights
 from torch_modal.precompute.stiffness import hat_gradients, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface
@@ -54,6 +55,11 @@ def element_hessian(solid: Tetrahedra) -> sp.csc_matrix:
     n = 3 * len(solid.vertices)
     k = sp.coo_matrix((blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(n, n)).tocsc()
     return sp.csc_matrix((k + k.T) / 2)
+
+
+def eigenmodes(k: sp.csc_matrix, mass: sp.spmatrix, positions: np.ndarray, n_modes: int) -> ElasticModes:
+    """Lowest modes of these matrices."""
+    return lowest_modes(ElasticBody(positions, k, mass, lambda motions: motions), n_modes)
 
 
 def as_it_is(points: np.ndarray, faces: np.ndarray) -> CanonicalSurface:

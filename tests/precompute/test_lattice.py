@@ -14,10 +14,9 @@ import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
-from solids import box, lumped_mass, surface
+from solids import box, eigenmodes, lumped_mass, surface
 
 from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.extract import extract_bases, extract_modes
 from torch_modal.precompute.lattice import Lattice, lattice
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
@@ -66,7 +65,7 @@ def test_what_is_thinner_than_a_cube_stays_in_one_piece() -> None:
     turn = np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0]
     sheet = CanonicalSurface.of(solid.vertices[used] @ turn, compact.reshape(-1, 3))
     filled = lattice(sheet, 0.03)
-    assert lowest_modes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).n_zero == 6
+    assert eigenmodes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).n_zero == 6
     assert solid_volumes(filled).sum() == pytest.approx(10 * 6 * 0.12 * sheet.scale**3, rel=0.2)
 
 
@@ -159,8 +158,8 @@ def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:
         solid.vertices[used] @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces=compact.reshape(-1, 3)
     )
     filled = lattice(bar, 0.025)
-    found = lowest_modes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).eigenvalues
-    wanted = lowest_modes(arap_hessian(solid), mass_matrix(solid), solid.vertices, 5).eigenvalues / bar.scale**2
+    found = eigenmodes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).eigenvalues
+    wanted = eigenmodes(arap_hessian(solid), mass_matrix(solid), solid.vertices, 5).eigenvalues / bar.scale**2
     np.testing.assert_allclose(found, wanted, rtol=0.35)
 
 

@@ -12,13 +12,13 @@ import scipy.sparse as sp
 import torch
 from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
-from solids import box, element_hessian, lumped_mass, surface, together
+from solids import box, eigenmodes, element_hessian, lumped_mass, surface, together
 
 from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.precompute import carrying, eigen, extract, parallel
 from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.eigen import ElasticModes, ModalAnalysisError, lowest_modes
+from torch_modal.precompute.eigen import ElasticModes, ModalAnalysisError
 from torch_modal.precompute.extract import extract_bases, extract_modes
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
@@ -32,7 +32,7 @@ BOX = box((6, 3, 2), (3.0, 1.5, 1.0), jitter=0.1)
 
 def solve(solid: Tetrahedra, n_modes: int, form: str = "edge") -> ElasticModes:
     k = element_hessian(solid) if form == "element" else arap_hessian(solid, form)
-    return lowest_modes(k, mass_matrix(solid), solid.vertices, n_modes)
+    return eigenmodes(k, mass_matrix(solid), solid.vertices, n_modes)
 
 
 def inertia(solid: Tetrahedra) -> sp.csr_matrix:
@@ -73,7 +73,7 @@ def test_agrees_with_dense_eigh(form: str, cells: tuple[int, int, int]) -> None:
     for mass in (mass_matrix(solid), sp.diags(lumped_mass(solid))):
         m = sp.kron(mass, sp.identity(3)).toarray()
         values, vectors = scipy.linalg.eigh(k.toarray(), m)
-        result = lowest_modes(k, mass, solid.vertices, 25)
+        result = eigenmodes(k, mass, solid.vertices, 25)
         assert_same_modes(result, values, vectors, m)
 
 
@@ -177,10 +177,10 @@ def test_untrustworthy_problems_are_refused() -> None:
     k, mass = arap_hessian(solid), lumped_mass(solid)
     anchored = k + sp.diags(np.r_[np.ones(3), np.zeros(k.shape[0] - 3)])
     with pytest.raises(ModalAnalysisError, match="six rigid motions"):
-        lowest_modes(sp.csc_matrix(anchored), sp.diags(mass), solid.vertices, 4)
+        eigenmodes(sp.csc_matrix(anchored), sp.diags(mass), solid.vertices, 4)
     indefinite = k - 0.1 * sp.diags(np.repeat(mass, 3))
     with pytest.raises(ModalAnalysisError):
-        lowest_modes(sp.csc_matrix(indefinite), sp.diags(mass), solid.vertices, 4)
+        eigenmodes(sp.csc_matrix(indefinite), sp.diags(mass), solid.vertices, 4)
 
 
 # -------------------------------------------------------------------------------- from key-frames to bases

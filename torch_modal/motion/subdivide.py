@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -127,9 +128,10 @@ def subdivide(
         require_contact()
     needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
     if bases is None and n_modes and needs_modes:
-        bases = bases_of_checked(
-            keyframes, working_faces, n_modes, progress=progress, meanwhile=choose(chosen.solver.backend).load
-        )
+        with ThreadPoolExecutor(1) as pool:
+            loading = pool.submit(choose(chosen.solver.backend).load)  # Warp takes a second
+            bases = bases_of_checked(keyframes, working_faces, n_modes, progress=progress)
+            loading.result()
     bases = keyframes.detach() if bases is None else bases
     if len(bases) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(bases)} bases for {n_keys} key-frames")

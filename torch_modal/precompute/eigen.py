@@ -11,7 +11,6 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
-from torch_modal.precompute.parallel import one_blas_thread
 
 N_RIGID = 6
 DENSE_BELOW = 600
@@ -33,15 +32,17 @@ class ModalAnalysisError(RuntimeError):
 
 
 class ElasticBody(NamedTuple):
-    """The eigenproblem of an elastic body with ``N`` vertices, of a surface with ``U`` points.
+    """The eigenproblem ``K phi = lambda M phi`` of an elastic body with ``N`` vertices, of a surface with ``U`` points.
 
     Attributes:
         points: Vertices at rest. *Shape:* ``(N, 3)``.
-        stiffness: Row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
-        mass: Entries for vertices. *Shape:* ``(N, N)``.
+        stiffness: ``K``, symmetric positive semi-definite; row ``3 i + c`` is coordinate ``c`` of vertex ``i``.
+            *Shape:* ``(3N, 3N)``.
+        mass: ``M``, entries for vertices. *Shape:* ``(N, N)``.
         to_surface: Displacements of the surface from those of the body. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
-        shift: As for :func:`lowest_modes`.
-        largest_residual: Likewise.
+        shift: Positive shift of the eigenproblem, near the lowest eigenvalues of slender bodies. None: that of a
+            solid, the inverse square of the diagonal of the bounding box.
+        largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
     """
 
     points: FloatArray
@@ -70,30 +71,13 @@ class ElasticModes(NamedTuple):
     n_pieces: int
 
 
-@one_blas_thread()
-def lowest_modes(
-    k: sp.csc_matrix,
-    mass: sp.spmatrix,
-    positions: FloatArray,
-    n_modes: int,
-    shift: float | None = None,
-    largest_residual: float = LARGEST_RESIDUAL,
-) -> ElasticModes:
-    """Lowest elastic modes of ``K phi = lambda M phi``.
+def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
+    """Lowest elastic modes of a body.
 
     Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite, and the modes are those of ``K``
     itself. Rigid motions are known and projected out, so that Lanczos need not find six equal eigenvalues. Connected
     components are solved separately for the same reason. Small problems are solved densely. The first of the largest
     components of each mode is positive.
-
-    Args:
-        k: Stiffness, symmetric positive semi-definite. *Shape:* ``(3N, 3N)``.
-        mass: Mass matrix, entries for vertices. *Shape:* ``(N, N)``.
-        positions: Rest positions. *Shape:* ``(N, 3)``.
-        n_modes: Number of elastic modes.
-        shift: Positive; near the lowest eigenvalues of slender bodies. Default: that of a solid, the inverse square of
-            the diagonal of the bounding box.
-        largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
 
     Returns:
         The modes. Rigid motions of connected components against each other come first, six for each further component,
@@ -103,7 +87,9 @@ def lowest_modes(
         ValueError: More modes than the mesh has.
         ModalAnalysisError: Rigid motions have energy, the stiffness is indefinite, all modes are zero modes, or a
             residual is too large.
+        RuntimeError, LinAlgError: Of SuperLU, ARPACK or LAPACK, where a matrix is singular.
     """
+    positions, k, mass, _, shift, largest_residual = body
     possible = 3 * len(positions) - N_RIGID
     if not 1 <= n_modes <= possible:
         raise ValueError(
@@ -120,7 +106,7 @@ def lowest_modes(
     if n_pieces == 1:
         return _component_modes(k, inertia, positions, n_modes, shift, largest_residual)
 
-    rigid = np.zeros((len(inertia.indptr) - 1, N_RIGID * n_pieces))
+    rigid = np.zeros((k.shape[0], N_RIGID * n_pieces))
     eigenvalues, modes, n_zero = [], [], N_RIGID * n_pieces
     for index in range(n_pieces):
         vertices = np.flatnonzero(piece == index)
@@ -167,15 +153,12 @@ def _component_modes(
     """Lowest elastic modes of a connected component, with checks."""
     rigid = rigid_motions(positions, inertia)
     momentum = inertia @ rigid
-    try:
-        if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
-            complement = scipy.linalg.qr(momentum)[0][:, N_RIGID:]
-            matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
-            span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
-        else:
-            span = _lanczos(k, inertia, rigid, momentum, n_modes, shift)
-    except (RuntimeError, np.linalg.LinAlgError) as error:  # ARPACK, SuperLU on a singular matrix, LAPACK
-        raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
+    if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
+        complement = scipy.linalg.qr(momentum)[0][:, N_RIGID:]
+        matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
+        span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
+    else:
+        span = _lanczos(k, inertia, rigid, momentum, n_modes, shift)
 
     # Rayleigh-Ritz, after which modes are orthonormal up to rounding.
     span = _orthonormal(span - rigid @ (momentum.T @ span), inertia)

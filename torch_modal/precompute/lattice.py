@@ -17,7 +17,7 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import bisected
-from torch_modal.precompute.parallel import closest_in
+from torch_modal.precompute.parallel import n_cpus
 from torch_modal.precompute.surface import CanonicalSurface, SurfaceSamples, clearances, sampled
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
@@ -139,7 +139,8 @@ class Indicator(NamedTuple):
         """Trilinear interpolation, with a sharper transition near the surface. *Shape:* ``(P, 3) -> (P,)``."""
         values = map_coordinates(self.values, ((points - self.low) / self.spacing).T, order=1, mode="nearest")
         doubtful = np.flatnonzero(values < SURELY_INSIDE)
-        distance, nearest = closest_in(self.samples.tree, points[doubtful], within=NEARBY * self.spacing)
+        reach = NEARBY * self.spacing
+        distance, nearest = self.samples.tree.query(points[doubtful], distance_upper_bound=reach, workers=n_cpus())
         # Beyond the boundary of an open surface there is no tangent plane.
         near = np.isfinite(distance) & np.append(self.has_sides, False)[nearest]
         doubtful, nearest = doubtful[near], nearest[near]
@@ -211,7 +212,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     sizes = np.full(len(filled.vertices), np.inf)
     np.minimum.at(sizes, filled.tets.reshape(-1), np.repeat(np.cbrt(6 * volumes), 4))
     rim = np.unique(filled.tets[np.asarray(filled.inside) < 1 - LEAST_INSIDE])
-    distance, nearest = closest_in(samples.tree, filled.vertices[rim])
+    distance, nearest = samples.tree.query(filled.vertices[rim], workers=n_cpus())
     near = distance < REACH * sizes[rim]
     rim, nearest = rim[near], nearest[near]
     height = np.einsum("vi,vi->v", filled.vertices[rim] - samples.points[nearest], samples.normals[nearest])
@@ -240,8 +241,8 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():
         return filled
     reach = 1.5 * sizes[filled.tets].max(axis=1).max()
-    is_covered = closest_in(cKDTree(fitted.vertices), samples.points, within=reach)[0] < np.inf
-    return fitted if is_covered.all() else filled
+    distance, _ = cKDTree(fitted.vertices).query(samples.points, distance_upper_bound=reach, workers=n_cpus())
+    return fitted if np.isfinite(distance).all() else filled
 
 
 def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:

@@ -1,7 +1,7 @@
 """The solid inside a surface: its tetrahedra, and the surface embedded in them."""
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -73,11 +73,6 @@ class Solid:
         found = cache.get("solid", inputs, mesher.key(), compute)
         tetrahedra = Tetrahedra(found["vertices"], found["tets"], found.get("inside"))
         return cls(surface, tetrahedra, found["neighbours"], found["kernel"])
-
-    def carried(self, surface: CanonicalSurface, vertices: FloatArray) -> "Solid":
-        """The solid in the pose of another key-frame."""
-        tetrahedra = self.tetrahedra._replace(vertices=vertices)
-        return replace(self, surface=surface, tetrahedra=tetrahedra, meshed=self)
 
     def weights(self) -> sp.csr_matrix:
         """Displacements of the surface from those of the tetrahedra. *Shape:* ``(U, N)``."""
