@@ -140,8 +140,3 @@ def test_mass_matrix_is_half_consistent_and_half_lumped() -> None:
     half = Tetrahedra(brick.vertices, brick.tets, np.full(len(brick.tets), 0.5))
     np.testing.assert_allclose(mass_matrix(half).toarray(), m.toarray() / 2)
     assert sp.issparse(m) and abs(m - m.T).max() < 1e-15
-
-
-def test_unknown_form(solid: Tetrahedra) -> None:
-    with pytest.raises(ValueError, match="'spokes'; give one of"):
-        arap_hessian(solid, "spokes")

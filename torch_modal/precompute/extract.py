@@ -215,7 +215,7 @@ class _Extraction:
         try:
             return first()
         except (TetrahedralizationError, ModalAnalysisError) as error:
-            if isinstance(error, TetrahedralizationError) and np.isfinite(error.fails_until):
+            if isinstance(error, TetrahedralizationError) and not error.lasting:
                 raise  # another attempt may succeed, and the same call should give the same modes
             self.stop.clear()
             logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
@@ -332,7 +332,7 @@ class _Extraction:
             if self.n_keyframes == 1:
                 raise
             named = type(error)(f"key-frame {index}: {error}")
-            named.__dict__.update(error.__dict__)  # how long a failure lasts
+            named.__dict__.update(error.__dict__)  # whether a failure lasts
             raise named from error
 
 

@@ -191,8 +191,8 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
         return indicator.at(low + root * places) >= 0.5
 
     most = int(MOST_TETRAHEDRA * max(1.0, USUAL_CUBE * CANONICAL_SIZE / largest) ** 3)
-    places, tets, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
-    vertices = low + root * places
+    cut, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    vertices, tets = low + root * cut.vertices, cut.tets
     inside = indicator.inside(vertices[tets])
     kept = inside >= LEAST_INSIDE
     kept[owner] = True

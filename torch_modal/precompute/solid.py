@@ -17,7 +17,6 @@ from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Mesher,
     Tetrahedra,
-    filled,
     kept_tetrahedra,
     loose_pieces,
     small_pieces,
@@ -60,7 +59,7 @@ class Solid:
         """
 
         def compute() -> dict[str, NDArray[Any]]:
-            tetrahedra = filled(surface, mesher, cache, stop)
+            tetrahedra = mesher.fill(surface, stop)
             neighbours, kernel = find_neighbours(surface.points, tetrahedra, surface.normals)
             piece = loose_pieces(tetrahedra)
             bears = np.bincount(piece[neighbours[kernel > 0]], minlength=piece.max() + 1) > 0

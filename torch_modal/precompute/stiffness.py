@@ -40,12 +40,7 @@ def arap_hessian(tetrahedra: Tetrahedra, form: HessianForm = "edge") -> sp.csc_m
 
     Returns:
         Symmetric matrix; row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
-
-    Raises:
-        ValueError: ``form`` is unknown.
     """
-    if form not in HESSIAN_FORMS:
-        raise ValueError(f"the Hessian form is {form!r}; give one of {HESSIAN_FORMS}")
     return _edge_hessian(tetrahedra) if form == "edge" else _vertex_hessian(tetrahedra)
 
 
