@@ -39,9 +39,9 @@ def together(*solids: Tetrahedra) -> Tetrahedra:
     )
 
 
-def embed_surface(points: np.ndarray, solid: Tetrahedra, normals: np.ndarray | None = None) -> sp.csr_matrix:
+def embed_surface(points: np.ndarray, solid: Tetrahedra, normals: np.ndarray | float = 0.0) -> sp.csr_matrix:
     """Weights of the surface in the pose in which its neighbours are found. *Shape:* ``(V, N)``."""
-    return fit_weights(points, solid.vertices, *find_neighbours(points, solid, normals))
+    return fit_weights(points, solid.vertices, *find_neighbours(points, solid, normals + np.zeros(points.shape)))
 
 
 def element_hessian(solid: Tetrahedra) -> sp.csc_matrix:

@@ -123,31 +123,20 @@ def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
     ``s = det(X)^(-1/3)`` (Higham 1986), in a quarter of the time of a singular value decomposition. The latter serves
     mirrored and singular matrices.
     """
-    x = np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.float64)
-    determinant = _cofactors(x)[1]
-    size = np.sqrt((x**2).sum(axis=(0, 1)))
-    sound = determinant > FLAT * size**3
+    sound = np.linalg.det(matrices) > FLAT * np.linalg.norm(matrices, axis=(1, 2)) ** 3
     result = np.empty((len(matrices), 3, 3))
     if not sound.all():
         u, _, vt = np.linalg.svd(matrices[~sound])
         flip = np.ones((len(u), 3))
         flip[:, 2] = np.sign(np.linalg.det(u @ vt))
         result[~sound] = (u * flip[:, None]) @ vt
-    x = x[..., sound]
+    x = np.ascontiguousarray(np.moveaxis(matrices[sound], 0, -1), dtype=np.float64)
     for _ in range(MOST_POLAR_STEPS):
-        cofactors, determinant = _cofactors(x)
+        cofactors = np.stack([np.cross(x[i - 2], x[i - 1], axis=0) for i in range(3)])  # det(X) X^-T
+        determinant = (x[0] * cofactors[0]).sum(axis=0)
         scale = np.cbrt(determinant)
         previous, x = x, 0.5 * (x / scale + cofactors * (scale / determinant))
         if np.abs(x - previous).max(initial=0.0) < 1e-14:
             break
     result[sound] = np.moveaxis(x, -1, 0)
     return result
-
-
-def _cofactors(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``det(X) X^-T`` and ``det(X)``. *Shape:* ``(3, 3, ·) -> (3, 3, ·), (·,)``."""
-    cofactors = np.empty_like(x)
-    for i in range(3):
-        (a, b, c), (d, e, f) = x[i - 2], x[i - 1]
-        cofactors[i] = b * f - c * e, c * d - a * f, a * e - b * d
-    return cofactors, (x[0] * cofactors[0]).sum(axis=0)

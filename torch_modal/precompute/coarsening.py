@@ -84,12 +84,10 @@ def coarsen(
     """
     if n_faces < 4:
         raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
-    if len(faces) <= n_faces:
-        return Coarsening.of_labels(np.arange(keyframes.shape[1]), faces)
     sources = range(len(keyframes)) if candidates is None else candidates
     found: list[tuple[float, Coarsening]] = []
     for n in (int(factor * n_faces) for factor in MORE_FACES):
-        if n >= len(faces) or (found and found[-1][0] >= NEEDLE):
+        if found and (n >= len(faces) or found[-1][0] >= NEEDLE):
             break
         tried = [(*_fatness(keyframes, each), each) for each in (collapsed(keyframes[i], faces, n) for i in sources)]
         # Those without needles first, then by the 1st percentile.
@@ -108,7 +106,12 @@ def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, floa
 
 
 def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
-    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately."""
+    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately.
+
+    Meshes of so few faces stay as they are.
+    """
+    if len(faces) <= n_faces:
+        return Coarsening.of_labels(np.arange(len(points)), faces)
     root = _roots(points, faces, n_faces)
     piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
     before = np.bincount(piece[faces[:, 0]])

@@ -47,9 +47,7 @@ def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: IntArray, 
     return sp.coo_matrix(entries, shape=(len(points), len(vertices))).tocsr()
 
 
-def find_neighbours(
-    points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None
-) -> tuple[IntArray, FloatArray]:
+def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray) -> tuple[IntArray, FloatArray]:
     """Nearest vertices of each point within a few edges of its closest tetrahedron.
 
     The search for the closest tetrahedron starts slightly below the surface, so that touching limbs do not mix.
@@ -57,14 +55,13 @@ def find_neighbours(
     Args:
         points: Positions on the surface. *Shape:* ``(V, 3)``.
         tetrahedra: The volume mesh.
-        normals: Outward unit normals at the points; without them the search starts at the points. *Shape:* ``(V, 3)``.
+        normals: Outward unit normals at the points, or zeros. *Shape:* ``(V, 3)``.
 
     Returns:
         Neighbours and kernels for :func:`fit_weights`, padded with zero kernels. *Shape:* ``(V, 12), (V, 12)``.
     """
     extent = np.ptp(tetrahedra.vertices, axis=0)
-    below = points if normals is None else points - PUSH * np.linalg.norm(extent) * normals
-    closest = closest_tetrahedra(below, tetrahedra)
+    closest = closest_tetrahedra(points - PUSH * np.linalg.norm(extent) * normals, tetrahedra)
     incidence = _incidence(tetrahedra.tets, len(tetrahedra.vertices))
     adjacency = sp.csr_matrix(incidence.T @ incidence)  # of vertices, with a non-zero diagonal
 
@@ -169,7 +166,11 @@ def _moving_least_squares(
     mean = (theta[:, None] @ offset)[:, 0]
     centered = offset - mean[:, None]
     covariance = (theta[..., None] * centered).transpose(0, 2, 1) @ centered
-    inverse = _inverses(covariance)
+    # Coplanar neighbours determine no slope across their plane: that of a pseudo-inverse is zero.
+    flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
+    inverse = np.empty_like(covariance)
+    inverse[~flat] = np.linalg.inv(covariance[~flat])
+    inverse[flat] = np.linalg.pinv(covariance[flat], rcond=1e-9, hermitian=True)
     # Eliminating the constant leaves 3 x 3: the weights are θ (a + s · (d - mean)) with a sum a and a moment C s.
     weights = np.zeros_like(theta)
     for _ in range(2):  # the second pass corrects the rounding of the first
@@ -178,16 +179,3 @@ def _moving_least_squares(
         slope = (inverse @ (moment_missing - sum_missing[:, None] * mean)[..., None])[..., 0]
         weights = weights + theta * (sum_missing[:, None] + (centered @ slope[..., None])[..., 0])
     return weights
-
-
-def _inverses(covariance: FloatArray) -> FloatArray:
-    """Inverses of symmetric positive semi-definite matrices. *Shape:* ``(·, 3, 3)``.
-
-    Nearly singular matrices have a pseudo-inverse: coplanar neighbours determine no slope across their plane, and zero
-    is used.
-    """
-    flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
-    inverse = np.empty_like(covariance)
-    inverse[~flat] = np.linalg.inv(covariance[~flat])
-    inverse[flat] = np.linalg.pinv(covariance[flat], rcond=1e-9, hermitian=True)
-    return inverse

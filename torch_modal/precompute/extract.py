@@ -227,11 +227,12 @@ class _Extraction:
 
     def shells(self) -> list[Arrays]:
         """Modes of all surfaces themselves."""
-
-        def compute(index: int) -> Arrays:
-            return self._modes_of(index, lambda: sheet_body(self.surfaces[index], self.n_modes))
-
-        return self._all(compute, {}, {"form": "shell"}, n_coarse_faces(self.n_modes) // 2)
+        return self._all(
+            lambda index: self._modes_of(index, lambda: sheet_body(self.surfaces[index], self.n_modes)),
+            {},
+            {"form": "shell"},
+            n_coarse_faces(self.n_modes) // 2,
+        )
 
     def solids(self) -> list[Arrays]:
         """Modes of all solids inside.
@@ -267,13 +268,9 @@ class _Extraction:
     def _all(
         self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int
     ) -> list[Arrays]:
-        """Results of all key-frames, from the cache or computed in as many threads as fit into memory.
+        """Modes of all key-frames, from the cache or computed in as many threads as fit into memory.
 
-        Args:
-            compute: Computes the modes of a key-frame.
-            inputs: Arrays that they depend on, beside the surface.
-            parameters: Numbers and strings that they depend on, beside the number of modes.
-            n_vertices: Size of an eigenproblem.
+        They depend on the surface, the number of modes, and these inputs and parameters.
         """
 
         def modes(index: int) -> Arrays:
@@ -341,15 +338,7 @@ def _deforming(motions: FloatArray, points: FloatArray, faces: IntArray) -> Floa
 
     Relative rigid motions of pieces have no energy, so their amplitudes would be undetermined; the interpolation of the
     key-frames determines them. A piece of the surface that spans several pieces of tetrahedra is deformed by their
-    rigid motions.
-
-    Args:
-        motions: Displacements, M-orthonormal in the volume. *Shape:* ``(k, U, 3)``.
-        points: *Shape:* ``(U, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-
-    Returns:
-        *Shape:* ``(m, U, 3)`` with ``m <= k``.
+    rigid motions. *Shape:* ``(k, U, 3), (U, 3), (F, 3) -> (m, U, 3)`` with ``m <= k``.
     """
     if len(motions) == 0:
         return motions

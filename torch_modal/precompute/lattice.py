@@ -105,12 +105,11 @@ class Lattice:
         found = lattice(surface, self.cube)
         pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
         most = connected_pieces(pairs, len(surface.points)).max()
-        if face_connected_pieces(found.tets).max() <= most:
+        if (n_pieces := face_connected_pieces(found.tets).max()) <= most:
             return found
         turned = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
-        if face_connected_pieces(turned.tets).max() >= face_connected_pieces(found.tets).max():
-            return found
-        return turned._replace(vertices=turned.vertices @ TURN)
+        better = face_connected_pieces(turned.tets).max() < n_pieces
+        return turned._replace(vertices=turned.vertices @ TURN) if better else found
 
 
 class Indicator(NamedTuple):
@@ -187,11 +186,14 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     cubes[tuple(((points - low) / root).astype(np.int64).T)] = True
     cubes[tuple(corner[indicator.at(low + root * (corner + 0.5)) >= 0.5].T)] = True
 
-    def is_inside(places: FloatArray) -> BoolArray:
-        return indicator.at(low + root * places) >= 0.5
-
     most = int(MOST_TETRAHEDRA * max(1.0, USUAL_CUBE * CANONICAL_SIZE / largest) ** 3)
-    cut, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    cut, owner = bisected(
+        np.argwhere(cubes),
+        (points - low) / root,
+        wanted / root,
+        lambda places: indicator.at(low + root * places) >= 0.5,
+        most,
+    )
     vertices, tets = low + root * cut.vertices, cut.tets
     inside = indicator.inside(vertices[tets])
     kept = inside >= LEAST_INSIDE

@@ -35,17 +35,12 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event, most: 
         stop: Cancels the work.
         most: Largest number of threads, to bound memory; at least one is used.
     """
-
-    def alone(index: int) -> Result:
-        with one_blas_thread():
-            return work(index)
-
     futures: list[Future[Result]] = []
     with ThreadPoolExecutor(max(1, min(n_cpus(), most)), thread_name_prefix="torch_modal") as pool:
         try:
             # Inside the try block: Ctrl-C may come between submissions.
             for index in range(n):
-                futures.append(pool.submit(alone, index))
+                futures.append(pool.submit(one_blas_thread()(work), index))
             pending = set(futures)
             while pending:
                 # A signal that another thread receives ends no wait of this one, which then looks for it by itself.

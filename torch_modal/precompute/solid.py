@@ -86,12 +86,12 @@ class Solid:
         """Stiffness and mass of the larger pieces."""
         tetrahedra, vertices, following = larger_pieces(self.tetrahedra)
         weights = sp.csr_matrix(self.weights() @ following)
-
-        def to_surface(motions: FloatArray) -> FloatArray:
-            return (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:])
-
-        mass = self.mass()[vertices][:, vertices]
-        return ElasticBody(tetrahedra.vertices, arap_hessian(tetrahedra, form), mass, to_surface)
+        return ElasticBody(
+            tetrahedra.vertices,
+            arap_hessian(tetrahedra, form),
+            self.mass()[vertices][:, vertices],
+            lambda motions: (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:]),
+        )
 
 
 def larger_pieces(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, sp.csr_matrix]:

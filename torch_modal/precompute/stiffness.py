@@ -4,9 +4,8 @@ from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.arrays import FloatArray
 from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
 
 HessianForm = Literal["edge", "vertex"]
@@ -113,7 +112,13 @@ def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
 def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     """``K = 2 L ⊗ I - Bᵀ C⁻¹ B`` (each edge occurs in both directions, hence the 2)."""
     n = len(tetrahedra.vertices)
-    tail, head, weights = _directed_cotangents(tetrahedra)
+    # Every edge in both directions with its clamped cotangent weight c_ij = -Σ_t vol_t g_i · g_j.
+    found = dirichlet_matrix(tetrahedra, hat_gradients(tetrahedra))
+    edges = found.row != found.col
+    summed = sp.coo_matrix((-found.data[edges], (found.row[edges], found.col[edges])), shape=(n, n)).tocsr()
+    summed = ((summed + summed.T) / 2).tocoo()  # equal up to rounding; exactly equal from here on
+    tail, head = summed.row.astype(np.int64), summed.col.astype(np.int64)
+    weights = np.maximum(summed.data, WEIGHT_FLOOR * np.abs(summed.data).mean())
     edges = tetrahedra.vertices[tail] - tetrahedra.vertices[head]
 
     # min over w_i of sum_j c |d - w × e|²: C_i = sum_j c (|e|² I - e eᵀ), right-hand side sum_j c e × d.
@@ -124,31 +129,16 @@ def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     cross[:, [2, 0, 1], [1, 2, 0]] = edges[:, [0, 1, 2]]
     cross[:, [1, 2, 0], [2, 0, 1]] = -edges[:, [0, 1, 2]]
     cross *= weights[:, None, None]
-    b = _from_blocks(np.concatenate([cross, -cross]), np.concatenate([tail, tail]), np.concatenate([tail, head]), n)
+    starts, number = np.searchsorted(tail, np.arange(n + 1)), np.arange(len(tail))
+    moments = sp.bsr_matrix((cross, number, starts), shape=(3 * n, 3 * len(tail)))
+    ones = np.ones(len(tail))
+    differences = sp.csr_matrix((np.append(ones, -ones), (np.tile(number, 2), np.append(tail, head))))
+    b = (moments @ sp.kron(differences, sp.identity(3))).tocsc()
     c_inverse = np.linalg.inv(c)
-    own = np.arange(n)
-    eliminated = b.T @ _from_blocks((c_inverse + c_inverse.transpose(0, 2, 1)) / 2, own, own, n) @ b
+    middle = sp.bsr_matrix(((c_inverse + c_inverse.transpose(0, 2, 1)) / 2, np.arange(n), np.arange(n + 1)))
+    eliminated = b.T @ middle.tocsc() @ b
 
     laplacian = sp.coo_matrix((-weights, (tail, head)), shape=(n, n)).tocsc()
     laplacian -= sp.diags(np.asarray(laplacian.sum(axis=1)).reshape(-1))
     k = 2 * sp.kron(laplacian, sp.identity(3), format="csc") - eliminated
     return sp.csc_matrix((k + k.T) / 2)
-
-
-def _directed_cotangents(tetrahedra: Tetrahedra) -> tuple[IntArray, IntArray, FloatArray]:
-    """Every edge in both directions with its clamped cotangent weight ``c_ij = -Σ_t vol_t g_i · g_j``."""
-    found = dirichlet_matrix(tetrahedra, hat_gradients(tetrahedra))
-    edges = found.row != found.col
-    summed = sp.coo_matrix((-found.data[edges], (found.row[edges], found.col[edges])), shape=found.shape).tocsr()
-    summed = ((summed + summed.T) / 2).tocoo()  # equal up to rounding; exactly equal from here on
-    weights = np.maximum(summed.data, WEIGHT_FLOOR * np.abs(summed.data).mean())
-    return summed.row.astype(np.int64), summed.col.astype(np.int64), weights
-
-
-def _from_blocks(blocks: FloatArray, rows: NDArray, columns: NDArray, n: int) -> sp.csc_matrix:
-    """Sum of 3 by 3 blocks ``(·, 3, 3)`` at the block rows and columns. *Shape:* ``(3n, 3n)``."""
-    axis = np.arange(3)
-    row = (3 * rows.reshape(-1, 1, 1) + axis[:, None]) + 0 * axis
-    column = (3 * columns.reshape(-1, 1, 1) + axis) + 0 * axis[:, None]
-    entries = (blocks.reshape(-1), (row.reshape(-1), column.reshape(-1)))
-    return sp.coo_matrix(entries, shape=(3 * n, 3 * n)).tocsc()
