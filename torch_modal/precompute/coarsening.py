@@ -128,14 +128,7 @@ def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
 
 
 def joined(points: FloatArray, faces: IntArray, coarsening: Coarsening, shortest: float) -> Coarsening:
-    """Merge clusters whose averages coincide.
-
-    Args:
-        points: A shape. *Shape:* ``(V, 3)``.
-        faces: Its faces. *Shape:* ``(F, 3)``.
-        coarsening: The clusters.
-        shortest: Length of an edge over the mean up to which its ends coincide.
-    """
+    """Merge clusters of a shape whose averages coincide: at edges up to ``shortest`` mean lengths."""
     centres, edges = coarsening.restrict(points), Connectivity(coarsening.faces).edges
     lengths = np.linalg.norm(centres[edges[:, 1]] - centres[edges[:, 0]], axis=1)
     short = lengths <= shortest * lengths.mean()

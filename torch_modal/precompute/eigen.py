@@ -124,11 +124,9 @@ def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
 
 
 def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
-    """M-orthonormal basis of the translations and infinitesimal rotations. *Shape:* ``(3N, 6)``.
+    """M-orthonormal translations and infinitesimal rotations of points that are not all on one line.
 
-    Args:
-        positions: Rest positions, not all on one line. *Shape:* ``(N, 3)``.
-        inertia: Mass matrix of coordinates. *Shape:* ``(3N, 3N)``.
+    *Shape:* ``(N, 3), (3N, 3N) -> (3N, 6)``, with the mass matrix of coordinates.
     """
     centered = positions - positions.mean(axis=0)
     # Scaled to order 1 like the translations, for a well-conditioned factorisation.

@@ -27,13 +27,8 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event, most: 
     """Results of ``work(0)`` to ``work(n - 1)``, computed in one thread per processor.
 
     On the first error or Ctrl-C, ``stop`` is set, pending calls are cancelled, and the error is raised after the
-    running calls have returned. BLAS has one thread in each call.
-
-    Args:
-        work: The function; long calls check ``stop`` and raise `StoppedError`.
-        n: Number of calls.
-        stop: Cancels the work.
-        most: Largest number of threads, to bound memory; at least one is used.
+    running calls have returned; long ones check ``stop`` and raise `StoppedError`. BLAS has one thread in each call.
+    The largest number of threads bounds memory; at least one is used.
     """
     futures: list[Future[Result]] = []
     with ThreadPoolExecutor(max(1, min(n_cpus(), most)), thread_name_prefix="torch_modal") as pool:

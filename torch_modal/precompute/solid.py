@@ -51,12 +51,7 @@ class Solid:
 
     @classmethod
     def filling(cls, surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> "Solid":
-        """Mesh a surface, unless the cache has its tetrahedra.
-
-        Raises:
-            TetrahedralizationError: The mesher failed.
-            StoppedError: ``stop`` was set.
-        """
+        """Mesh a surface, unless the cache has its tetrahedra; raises as :meth:`Mesher.fill`."""
 
         def compute() -> dict[str, NDArray[Any]]:
             tetrahedra = mesher.fill(surface, stop)
@@ -98,11 +93,8 @@ def larger_pieces(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, sp.csr_
     """Tetrahedra without small loose pieces, which follow the nearest part of the others.
 
     Small pieces have little mass, so their rigid motions of unit mass would be larger than other modes by orders of
-    magnitude.
-
-    Returns:
-        The larger pieces; indices of their vertices in the whole mesh, *Shape:* ``(M,)``; displacements of all vertices
-        from these, exact for linear fields, *Shape:* ``(N, M)``.
+    magnitude. Returns the larger pieces, the indices of their vertices, *shape* ``(M,)``, and weights that extend their
+    displacements to all vertices, exact for linear fields, *shape* ``(N, M)``.
     """
     n, piece = len(tetrahedra.vertices), loose_pieces(tetrahedra)
     of_tets = piece[tetrahedra.tets[:, 0]]

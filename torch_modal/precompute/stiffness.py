@@ -55,11 +55,9 @@ def mass_matrix(tetrahedra: Tetrahedra) -> sp.csr_matrix:
 
 
 def dirichlet_matrix(tetrahedra: Tetrahedra, gradients: FloatArray) -> sp.coo_matrix:
-    """Matrix of ``∫ |∇f|²`` for a scalar at each vertex, entries ``Σ_t vol_t g_i · g_j``. *Shape:* ``(N, N)``.
+    """Matrix of ``∫ |∇f|²`` for a scalar at each vertex, entries ``Σ_t vol_t g_i · g_j`` of its hat gradients ``g``.
 
-    Args:
-        tetrahedra: The mesh.
-        gradients: Its :func:`hat_gradients`. *Shape:* ``(T, 4, 3)``.
+    *Shape:* ``(T, 4, 3) -> (N, N)``.
     """
     products = np.einsum("tak,tbk->tab", gradients, gradients)
     return _assembled(products * solid_volumes(tetrahedra)[:, None, None], tetrahedra)
@@ -114,8 +112,8 @@ def _vertex_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
     n = len(tetrahedra.vertices)
     # Every edge in both directions with its clamped cotangent weight c_ij = -Σ_t vol_t g_i · g_j.
     found = dirichlet_matrix(tetrahedra, hat_gradients(tetrahedra))
-    edges = found.row != found.col
-    summed = sp.coo_matrix((-found.data[edges], (found.row[edges], found.col[edges])), shape=(n, n)).tocsr()
+    apart = found.row != found.col
+    summed = sp.coo_matrix((-found.data[apart], (found.row[apart], found.col[apart])), shape=(n, n)).tocsr()
     summed = ((summed + summed.T) / 2).tocoo()  # equal up to rounding; exactly equal from here on
     tail, head = summed.row.astype(np.int64), summed.col.astype(np.int64)
     weights = np.maximum(summed.data, WEIGHT_FLOOR * np.abs(summed.data).mean())

@@ -56,11 +56,7 @@ class CanonicalSurface:
 
     @classmethod
     def of(cls, shape: FloatArray, faces: IntArray) -> "CanonicalSurface":
-        """Canonical surface of a checked shape.
-
-        Args:
-            shape: Positions in any units. *Shape:* ``(V, 3)``.
-            faces: Vertex indices. *Shape:* ``(F, 3)``.
+        """Canonical surface of a checked shape in any units. *Shape:* ``(V, 3), (F, 3)``.
 
         Raises:
             MeshError: The surface has no area, or is so large or small that eigenvalues leave the range of float64.
@@ -112,30 +108,21 @@ class CanonicalSurface:
 
 
 class SurfaceSamples(NamedTuple):
-    """Samples of a surface.
-
-    Attributes:
-        points: *Shape:* ``(P, 3)``.
-        normals: Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``.
-        areas: Area of each sample. *Shape:* ``(P,)``.
-        faces: Face of each sample. *Shape:* ``(P,)``.
-        tree: Search tree of the points.
-    """
+    """Samples of a surface."""
 
     points: FloatArray
+    """*Shape:* ``(P, 3)``."""
     normals: FloatArray
+    """Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``."""
     areas: FloatArray
+    """Area of each sample. *Shape:* ``(P,)``."""
     faces: IntArray
+    """Face of each sample. *Shape:* ``(P,)``."""
     tree: cKDTree
 
 
 def sampled(surface: CanonicalSurface, spacing: FloatArray) -> SurfaceSamples:
-    """Sample all faces at a given spacing, with at least one sample per face.
-
-    Args:
-        surface: The surface.
-        spacing: Distance of the samples in each face. *Shape:* ``(F,)``.
-    """
+    """Sample each face at a spacing of its own, with at least one sample per face. *Shape:* ``(F,)``."""
     corners = surface.points[surface.faces]
     sides = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(sides, axis=2).max(axis=1) / spacing
@@ -155,13 +142,8 @@ def sampled(surface: CanonicalSurface, spacing: FloatArray) -> SurfaceSamples:
         faces.append(np.repeat(np.flatnonzero(chosen), n**2))
     places, normal = np.concatenate(points), np.concatenate(shares)
     areas = np.linalg.norm(normal, axis=1)
-    return SurfaceSamples(
-        places,
-        normal / np.maximum(areas, 1e-300)[:, None],
-        areas,
-        np.concatenate(faces),
-        cKDTree(places, leafsize=LEAF),
-    )
+    unit = normal / np.maximum(areas, 1e-300)[:, None]
+    return SurfaceSamples(places, unit, areas, np.concatenate(faces), cKDTree(places, leafsize=LEAF))
 
 
 def self_proximity(surface: CanonicalSurface) -> float:

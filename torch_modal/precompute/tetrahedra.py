@@ -116,13 +116,7 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
 def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) -> BoolArray:
     """True for pieces that have little volume or area, and little extent; false for the largest.
 
-    Args:
-        amounts: Volume or area of each piece. *Shape:* ``(P,)``.
-        corners: Of elements. *Shape:* ``(M, n, 3)``.
-        piece: Piece of each element. *Shape:* ``(M,)``.
-
-    Returns:
-        *Shape:* ``(P,)``.
+    From the amount of each piece, and the corners and pieces of elements. *Shape:* ``(P,), (M, n, 3), (M,) -> (P,)``.
     """
     low, high = (np.full((len(amounts), 3), bound) for bound in (np.inf, -np.inf))
     np.minimum.at(low, piece, corners.min(axis=1))
