@@ -174,8 +174,6 @@ def test_sheets_without_an_area_are_refused() -> None:
     vertices, faces = strip()
     with pytest.raises(MeshError, match="on a line"):
         extract_modes(vertices * (1, 0, 0), faces, 4, cache=False)
-    with pytest.raises(ValueError, match="the method is 'sheet'; give one of"):
-        extract_modes(vertices, faces, 4, method="sheet")  # type: ignore[arg-type]
 
 
 def test_a_triangle_has_three_modes() -> None:

@@ -172,45 +172,6 @@ def test_timeout_kills_the_worker_and_its_children(worker, capsule: Mesh, tmp_pa
     assert not any(_is_running(int(pid)) for pid in (tmp_path / "pids").read_text().split())
 
 
-@pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
-def test_ctrl_c_ends_the_worker(tmp_path: Path) -> None:
-    pid_file = tmp_path / "pid"
-    (tmp_path / "worker.py").write_text(
-        f"import os, time\nopen({str(pid_file)!r} + '~', 'w').write(str(os.getpid()))\n"
-        f"os.replace({str(pid_file)!r} + '~', {str(pid_file)!r})\ntime.sleep(60)\n"
-    )
-    code = f"""
-        import pathlib, signal, trimesh
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        from torch_modal.precompute import tetwild
-        from torch_modal.precompute.extract import extract_modes
-        tetwild.WORKER = pathlib.Path({str(tmp_path / "worker.py")!r})
-        ball = trimesh.creation.icosphere(subdivisions=1)
-        try:
-            extract_modes(ball.vertices, ball.faces, 4, mesher="tetwild", cache=False)
-        except KeyboardInterrupt:
-            print("interrupted")
-    """
-    root = str(Path(tetwild.__file__).parents[2])
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": root},
-    )
-    try:
-        for _ in range(300):
-            if pid_file.exists():
-                break
-            time.sleep(0.1)
-        worker_pid = int(pid_file.read_text())
-        process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=10)[0] == "interrupted\n"
-    finally:
-        process.kill()
-    assert not _is_running(worker_pid)
-
-
 def test_oriented_drops_flat_and_unused() -> None:
     solid = box((1, 1, 1), (1.0, 1.0, 1.0))
     n = len(solid.vertices)
