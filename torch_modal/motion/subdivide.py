@@ -129,7 +129,7 @@ def subdivide(
     needs_modes = chosen.objective.contact or bool(chosen.objective.terms) or not (smooth and n_keys > 2)
     if bases is None and n_modes and needs_modes:
         with ThreadPoolExecutor(1) as pool:
-            loading = pool.submit(choose(chosen.solver.backend).load)  # Warp takes a second
+            loading = pool.submit(choose(chosen.solver.backend).load)  # takes a second
             bases = bases_of_checked(keyframes, working_faces, n_modes, progress=progress)
             loading.result()
     bases = keyframes.detach() if bases is None else bases

@@ -176,24 +176,18 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
     at_rim = np.zeros(len(surface.points), dtype=bool)
     at_rim[Connectivity(surface.faces).boundary_edges] = True
-    has_sides = ~np.any(at_rim[surface.faces[samples.faces]], axis=1)
-    indicator = Indicator(
-        _indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, np.asarray(has_sides)
-    )
+    has_sides: BoolArray = ~at_rim[surface.faces[samples.faces]].any(axis=1)
+    indicator = Indicator(_indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, has_sides)
+
+    def is_inside(places: FloatArray) -> BoolArray:
+        return indicator.at(low + root * places) >= 0.5
 
     corner = np.stack(np.meshgrid(*(np.arange(c) for c in counts), indexing="ij"), axis=-1).reshape(-1, 3)
     cubes = np.zeros(counts, dtype=bool)
     cubes[tuple(((points - low) / root).astype(np.int64).T)] = True
-    cubes[tuple(corner[indicator.at(low + root * (corner + 0.5)) >= 0.5].T)] = True
-
+    cubes[tuple(corner[is_inside(corner + 0.5)].T)] = True
     most = int(MOST_TETRAHEDRA * max(1.0, USUAL_CUBE * CANONICAL_SIZE / largest) ** 3)
-    cut, owner = bisected(
-        np.argwhere(cubes),
-        (points - low) / root,
-        wanted / root,
-        lambda places: indicator.at(low + root * places) >= 0.5,
-        most,
-    )
+    cut, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
     vertices, tets = low + root * cut.vertices, cut.tets
     inside = indicator.inside(vertices[tets])
     kept = inside >= LEAST_INSIDE
