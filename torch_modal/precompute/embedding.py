@@ -38,12 +38,10 @@ def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: IntArray, 
     Returns:
         Rows sum to one, and ``weights @ vertices`` are the points. *Shape:* ``(V, N)``.
     """
-    rows = np.repeat(np.arange(len(points)), N_NEIGHBOURS)
-    weights = [
-        _moving_least_squares(points[chunk], vertices, neighbours[chunk], kernels[chunk])
-        for chunk in _chunks(np.arange(len(points)))
-    ]
-    entries = (np.concatenate(weights).reshape(-1), (rows, neighbours.reshape(-1)))
+    rows = np.arange(len(points))
+    chunks = ((points[rows], vertices, neighbours[rows], kernels[rows]) for rows in _chunks(rows))
+    weights = np.concatenate([_moving_least_squares(*chunk) for chunk in chunks])
+    entries = (weights.reshape(-1), (np.repeat(rows, N_NEIGHBOURS), neighbours.reshape(-1)))
     return sp.coo_matrix(entries, shape=(len(points), len(vertices))).tocsr()
 
 
@@ -60,22 +58,23 @@ def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatAr
     Returns:
         Neighbours and kernels for :func:`fit_weights`, padded with zero kernels. *Shape:* ``(V, 12), (V, 12)``.
     """
-    extent = np.ptp(tetrahedra.vertices, axis=0)
-    closest = closest_tetrahedra(points - PUSH * np.linalg.norm(extent) * normals, tetrahedra)
-    incidence = _incidence(tetrahedra.tets, len(tetrahedra.vertices))
-    adjacency = sp.csr_matrix(incidence.T @ incidence)  # of vertices, with a non-zero diagonal
+    vertices, tets = tetrahedra.vertices, tetrahedra.tets
+    push = PUSH * np.linalg.norm(np.ptp(vertices, axis=0))
+    closest = closest_tetrahedra(points - push * normals, tetrahedra)
+    ones, starts = np.ones(tets.size, dtype=np.int32), np.arange(0, tets.size + 1, 4)
+    incidence = sp.csr_matrix((ones, tets.reshape(-1), starts), shape=(len(tets), len(vertices)))
+    adjacency = reached = sp.csr_matrix(incidence.T @ incidence)  # of vertices, with a non-zero diagonal
 
-    wanted = min(N_NEIGHBOURS, len(tetrahedra.vertices))
-    neighbours, kernels = np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64), np.zeros((len(points), N_NEIGHBOURS))
+    wanted = min(N_NEIGHBOURS, len(vertices))
+    neighbours, kernels = np.zeros((len(points), N_NEIGHBOURS), np.int64), np.zeros((len(points), N_NEIGHBOURS))
     left = np.arange(len(points))
-    reached = adjacency
     for rings in range(2, MAX_RINGS + 1):
         reached = sp.csr_matrix(reached @ adjacency)
         last = rings == MAX_RINGS
         retry = []
         for chunk in _chunks(left):
-            nearest, kernel, number = _nearest_reached(points[chunk], tetrahedra, closest[chunk], reached)
-            fit = _moving_least_squares(points[chunk], tetrahedra.vertices, nearest, kernel)
+            nearest, kernel, number = _nearest_reached(points[chunk], vertices, closest[chunk], incidence, reached)
+            fit = _moving_least_squares(points[chunk], vertices, nearest, kernel)
             good = (number >= wanted) & (np.abs(fit).sum(axis=1) <= MAX_AMPLIFICATION) | last
             neighbours[chunk[good]], kernels[chunk[good]] = nearest[good], kernel[good]
             retry.append(chunk[~good])
@@ -116,18 +115,12 @@ def _chunks(indices: IntArray) -> list[IntArray]:
     return np.array_split(indices, max(1, -(-len(indices) // _CHUNK)))
 
 
-def _incidence(tets: IntArray, n_vertices: int) -> sp.csr_matrix:
-    """Ones at the vertices of each tetrahedron. *Shape:* ``(T, N)``."""
-    ones, starts = np.ones(tets.size, dtype=np.int32), np.arange(0, tets.size + 1, 4)
-    return sp.csr_matrix((ones, tets.reshape(-1), starts), shape=(len(tets), n_vertices))
-
-
 def _nearest_reached(
-    points: FloatArray, tetrahedra: Tetrahedra, closest: IntArray, reached: sp.csr_matrix
+    points: FloatArray, vertices: FloatArray, closest: IntArray, incidence: sp.csr_matrix, reached: sp.csr_matrix
 ) -> tuple[IntArray, FloatArray, IntArray]:
     """Nearest vertices that ``reached`` connects with the closest tetrahedron, their kernels, and their number."""
     tets, row_of_point = np.unique(closest, return_inverse=True)
-    around = sp.csr_matrix(_incidence(tetrahedra.tets[tets], len(tetrahedra.vertices)) @ reached)
+    around = sp.csr_matrix(incidence[tets] @ reached)
     sizes = np.diff(around.indptr)
     width = max(int(sizes.max()), N_NEIGHBOURS + 1)
     padded = np.full((len(tets), width), -1, dtype=np.int64)
@@ -136,13 +129,12 @@ def _nearest_reached(
     index = padded[row_of_point.reshape(-1)]
     # Coordinate by coordinate: a third of the time of sums over three neighbours in memory.
     squared = np.zeros(index.shape)
-    for place, vertex in zip(points.T, tetrahedra.vertices.T.copy(), strict=True):
+    for place, vertex in zip(points.T, vertices.T.copy(), strict=True):
         squared += (place[:, None] - vertex[index]) ** 2
     squared[index < 0] = np.inf
     order = np.argpartition(squared, N_NEIGHBOURS, axis=1)[:, : N_NEIGHBOURS + 1]
+    order = np.take_along_axis(order, np.argsort(np.take_along_axis(squared, order, axis=1), axis=1), axis=1)
     squared = np.take_along_axis(squared, order, axis=1)
-    order = np.take_along_axis(order, np.argsort(squared, axis=1), axis=1)
-    squared = np.sort(squared, axis=1)
 
     count = np.minimum(sizes[row_of_point.reshape(-1)], N_NEIGHBOURS)
     # The kernel vanishes at the first vertex outside of the support, so that weights vary smoothly over the surface;

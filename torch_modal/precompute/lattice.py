@@ -176,7 +176,7 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
     at_rim = np.zeros(len(surface.points), dtype=bool)
     at_rim[Connectivity(surface.faces).boundary_edges] = True
-    has_sides: BoolArray = ~at_rim[surface.faces[samples.faces]].any(axis=1)
+    has_sides = np.asarray(~at_rim[surface.faces[samples.faces]].any(axis=1))
     indicator = Indicator(_indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, has_sides)
 
     def is_inside(places: FloatArray) -> BoolArray:

@@ -72,19 +72,16 @@ class Solid:
         """Displacements of the surface from those of the tetrahedra. *Shape:* ``(U, N)``."""
         return fit_weights(self.surface.points, self.tetrahedra.vertices, self.neighbours, self.kernel)
 
-    def mass(self) -> sp.csr_matrix:
-        """Mass at a density of 1. *Shape:* ``(N, N)``."""
-        rest = (self.meshed or self).tetrahedra
-        return mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
-
     def body(self, form: HessianForm) -> ElasticBody:
-        """Stiffness and mass of the larger pieces."""
+        """Stiffness of the larger pieces, and their mass at a density of 1."""
         tetrahedra, vertices, following = larger_pieces(self.tetrahedra)
         weights = sp.csr_matrix(self.weights() @ following)
+        rest = (self.meshed or self).tetrahedra
+        mass = mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
         return ElasticBody(
             tetrahedra.vertices,
             arap_hessian(tetrahedra, form),
-            self.mass()[vertices][:, vertices],
+            mass[vertices][:, vertices],
             lambda motions: (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:]),
         )
 
