@@ -57,6 +57,12 @@ def element_hessian(solid: Tetrahedra) -> sp.csc_matrix:
     return sp.csc_matrix((k + k.T) / 2)
 
 
+def as_mesh(solid: Tetrahedra) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of its surface alone."""
+    used, faces = np.unique(surface(solid), return_inverse=True)
+    return solid.vertices[used], faces.reshape(-1, 3)
+
+
 def eigenmodes(k: sp.csc_matrix, mass: sp.spmatrix, positions: np.ndarray, n_modes: int) -> ElasticModes:
     """Lowest modes of these matrices."""
     return lowest_modes(ElasticBody(positions, k, mass, lambda motions: motions), n_modes)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from bodies import bend
-from solids import as_it_is, box, eigenmodes, surface
+from solids import as_it_is, as_mesh, box, eigenmodes
 
 from torch_modal.precompute import carrying
 from torch_modal.precompute.carrying import Carrier, nearest_rotations, vertex_rotations
@@ -18,10 +18,7 @@ from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
 from torch_modal.precompute.tetwild import TetWild
 
 BAR = box((16, 4, 4), (8.0, 1.0, 1.0))
-FACES = surface(BAR)
-USED, COMPACT = np.unique(FACES, return_inverse=True)
-COMPACT = COMPACT.reshape(-1, 3)
-POINTS = BAR.vertices[USED]
+POINTS, COMPACT = as_mesh(BAR)
 TURN = np.linalg.qr(np.array([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]]))[0]
 TURN = TURN * np.sign(np.linalg.det(TURN))
 
@@ -99,13 +96,9 @@ def test_a_degenerate_face_does_no_harm() -> None:
 
 def test_clearances_of_a_plate_and_of_a_gap() -> None:
     """A plate of 8 by 4 by 0.4, and another 0.3 above it: a diagonal of 9."""
-    plate = box((40, 20, 2), (8.0, 4.0, 0.4))
-    used, compact = np.unique(surface(plate), return_inverse=True)
-    one = plate.vertices[used]
-    whole = CanonicalSurface.of(
-        np.concatenate([one, one + np.array([0, 0, 0.7])]),
-        np.concatenate([compact.reshape(-1, 3), compact.reshape(-1, 3) + len(one)]),
-    )
+    one, faces = as_mesh(box((40, 20, 2), (8.0, 4.0, 0.4)))
+    above = one + np.array([0, 0, 0.7])
+    whole = CanonicalSurface.of(np.concatenate([one, above]), np.concatenate([faces, faces + len(one)]))
     thickness, gap = clearances(whole)
     middle = whole.points[whole.faces].mean(axis=1)
     flat = (np.ptp(whole.points[whole.faces][..., 2], axis=1) == 0) & (np.abs(middle[:, :2]) < [30.0, 12.0]).all(axis=1)
@@ -114,23 +107,17 @@ def test_clearances_of_a_plate_and_of_a_gap() -> None:
     np.testing.assert_allclose(gap[facing], 0.3 * whole.scale, rtol=0.02)
     assert np.isinf(gap[flat & ~facing]).all()
     # Corners of a box are no thin parts.
-    cube = box((20, 20, 20), (1.0, 1.0, 1.0))
-    used, compact = np.unique(surface(cube), return_inverse=True)
-    assert np.isinf(clearances(CanonicalSurface.of(cube.vertices[used], compact.reshape(-1, 3)))[0]).all()
-
-
-def horseshoe(angle: float) -> np.ndarray:
-    fine = box((48, 6, 6), (16.0, 1.0, 1.0))
-    return bent(fine.vertices[np.unique(surface(fine))], angle)
+    assert np.isinf(clearances(CanonicalSurface.of(*as_mesh(box((20, 20, 20), (1.0, 1.0, 1.0)))))[0]).all()
 
 
 def test_self_proximity_grows_as_the_ends_meet() -> None:
-    fine = box((48, 6, 6), (16.0, 1.0, 1.0))
-    faces = np.unique(surface(fine), return_inverse=True)[1].reshape(-1, 3)
-    surfaces = [CanonicalSurface.of(horseshoe(angle), faces) for angle in (1.98 * np.pi, 1.0, 0.0)]
-    closeness = [self_proximity(s) for s in surfaces]
-    assert closeness[2] == 0
-    assert closeness[0] > closeness[1]
+    """Of a horseshoe."""
+    points, faces = as_mesh(box((48, 6, 6), (16.0, 1.0, 1.0)))
+    nearly_closed, half, straight = (
+        self_proximity(CanonicalSurface.of(bent(points, angle), faces)) for angle in (1.98 * np.pi, 1.0, 0.0)
+    )
+    assert nearly_closed > half
+    assert straight == 0
 
 
 # --------------------------------------------------------------------------------------- a set of key-frames

@@ -14,7 +14,7 @@ import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
-from solids import box, eigenmodes, lumped_mass, surface
+from solids import as_mesh, box, eigenmodes, lumped_mass, surface
 
 from torch_modal.precompute import lattice as lattice_module
 from torch_modal.precompute.extract import extract_modes
@@ -84,17 +84,10 @@ def test_the_same_in_every_process_with_any_threads() -> None:
     assert len(found) == 1
 
 
-def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
-    """A thin box; its flat sides lie along sides of the lattice's cubes."""
-    solid = box((*cells, 1), size)
-    used, faces = np.unique(surface(solid), return_inverse=True)
-    return solid.vertices[used], faces.reshape(-1, 3)
-
-
 @pytest.mark.parametrize("thickness", [0.05, 0.005, 0.0005])
 def test_thin_plates_are_filled(thickness: float) -> None:
-    """By tetrahedra in one piece, all over."""
-    vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
+    """By tetrahedra in one piece, all over; their flat sides lie along sides of the lattice's cubes."""
+    vertices, faces = as_mesh(box((20, 15, 1), (4.0, 3.0, thickness)))
     whole = CanonicalSurface.of(vertices, faces)
     filled = Lattice().fill(whole, threading.Event())
     assert face_connected_pieces(filled.tets).max() == 0
@@ -142,11 +135,8 @@ def test_lowest_mode_of_a_rod() -> None:
 def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:
     """The bar fills its cells by a third only; a lattice that counted cells as full would be far too stiff."""
     solid = box((30, 6, 6), (10.0, 1.0, 1.3))
-    faces = surface(solid)
-    used, compact = np.unique(faces, return_inverse=True)
-    bar = CanonicalSurface.of(
-        solid.vertices[used] @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces=compact.reshape(-1, 3)
-    )
+    vertices, faces = as_mesh(solid)
+    bar = CanonicalSurface.of(vertices @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces)
     filled = lattice(bar, 0.025)
     found = eigenmodes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).eigenvalues
     wanted = eigenmodes(arap_hessian(solid), mass_matrix(solid), solid.vertices, 5).eigenvalues / bar.scale**2

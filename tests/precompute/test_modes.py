@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import torch
 from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
-from solids import box, eigenmodes, element_hessian, lumped_mass, surface, together
+from solids import as_mesh, box, eigenmodes, element_hessian, lumped_mass, surface, together
 
 from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
@@ -217,12 +217,6 @@ def test_cached_modes_are_the_same_and_not_recomputed(
         np.testing.assert_array_equal(basis.eigenvalues, again.eigenvalues)
     with pytest.raises(TypeError):  # another number of modes is another entry
         extract_bases(keyframes, boxed[1], 5, cache_dir=str(tmp_path))
-
-
-def as_mesh(solid: Tetrahedra) -> Mesh:
-    """Its surface."""
-    used, faces = np.unique(surface(solid), return_inverse=True)
-    return solid.vertices[used], faces.reshape(-1, 3)
 
 
 def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: Mesh) -> None:
