@@ -13,7 +13,7 @@ import torch
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-from torch_modal.geometry.inspect import OPEN, open_part, signed_volume
+from torch_modal.geometry.inspect import OPEN, open_part
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.precompute.basis import ModalBasis
@@ -35,7 +35,7 @@ MESHERS: dict[str, Callable[[], Mesher]] = {"lattice": Lattice, "tetwild": TetWi
 """Constructors of meshers by name."""
 
 THIN = 0.01
-"""Mean thickness, twice the volume over the area, in roots of the area, below which the shell is taken."""
+"""Mean thickness, in roots of the area, below which the shell is taken."""
 VERTICES_AT_ONCE = 30_000
 """Total size of concurrent eigenproblems: about 2 GiB."""
 DEFORMS = 1e-6
@@ -168,9 +168,8 @@ def bases_of_checked(
 def why_shell(surfaces: list[CanonicalSurface]) -> str:
     """Reason for which a set of key-frames has modes of the surface itself; empty if of the solid."""
     for index, surface in enumerate(surfaces):
-        mesh = Connectivity(surface.faces, len(surface.points))
-        holes = open_part(surface.points, mesh)
-        thickness = 2 * abs(signed_volume(surface.points, surface.faces)) / surface.area**1.5
+        holes = open_part(surface.points, Connectivity(surface.faces, len(surface.points)))
+        thickness = surface.thickness / surface.area**0.5
         what = f"key-frame {index} is" if len(surfaces) > 1 else "the shape is"
         if holes > OPEN:
             return f"{what} open: a round hole with its boundary would have {holes:.2g} times its area"

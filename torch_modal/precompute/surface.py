@@ -101,6 +101,11 @@ class CanonicalSurface:
         """Surface area."""
         return float(vertex_areas(self.points, self.faces).sum())
 
+    @property
+    def thickness(self) -> float:
+        """Mean thickness of the body: twice the volume over the area."""
+        return 2 * abs(signed_volume(self.points, self.faces)) / self.area
+
     @cached_property
     def normals(self) -> FloatArray:
         """Outward unit normals of the points, zero where the faces have no area. *Shape:* ``(U, 3)``."""

@@ -17,8 +17,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.connectivity import vertex_areas
-from torch_modal.geometry.inspect import signed_volume
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.surface import CanonicalSurface
@@ -84,23 +82,18 @@ class TetWild:
     def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         """Fill a closed surface with tetrahedra of positive volume.
 
-        Args:
-            surface: The surface.
-            stop: Event that kills the child process.
-
         Raises:
             TetrahedralizationError: The child process crashed, took longer than the timeout, or gave no tetrahedra or
                 ones that do not fill the surface.
-            StoppedError: ``stop`` was set.
+            StoppedError: ``stop`` was set, and the child process killed.
         """
         low, high = surface.points.min(axis=0), surface.points.max(axis=0)
         center, scale = (low + high) / 2, BOX_DIAGONAL / np.linalg.norm(high - low)
         points = (surface.points - center) * scale
         edge_length_fac = self.edge_length_fac
         if edge_length_fac is None:
-            volume = abs(signed_volume(points, surface.faces))
-            thickness = 2 * volume / vertex_areas(points, surface.faces).sum() / BOX_DIAGONAL
-            edge_length_fac = float(np.clip(EDGES_PER_THICKNESS * thickness, *EDGE_RANGE))
+            edges = EDGES_PER_THICKNESS * surface.thickness / np.linalg.norm(high - low)
+            edge_length_fac = float(np.clip(edges, *EDGE_RANGE))
         settings = replace(self, edge_length_fac=edge_length_fac)
         try:
             tetrahedra = without_debris(oriented(_run_worker(points, surface.faces, settings, stop)))
