@@ -5,6 +5,7 @@ import functools
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -142,7 +143,10 @@ def bases_of_checked(
             f"deform; give 1 to {possible}"
         )
     with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
-        extraction = _Extraction(shapes, triangles, int(n_modes), form, mesher, cache or Cache.at(None), bar)
+        extraction = _Extraction(len(shapes), int(n_modes), form, mesher, cache or Cache.at(None), bar)
+        for index, shape in enumerate(shapes):
+            with extraction.stage(index, "checks"):
+                extraction.surfaces.append(CanonicalSurface.of(shape, triangles))
         found = extraction.by(method)
     if loose := [one for one in found if one["n_zero"][0] > N_RIGID]:
         warnings.warn(
@@ -178,30 +182,18 @@ def why_shell(surfaces: list[CanonicalSurface]) -> str:
     return ""
 
 
+@dataclass
 class _Extraction:
-    """Modes of all key-frames of a set, as arrays in canonical units.
+    """Modes of all key-frames of a set, as arrays in canonical units; ``stop`` cancels the work."""
 
-    Raises:
-        MeshError: A surface has no area.
-    """
-
-    def __init__(
-        self,
-        shapes: FloatArray,
-        faces: IntArray,
-        n_modes: int,
-        form: HessianForm,
-        mesher: Mesher,
-        cache: Cache,
-        bar: ProgressReport,
-    ) -> None:
-        self.n_keyframes, self.n_modes, self.form, self.mesher = len(shapes), n_modes, form, mesher
-        self.cache, self.bar = cache, bar
-        self.stop = threading.Event()  # cancels the work
-        self.surfaces: list[CanonicalSurface] = []
-        for index, shape in enumerate(shapes):
-            with self._stage(index, "checks"):
-                self.surfaces.append(CanonicalSurface.of(shape, faces))
+    n_keyframes: int
+    n_modes: int
+    form: HessianForm
+    mesher: Mesher
+    cache: Cache
+    bar: ProgressReport
+    surfaces: list[CanonicalSurface] = field(default_factory=list)
+    stop: threading.Event = field(default_factory=threading.Event)
 
     def by(self, method: Method) -> list[Arrays]:
         """Modes by a method; where that was chosen here and fails because of the surface, by the other."""
@@ -240,7 +232,7 @@ class _Extraction:
         carried to the others. Those that they cannot follow are meshed, too.
         """
         for index, surface in enumerate(self.surfaces):
-            with self._stage(index, "checks"):
+            with self.stage(index, "checks"):
                 surface.require_solid()
         first = min(range(len(self.surfaces)), key=lambda index: self_proximity(self.surfaces[index]))
         solid, lock = self._mesh(first), threading.Lock()
@@ -250,7 +242,7 @@ class _Extraction:
             if index == first:
                 return self._modes_of(index, lambda: solid.body(self.form))
             carried = None
-            with self._stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
+            with self.stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
                 with lock:  # all key-frames share one factorisation
                     carrier = make_carrier()
                 carried = carrier.carry(self.surfaces[index])
@@ -282,13 +274,13 @@ class _Extraction:
         return run_all(modes, len(self.surfaces), self.stop, VERTICES_AT_ONCE // n_vertices)
 
     def _mesh(self, index: int) -> Solid:
-        with self._stage(index, "tetrahedra"):
+        with self.stage(index, "tetrahedra"):
             return Solid.filling(self.surfaces[index], self.mesher, self.cache, self.stop)
 
     def _modes_of(self, index: int, make_body: Callable[[], ElasticBody]) -> Arrays:
         """Modes of a body, at the points of its surface. *Shape:* ``modes (k, U, 3)``."""
         surface = self.surfaces[index]
-        with self._stage(index, "modes"):
+        with self.stage(index, "modes"):
             try:
                 body = make_body()
                 found = lowest_modes(body, min(self.n_modes, body.points.size - N_RIGID))
@@ -317,7 +309,7 @@ class _Extraction:
         }
 
     @contextlib.contextmanager
-    def _stage(self, index: int, what: str) -> Iterator[None]:
+    def stage(self, index: int, what: str) -> Iterator[None]:
         """Report a stage of a key-frame, unless the work was cancelled; errors name the key-frame if it has others."""
         if self.stop.is_set():
             raise StoppedError
