@@ -154,12 +154,7 @@ def _repaired(faces: IntArray, n_vertices: int, note: Callable[[str], None]) -> 
     return mesh, not len(winding.non_orientable)
 
 
-def _check_sizes(
-    shapes: FloatArray,
-    mesh: Connectivity,
-    dtype: torch.dtype,
-    note: Callable[[str], None],
-) -> FloatArray:
+def _check_sizes(shapes: FloatArray, mesh: Connectivity, dtype: torch.dtype, note: Callable[[str], None]) -> FloatArray:
     """Reject unusable sizes; return centred shapes with a diagonal of 1."""
     surface = shapes[:, mesh.used]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -199,11 +194,7 @@ def _check_sizes(
 
 
 def _check_surface(
-    scaled: FloatArray,
-    mesh: Connectivity,
-    orientable: bool,
-    resolution: float,
-    note: Callable[[str], None],
+    scaled: FloatArray, mesh: Connectivity, orientable: bool, resolution: float, note: Callable[[str], None]
 ) -> None:
     """Report flaws that the solver tolerates; reject mirrored closed meshes."""
     faces, edges, counts = mesh.faces, mesh.edges, mesh.counts
@@ -236,9 +227,13 @@ def _check_surface(
         )
     boundary = mesh.boundary_edges
     if len(boundary):
+        # Rendering formats create coincident vertices at texture seams.
+        copies = np.unique(scaled[0][np.unique(boundary)], axis=0, return_counts=True)[1]
+        split = int(copies[copies > 1].sum())
+        seam = f"; {split} of its vertices lie exactly on each other, perhaps a seam: torch_modal.weld_seams joins them"
         note(
             f"the surface is open: {len(boundary)} edges belong to one face only, the first is edge "
-            f"{boundary[0].tolist()}" + _seam_hint(scaled[0], boundary)
+            f"{boundary[0].tolist()}{seam if split else ''}"
         )
     elif orientable and not (counts % 2).any():
         volumes = np.array([inspect.signed_volume(shape, faces) for shape in scaled])
@@ -253,15 +248,3 @@ def _check_surface(
                     f"{few}, seen from outside, and no motion without passing through itself leads from one to the "
                     "other; mirror it back (negate one coordinate)"
                 )
-
-
-def _seam_hint(vertices: FloatArray, boundary: IntArray) -> str:
-    """Hint at coincident boundary vertices, which rendering formats create at texture seams."""
-    ends = np.unique(boundary)
-    _, copies = np.unique(vertices[ends], axis=0, return_counts=True)
-    split = int(copies[copies > 1].sum())
-    return (
-        f"; {split} of its vertices lie exactly on each other, perhaps a seam: torch_modal.weld_seams joins them"
-        if split
-        else ""
-    )
