@@ -30,12 +30,16 @@ def run_all(work: Callable[[int], Result], n: int, stop: threading.Event, most: 
     running calls have returned; long ones check ``stop`` and raise `StoppedError`. BLAS has one thread in each call.
     The largest number of threads bounds memory; at least one is used.
     """
+    alone = one_blas_thread()(work)
+    n_threads = min(n, n_cpus(), max(most, 1))
+    if n_threads < 2:  # in this thread, which Ctrl-C ends at once
+        return [alone(index) for index in range(n)]
     futures: list[Future[Result]] = []
-    with ThreadPoolExecutor(max(1, min(n_cpus(), most)), thread_name_prefix="torch_modal") as pool:
+    with ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
         try:
             # Inside the try block: Ctrl-C may come between submissions.
             for index in range(n):
-                futures.append(pool.submit(one_blas_thread()(work), index))
+                futures.append(pool.submit(alone, index))
             pending = set(futures)
             while pending:
                 # A signal that another thread receives ends no wait of this one, which then looks for it by itself.
