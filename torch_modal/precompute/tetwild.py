@@ -147,7 +147,7 @@ def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: th
                 lasting=code in _OWN_FAILURES,
             )
         try:
-            with np.load(result) as arrays:
+            with result.open("rb") as file, np.load(file) as arrays:  # np.load leaves damaged files open
                 return Tetrahedra(arrays["vertices"], arrays["tets"])
         except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise TetrahedralizationError(f"the worker process left no readable result ({error}). Try again") from error
