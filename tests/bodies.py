@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solids import box, surface
+from solids import as_mesh, box
 
 from torch_modal.geometry.inspect import signed_volume
 
@@ -71,9 +71,8 @@ def twist(points: FloatArray, time: float, angle: float, start: float, stop: flo
 
 def bar_surface(cells: tuple[int, int, int], size: tuple[float, float, float]) -> tuple[FloatArray, IntArray]:
     """A box along x, centred on the axis, its vertices spread evenly."""
-    solid = box(cells, size)
-    used, faces = np.unique(surface(solid), return_inverse=True)
-    return solid.vertices[used] - [0, size[1] / 2, size[2] / 2], faces.reshape(-1, 3)
+    vertices, faces = as_mesh(box(cells, size))
+    return vertices - [0, size[1] / 2, size[2] / 2], faces
 
 
 def turned_surface(profile: FloatArray, spacing: float, closed: bool = False) -> tuple[FloatArray, IntArray]:

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 import torch
 import trimesh
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from solids import as_it_is, box, element_hessian, lumped_mass, surface
+from solids import as_it_is, box, eigenmodes, element_hessian, lumped_mass, surface
 from timing import limit_threads
 
 from torch_modal.energy.energy import RestShapes
@@ -23,7 +23,6 @@ from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
 from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.eigen import lowest_modes
 from torch_modal.precompute.extract import extract_bases
 from torch_modal.precompute.tetrahedra import Tetrahedra
 from torch_modal.precompute.tetwild import TetWild
@@ -94,7 +93,7 @@ def bent_bar(cells: tuple[int, int, int], n_modes: int) -> Shapes:
     bases = []
     for pose in poses:
         solid = Tetrahedra(pose, bar.tets)
-        modes = lowest_modes(element_hessian(solid), sp.diags(lumped_mass(solid)), pose, n_modes)
+        modes = eigenmodes(element_hessian(solid), sp.diags(lumped_mass(solid)), pose, n_modes)
         at_surface = modes.modes.T.reshape(n_modes, -1, 3)[:, used]
         numbers = (pose[used], modes.eigenvalues, at_surface.copy(), modes.rigid_eigenvalues)
         bases.append(ModalBasis(*map(torch.from_numpy, numbers)))

@@ -17,7 +17,7 @@ from torch_modal.energy.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.coarse import resolving
-from torch_modal.precompute.coarsening import Collapses, coarsen
+from torch_modal.precompute.coarsening import coarsen, collapsed
 from torch_modal.solve.minimise import Status
 
 BACKENDS = ["torch", "warp"]
@@ -140,7 +140,7 @@ def test_the_coarse_mesh_is_that_of_the_curved_key_frame() -> None:
     """Edge collapses of a flat sheet are arbitrary, and leave no more edges where it is going to bend."""
     shapes = torch.stack([fold(0), fold(1)]) * 20
     found = resolving(shapes, faces(), 100, ())
-    curved = Collapses(strip()[1]).of(range(2), shapes.numpy())(1, len(found.faces))
+    curved = collapsed(shapes[1].numpy(), strip()[1], len(found.faces))
     np.testing.assert_array_equal(found.clusters, curved.clusters)
     both_flat = resolving(shapes[:1].repeat(2, 1, 1), faces(), 100, ())
     np.testing.assert_array_equal(both_flat.clusters, coarsen(shapes[:1].numpy(), strip()[1], 1000).clusters)

@@ -1,6 +1,5 @@
 """The main job on bars: counts, places, what stays bit for bit, and the order of modes and motions."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -207,11 +206,8 @@ def test_makes_bases_where_none_are_given(scattered: Shapes, monkeypatch: pytest
     asked: list[Any] = []
     loaded: list[bool] = []
 
-    def extract(
-        keyframes: Tensor, faces: Tensor, n_modes: int, progress: bool | None, meanwhile: Callable[[], None]
-    ) -> list[tm.ModalBasis]:
+    def extract(keyframes: Tensor, faces: Tensor, n_modes: int, progress: bool | None) -> list[tm.ModalBasis]:
         asked.append((len(keyframes), n_modes))
-        meanwhile()
         return pair.bases
 
     monkeypatch.setattr(sequence, "bases_of_checked", extract)

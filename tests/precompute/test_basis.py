@@ -23,10 +23,6 @@ def basis() -> ModalBasis:
     )
 
 
-def test_sizes(basis: ModalBasis) -> None:
-    assert (basis.n_modes, basis.n_vertices) == (K, V)
-
-
 def test_is_a_constant_of_the_graph(basis: ModalBasis) -> None:
     tracked = ModalBasis(
         basis.reference.clone().requires_grad_(),

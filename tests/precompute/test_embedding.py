@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solids import box, embed_surface, surface, together
+from solids import box, embed_surface, surface
 
 from torch_modal.precompute.embedding import closest_tetrahedra
 from torch_modal.precompute.tetrahedra import Tetrahedra
@@ -56,18 +56,6 @@ def test_touching_limbs_do_not_mix() -> None:
         weights = embed_surface(points, hand, normals)
         assert abs(weights[:, others]).max() == 0
         assert abs(weights).max() > 0
-
-
-def test_limbs_of_separate_pieces_do_not_mix() -> None:
-    lower, upper = box((4, 4, 4), (1.0, 1.0, 1.0)), box((4, 4, 4), (1.0, 1.0, 1.0))
-    upper.vertices[:, 2] += 1.001
-    both = together(lower, upper)
-    points = np.random.default_rng(0).uniform(0.1, 0.9, (50, 3))
-    for height, normal, columns in ((1.0, 1.0, slice(125, None)), (1.001, -1.0, slice(0, 125))):
-        points[:, 2] = height
-        weights = embed_surface(points, both, np.broadcast_to([0.0, 0.0, normal], points.shape))
-        assert abs(weights[:, columns]).sum() == 0
-        np.testing.assert_allclose(weights @ both.vertices, points, atol=1e-12)
 
 
 @pytest.mark.parametrize("cells", [(1, 1, 1), (30, 1, 1), (6, 6, 1)])

@@ -14,11 +14,10 @@ import torch
 import trimesh
 from bodies import body
 from scipy.spatial import cKDTree
-from solids import box, lumped_mass, surface
+from solids import as_mesh, box, eigenmodes, lumped_mass, surface
 
 from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.eigen import lowest_modes
-from torch_modal.precompute.extract import extract_bases, extract_modes
+from torch_modal.precompute.extract import extract_modes
 from torch_modal.precompute.lattice import Lattice, lattice
 from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
 from torch_modal.precompute.surface import CanonicalSurface, clearances
@@ -60,16 +59,6 @@ def test_outer_vertices_lie_on_the_surface(capsule: Mesh) -> None:
     assert distance.max() < 10.0  # one of the cubes that all come from
 
 
-def test_what_is_thinner_than_a_cube_stays_in_one_piece() -> None:
-    solid = box((30, 20, 1), (10.0, 6.0, 0.12))
-    used, compact = np.unique(surface(solid), return_inverse=True)
-    turn = np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0]
-    sheet = CanonicalSurface.of(solid.vertices[used] @ turn, compact.reshape(-1, 3))
-    filled = lattice(sheet, 0.03)
-    assert lowest_modes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).n_zero == 6
-    assert solid_volumes(filled).sum() == pytest.approx(10 * 6 * 0.12 * sheet.scale**3, rel=0.2)
-
-
 THREADS = """
 import hashlib, sys
 import numpy as np
@@ -95,17 +84,10 @@ def test_the_same_in_every_process_with_any_threads() -> None:
     assert len(found) == 1
 
 
-def plate(cells: tuple[int, int], size: tuple[float, float, float]) -> Mesh:
-    """A thin box; its flat sides lie along sides of the lattice's cubes."""
-    solid = box((*cells, 1), size)
-    used, faces = np.unique(surface(solid), return_inverse=True)
-    return solid.vertices[used], faces.reshape(-1, 3)
-
-
 @pytest.mark.parametrize("thickness", [0.05, 0.005, 0.0005])
 def test_thin_plates_are_filled(thickness: float) -> None:
-    """By tetrahedra in one piece, all over."""
-    vertices, faces = plate((20, 15), (4.0, 3.0, thickness))
+    """By tetrahedra in one piece, all over; their flat sides lie along sides of the lattice's cubes."""
+    vertices, faces = as_mesh(box((20, 15, 1), (4.0, 3.0, thickness)))
     whole = CanonicalSurface.of(vertices, faces)
     filled = Lattice().fill(whole, threading.Event())
     assert face_connected_pieces(filled.tets).max() == 0
@@ -153,14 +135,11 @@ def test_lowest_mode_of_a_rod() -> None:
 def test_modes_of_a_bar_against_its_own_tetrahedra() -> None:
     """The bar fills its cells by a third only; a lattice that counted cells as full would be far too stiff."""
     solid = box((30, 6, 6), (10.0, 1.0, 1.3))
-    faces = surface(solid)
-    used, compact = np.unique(faces, return_inverse=True)
-    bar = CanonicalSurface.of(
-        solid.vertices[used] @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces=compact.reshape(-1, 3)
-    )
+    vertices, faces = as_mesh(solid)
+    bar = CanonicalSurface.of(vertices @ np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0], faces)
     filled = lattice(bar, 0.025)
-    found = lowest_modes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).eigenvalues
-    wanted = lowest_modes(arap_hessian(solid), mass_matrix(solid), solid.vertices, 5).eigenvalues / bar.scale**2
+    found = eigenmodes(arap_hessian(filled), mass_matrix(filled), filled.vertices, 5).eigenvalues
+    wanted = eigenmodes(arap_hessian(solid), mass_matrix(solid), solid.vertices, 5).eigenvalues / bar.scale**2
     np.testing.assert_allclose(found, wanted, rtol=0.35)
 
 
@@ -172,12 +151,6 @@ def test_open_and_half_flipped_surfaces(capsule: Mesh) -> None:
     whole, opened = CanonicalSurface.of(vertices, faces), CanonicalSurface.of(vertices, faces[~far])
     share = solid_volumes(lattice(opened, 0.05)).sum() / opened.scale**3
     assert share == pytest.approx(solid_volumes(lattice(whole, 0.05)).sum() / whole.scale**3, rel=0.25)
-
-
-@pytest.mark.parametrize(("name", "value"), [("mesher", "cubes"), ("mesher", "auto"), ("form", "spokes")])
-def test_unknown_names(capsule: Mesh, name: str, value: str) -> None:
-    with pytest.raises(ValueError, match=f"{value}.*give"):
-        extract_bases([capsule[0]], capsule[1], 5, **{name: value})
 
 
 @dataclass(frozen=True)
@@ -203,5 +176,3 @@ def test_a_mesher_of_ones_own(capsule: Mesh, tmp_path: Path) -> None:
     assert coarse.filled == fine.filled == [len(capsule[0])]
     assert torch.equal(first.eigenvalues, again.eigenvalues)
     assert not torch.equal(first.eigenvalues, second.eigenvalues)
-    with pytest.raises(ValueError, match="the mesher is 'cube'"):
-        extract_modes(*capsule, 5, mesher="cube")

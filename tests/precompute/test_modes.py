@@ -12,17 +12,15 @@ import scipy.sparse as sp
 import torch
 from benchmarks.quadratic import quadratic_modes
 from conftest import COARSE
-from solids import box, element_hessian, lumped_mass, surface, together
+from solids import as_mesh, box, eigenmodes, element_hessian, lumped_mass, surface, together
 
 from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
 from torch_modal.precompute import carrying, eigen, extract, parallel
 from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.eigen import ElasticModes, ModalAnalysisError, lowest_modes
+from torch_modal.precompute.eigen import ElasticModes, ModalAnalysisError
 from torch_modal.precompute.extract import extract_bases, extract_modes
-from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
 from torch_modal.precompute.tetwild import TetWild
 
@@ -32,7 +30,7 @@ BOX = box((6, 3, 2), (3.0, 1.5, 1.0), jitter=0.1)
 
 def solve(solid: Tetrahedra, n_modes: int, form: str = "edge") -> ElasticModes:
     k = element_hessian(solid) if form == "element" else arap_hessian(solid, form)
-    return lowest_modes(k, mass_matrix(solid), solid.vertices, n_modes)
+    return eigenmodes(k, mass_matrix(solid), solid.vertices, n_modes)
 
 
 def inertia(solid: Tetrahedra) -> sp.csr_matrix:
@@ -73,7 +71,7 @@ def test_agrees_with_dense_eigh(form: str, cells: tuple[int, int, int]) -> None:
     for mass in (mass_matrix(solid), sp.diags(lumped_mass(solid))):
         m = sp.kron(mass, sp.identity(3)).toarray()
         values, vectors = scipy.linalg.eigh(k.toarray(), m)
-        result = lowest_modes(k, mass, solid.vertices, 25)
+        result = eigenmodes(k, mass, solid.vertices, 25)
         assert_same_modes(result, values, vectors, m)
 
 
@@ -126,26 +124,6 @@ def test_thin_bodies_pass_the_check_of_residuals(cells: tuple[int, int, int], si
     assert (np.linalg.norm(residual, axis=0) / np.linalg.norm(force, axis=0)).max() < 1e-6
 
 
-def test_a_wire() -> None:
-    """Of one thickness and twice the length: eigenvalues are a 16th. Rounding is all that their residuals are."""
-    short, long = (solve(box((n, 2, 2), (float(n), 1.0, 1.0)), 8).eigenvalues for n in (150, 300))
-    np.testing.assert_allclose(long / short, 1 / 16, rtol=3e-3)
-
-
-def test_coarse_tetrahedra_against_quadratic_ones() -> None:
-    """A plate on a block, one cell thin: what the default gives on them is what ten nodes each give, nearly."""
-    solid = box((8, 4, 4), (4.0, 2.0, 2.0), jitter=0.1)
-    centres = solid.vertices[solid.tets].mean(axis=1)
-    kept = solid.tets[(centres[:, 0] < 2.0) | (centres[:, 2] < 0.5)]
-    used, compact = np.unique(kept, return_inverse=True)
-    solid = Tetrahedra(solid.vertices[used], compact.reshape(-1, 4))
-    truth = quadratic_modes(solid, 12)
-    edge, element = (solve(solid, 12, form).eigenvalues / truth.eigenvalues for form in ("edge", "element"))
-    assert np.abs(edge - 1).max() < 0.25
-    assert np.abs(edge - 1).mean() < 0.1
-    assert element.max() > 2.0, "the plate bends too stiffly with linear tetrahedra"
-
-
 def test_deterministic_in_sign_too() -> None:
     solid = box((10, 5, 3), (5.0, 1.3, 1.0), jitter=0.1)
     first, second = solve(solid, 10), solve(solid, 10)
@@ -166,21 +144,15 @@ def test_pieces_add_zero_modes() -> None:
     np.testing.assert_allclose(result.eigenvalues[6:], each[:4], rtol=1e-9)
 
 
-def test_more_modes_than_there_are() -> None:
-    with pytest.raises(ValueError, match="50 modes requested, but a mesh of 8 vertices has 18 elastic modes"):
-        solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 50)
-    assert solve(box((1, 1, 1), (1.0, 1.0, 1.0)), 18).modes.shape == (24, 18)
-
-
 def test_untrustworthy_problems_are_refused() -> None:
     solid = box((4, 2, 2), (2.0, 1.0, 1.0))
     k, mass = arap_hessian(solid), lumped_mass(solid)
     anchored = k + sp.diags(np.r_[np.ones(3), np.zeros(k.shape[0] - 3)])
     with pytest.raises(ModalAnalysisError, match="six rigid motions"):
-        lowest_modes(sp.csc_matrix(anchored), sp.diags(mass), solid.vertices, 4)
+        eigenmodes(sp.csc_matrix(anchored), sp.diags(mass), solid.vertices, 4)
     indefinite = k - 0.1 * sp.diags(np.repeat(mass, 3))
     with pytest.raises(ModalAnalysisError):
-        lowest_modes(sp.csc_matrix(indefinite), sp.diags(mass), solid.vertices, 4)
+        eigenmodes(sp.csc_matrix(indefinite), sp.diags(mass), solid.vertices, 4)
 
 
 # -------------------------------------------------------------------------------- from key-frames to bases
@@ -247,12 +219,6 @@ def test_cached_modes_are_the_same_and_not_recomputed(
         extract_bases(keyframes, boxed[1], 5, cache_dir=str(tmp_path))
 
 
-def as_mesh(solid: Tetrahedra) -> Mesh:
-    """Its surface."""
-    used, faces = np.unique(surface(solid), return_inverse=True)
-    return solid.vertices[used], faces.reshape(-1, 3)
-
-
 def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: Mesh) -> None:
     """Have the lattice give these tetrahedra, placed as this surface is."""
     own = placed(*like)
@@ -283,24 +249,6 @@ def test_more_pieces_than_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.warns(MeshWarning, match="has 10 loose pieces"):
         basis = extract_modes(vertices, faces, 20, cache=False)
     assert basis.eigenvalues[0] > 0.01
-
-
-@pytest.mark.parametrize("mesher", ["lattice", "tetwild"])
-def test_a_stray_clump_is_no_body(mesher: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six tetrahedra beside the corner of a box, which some of its surface hangs on."""
-    clump = box((1, 1, 1), (0.1, 0.1, 0.1))
-    clump.vertices[:] += [3.01, 1.4, 0.9]
-    vertices, faces = as_mesh(BOX)
-    found = []
-    for solid in (BOX, together(BOX, clump)):
-        filled_with(monkeypatch, solid, (vertices, faces))
-        monkeypatch.setattr(TetWild, "fill", lambda *_: lattice_module.lattice())
-        found.append(extract_modes(vertices, faces, 10, mesher=mesher, cache=False))
-    plain, stray = found
-    np.testing.assert_allclose(stray.eigenvalues, plain.eigenvalues, rtol=1e-6)
-    assert stray.modes.abs().max() < 2 * plain.modes.abs().max()
-    apart = (stray.modes - plain.modes).flatten(1).norm(dim=1) / plain.modes.flatten(1).norm(dim=1)
-    assert apart.max() < 0.1
 
 
 def test_a_small_piece_goes_along(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -395,35 +343,18 @@ def test_keyframes_are_meshed_at_the_same_time(boxed: Mesh, monkeypatch: pytest.
     assert len(extract_bases(four, faces, 4, mesher="tetwild", cache=False)) == 4
 
 
-def test_one_failure_ends_the_other_workers(boxed: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    vertices, faces = boxed
-    begun, stopped, calls = threading.Event(), [], []
-
-    def fill(mesher: TetWild, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
-        calls.append(None)
-        if len(calls) == 1:  # the first one is meshed alone
-            return lattice_module.lattice()
-        _, middle, longest = np.sort(np.ptp(surface.points, axis=0))
-        if middle > 0.55 * longest:  # the stretched one
-            assert begun.wait(30)
-            raise TetrahedralizationError("no luck")
-        begun.set()
-        stopped.append(stop.wait(30))
-        raise StoppedError
-
-    monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
-    monkeypatch.setattr(TetWild, "fill", fill)
-    monkeypatch.setattr(carrying, "MAX_FIT", -1.0)  # each needs its own
-    keyframes = np.stack([vertices, vertices, vertices * (1, 1, 5)])
-    with pytest.raises(TetrahedralizationError, match="key-frame 2: no luck"):
-        extract_bases(keyframes, faces, 4, method="solid", mesher="tetwild", cache=False)
-    assert stopped == [True]
-
-
-@pytest.mark.parametrize("n_modes", [0, -1, 2.5, True, 10_000])
-def test_impossible_numbers_of_modes(boxed: Mesh, n_modes: float) -> None:
-    with pytest.raises(ValueError, match=r"n_modes is|at most 216 ways"):
-        extract_modes(*boxed, n_modes, cache=False)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        *(("n_modes", value, "n_modes is .*; give a whole number") for value in (0, -1, 2.5, True)),
+        ("n_modes", 10_000, "at most 216 ways to deform; give 1 to 216"),
+        *((name, "spokes", f"the {what} is 'spokes'; give") for name, what in (("mesher",) * 2, ("method",) * 2)),
+        ("form", "spokes", "the Hessian form is 'spokes'; give"),
+    ],
+)
+def test_impossible_options(boxed: Mesh, name: str, value: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        extract_modes(*boxed, cache=False, **{name: value})
 
 
 def test_the_bar_shows_only_on_request(boxed: Mesh, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,14 +26,14 @@ def test_results_are_in_order(cpus: int) -> None:
         time.sleep(0.01 * (5 - index))
         return index * index
 
-    assert run_all(work, 5, threading.Event()) == [0, 1, 4, 9, 16]
-    assert run_all(work, 0, threading.Event()) == []
+    assert run_all(work, 5, threading.Event(), 5) == [0, 1, 4, 9, 16]
+    assert run_all(work, 0, threading.Event(), 5) == []
 
 
-@pytest.mark.parametrize("bound", [None, 0, 2])
-def test_as_many_at_once_as_processors(cpus: int, bound: int | None) -> None:
+@pytest.mark.parametrize("bound", [0, 2, 9])
+def test_as_many_at_once_as_processors(cpus: int, bound: int) -> None:
     running, most, lock = 0, 0, threading.Lock()
-    allowed = cpus if bound is None else min(cpus, max(bound, 1))
+    allowed = min(cpus, max(bound, 1))
     together = threading.Barrier(allowed)
 
     def work(index: int) -> None:
@@ -47,26 +47,6 @@ def test_as_many_at_once_as_processors(cpus: int, bound: int | None) -> None:
 
     run_all(work, 2 * cpus, threading.Event(), bound)
     assert most == allowed
-
-
-def test_who_has_nothing_else_to_do_does_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "n_cpus", lambda: 2)
-    did: list[Any] = []
-    done = threading.Event()
-
-    def work(index: int) -> int:
-        did.append(index)
-        assert index < 2 or done.wait(30)  # the last one ends after it
-        return index
-
-    def meanwhile() -> None:
-        did.append("meanwhile")
-        done.set()
-
-    assert run_all(work, 3, threading.Event(), meanwhile=meanwhile) == [0, 1, 2]
-    assert "meanwhile" in did
-    with pytest.raises(ZeroDivisionError):
-        run_all(lambda index: index, 3, threading.Event(), meanwhile=lambda: 1 // 0)
 
 
 def test_ctrl_c_while_work_is_handed_out_ends_what_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +67,7 @@ def test_ctrl_c_while_work_is_handed_out_ends_what_has_begun(monkeypatch: pytest
 
     monkeypatch.setattr(parallel, "ThreadPoolExecutor", Interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run_all(work, 2, stop)
+        run_all(work, 2, stop, 2)
     assert told == [True]
 
 
@@ -105,7 +85,7 @@ def test_the_first_error_ends_the_others(monkeypatch: pytest.MonkeyPatch) -> Non
         raise StoppedError
 
     with pytest.raises(ValueError, match="no luck"):
-        run_all(work, 6, stop)
+        run_all(work, 6, stop, 6)
     # The second ran beside the first and saw the flag; at most one more was begun before the rest was called off.
     assert sorted(begun) in ([0, 1], [0, 1, 2])
     assert sorted(ended) == [index for index in sorted(begun) if index > 0]

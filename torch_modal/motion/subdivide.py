@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -113,8 +114,10 @@ def subdivide(
         if callable(bases):
             made = bases(keyframes, faces)
         else:
-            load = choose(chosen.solver.backend).load
-            made = bases_of_checked(keyframes, faces, n_modes, progress=progress, meanwhile=load)
+            with ThreadPoolExecutor(1) as pool:
+                loading = pool.submit(choose(chosen.solver.backend).load)  # takes a second
+                made = bases_of_checked(keyframes, faces, n_modes, progress=progress)
+                loading.result()
     made = keyframes.detach() if made is None else made
     if len(made) != n_keys:
         raise ValueError(f"each key-frame needs its basis: got {len(made)} bases for {n_keys} key-frames")

@@ -43,16 +43,23 @@ def main(job_path: str, result_path: str) -> None:
         pr_set_pdeathsig = 1  # ends this process together with its parent
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
 
-    # Imported after the alarm is set, and where needed.
     if len(faces) > max_surface_faces:
-        import fast_simplification
+        import fast_simplification  # after the alarm is set
 
         # agg=7 are the quadrics' absolute thresholds, right for a diagonal of 100.
         vertices, faces = fast_simplification.simplify(
             np.ascontiguousarray(vertices), faces, target_count=max_surface_faces, agg=7
         )
 
-    tetrahedralize = _pytetwild().tetrahedralize
+    # pyvista serves only a plotting accessor: without it, start-up takes half the time and needs no display libraries.
+    sys.modules["pyvista"] = types.ModuleType("pyvista")
+    try:
+        from pytetwild import tetrahedralize
+    except (ImportError, AttributeError):  # a version that needs more of it
+        for name in [name for name in sys.modules if name.split(".")[0] in ("pyvista", "pytetwild")]:
+            del sys.modules[name]
+        from pytetwild import tetrahedralize
+
     try:
         points, tets = tetrahedralize(
             np.ascontiguousarray(vertices, dtype=np.float64),
@@ -63,25 +70,10 @@ def main(job_path: str, result_path: str) -> None:
             num_threads=1,  # more make it no faster
         )
     except (RuntimeError, ValueError) as error:
-        # The parent caches failures of the mesher, but not those of missing libraries, memory or threads.
+        # Failures of the mesher last, but not those of missing libraries, memory or threads.
         traceback.print_exc()
         sys.exit(1 if any(word in str(error) for word in ("alloc", "memory", "Resource")) else MESHER_RAISED)
     np.savez(result_path, vertices=np.asarray(points, np.float64), tets=np.asarray(tets, np.int64))
-
-
-def _pytetwild() -> types.ModuleType:
-    """Import pytetwild without pyvista, which it needs only for a plotting accessor.
-
-    This halves the start-up time and avoids VTK's display libraries. If the import fails, the real pyvista is used.
-    """
-    sys.modules["pyvista"] = types.ModuleType("pyvista")
-    try:
-        import pytetwild
-    except (ImportError, AttributeError):
-        for name in [name for name in sys.modules if name.split(".")[0] in ("pyvista", "pytetwild")]:
-            del sys.modules[name]
-        import pytetwild
-    return pytetwild
 
 
 if __name__ == "__main__":

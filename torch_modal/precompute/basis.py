@@ -44,12 +44,7 @@ class ModalBasis:
     def __post_init__(self) -> None:
         shapes = {name: tuple(tensor.shape) for name, tensor in self._tensors().items()}
         v, k = shapes["reference"][:1], shapes["eigenvalues"][:1]
-        expected = {
-            "reference": (*v, 3),
-            "eigenvalues": k,
-            "modes": (*k, *v, 3),
-            "rigid_eigenvalues": (6,),
-        }
+        expected = {"reference": (*v, 3), "eigenvalues": k, "modes": (*k, *v, 3), "rigid_eigenvalues": (6,)}
         if shapes != expected:
             raise ValueError(
                 "a basis needs reference (V, 3), eigenvalues (k,), modes (k, V, 3), rigid_eigenvalues (6,); "

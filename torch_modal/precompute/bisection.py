@@ -6,9 +6,14 @@ from collections.abc import Callable
 import numpy as np
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.precompute.tetrahedra import Tetrahedra, oriented
 
 UNITS = 256
 """Integer coordinates along the edge of a cube, so that edges can be bisected eight times."""
+_ORDERS = np.array(list(itertools.permutations(range(3))))
+"""Orders of the axes, each a path from the lowest corner of a cube to the highest. *Shape:* ``(6, 3)``."""
+_PATHS = np.array([[np.isin(range(3), order[:step]) for step in range(4)] for order in _ORDERS]).astype(np.int64)
+"""Their corners, six tetrahedra: adjacent cubes cut their common face in the same way. *Shape:* ``(6, 4, 3)``."""
 _EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 _SECOND_HALF = np.array([(0, 1, 2, 3), (1, 1, 2, 3), (1, 2, 2, 3), (1, 2, 3, 3)])
 """Corners of the second half by the end of the bisected edge; the midpoint replaces the one at its place."""
@@ -16,7 +21,7 @@ _SECOND_HALF = np.array([(0, 1, 2, 3), (1, 1, 2, 3), (1, 2, 2, 3), (1, 2, 3, 3)]
 
 def bisected(
     cubes: IntArray, points: FloatArray, wanted: FloatArray, is_inside: Callable[[FloatArray], BoolArray], most: int
-) -> tuple[FloatArray, IntArray, IntArray]:
+) -> tuple[Tetrahedra, IntArray]:
     """Cut cubes into tetrahedra and bisect them until none is larger than the target size at the points it contains.
 
     Each cube is cut into six tetrahedra, the paths along its edges from its lowest corner to its highest (Kuhn 1960).
@@ -32,20 +37,21 @@ def bisected(
         most: Approximate limit of the number of tetrahedra; the largest relative to their target size come first.
 
     Returns:
-        Vertices in cube edges, *Shape:* ``(N, 3)``; tetrahedra of positive volume, *Shape:* ``(T, 4)``; the tetrahedron
-        that contains each point, *Shape:* ``(P,)``.
+        Tetrahedra of positive volume, in cube edges; the one that contains each point, *Shape:* ``(P,)``.
     """
     mesh = _Mesh(cubes, points)
     while True:
         mesh.drop(is_inside)
-        ratio = np.zeros(len(mesh.tets))
-        np.maximum.at(ratio, mesh.owner, mesh.sizes()[mesh.owner] / wanted)
+        # Edge lengths of cubes with six times the volume.
+        sizes, ratio = 2.0 ** (-mesh.halvings / 3), np.zeros(len(mesh.tets))
+        np.maximum.at(ratio, mesh.owner, sizes[mesh.owner] / wanted)
         chosen = ratio > 1.0
         if not chosen.any() or len(mesh.tets) >= most:
             break
         # Halves have 0.79 of the size. The largest come first, as the number is limited.
         mesh.halve(chosen & (ratio > 0.8 * ratio.max()))
-    return mesh.result()
+    used, tets = np.unique(mesh.tets, return_inverse=True)
+    return oriented(Tetrahedra(mesh.coordinates(used), tets.reshape(-1, 4))), mesh.owner
 
 
 class _Mesh:
@@ -58,7 +64,7 @@ class _Mesh:
         counts = cubes.max(axis=0) + 1
         sides = (counts + 1) * UNITS
         self.stride = np.array([sides[1] * sides[2], sides[2], 1])
-        self.tets: IntArray = (UNITS * (cubes[:, None, None] + _paths()) @ self.stride).reshape(-1, 4)
+        self.tets: IntArray = (UNITS * (cubes[:, None, None] + _PATHS) @ self.stride).reshape(-1, 4)
         self.halvings = np.zeros(len(self.tets), dtype=np.int64)
         self.inner = np.zeros(len(self.tets), dtype=bool)
         self.vertices: IntArray = np.unique(self.tets)
@@ -66,13 +72,15 @@ class _Mesh:
         cube = points.astype(np.int64)
         order = np.argsort(-(points - cube), axis=1, kind="stable")
         within = np.take_along_axis(points - cube, order, axis=1)
-        ends = np.ones((len(points), 1)), np.zeros((len(points), 1))
-        self.shares = -np.diff(np.concatenate([ends[0], within, ends[1]], axis=1), axis=1)
-        number = np.zeros((3, 3, 3), dtype=np.int64)
-        number[tuple(np.array(list(itertools.permutations(range(3)))).T)] = np.arange(6)
-        place = np.full(counts, -1)
-        place[tuple(cubes.T)] = np.arange(len(cubes))
+        self.shares = -np.diff(within, axis=1, prepend=1.0, append=0.0)
+        number, place = np.zeros((3, 3, 3), dtype=np.int64), np.full(counts, -1)
+        number[tuple(_ORDERS.T)], place[tuple(cubes.T)] = np.arange(6), np.arange(len(cubes))
         self.owner = place[tuple(cube.T)] * 6 + number[tuple(order.T)]
+
+    def coordinates(self, keys: IntArray) -> FloatArray:
+        """Positions of vertices, in cube edges. *Shape:* ``(...) -> (..., 3)``."""
+        x, rest = np.divmod(keys, self.stride[0])
+        return np.stack([x, *np.divmod(rest, self.stride[1])], axis=-1) / UNITS
 
     def drop(self, is_inside: Callable[[FloatArray], BoolArray]) -> None:
         """Remove tetrahedra outside."""
@@ -80,21 +88,12 @@ class _Mesh:
         touched[self.owner] = True
         unsure = np.flatnonzero(~touched & ~self.inner)
         corners, index = np.unique(self.tets[unsure], return_inverse=True)
-        inside = is_inside(self._coordinates(corners))[index.reshape(-1, 4)].any(axis=1)
-        unsure = unsure[inside | is_inside(self._coordinates(self.tets[unsure]).mean(axis=1))]
+        inside = is_inside(self.coordinates(corners))[index.reshape(-1, 4)].any(axis=1)
+        unsure = unsure[inside | is_inside(self.coordinates(self.tets[unsure]).mean(axis=1))]
         self.inner[unsure] = True
         kept = touched | self.inner
         self.owner = (np.cumsum(kept) - 1)[self.owner]
         self.tets, self.halvings, self.inner = self.tets[kept], self.halvings[kept], self.inner[kept]
-
-    def _coordinates(self, keys: IntArray) -> FloatArray:
-        """Positions of vertices, in cube edges. *Shape:* ``(...) -> (..., 3)``."""
-        x, rest = np.divmod(keys, self.stride[0])
-        return np.stack([x, *np.divmod(rest, self.stride[1])], axis=-1) / UNITS
-
-    def sizes(self) -> FloatArray:
-        """Edge length of the cube with six times the volume of each tetrahedron, in cube edges. *Shape:* ``(T,)``."""
-        return 2.0 ** (-self.halvings / 3)
 
     def halve(self, chosen: BoolArray) -> None:
         """Bisect the chosen tetrahedra and all that conformity requires."""
@@ -102,18 +101,12 @@ class _Mesh:
             added = self._halve_alone(chosen)
             changed = np.concatenate([chosen, np.ones(int(chosen.sum()), dtype=bool)])
             chosen = np.zeros(len(self.tets), dtype=bool)
-            # Unchanged tetrahedra can only have a hanging vertex that is new.
-            chosen[~changed] = self._hanging(self.tets[~changed], added)
-            chosen[changed] = self._hanging(self.tets[changed], self.vertices)
-
-    @staticmethod
-    def _hanging(tets: IntArray, vertices: IntArray) -> BoolArray:
-        """True for an edge that has one of the vertices as its midpoint (a hanging vertex)."""
-        if len(vertices) == 0:
-            return np.zeros(len(tets), dtype=bool)
-        middles = (tets[:, _EDGES[:, 0]] + tets[:, _EDGES[:, 1]]) // 2
-        place = np.minimum(np.searchsorted(vertices, middles), len(vertices) - 1)
-        return (vertices[place] == middles).any(axis=1)
+            # Unchanged tetrahedra can only have a hanging vertex, the midpoint of an edge, that is new.
+            for those, vertices in ((~changed, added), (changed, self.vertices)):
+                if len(vertices):
+                    middles = self.tets[those][:, _EDGES].sum(axis=2) // 2
+                    place = np.minimum(np.searchsorted(vertices, middles), len(vertices) - 1)
+                    chosen[those] = (vertices[place] == middles).any(axis=1)
 
     def _halve_alone(self, chosen: BoolArray) -> IntArray:
         """Bisect the chosen tetrahedra only; return the new vertices."""
@@ -149,25 +142,3 @@ class _Mesh:
         added = added[~np.isin(added, self.vertices)]
         self.vertices = np.sort(np.concatenate([self.vertices, added]))
         return added
-
-    def result(self) -> tuple[FloatArray, IntArray, IntArray]:
-        """Vertices, tetrahedra, and the tetrahedron of each point."""
-        used, tets = np.unique(self.tets, return_inverse=True)
-        tets = tets.reshape(-1, 4)
-        vertices = self._coordinates(used)
-        corners = vertices[tets]
-        mirrored = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-        tets[mirrored] = tets[mirrored][:, [1, 0, 2, 3]]
-        return vertices, tets, self.owner
-
-
-def _paths() -> IntArray:
-    """Corners of the six tetrahedra of a cube: each axis order is a path from its lowest to its highest corner.
-
-    Adjacent cubes cut their common face in the same way. *Shape:* ``(6, 4, 3)``.
-    """
-    paths = np.zeros((6, 4, 3), dtype=np.int64)
-    for path, order in zip(paths, itertools.permutations(range(3)), strict=True):
-        for i, axis in enumerate(order):
-            path[i + 1 :, axis] += 1
-    return paths

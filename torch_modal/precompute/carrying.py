@@ -1,5 +1,6 @@
 """Deformation of the tetrahedra of one key-frame to other poses, so that each set is meshed once."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,10 @@ from numpy.typing import NDArray
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.sparse import factorize
+from torch_modal.precompute.solid import Solid
 from torch_modal.precompute.stiffness import dirichlet_matrix, hat_gradients
-from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes, tet_volumes
+from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.precompute.tetrahedra import solid_volumes, tet_volumes
 
 FIT_WEIGHT = 1e4
 """Weight of the surface term relative to the deformation energy; both are dimensionless."""
@@ -33,69 +36,60 @@ class Carrier:
     matrix, which is factorised here.
 
     Args:
-        tetrahedra: The mesh in the first pose.
-        points: The surface in the first pose. *Shape:* ``(U, 3)``.
-        faces: Its faces. *Shape:* ``(F, 3)``.
-        weights: Embedding of the surface in the tetrahedra
-            (:func:`~torch_modal.precompute.embedding.fit_weights`). *Shape:* ``(U, N)``.
+        solid: The first pose.
 
     Raises:
         RuntimeError: The matrix is singular, for example if no surface point is embedded in a piece.
         LinAlgError: A tetrahedron is degenerate.
     """
 
-    def __init__(self, tetrahedra: Tetrahedra, points: FloatArray, faces: IntArray, weights: sp.csr_matrix) -> None:
-        self._rest = tetrahedra
-        self._points = points
-        self._faces = faces
-        self._weights = weights
-        self._gradients = hat_gradients(tetrahedra)
-        self._volumes = solid_volumes(tetrahedra)
+    def __init__(self, solid: Solid) -> None:
+        tetrahedra, points = solid.tetrahedra, solid.surface.points
+        self.solid, self.weights = solid, solid.weights()
+        self.gradients, self.volumes = hat_gradients(tetrahedra), solid_volumes(tetrahedra)
         extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-        areas = vertex_areas(points, faces)
-        self._area = areas.sum()
+        areas = vertex_areas(points, solid.surface.faces)
+        self.area = areas.sum()
         # |W x - p|² is a mean over the surface, per diagonal squared; the other term a mean over the volume.
-        self._pull = sp.diags(FIT_WEIGHT * self._volumes.sum() / extent**2 * areas / areas.sum()) @ weights
-        laplacian = dirichlet_matrix(tetrahedra, self._gradients).tocsc()
-        self._factors = factorize(laplacian + weights.T @ self._pull)
+        self.pull = sp.diags(FIT_WEIGHT * self.volumes.sum() / extent**2 * areas / self.area) @ self.weights
+        laplacian = dirichlet_matrix(tetrahedra, self.gradients).tocsc()
+        self.factors = factorize(laplacian + self.weights.T @ self.pull)
 
-    def carry(self, points: FloatArray) -> FloatArray | None:
-        """Vertices of the tetrahedra in the pose of another key-frame. *Shape:* ``(N, 3)``.
-
-        Args:
-            points: The surface in the new pose. *Shape:* ``(U, 3)``.
+    def carry(self, surface: CanonicalSurface) -> Solid | None:
+        """The solid in the pose of another key-frame.
 
         Returns:
-            The positions; None if they are too bad for modes: far from the surface, or with many inverted tetrahedra.
+            None if its tetrahedra are too bad for modes: far from the surface, or many of them inverted.
 
         Raises:
             LinAlgError: The result is not finite.
         """
-        areas = vertex_areas(points, self._faces)
+        rest, faces = self.solid.tetrahedra, self.solid.surface.faces
+        areas = vertex_areas(surface.points, faces)
         # The diagonal, the unit of length here, depends on the pose; the area hardly does.
-        scale = np.sqrt(areas.sum() / self._area)
-        target = points / scale
-        turns = vertex_rotations(self._points, target, self._faces)
+        scale = np.sqrt(areas.sum() / self.area)
+        target = surface.points / scale
+        turns = vertex_rotations(self.solid.surface.points, target, faces)
         # Harmonic extension of the surface rotations to the volume.
-        field = self._factors.solve(self._pull.T @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
-        rotations = nearest_rotations(field[self._rest.tets].mean(axis=1))
-        vertices = self._place(rotations, target)
-        for _ in range(N_STEPS):
-            gradients = np.einsum("tai,taj->tij", vertices[self._rest.tets], self._gradients)
-            vertices = self._place(nearest_rotations(gradients), target)
+        field = self.factors.solve(self.pull.T @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
+        gradients = field[rest.tets].mean(axis=1)
+        corners, n = rest.tets.reshape(-1), len(rest.vertices)
+        for _ in range(N_STEPS + 1):
+            # Minimises sum_t vol_t |∇x - R_t|² with the surface pulled to the target.
+            rotations = nearest_rotations(gradients)
+            forces = np.einsum("t,tij,taj->tai", self.volumes, rotations, self.gradients).reshape(-1, 3)
+            summed = np.stack([np.bincount(corners, force, minlength=n) for force in forces.T], axis=1)
+            vertices = self.factors.solve(summed + self.pull.T @ target)
+            gradients = np.einsum("tai,taj->tij", vertices[rest.tets], self.gradients)
 
-        distance = np.linalg.norm(self._weights @ vertices - target, axis=1) / np.linalg.norm(np.ptp(target, axis=0))
-        inverted = (tet_volumes(self._rest._replace(vertices=vertices)) <= 0).mean()
+        distance = np.linalg.norm(self.weights @ vertices - target, axis=1) / np.linalg.norm(np.ptp(target, axis=0))
+        inverted = (tet_volumes(rest._replace(vertices=vertices)) <= 0).mean()
         fits = np.sqrt(np.average(distance**2, weights=areas)) <= MAX_FIT_RMS and distance.max() <= MAX_FIT
-        return vertices * scale if fits and inverted <= MAX_INVERTED else None
-
-    def _place(self, rotations: FloatArray, points: FloatArray) -> FloatArray:
-        """Minimise ``sum_t vol_t |∇x - R_t|²`` with the surface pulled to the points. *Shape:* ``(N, 3)``."""
-        forces = np.einsum("t,tij,taj->tai", self._volumes, rotations, self._gradients).reshape(-1, 3)
-        corners = self._rest.tets.reshape(-1)
-        n = len(self._rest.vertices)
-        summed = np.stack([np.bincount(corners, force, minlength=n) for force in forces.T], axis=1)
-        return self._factors.solve(summed + self._pull.T @ points)
+        if not fits or inverted > MAX_INVERTED:
+            return None
+        return replace(
+            self.solid, surface=surface, tetrahedra=rest._replace(vertices=vertices * scale), meshed=self.solid
+        )
 
 
 def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
@@ -129,31 +123,20 @@ def nearest_rotations(matrices: NDArray[Any]) -> FloatArray:
     ``s = det(X)^(-1/3)`` (Higham 1986), in a quarter of the time of a singular value decomposition. The latter serves
     mirrored and singular matrices.
     """
-    x = np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.float64)
-    determinant = _cofactors(x)[1]
-    size = np.sqrt((x**2).sum(axis=(0, 1)))
-    sound = determinant > FLAT * size**3
+    sound = np.linalg.det(matrices) > FLAT * np.linalg.norm(matrices, axis=(1, 2)) ** 3
     result = np.empty((len(matrices), 3, 3))
     if not sound.all():
         u, _, vt = np.linalg.svd(matrices[~sound])
         flip = np.ones((len(u), 3))
         flip[:, 2] = np.sign(np.linalg.det(u @ vt))
         result[~sound] = (u * flip[:, None]) @ vt
-    x = x[..., sound]
+    x = np.ascontiguousarray(np.moveaxis(matrices[sound], 0, -1), dtype=np.float64)
     for _ in range(MOST_POLAR_STEPS):
-        cofactors, determinant = _cofactors(x)
+        cofactors = np.stack([np.cross(x[i - 2], x[i - 1], axis=0) for i in range(3)])  # det(X) X^-T
+        determinant = (x[0] * cofactors[0]).sum(axis=0)
         scale = np.cbrt(determinant)
         previous, x = x, 0.5 * (x / scale + cofactors * (scale / determinant))
         if np.abs(x - previous).max(initial=0.0) < 1e-14:
             break
     result[sound] = np.moveaxis(x, -1, 0)
     return result
-
-
-def _cofactors(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``det(X) X^-T`` and ``det(X)``. *Shape:* ``(3, 3, ·) -> (3, 3, ·), (·,)``."""
-    cofactors = np.empty_like(x)
-    for i in range(3):
-        (a, b, c), (d, e, f) = x[i - 2], x[i - 1]
-        cofactors[i] = b * f - c * e, c * d - a * f, a * e - b * d
-    return cofactors, (x[0] * cofactors[0]).sum(axis=0)

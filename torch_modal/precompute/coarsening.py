@@ -1,8 +1,7 @@
 """Edge-collapse coarsening shared by all key-frames, with cluster averages (section 3.2 of the paper)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy import sparse
@@ -33,110 +32,109 @@ class Coarsening:
     """
 
     clusters: IntArray
-    """Coarse vertex of each fine vertex, -1 for unreferenced ones. *Shape:* ``(V,)``."""
+    """Coarse vertex of each fine vertex, -1 for those without a face. *Shape:* ``(V,)``."""
     faces: IntArray
     """Faces of the coarse mesh. *Shape:* ``(F_coarse, 3)``."""
+
+    @classmethod
+    def of_labels(cls, labels: IntArray, faces: IntArray) -> "Coarsening":
+        """Clusters of equal labels; those without faces carry no energy and are removed.
+
+        Args:
+            labels: Label of each fine vertex, -1 for none. *Shape:* ``(V,)``.
+            faces: Faces of the fine mesh. *Shape:* ``(F, 3)``.
+        """
+        coarse = _coarse_faces(labels, faces)
+        used = np.unique(coarse)
+        index = np.full(labels.max() + 2, -1)  # the last for the label -1
+        index[used] = np.arange(len(used))
+        return cls(index[labels], index[coarse])
 
     @property
     def n_vertices(self) -> int:
         """Number of coarse vertices."""
         return int(self.clusters.max()) + 1
 
-    def joined(self, x: FloatArray, shortest: float) -> "Coarsening":
-        """With clusters merged whose averages coincide.
-
-        Args:
-            x: A shape. *Shape:* ``(V, 3)``.
-            shortest: Length of an edge over the mean up to which its ends coincide.
-        """
-        points, edges = self.restrict(x), Connectivity(self.faces, self.n_vertices).edges
-        lengths = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
-        short = lengths <= shortest * lengths.mean()
-        if not short.any():
-            return self
-        joint = connected_pieces(edges[short], len(points))
-        faces = _coarse_faces(joint, self.faces)
-        index = _compact(faces, len(points))
-        return Coarsening(np.where(self.clusters >= 0, index[joint[self.clusters]], -1), index[faces])
-
-    def restriction(self) -> sparse.csr_matrix:
-        """Matrix of the cluster average. *Shape:* ``(V_coarse, V)``."""
-        members = np.flatnonzero(self.clusters >= 0)
-        clusters = self.clusters[members]
-        sizes = np.bincount(clusters, minlength=self.n_vertices)
-        shape = (self.n_vertices, len(self.clusters))
-        return sparse.csr_matrix((1.0 / sizes[clusters], (clusters, members)), shape=shape)
-
     def restrict(self, x: FloatArray) -> FloatArray:
         """Cluster averages. *Shape:* ``(..., V, 3) -> (..., V_coarse, 3)``."""
-        matrix = self.restriction()
-        coarse = np.stack([matrix @ shape for shape in x.reshape(-1, *x.shape[-2:])])
-        return coarse.reshape(*x.shape[:-2], self.n_vertices, 3)
+        members = np.flatnonzero(self.clusters >= 0)
+        clusters, n = self.clusters[members], self.n_vertices
+        shares = 1.0 / np.bincount(clusters, minlength=n)
+        matrix = sparse.csr_matrix((shares[clusters], (clusters, members)), shape=(n, len(self.clusters)))
+        return np.stack([matrix @ shape for shape in x.reshape(-1, *x.shape[-2:])]).reshape(*x.shape[:-2], n, 3)
 
 
-class Collapses:
-    """Cached partitions by the edge collapses of single key-frames, shared by pairs of key-frames.
+def coarsen(
+    keyframes: FloatArray, faces: IntArray, n_faces: int = 1000, candidates: Sequence[int] | None = None
+) -> Coarsening:
+    """Partition the vertices of all key-frames by the edge collapses of one of them.
+
+    The collapses of each candidate are tried; the partition with the best triangle quality over all key-frames is used,
+    as thin coarse triangles exaggerate bending and collapse in between. Regular meshes with flat sides can lead to
+    degenerate triangles: then somewhat more faces are tried.
 
     Args:
+        keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
+        n_faces: Faces of the coarse mesh; smaller meshes are not coarsened.
+        candidates: Indices of the key-frames whose collapses are tried; by default all.
+
+    Raises:
+        ValueError: If ``n_faces`` is below 4.
     """
+    if n_faces < 4:
+        raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
+    sources = range(len(keyframes)) if candidates is None else candidates
+    found: list[tuple[float, Coarsening]] = []
+    for n in (int(factor * n_faces) for factor in MORE_FACES):
+        if found and (n >= len(faces) or found[-1][0] >= NEEDLE):
+            break
+        tried = [(*_fatness(keyframes, each), each) for each in (collapsed(keyframes[i], faces, n) for i in sources)]
+        # Those without needles first, then by the 1st percentile.
+        least, _, best = max(tried, key=lambda one: (min(one[0], NEEDLE), one[1]))
+        found.append((least, best))
+    return max(found, key=lambda one: min(one[0], NEEDLE))[1]
 
-    def __init__(self, faces: IntArray) -> None:
-        # Copies: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
-        self.faces = faces.copy()
-        self._poses: dict[int, FloatArray] = {}
-        self._known: dict[tuple[int, int], Coarsening] = {}
 
-    def of(self, places: Sequence[int], keyframes: FloatArray) -> Callable[[int, int], Coarsening]:
-        """A function of local indices of key-frames. The first pose passed for a key-frame is kept.
-
-        Args:
-            places: Global index of each key-frame.
-            keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
-        """
-        for place, points in zip(places, keyframes, strict=True):
-            self._poses.setdefault(place, points.copy())
-        return partial(self._at, tuple(places))
-
-    def _at(self, places: tuple[int, ...], keyframe: int, n_faces: int) -> Coarsening:
-        """The partition by the collapses of one key-frame to a number of faces."""
-        key = places[keyframe], n_faces
-        if key not in self._known:
-            self._known[key] = collapsed(self._poses[key[0]], self.faces, n_faces)
-        return self._known[key]
+def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, float]:
+    """Ratio of area to squared longest edge in the worst key-frame: the minimum and the 1st percentile of triangles."""
+    corners = coarsening.restrict(keyframes)[:, coarsening.faces]
+    sides = corners - np.roll(corners, 1, axis=2)
+    area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
+    fatness = area / np.maximum((sides**2).sum(-1).max(-1), np.finfo(np.float64).tiny)
+    return float(fatness.min()), float(np.percentile(fatness, 1, axis=-1).min())
 
 
 def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
-    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately."""
+    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately.
+
+    Meshes of so few faces stay as they are.
+    """
+    if len(faces) <= n_faces:
+        return Coarsening.of_labels(np.arange(len(points)), faces)
     root = _roots(points, faces, n_faces)
-    coarse_faces = _coarse_faces(root, faces)
-    piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))[faces[:, 0]]
-    before = np.bincount(piece)
+    piece = connected_pieces(np.concatenate([faces[:, :2], faces[:, 1:]]), len(points))
+    before = np.bincount(piece[faces[:, 0]])
     if np.count_nonzero(before) > 1:
-        owner = np.zeros(len(points), dtype=np.int64)
-        owner[faces] = piece[:, None]
-        after = np.bincount(owner[coarse_faces[:, 0]], minlength=len(before))
+        after = np.bincount(piece[_coarse_faces(root, faces)[:, 0]], minlength=len(before))
         poor = after < np.minimum(FACES_OF_PIECE, before)
-        areas = np.bincount(piece, double_areas(points, faces), minlength=len(before))
+        areas = np.bincount(piece[faces[:, 0]], double_areas(points, faces))
         for i in np.argsort(-areas, kind="stable")[:MOST_PIECES]:
             if poor[i]:
-                own = faces[piece == i]
-                members = np.unique(own)
-                compact = np.searchsorted(members, own)
+                members, own = np.unique(faces[piece[faces[:, 0]] == i], return_inverse=True)
                 few = before[i] <= FACES_OF_PIECE
-                root[members] = members if few else members[_roots(points[members], compact, FACES_OF_PIECE)]
-        coarse_faces = _coarse_faces(root, faces)
-    # Clusters without faces carry no energy and are removed.
-    index = _compact(coarse_faces, len(points))
-    return Coarsening(index[root], index[coarse_faces])
+                root[members] = members if few else members[_roots(points[members], own.reshape(-1, 3), FACES_OF_PIECE)]
+    return Coarsening.of_labels(root, faces)
 
 
-def _compact(faces: IntArray, n: int) -> IntArray:
-    """Number of each vertex among those that faces use, -1 for the others. *Shape:* ``(n,)``."""
-    used = np.unique(faces)
-    index = np.full(n, -1)
-    index[used] = np.arange(len(used))
-    return index
+def joined(points: FloatArray, faces: IntArray, coarsening: Coarsening, shortest: float) -> Coarsening:
+    """Merge clusters of a shape whose averages coincide: at edges up to ``shortest`` mean lengths."""
+    centres, edges = coarsening.restrict(points), Connectivity(coarsening.faces).edges
+    lengths = np.linalg.norm(centres[edges[:, 1]] - centres[edges[:, 0]], axis=1)
+    short = lengths <= shortest * lengths.mean()
+    joint = connected_pieces(edges[short], len(centres))
+    labels = np.where(coarsening.clusters >= 0, joint[coarsening.clusters], -1)
+    return Coarsening.of_labels(labels, faces) if short.any() else coarsening
 
 
 def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
@@ -149,63 +147,8 @@ def _roots(points: FloatArray, faces: IntArray, n_faces: int) -> IntArray:
     return root
 
 
-def _coarse_faces(root: IntArray, faces: IntArray) -> IntArray:
-    """Faces of the coarse mesh in terms of the representative vertices. *Shape:* ``(F_coarse, 3)``."""
-    left = root[faces]
+def _coarse_faces(labels: IntArray, faces: IntArray) -> IntArray:
+    """Faces in terms of labels, without degenerate and repeated ones. *Shape:* ``(F_coarse, 3)``."""
+    left = labels[faces]
     left = left[~degenerate_faces(left)]
     return left[~repeated_faces(left)]
-
-
-def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, float]:
-    """Ratio of area to squared longest edge in the worst key-frame.
-
-    Returns:
-        Minimum and 1st percentile over the coarse triangles.
-    """
-    corners = coarsening.restrict(keyframes)[:, coarsening.faces]
-    sides = corners - np.roll(corners, 1, axis=2)
-    area = 0.5 * np.linalg.norm(np.cross(sides[..., 0, :], sides[..., 1, :]), axis=-1)
-    longest = (sides**2).sum(-1).max(-1)
-    fatness = area / np.maximum(longest, np.finfo(np.float64).tiny)
-    return float(fatness.min()), float(np.percentile(fatness, 1, axis=-1).min())
-
-
-def coarsen(
-    keyframes: FloatArray,
-    faces: IntArray,
-    n_faces: int = 1000,
-    collapses: Callable[[int, int], Coarsening] | None = None,
-) -> Coarsening:
-    """Partition the vertices of all key-frames by the edge collapses of one of them.
-
-    The collapses of each key-frame are candidates; the partition with the best triangle quality over all key-frames is
-    used, as thin coarse triangles exaggerate bending and collapse in between. Regular meshes with flat sides can lead
-    to degenerate triangles: then somewhat more faces are tried.
-
-    Args:
-        keyframes: Vertex positions. *Shape:* ``(K, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_faces: Faces of the coarse mesh; smaller meshes are not coarsened.
-        collapses: Shared partitions, from key-frame and number of faces (:meth:`Collapses.of`).
-
-    Raises:
-        ValueError: If ``n_faces`` is below 4.
-    """
-    if n_faces < 4:
-        raise ValueError(f"a coarse mesh needs at least 4 faces, got n_faces={n_faces}")
-    if len(faces) <= n_faces:
-        index = _compact(faces, keyframes.shape[1])
-        return Coarsening(index, index[faces])
-    collapses = Collapses(faces).of(range(len(keyframes)), keyframes) if collapses is None else collapses
-    found: list[tuple[float, Coarsening]] = []
-    for n in (int(factor * n_faces) for factor in MORE_FACES):
-        if n >= len(faces):
-            break
-        candidates = [collapses(i, n) for i in range(len(keyframes))]
-        fatness = [_fatness(keyframes, candidate) for candidate in candidates]
-        # Candidates without needles first, then by the 1st percentile.
-        best = max(range(len(candidates)), key=lambda i: (min(fatness[i][0], NEEDLE), fatness[i][1]))
-        found.append((fatness[best][0], candidates[best]))
-        if fatness[best][0] >= NEEDLE:
-            break
-    return max(found, key=lambda item: min(item[0], NEEDLE))[1]

@@ -11,7 +11,6 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.sparse import factorize
-from torch_modal.precompute.parallel import one_blas_thread
 
 N_RIGID = 6
 DENSE_BELOW = 600
@@ -33,15 +32,17 @@ class ModalAnalysisError(RuntimeError):
 
 
 class ElasticBody(NamedTuple):
-    """The eigenproblem of an elastic body with ``N`` vertices, of a surface with ``U`` points.
+    """The eigenproblem ``K phi = lambda M phi`` of an elastic body with ``N`` vertices, of a surface with ``U`` points.
 
     Attributes:
         points: Vertices at rest. *Shape:* ``(N, 3)``.
-        stiffness: Row ``3 i + c`` is coordinate ``c`` of vertex ``i``. *Shape:* ``(3N, 3N)``.
-        mass: Entries for vertices. *Shape:* ``(N, N)``.
+        stiffness: ``K``, symmetric positive semi-definite; row ``3 i + c`` is coordinate ``c`` of vertex ``i``.
+            *Shape:* ``(3N, 3N)``.
+        mass: ``M``, entries for vertices. *Shape:* ``(N, N)``.
         to_surface: Displacements of the surface from those of the body. *Shape:* ``(N, 3, k) -> (U, 3, k)``.
-        shift: As for :func:`lowest_modes`.
-        largest_residual: Likewise.
+        shift: Positive shift of the eigenproblem, near the lowest eigenvalues of slender bodies. None: that of a
+            solid, the inverse square of the diagonal of the bounding box.
+        largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
     """
 
     points: FloatArray
@@ -70,46 +71,24 @@ class ElasticModes(NamedTuple):
     n_pieces: int
 
 
-@one_blas_thread()
-def lowest_modes(
-    k: sp.csc_matrix,
-    mass: sp.spmatrix,
-    positions: FloatArray,
-    n_modes: int,
-    shift: float | None = None,
-    largest_residual: float = LARGEST_RESIDUAL,
-) -> ElasticModes:
-    """Lowest elastic modes of ``K phi = lambda M phi``.
+def lowest_modes(body: ElasticBody, n_modes: int) -> ElasticModes:
+    """Lowest elastic modes of a body, at most ``3N - 6``.
 
     Shift-invert Lanczos with a negative shift: ``K + shift M`` is positive definite, and the modes are those of ``K``
     itself. Rigid motions are known and projected out, so that Lanczos need not find six equal eigenvalues. Connected
     components are solved separately for the same reason. Small problems are solved densely. The first of the largest
     components of each mode is positive.
 
-    Args:
-        k: Stiffness, symmetric positive semi-definite. *Shape:* ``(3N, 3N)``.
-        mass: Mass matrix, entries for vertices. *Shape:* ``(N, N)``.
-        positions: Rest positions. *Shape:* ``(N, 3)``.
-        n_modes: Number of elastic modes.
-        shift: Positive; near the lowest eigenvalues of slender bodies. Default: that of a solid, the inverse square of
-            the diagonal of the bounding box.
-        largest_residual: Largest residual ``|K phi - lambda M phi| / (lambda |M phi|)`` of a mode.
-
     Returns:
         The modes. Rigid motions of connected components against each other come first, six for each further component,
         beside the ``n_modes`` requested ones.
 
     Raises:
-        ValueError: More modes than the mesh has.
         ModalAnalysisError: Rigid motions have energy, the stiffness is indefinite, all modes are zero modes, or a
             residual is too large.
+        RuntimeError, LinAlgError: Of SuperLU, ARPACK or LAPACK, where a matrix is singular.
     """
-    possible = 3 * len(positions) - N_RIGID
-    if not 1 <= n_modes <= possible:
-        raise ValueError(
-            f"{n_modes} modes requested, but a mesh of {len(positions)} vertices has {possible} elastic modes; "
-            f"give 1 to {possible}"
-        )
+    positions, k, mass, _, shift, largest_residual = body
     n_massless = int((np.asarray(mass.sum(axis=1)) <= 0).sum())
     if n_massless:
         raise ModalAnalysisError(f"{n_massless} vertices have no mass; remove unused vertices first")
@@ -120,7 +99,7 @@ def lowest_modes(
     if n_pieces == 1:
         return _component_modes(k, inertia, positions, n_modes, shift, largest_residual)
 
-    rigid = np.zeros((len(inertia.indptr) - 1, N_RIGID * n_pieces))
+    rigid = np.zeros((k.shape[0], N_RIGID * n_pieces))
     eigenvalues, modes, n_zero = [], [], N_RIGID * n_pieces
     for index in range(n_pieces):
         vertices = np.flatnonzero(piece == index)
@@ -145,11 +124,9 @@ def lowest_modes(
 
 
 def rigid_motions(positions: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
-    """M-orthonormal basis of the translations and infinitesimal rotations. *Shape:* ``(3N, 6)``.
+    """M-orthonormal translations and infinitesimal rotations of points that are not all on one line.
 
-    Args:
-        positions: Rest positions, not all on one line. *Shape:* ``(N, 3)``.
-        inertia: Mass matrix of coordinates. *Shape:* ``(3N, 3N)``.
+    *Shape:* ``(N, 3), (3N, 3N) -> (3N, 6)``, with the mass matrix of coordinates.
     """
     centered = positions - positions.mean(axis=0)
     # Scaled to order 1 like the translations, for a well-conditioned factorisation.
@@ -167,15 +144,12 @@ def _component_modes(
     """Lowest elastic modes of a connected component, with checks."""
     rigid = rigid_motions(positions, inertia)
     momentum = inertia @ rigid
-    try:
-        if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
-            complement = scipy.linalg.qr(momentum)[0][:, N_RIGID:]
-            matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
-            span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
-        else:
-            span = _lanczos(k, inertia, rigid, momentum, n_modes, shift)
-    except (RuntimeError, np.linalg.LinAlgError) as error:  # ARPACK, SuperLU on a singular matrix, LAPACK
-        raise ModalAnalysisError(f"the eigenproblem could not be solved: {error}") from error
+    if k.shape[0] < DENSE_BELOW or 2 * n_modes > k.shape[0]:
+        complement = scipy.linalg.qr(momentum)[0][:, N_RIGID:]
+        matrices = (complement.T @ (matrix @ complement) for matrix in (k, inertia))
+        span = complement @ scipy.linalg.eigh(*matrices, subset_by_index=(0, n_modes - 1))[1]
+    else:
+        span = _lanczos(k, inertia, rigid, momentum, n_modes, shift)
 
     # Rayleigh-Ritz, after which modes are orthonormal up to rounding.
     span = _orthonormal(span - rigid @ (momentum.T @ span), inertia)
@@ -218,12 +192,23 @@ def _component_modes(
 def _lanczos(
     k: sp.csc_matrix, inertia: sp.csr_matrix, rigid: FloatArray, momentum: FloatArray, n_modes: int, shift: float
 ) -> FloatArray:
-    """Lowest eigenvectors that are M-orthogonal to the rigid motions, by ARPACK. *Shape:* ``(3N, n_modes)``."""
-    n = k.shape[0]
-    solve = _inverse(k + shift * inertia)
+    """Lowest eigenvectors that are M-orthogonal to the rigid motions, by ARPACK. *Shape:* ``(3N, n_modes)``.
+
+    Vertices are ordered instead of unknowns, which gives a third less fill: by minimum degree, from the factorisation
+    of a well-conditioned matrix with their graph.
+    """
+    n, shifted = k.shape[0], k + shift * inertia
+    graph = _vertex_graph(shifted)
+    laplacian = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
+    degrees = np.diff(graph.indptr)
+    by_vertex = factorize(laplacian + sp.identity(len(degrees)) * (1.0 + degrees.max()))
+    order = _unknowns(np.argsort(by_vertex.perm_c))
+    # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
+    factors = factorize(shifted[order][:, order].tocsr().T, "NATURAL")
 
     def elastic_solve(forces: FloatArray) -> FloatArray:
-        found = solve(forces.reshape(-1))
+        found = np.empty(n)
+        found[order] = factors.solve(forces.reshape(-1)[order])
         return found - rigid @ (momentum.T @ found)
 
     # A fixed start makes modes reproducible. Full accuracy: a looser tolerance misses copies of equal eigenvalues.
@@ -232,28 +217,6 @@ def _lanczos(
     n_vectors = min(n_modes + MORE_VECTORS, n)
     vectors: FloatArray = eigsh(k, n_modes, inertia, sigma=-shift, OPinv=inverse, v0=start, ncv=n_vectors, tol=0)[1]
     return vectors
-
-
-def _inverse(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
-    """Solver with a symmetric positive definite matrix of three unknowns for each vertex.
-
-    Vertices are ordered instead of unknowns, which gives a third less fill: by minimum degree, from the factorisation
-    of a well-conditioned matrix with their graph.
-    """
-    graph = _vertex_graph(matrix)
-    laplacian = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
-    degrees = np.diff(graph.indptr)
-    by_vertex = factorize(laplacian + sp.identity(len(degrees)) * (1.0 + degrees.max()))
-    order = _unknowns(np.argsort(by_vertex.perm_c))
-    # The transpose of the symmetric matrix has sorted indices, in a fraction of the time of sorting.
-    factors = factorize(matrix[order][:, order].tocsr().T, "NATURAL")
-
-    def solve(right: FloatArray) -> FloatArray:
-        found = np.empty_like(right)
-        found[order] = factors.solve(right[order])
-        return found
-
-    return solve
 
 
 def _unknowns(vertices: IntArray) -> IntArray:

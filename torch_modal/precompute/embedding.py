@@ -5,7 +5,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.precompute.parallel import closest_in
+from torch_modal.precompute.parallel import n_cpus
 from torch_modal.precompute.stiffness import hat_gradients
 from torch_modal.precompute.tetrahedra import Tetrahedra
 
@@ -38,18 +38,14 @@ def fit_weights(points: FloatArray, vertices: FloatArray, neighbours: IntArray, 
     Returns:
         Rows sum to one, and ``weights @ vertices`` are the points. *Shape:* ``(V, N)``.
     """
-    rows = np.repeat(np.arange(len(points)), N_NEIGHBOURS)
-    weights = [
-        _moving_least_squares(points[chunk], vertices, neighbours[chunk], kernels[chunk])
-        for chunk in _chunks(np.arange(len(points)))
-    ]
-    entries = (np.concatenate(weights).reshape(-1), (rows, neighbours.reshape(-1)))
+    rows = np.arange(len(points))
+    chunks = ((points[rows], vertices, neighbours[rows], kernels[rows]) for rows in _chunks(rows))
+    weights = np.concatenate([_moving_least_squares(*chunk) for chunk in chunks])
+    entries = (weights.reshape(-1), (np.repeat(rows, N_NEIGHBOURS), neighbours.reshape(-1)))
     return sp.coo_matrix(entries, shape=(len(points), len(vertices))).tocsr()
 
 
-def find_neighbours(
-    points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray | None = None
-) -> tuple[IntArray, FloatArray]:
+def find_neighbours(points: FloatArray, tetrahedra: Tetrahedra, normals: FloatArray) -> tuple[IntArray, FloatArray]:
     """Nearest vertices of each point within a few edges of its closest tetrahedron.
 
     The search for the closest tetrahedron starts slightly below the surface, so that touching limbs do not mix.
@@ -57,28 +53,28 @@ def find_neighbours(
     Args:
         points: Positions on the surface. *Shape:* ``(V, 3)``.
         tetrahedra: The volume mesh.
-        normals: Outward unit normals at the points; without them the search starts at the points. *Shape:* ``(V, 3)``.
+        normals: Outward unit normals at the points, or zeros. *Shape:* ``(V, 3)``.
 
     Returns:
         Neighbours and kernels for :func:`fit_weights`, padded with zero kernels. *Shape:* ``(V, 12), (V, 12)``.
     """
-    extent = np.ptp(tetrahedra.vertices, axis=0)
-    below = points if normals is None else points - PUSH * np.linalg.norm(extent) * normals
-    closest = closest_tetrahedra(below, tetrahedra)
-    incidence = _incidence(tetrahedra.tets, len(tetrahedra.vertices))
-    adjacency = sp.csr_matrix(incidence.T @ incidence)  # of vertices, with a non-zero diagonal
+    vertices, tets = tetrahedra.vertices, tetrahedra.tets
+    push = PUSH * np.linalg.norm(np.ptp(vertices, axis=0))
+    closest = closest_tetrahedra(points - push * normals, tetrahedra)
+    ones, starts = np.ones(tets.size, dtype=np.int32), np.arange(0, tets.size + 1, 4)
+    incidence = sp.csr_matrix((ones, tets.reshape(-1), starts), shape=(len(tets), len(vertices)))
+    adjacency = reached = sp.csr_matrix(incidence.T @ incidence)  # of vertices, with a non-zero diagonal
 
-    wanted = min(N_NEIGHBOURS, len(tetrahedra.vertices))
-    neighbours, kernels = np.zeros((len(points), N_NEIGHBOURS), dtype=np.int64), np.zeros((len(points), N_NEIGHBOURS))
+    wanted = min(N_NEIGHBOURS, len(vertices))
+    neighbours, kernels = np.zeros((len(points), N_NEIGHBOURS), np.int64), np.zeros((len(points), N_NEIGHBOURS))
     left = np.arange(len(points))
-    reached = adjacency
     for rings in range(2, MAX_RINGS + 1):
         reached = sp.csr_matrix(reached @ adjacency)
         last = rings == MAX_RINGS
         retry = []
         for chunk in _chunks(left):
-            nearest, kernel, number = _nearest_reached(points[chunk], tetrahedra, closest[chunk], reached)
-            fit = _moving_least_squares(points[chunk], tetrahedra.vertices, nearest, kernel)
+            nearest, kernel, number = _nearest_reached(points[chunk], vertices, closest[chunk], incidence, reached)
+            fit = _moving_least_squares(points[chunk], vertices, nearest, kernel)
             good = (number >= wanted) & (np.abs(fit).sum(axis=1) <= MAX_AMPLIFICATION) | last
             neighbours[chunk[good]], kernels[chunk[good]] = nearest[good], kernel[good]
             retry.append(chunk[~good])
@@ -104,7 +100,7 @@ def closest_tetrahedra(points: FloatArray, tetrahedra: Tetrahedra) -> IntArray:
         n_candidates = min(n_candidates, len(centroids))
         outside = []
         for chunk in _chunks(left):
-            tets = closest_in(tree, points[chunk], n_candidates)[1].reshape(len(chunk), n_candidates)
+            tets = tree.query(points[chunk], n_candidates, workers=n_cpus())[1].reshape(len(chunk), n_candidates)
             offset = points[chunk, None] - centroids[tets]
             barycentric = 0.25 + (gradients[tets] @ offset[..., None])[..., 0]
             inside = (barycentric * heights[tets]).min(axis=2)  # signed distance, positive inside
@@ -119,18 +115,12 @@ def _chunks(indices: IntArray) -> list[IntArray]:
     return np.array_split(indices, max(1, -(-len(indices) // _CHUNK)))
 
 
-def _incidence(tets: IntArray, n_vertices: int) -> sp.csr_matrix:
-    """Ones at the vertices of each tetrahedron. *Shape:* ``(T, N)``."""
-    ones, starts = np.ones(tets.size, dtype=np.int32), np.arange(0, tets.size + 1, 4)
-    return sp.csr_matrix((ones, tets.reshape(-1), starts), shape=(len(tets), n_vertices))
-
-
 def _nearest_reached(
-    points: FloatArray, tetrahedra: Tetrahedra, closest: IntArray, reached: sp.csr_matrix
+    points: FloatArray, vertices: FloatArray, closest: IntArray, incidence: sp.csr_matrix, reached: sp.csr_matrix
 ) -> tuple[IntArray, FloatArray, IntArray]:
     """Nearest vertices that ``reached`` connects with the closest tetrahedron, their kernels, and their number."""
     tets, row_of_point = np.unique(closest, return_inverse=True)
-    around = sp.csr_matrix(_incidence(tetrahedra.tets[tets], len(tetrahedra.vertices)) @ reached)
+    around = sp.csr_matrix(incidence[tets] @ reached)
     sizes = np.diff(around.indptr)
     width = max(int(sizes.max()), N_NEIGHBOURS + 1)
     padded = np.full((len(tets), width), -1, dtype=np.int64)
@@ -139,13 +129,12 @@ def _nearest_reached(
     index = padded[row_of_point.reshape(-1)]
     # Coordinate by coordinate: a third of the time of sums over three neighbours in memory.
     squared = np.zeros(index.shape)
-    for place, vertex in zip(points.T, tetrahedra.vertices.T.copy(), strict=True):
+    for place, vertex in zip(points.T, vertices.T.copy(), strict=True):
         squared += (place[:, None] - vertex[index]) ** 2
     squared[index < 0] = np.inf
     order = np.argpartition(squared, N_NEIGHBOURS, axis=1)[:, : N_NEIGHBOURS + 1]
+    order = np.take_along_axis(order, np.argsort(np.take_along_axis(squared, order, axis=1), axis=1), axis=1)
     squared = np.take_along_axis(squared, order, axis=1)
-    order = np.take_along_axis(order, np.argsort(squared, axis=1), axis=1)
-    squared = np.sort(squared, axis=1)
 
     count = np.minimum(sizes[row_of_point.reshape(-1)], N_NEIGHBOURS)
     # The kernel vanishes at the first vertex outside of the support, so that weights vary smoothly over the surface;
@@ -169,7 +158,11 @@ def _moving_least_squares(
     mean = (theta[:, None] @ offset)[:, 0]
     centered = offset - mean[:, None]
     covariance = (theta[..., None] * centered).transpose(0, 2, 1) @ centered
-    inverse = _inverses(covariance)
+    # Coplanar neighbours determine no slope across their plane: that of a pseudo-inverse is zero.
+    flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
+    inverse = np.empty_like(covariance)
+    inverse[~flat] = np.linalg.inv(covariance[~flat])
+    inverse[flat] = np.linalg.pinv(covariance[flat], rcond=1e-9, hermitian=True)
     # Eliminating the constant leaves 3 x 3: the weights are θ (a + s · (d - mean)) with a sum a and a moment C s.
     weights = np.zeros_like(theta)
     for _ in range(2):  # the second pass corrects the rounding of the first
@@ -178,16 +171,3 @@ def _moving_least_squares(
         slope = (inverse @ (moment_missing - sum_missing[:, None] * mean)[..., None])[..., 0]
         weights = weights + theta * (sum_missing[:, None] + (centered @ slope[..., None])[..., 0])
     return weights
-
-
-def _inverses(covariance: FloatArray) -> FloatArray:
-    """Inverses of symmetric positive semi-definite matrices. *Shape:* ``(·, 3, 3)``.
-
-    Nearly singular matrices have a pseudo-inverse: coplanar neighbours determine no slope across their plane, and zero
-    is used.
-    """
-    flat = np.linalg.det(covariance) <= FLAT * np.trace(covariance, axis1=1, axis2=2) ** 3
-    inverse = np.empty_like(covariance)
-    inverse[~flat] = np.linalg.inv(covariance[~flat])
-    inverse[flat] = np.linalg.pinv(covariance[flat], rcond=1e-9, hermitian=True)
-    return inverse

@@ -6,17 +6,17 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from torch_modal.arrays import FloatArray, IntArray
+from torch_modal.errors import MeshError, MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-from torch_modal.geometry.inspect import OPEN, open_part, signed_volume
+from torch_modal.geometry.inspect import OPEN, open_part
 from torch_modal.io.cache import Arrays, Cache
-from torch_modal.keyframes.check import MeshError, MeshWarning, check_keyframes, require_area, require_solid
+from torch_modal.keyframes.check import check_keyframes
 from torch_modal.precompute.basis import ModalBasis
 from torch_modal.precompute.carrying import Carrier
 from torch_modal.precompute.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lowest_modes
@@ -36,41 +36,26 @@ MESHERS: dict[str, Callable[[], Mesher]] = {"lattice": Lattice, "tetwild": TetWi
 """Constructors of meshers by name."""
 
 THIN = 0.01
-"""Mean thickness, twice the volume over the area, in roots of the area, below which the shell is taken."""
+"""Mean thickness, in roots of the area, below which the shell is taken."""
 VERTICES_AT_ONCE = 30_000
 """Total size of concurrent eigenproblems: about 2 GiB."""
 DEFORMS = 1e-6
 """Norm of the non-rigid part of a motion, relative to the motion, above which it is a deformation."""
 
 
-def extract_modes(
-    vertices: Any,
-    faces: Any,
-    n_modes: int = 30,
-    *,
-    method: Method = "auto",
-    form: HessianForm = "edge",
-    mesher: Mesher | str = "lattice",
-    cache_dir: str | None = None,
-    cache: bool = True,
-) -> ModalBasis:
-    """Lowest vibration modes of one shape: `extract_bases` for a single key-frame, with the same options and errors.
+def extract_modes(vertices: Any, faces: Any, n_modes: int = 30, **options: Any) -> ModalBasis:
+    """Lowest vibration modes of one shape: `extract_bases` for a single key-frame, with the same errors and warnings.
 
     Args:
         vertices: Positions, tensor or array, any units. *Shape:* ``(V, 3)``.
         faces: Vertex indices. *Shape:* ``(F, 3)``.
         n_modes: Number of elastic modes, k.
-        method: ``"auto"``, ``"solid"`` or ``"shell"``.
-        form: Form of the solid's Hessian.
-        mesher: ``"lattice"``, ``"tetwild"``, or an object.
-        cache_dir: Folder of the cache.
-        cache: Whether results are kept on disk and found there.
+        options: Those of :func:`extract_bases`; no bar is shown unless ``progress`` is given.
 
     Returns:
         The basis: float64, on the CPU, without gradient.
     """
-    options: dict[str, Any] = {"method": method, "form": form, "mesher": mesher, "cache_dir": cache_dir, "cache": cache}
-    return extract_bases([vertices], faces, n_modes, **options, progress=False)[0]
+    return extract_bases([vertices], faces, n_modes, **{"progress": False, **options})[0]
 
 
 def extract_bases(
@@ -124,6 +109,21 @@ def extract_bases(
     Warns:
         MeshWarning: The warnings of `check_keyframes`; a shape of several loose pieces.
     """
+    store = Cache.at(cache_dir, enabled=cache)
+    return bases_of_checked(*check_keyframes(keyframes, faces), n_modes, method, form, mesher, store, progress)
+
+
+def bases_of_checked(
+    keyframes: torch.Tensor,
+    faces: torch.Tensor,
+    n_modes: int,
+    method: Method = "auto",
+    form: HessianForm = "edge",
+    mesher: Mesher | str = "lattice",
+    cache: Cache | None = None,
+    progress: Progress = None,
+) -> list[ModalBasis]:
+    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`."""
     if method not in METHODS:
         raise ValueError(f"the method is {method!r}; give one of {METHODS}")
     if form not in HESSIAN_FORMS:
@@ -132,33 +132,9 @@ def extract_bases(
         if mesher not in MESHERS:
             raise ValueError(f"the mesher is {mesher!r}; give a Mesher or one of {tuple(MESHERS)}")
         mesher = MESHERS[mesher]()
-    store = Cache.at(cache_dir, enabled=cache)
-    positions, working_faces = check_keyframes(keyframes, faces)
-    return bases_of_checked(
-        positions, working_faces, n_modes, method=method, form=form, mesher=mesher, cache=store, progress=progress
-    )
-
-
-def bases_of_checked(
-    keyframes: torch.Tensor,
-    faces: torch.Tensor,
-    n_modes: int,
-    *,
-    method: Method = "auto",
-    form: HessianForm = "edge",
-    mesher: Mesher | None = None,
-    cache: Cache | None = None,
-    progress: Progress = None,
-    meanwhile: Callable[[], object] | None = None,
-) -> list[ModalBasis]:
-    """`extract_bases` for the output of :func:`~torch_modal.keyframes.check.check_keyframes`.
-
-    ``meanwhile`` is a background task for an idle processor.
-    """
-    shapes = keyframes.detach().cpu().double().numpy()
-    triangles = faces.cpu().numpy()
     if isinstance(n_modes, bool) or not isinstance(n_modes, (int, np.integer)) or n_modes < 1:
         raise ValueError(f"n_modes is {n_modes!r}; give a whole number of at least 1")
+    shapes, triangles = keyframes.detach().cpu().double().numpy(), faces.cpu().numpy()
     n_used = len(np.unique(triangles))
     possible = 3 * n_used - N_RIGID
     if n_modes > possible:
@@ -166,16 +142,11 @@ def bases_of_checked(
             f"{n_modes} modes requested, but a surface of {n_used} vertices has at most {possible} ways to "
             f"deform; give 1 to {possible}"
         )
-    surfaces: list[CanonicalSurface] = []
-    for index, shape in enumerate(shapes):
-        with _naming_keyframe(index, len(shapes)):
-            require_area(shape, triangles)
-            surfaces.append(CanonicalSurface.of(shape, triangles))
-
     with one_blas_thread(), ProgressReport(len(shapes), "vibration modes", progress) as bar:
-        extraction = _Extraction(
-            surfaces, n_modes, form, mesher or Lattice(), cache or Cache.at(None), bar, meanwhile=meanwhile
-        )
+        extraction = _Extraction(len(shapes), int(n_modes), form, mesher, cache or Cache.at(None), bar)
+        for index, shape in enumerate(shapes):
+            with extraction.stage(index, "checks"):
+                extraction.surfaces.append(CanonicalSurface.of(shape, triangles))
         found = extraction.by(method)
     if loose := [one for one in found if one["n_zero"][0] > N_RIGID]:
         warnings.warn(
@@ -186,26 +157,23 @@ def bases_of_checked(
             stacklevel=3,
         )
     bases = []
-    for shape, surface, one in zip(shapes, surfaces, found, strict=True):
+    for shape, surface, one in zip(shapes, extraction.surfaces, found, strict=True):
         # lambda ~ 1 / length², and phi ~ length^(-3/2) since phi' M phi = 1 with a mass ~ length³.
         modes = np.zeros((n_modes, *shape.shape))
         modes[:, surface.used] = one["modes"] @ surface.axes * surface.scale**1.5
-        basis = ModalBasis(
-            reference=torch.from_numpy(shape.copy()),
-            eigenvalues=torch.from_numpy(one["eigenvalues"] * surface.scale**2),
-            modes=torch.from_numpy(modes),
-            rigid_eigenvalues=torch.from_numpy(one["rigid_eigenvalues"] * surface.scale**2),
+        values = (one[name] * surface.scale**2 for name in ("eigenvalues", "rigid_eigenvalues"))
+        eigenvalues, rigid_eigenvalues = map(torch.from_numpy, values)
+        bases.append(
+            ModalBasis(torch.from_numpy(shape.copy()), eigenvalues, torch.from_numpy(modes), rigid_eigenvalues)
         )
-        bases.append(basis)
     return bases
 
 
 def why_shell(surfaces: list[CanonicalSurface]) -> str:
     """Reason for which a set of key-frames has modes of the surface itself; empty if of the solid."""
     for index, surface in enumerate(surfaces):
-        mesh = Connectivity(surface.faces, len(surface.points))
-        holes = open_part(surface.points, mesh)
-        thickness = 2 * abs(signed_volume(surface.points, surface.faces)) / surface.area**1.5
+        holes = open_part(surface.points, Connectivity(surface.faces, len(surface.points)))
+        thickness = surface.thickness / surface.area**0.5
         what = f"key-frame {index} is" if len(surfaces) > 1 else "the shape is"
         if holes > OPEN:
             return f"{what} open: a round hole with its boundary would have {holes:.2g} times its area"
@@ -214,41 +182,17 @@ def why_shell(surfaces: list[CanonicalSurface]) -> str:
     return ""
 
 
-@contextlib.contextmanager
-def _naming_keyframe(index: int, n_keyframes: int) -> Iterator[None]:
-    """Prefix error messages with the index of the key-frame if there are several."""
-    try:
-        yield
-    except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
-        if n_keyframes == 1:
-            raise
-        named = type(error)(f"key-frame {index}: {error}")
-        named.__dict__.update(error.__dict__)  # how long a failure lasts
-        raise named from error
-
-
 @dataclass
 class _Extraction:
-    """Modes of all key-frames of a set, as arrays in canonical units.
+    """Modes of all key-frames of a set, as arrays in canonical units; ``stop`` cancels the work."""
 
-    Attributes:
-        surfaces: The key-frames.
-        n_modes: Number of elastic modes of each.
-        form: Form of the solid's Hessian.
-        mesher: Fills surfaces with tetrahedra.
-        cache: Storage of tetrahedra, failures and modes.
-        bar: Updated once for each key-frame.
-        meanwhile: Background task for an idle processor.
-        stop: Event that cancels the work and kills child processes.
-    """
-
-    surfaces: list[CanonicalSurface]
+    n_keyframes: int
     n_modes: int
     form: HessianForm
     mesher: Mesher
     cache: Cache
     bar: ProgressReport
-    meanwhile: Callable[[], object] | None = None
+    surfaces: list[CanonicalSurface] = field(default_factory=list)
     stop: threading.Event = field(default_factory=threading.Event)
 
     def by(self, method: Method) -> list[Arrays]:
@@ -262,7 +206,7 @@ class _Extraction:
         try:
             return first()
         except (TetrahedralizationError, ModalAnalysisError) as error:
-            if isinstance(error, TetrahedralizationError) and np.isfinite(error.fails_until):
+            if isinstance(error, TetrahedralizationError) and not error.lasting:
                 raise  # another attempt may succeed, and the same call should give the same modes
             self.stop.clear()
             logger.info("modes of %s: %s", "a solid" if reason else "the surface itself, not of a solid", error)
@@ -274,11 +218,12 @@ class _Extraction:
 
     def shells(self) -> list[Arrays]:
         """Modes of all surfaces themselves."""
-
-        def compute(index: int) -> Arrays:
-            return self._modes_of(index, partial(sheet_body, self.surfaces[index], self.n_modes))
-
-        return self._all(compute, {}, {"form": "shell"}, n_coarse_faces(self.n_modes) // 2)
+        return self._all(
+            lambda index: self._modes_of(index, lambda: sheet_body(self.surfaces[index], self.n_modes)),
+            {},
+            {"form": "shell"},
+            n_coarse_faces(self.n_modes) // 2,
+        )
 
     def solids(self) -> list[Arrays]:
         """Modes of all solids inside.
@@ -287,68 +232,59 @@ class _Extraction:
         carried to the others. Those that they cannot follow are meshed, too.
         """
         for index, surface in enumerate(self.surfaces):
-            with _naming_keyframe(index, len(self.surfaces)):
-                require_solid(surface.points / surface.scale, surface.faces)
+            with self.stage(index, "checks"):
+                surface.require_solid()
         first = min(range(len(self.surfaces)), key=lambda index: self_proximity(self.surfaces[index]))
-        rest, solid = self.surfaces[first], self._mesh(first)
-        one_at_a_time = threading.Lock()
-
-        @functools.cache
-        def make_carrier() -> Carrier:
-            return Carrier(solid.tetrahedra, rest.points, rest.faces, solid.weights())
-
-        def carry(index: int) -> Solid | None:
-            """The first solid in the pose of a key-frame; None if it is too distorted."""
-            surface = self.surfaces[index]
-            with self._stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
-                with one_at_a_time:  # all key-frames share one factorisation
-                    carrier = make_carrier()
-                vertices = carrier.carry(surface.points)
-                return None if vertices is None else solid.carried(surface, vertices)
-            return None  # a matrix is singular
+        solid, lock = self._mesh(first), threading.Lock()
+        make_carrier = functools.cache(lambda: Carrier(solid))
 
         def compute(index: int) -> Arrays:
-            if index != first and (carried := carry(index)) is not None:
+            if index == first:
+                return self._modes_of(index, lambda: solid.body(self.form))
+            carried = None
+            with self.stage(index, "carrying tetrahedra"), contextlib.suppress(RuntimeError, np.linalg.LinAlgError):
+                with lock:  # all key-frames share one factorisation
+                    carrier = make_carrier()
+                carried = carrier.carry(self.surfaces[index])
+            if carried is not None:
                 with contextlib.suppress(ModalAnalysisError):  # too distorted
-                    return self._modes_of(index, partial(carried.body, self.form))
-            own = solid if index == first else self._mesh(index)
-            return self._modes_of(index, partial(own.body, self.form))
+                    return self._modes_of(index, lambda: carried.body(self.form))
+            own = self._mesh(index)
+            return self._modes_of(index, lambda: own.body(self.form))
 
-        inputs = {f"rest_{name}": array for name, array in solid.tetrahedra.arrays().items()}
-        parameters = {"form": self.form, **self.mesher.key()}
-        return self._all(compute, {"rest_points": rest.points, **inputs}, parameters, len(solid.tetrahedra.vertices))
+        inputs = {"points": solid.surface.points, **solid.tetrahedra.arrays()}
+        inputs = {f"rest_{name}": array for name, array in inputs.items()}
+        return self._all(compute, inputs, {"form": self.form, **self.mesher.key()}, len(solid.tetrahedra.vertices))
 
     def _all(
         self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int
     ) -> list[Arrays]:
-        """Results of all key-frames, from the cache or computed in as many threads as fit into memory.
+        """Modes of all key-frames, from the cache or computed in as many threads as fit into memory.
 
-        Args:
-            compute: Computes the modes of a key-frame.
-            inputs: Arrays that they depend on, beside the surface.
-            parameters: Numbers and strings that they depend on.
-            n_vertices: Size of an eigenproblem.
+        They depend on the surface, the number of modes, and these inputs and parameters.
         """
 
         def modes(index: int) -> Arrays:
             surface = self.surfaces[index]
             arrays = {"points": surface.points, "faces": surface.faces, **inputs}
-            key = {"n_modes": int(self.n_modes), **parameters}
-            found = self.cache.get("modes", arrays, key, lambda: compute(index))
+            found = self.cache.get("modes", arrays, {"n_modes": self.n_modes, **parameters}, lambda: compute(index))
             self.bar.update()
             return found
 
-        return run_all(modes, len(self.surfaces), self.stop, VERTICES_AT_ONCE // n_vertices, self.meanwhile)
+        return run_all(modes, len(self.surfaces), self.stop, VERTICES_AT_ONCE // n_vertices)
 
     def _mesh(self, index: int) -> Solid:
-        with self._stage(index, "tetrahedra"):
+        with self.stage(index, "tetrahedra"):
             return Solid.filling(self.surfaces[index], self.mesher, self.cache, self.stop)
 
     def _modes_of(self, index: int, make_body: Callable[[], ElasticBody]) -> Arrays:
-        """Modes of a body, at the points of its surface, ``modes (k, U, 3)``."""
-        with self._stage(index, "modes"):
+        """Modes of a body, at the points of its surface. *Shape:* ``modes (k, U, 3)``."""
+        surface = self.surfaces[index]
+        with self.stage(index, "modes"):
             try:
-                return _surface_modes(make_body(), self.surfaces[index], self.n_modes)
+                body = make_body()
+                found = lowest_modes(body, min(self.n_modes, body.points.size - N_RIGID))
+                modes = body.to_surface(found.modes.reshape(len(body.points), 3, -1))
             except ModalAnalysisError:
                 raise
             except (RuntimeError, np.linalg.LinAlgError) as error:
@@ -356,40 +292,36 @@ class _Extraction:
                     f"the modes cannot be computed: {error}; the mesh is likely degenerate: check the surface, or try "
                     "another method or mesher"
                 ) from error
+            modes = np.ascontiguousarray(modes.transpose(2, 0, 1))
+            n_zero = found.n_zero - N_RIGID
+            modes = np.concatenate([_deforming(modes[:n_zero], surface.points, surface.faces), modes[n_zero:]])
+            if len(modes) < self.n_modes:
+                raise ModalAnalysisError(
+                    f"only {len(modes)} modes deform the {found.n_pieces} loose pieces, {self.n_modes} are requested; "
+                    "request fewer, or give a finer mesher"
+                )
+        return {
+            "eigenvalues": found.eigenvalues[len(found.eigenvalues) - len(modes) :][: self.n_modes],
+            "modes": modes[: self.n_modes],
+            "rigid_eigenvalues": found.rigid_eigenvalues,
+            "n_zero": np.array([found.n_zero]),
+            "n_pieces": np.array([found.n_pieces]),
+        }
 
     @contextlib.contextmanager
-    def _stage(self, index: int, what: str) -> Iterator[None]:
-        """Report a stage of a key-frame, unless the work was cancelled; its errors name the key-frame."""
-        n = len(self.surfaces)
-        with _naming_keyframe(index, n):
-            if self.stop.is_set():
-                raise StoppedError
-            self.bar.describe(f"key-frame {index + 1}/{n}: {what}")
+    def stage(self, index: int, what: str) -> Iterator[None]:
+        """Report a stage of a key-frame, unless the work was cancelled; errors name the key-frame if it has others."""
+        if self.stop.is_set():
+            raise StoppedError
+        self.bar.describe(f"key-frame {index + 1}/{self.n_keyframes}: {what}")
+        try:
             yield
-
-
-def _surface_modes(body: ElasticBody, surface: CanonicalSurface, n_modes: int) -> Arrays:
-    """Modes of a body, at the points of its surface. *Shape:* ``modes (k, U, 3)``."""
-    n_possible = body.points.size - N_RIGID
-    found = lowest_modes(
-        body.stiffness, body.mass, body.points, min(n_modes, n_possible), body.shift, body.largest_residual
-    )
-    modes = body.to_surface(found.modes.reshape(len(body.points), 3, -1))
-    modes = np.ascontiguousarray(modes.transpose(2, 0, 1))
-    n_zero = found.n_zero - N_RIGID
-    modes = np.concatenate([_deforming(modes[:n_zero], surface.points, surface.faces), modes[n_zero:]])
-    if len(modes) < n_modes:
-        raise ModalAnalysisError(
-            f"only {len(modes)} modes deform the {found.n_pieces} loose pieces, {n_modes} are requested; "
-            "request fewer, or give a finer mesher"
-        )
-    return {
-        "eigenvalues": found.eigenvalues[len(found.eigenvalues) - len(modes) :][:n_modes],
-        "modes": modes[:n_modes],
-        "rigid_eigenvalues": found.rigid_eigenvalues,
-        "n_zero": np.array([found.n_zero]),
-        "n_pieces": np.array([found.n_pieces]),
-    }
+        except (MeshError, TetrahedralizationError, ModalAnalysisError) as error:
+            if self.n_keyframes == 1:
+                raise
+            named = type(error)(f"key-frame {index}: {error}")
+            named.__dict__.update(error.__dict__)  # whether a failure lasts
+            raise named from error
 
 
 def _deforming(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
@@ -397,15 +329,7 @@ def _deforming(motions: FloatArray, points: FloatArray, faces: IntArray) -> Floa
 
     Relative rigid motions of pieces have no energy, so their amplitudes would be undetermined; the interpolation of the
     key-frames determines them. A piece of the surface that spans several pieces of tetrahedra is deformed by their
-    rigid motions.
-
-    Args:
-        motions: Displacements, M-orthonormal in the volume. *Shape:* ``(k, U, 3)``.
-        points: *Shape:* ``(U, 3)``.
-        faces: *Shape:* ``(F, 3)``.
-
-    Returns:
-        *Shape:* ``(m, U, 3)`` with ``m <= k``.
+    rigid motions. *Shape:* ``(k, U, 3), (U, 3), (F, 3) -> (m, U, 3)`` with ``m <= k``.
     """
     if len(motions) == 0:
         return motions

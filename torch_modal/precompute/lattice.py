@@ -17,7 +17,7 @@ from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.precompute.bisection import bisected
-from torch_modal.precompute.parallel import closest_in
+from torch_modal.precompute.parallel import n_cpus
 from torch_modal.precompute.surface import CanonicalSurface, SurfaceSamples, clearances, sampled
 from torch_modal.precompute.tetrahedra import (
     Tetrahedra,
@@ -105,12 +105,11 @@ class Lattice:
         found = lattice(surface, self.cube)
         pairs = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
         most = connected_pieces(pairs, len(surface.points)).max()
-        if face_connected_pieces(found.tets).max() <= most:
+        if (n_pieces := face_connected_pieces(found.tets).max()) <= most:
             return found
         turned = lattice(replace(surface, points=surface.points @ TURN.T), self.cube)
-        if face_connected_pieces(turned.tets).max() >= face_connected_pieces(found.tets).max():
-            return found
-        return turned._replace(vertices=turned.vertices @ TURN)
+        better = face_connected_pieces(turned.tets).max() < n_pieces
+        return turned._replace(vertices=turned.vertices @ TURN) if better else found
 
 
 class Indicator(NamedTuple):
@@ -139,7 +138,8 @@ class Indicator(NamedTuple):
         """Trilinear interpolation, with a sharper transition near the surface. *Shape:* ``(P, 3) -> (P,)``."""
         values = map_coordinates(self.values, ((points - self.low) / self.spacing).T, order=1, mode="nearest")
         doubtful = np.flatnonzero(values < SURELY_INSIDE)
-        distance, nearest = closest_in(self.samples.tree, points[doubtful], within=NEARBY * self.spacing)
+        reach = NEARBY * self.spacing
+        distance, nearest = self.samples.tree.query(points[doubtful], distance_upper_bound=reach, workers=n_cpus())
         # Beyond the boundary of an open surface there is no tangent plane.
         near = np.isfinite(distance) & np.append(self.has_sides, False)[nearest]
         doubtful, nearest = doubtful[near], nearest[near]
@@ -176,22 +176,19 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
     grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
     at_rim = np.zeros(len(surface.points), dtype=bool)
     at_rim[Connectivity(surface.faces).boundary_edges] = True
-    has_sides = ~np.any(at_rim[surface.faces[samples.faces]], axis=1)
-    indicator = Indicator(
-        _indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, np.asarray(has_sides)
-    )
-
-    corner = np.stack(np.meshgrid(*(np.arange(c) for c in counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    cubes = np.zeros(counts, dtype=bool)
-    cubes[tuple(((points - low) / root).astype(np.int64).T)] = True
-    cubes[tuple(corner[indicator.at(low + root * (corner + 0.5)) >= 0.5].T)] = True
+    has_sides = np.asarray(~at_rim[surface.faces[samples.faces]].any(axis=1))
+    indicator = Indicator(_indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, has_sides)
 
     def is_inside(places: FloatArray) -> BoolArray:
         return indicator.at(low + root * places) >= 0.5
 
+    corner = np.stack(np.meshgrid(*(np.arange(c) for c in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    cubes = np.zeros(counts, dtype=bool)
+    cubes[tuple(((points - low) / root).astype(np.int64).T)] = True
+    cubes[tuple(corner[is_inside(corner + 0.5)].T)] = True
     most = int(MOST_TETRAHEDRA * max(1.0, USUAL_CUBE * CANONICAL_SIZE / largest) ** 3)
-    places, tets, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
-    vertices = low + root * places
+    cut, owner = bisected(np.argwhere(cubes), (points - low) / root, wanted / root, is_inside, most)
+    vertices, tets = low + root * cut.vertices, cut.tets
     inside = indicator.inside(vertices[tets])
     kept = inside >= LEAST_INSIDE
     kept[owner] = True
@@ -211,7 +208,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     sizes = np.full(len(filled.vertices), np.inf)
     np.minimum.at(sizes, filled.tets.reshape(-1), np.repeat(np.cbrt(6 * volumes), 4))
     rim = np.unique(filled.tets[np.asarray(filled.inside) < 1 - LEAST_INSIDE])
-    distance, nearest = closest_in(samples.tree, filled.vertices[rim])
+    distance, nearest = samples.tree.query(filled.vertices[rim], workers=n_cpus())
     near = distance < REACH * sizes[rim]
     rim, nearest = rim[near], nearest[near]
     height = np.einsum("vi,vi->v", filled.vertices[rim] - samples.points[nearest], samples.normals[nearest])
@@ -240,8 +237,8 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
     if solid_volumes(fitted).sum() < LEAST_KEPT * solid_volumes(filled).sum():
         return filled
     reach = 1.5 * sizes[filled.tets].max(axis=1).max()
-    is_covered = closest_in(cKDTree(fitted.vertices), samples.points, within=reach)[0] < np.inf
-    return fitted if is_covered.all() else filled
+    distance, _ = cKDTree(fitted.vertices).query(samples.points, distance_upper_bound=reach, workers=n_cpus())
+    return fitted if np.isfinite(distance).all() else filled
 
 
 def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:

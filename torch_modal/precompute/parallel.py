@@ -7,16 +7,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-import numpy as np
-from scipy.spatial import cKDTree
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
-from torch_modal.arrays import FloatArray, IntArray
-
 Result = TypeVar("Result")
-
-MANY = 500
-"""Number of points above which a nearest-neighbour search uses threads."""
 
 
 class StoppedError(Exception):
@@ -30,41 +23,23 @@ def n_cpus() -> int:
     return os.cpu_count() or 1
 
 
-def run_all(
-    work: Callable[[int], Result],
-    n: int,
-    stop: threading.Event,
-    most: int | None = None,
-    meanwhile: Callable[[], object] | None = None,
-) -> list[Result]:
+def run_all(work: Callable[[int], Result], n: int, stop: threading.Event, most: int) -> list[Result]:
     """Results of ``work(0)`` to ``work(n - 1)``, computed in one thread per processor.
 
     On the first error or Ctrl-C, ``stop`` is set, pending calls are cancelled, and the error is raised after the
-    running calls have returned. BLAS has one thread in each call.
-
-    Args:
-        work: The function; long calls check ``stop`` and raise `StoppedError`.
-        n: Number of calls.
-        stop: Cancels the work.
-        most: Largest number of threads, to bound memory.
-        meanwhile: Background task for the first idle thread; skipped if only one thread is used.
+    running calls have returned; long ones check ``stop`` and raise `StoppedError`. BLAS has one thread in each call.
+    The largest number of threads bounds memory; at least one is used.
     """
-
-    def alone(index: int) -> Result:
-        with one_blas_thread():
-            return work(index)
-
-    n_threads = min(n, n_cpus(), n if most is None else max(most, 1))
-    if n_threads < 2:
+    alone = one_blas_thread()(work)
+    n_threads = min(n, n_cpus(), max(most, 1))
+    if n_threads < 2:  # in this thread, which Ctrl-C ends at once
         return [alone(index) for index in range(n)]
-    with one_blas_thread(), ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
-        futures: list[Future[Any]] = []
+    futures: list[Future[Result]] = []
+    with ThreadPoolExecutor(n_threads, thread_name_prefix="torch_modal") as pool:
         try:
             # Inside the try block: Ctrl-C may come between submissions.
             for index in range(n):
                 futures.append(pool.submit(alone, index))
-            if meanwhile is not None:
-                futures.append(pool.submit(meanwhile))
             pending = set(futures)
             while pending:
                 # A signal that another thread receives ends no wait of this one, which then looks for it by itself.
@@ -76,7 +51,7 @@ def run_all(
             for future in futures:
                 future.cancel()
             raise
-    return [future.result() for future in futures[:n]]
+    return [future.result() for future in futures]
 
 
 class _Inside:
@@ -109,14 +84,3 @@ def one_blas_thread() -> Iterator[None]:
                 # Later versions of threadpoolctl accept the limit from its first thread only, unless that is cleared.
                 getattr(OpenBLASController, "clear_controlling_thread", lambda **_: None)(force=True)
                 _Inside.limits.__exit__(None, None, None)
-
-
-def closest_in(tree: cKDTree, points: FloatArray, k: int = 1, within: float = np.inf) -> tuple[FloatArray, IntArray]:
-    """Distances and indices of the nearest points of a tree, in parallel for many queries.
-
-    *Shape:* ``(n, 3) -> (n,), (n,)``, or ``(n, k), (n, k)``.
-    Queries without a neighbour within the distance have the index ``tree.n``.
-    """
-    n_threads = n_cpus() if len(points) >= MANY else 1
-    distance, index = tree.query(points, k=k, distance_upper_bound=within, workers=n_threads)
-    return distance, index

@@ -9,12 +9,12 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from torch_modal.arrays import BoolArray, FloatArray, IntArray
+from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.energy.rest_hessian import rest_hessian
 from torch_modal.energy.shell import BETA
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
-from torch_modal.precompute.coarsening import Coarsening, coarsen, collapsed
+from torch_modal.precompute.coarsening import collapsed, joined
 from torch_modal.precompute.eigen import ElasticBody
 from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import small_pieces
@@ -37,6 +37,11 @@ SPREAD = 1.5
 """Averages over neighbours that carry displacements from clusters to vertices, per radius of a cluster in edges."""
 
 
+def n_coarse_faces(n_modes: int) -> int:
+    """Faces of the mesh that a number of modes is computed on."""
+    return max(COARSE_FACES, FACES_PER_MODE * n_modes)
+
+
 def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
     """A surface as a thin elastic sheet.
 
@@ -48,7 +53,12 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
         n_modes: Number of modes that the coarse mesh must resolve.
     """
     fine = Connectivity(surface.faces, len(surface.points))
-    coarsening = _coarse(surface, fine, n_coarse_faces(n_modes))
+    piece = fine.vertex_pieces[surface.faces[:, 0]]
+    amounts = np.bincount(piece, double_areas(surface.points, surface.faces))
+    large = surface.faces[~small_pieces(amounts, surface.points[surface.faces], piece)[piece]]
+    # Modes do not mind needles, for which `coarsen` would collapse several times.
+    coarsening = collapsed(surface.points, large, n_coarse_faces(n_modes))
+    coarsening = joined(surface.points, large, coarsening, SHORTEST)
     points, mesh = coarsening.restrict(surface.points), Connectivity(coarsening.faces, coarsening.n_vertices)
 
     coarser = _mean_length(points, mesh) / _mean_length(surface.points, fine)
@@ -80,30 +90,13 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
     return ElasticBody(points, stiffness, mass, to_surface, SHIFT, LARGEST_RESIDUAL)
 
 
-def n_coarse_faces(n_modes: int) -> int:
-    """Faces of the mesh that a number of modes is computed on."""
-    return max(COARSE_FACES, FACES_PER_MODE * n_modes)
-
-
-def _coarse(surface: CanonicalSurface, fine: Connectivity, n_faces: int) -> Coarsening:
-    """Clusters of the vertices, -1 in small pieces, and the mesh that they make."""
-    points, faces = surface.points, surface.faces
-    piece = fine.vertex_pieces[faces[:, 0]]
-    small = small_pieces(np.bincount(piece, double_areas(points, faces)), points[faces], piece)
-    own = faces[~small[piece]]
-    # Modes do not mind needles, for which `coarsen` would collapse several times.
-    few = len(own) <= n_faces
-    coarse = coarsen(points[None], own, n_faces) if few else collapsed(points, own, n_faces)
-    return coarse.joined(points, SHORTEST)
-
-
 def _cluster_weights(
     clusters: IntArray, surface: CanonicalSurface, fine: Connectivity, points: FloatArray, mesh: Connectivity
 ) -> sp.coo_matrix:
     """Weights of the clusters that move each vertex; rows sum to one. *Shape:* ``(U, N)``.
 
     Membership, averaged over the neighbours on the surface a few times: weights are smooth, and do not reach from
-    one finger to the next.
+    one finger to the next. Pieces that no cluster reaches follow those around the nearest one.
     """
     n_fine, n = len(surface.points), len(points)
     own = np.flatnonzero(clusters >= 0)
@@ -113,26 +106,15 @@ def _cluster_weights(
         weights = averages @ weights
     total = np.asarray(weights.sum(axis=1)).reshape(-1)
     weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights
-    loose = total == 0
-    if loose.any():
-        weights = weights + _weights_of_loose(loose, surface, fine, points, mesh)
+    rows = np.flatnonzero(total == 0)
+    if len(rows):
+        tree, piece = cKDTree(points), fine.vertex_pieces[rows]
+        nearest = np.zeros(len(rows), dtype=np.int64)
+        for index in np.unique(piece):
+            nearest[piece == index] = tree.query(surface.points[rows[piece == index]].mean(axis=0))[1]
+        follows = sp.csr_matrix((np.ones(len(rows)), (rows, nearest)), shape=(n_fine, n))
+        weights = weights + follows @ _averages(mesh)
     return sp.coo_matrix(weights)
-
-
-def _weights_of_loose(
-    loose: BoolArray, surface: CanonicalSurface, fine: Connectivity, points: FloatArray, mesh: Connectivity
-) -> sp.csr_matrix:
-    """Weights of vertices that no cluster reaches: those around the nearest one, for a whole piece the same.
-
-    *Shape:* ``(U, N)``.
-    """
-    tree, rows = cKDTree(points), np.flatnonzero(loose)
-    follows = np.zeros(len(loose), dtype=np.int64)
-    for index in np.unique(fine.vertex_pieces[rows]):
-        own = rows[fine.vertex_pieces[rows] == index]
-        follows[own] = tree.query(surface.points[own].mean(axis=0))[1]
-    nearest = sp.csr_matrix((np.ones(len(rows)), (rows, follows[rows])), shape=(len(loose), len(points)))
-    return sp.csr_matrix(nearest @ _averages(mesh))
 
 
 def _mean_length(points: FloatArray, mesh: Connectivity) -> float:

@@ -1,7 +1,7 @@
 """The solid inside a surface: its tetrahedra, and the surface embedded in them."""
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from torch_modal.precompute.surface import CanonicalSurface
 from torch_modal.precompute.tetrahedra import (
     Mesher,
     Tetrahedra,
-    filled,
     kept_tetrahedra,
     loose_pieces,
     small_pieces,
@@ -52,15 +51,10 @@ class Solid:
 
     @classmethod
     def filling(cls, surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> "Solid":
-        """Mesh a surface, unless the cache has its tetrahedra.
-
-        Raises:
-            TetrahedralizationError: The mesher failed.
-            StoppedError: ``stop`` was set.
-        """
+        """Mesh a surface, unless the cache has its tetrahedra; raises as :meth:`Mesher.fill`."""
 
         def compute() -> dict[str, NDArray[Any]]:
-            tetrahedra = filled(surface, mesher, cache, stop)
+            tetrahedra = mesher.fill(surface, stop)
             neighbours, kernel = find_neighbours(surface.points, tetrahedra, surface.normals)
             piece = loose_pieces(tetrahedra)
             bears = np.bincount(piece[neighbours[kernel > 0]], minlength=piece.max() + 1) > 0
@@ -74,41 +68,30 @@ class Solid:
         tetrahedra = Tetrahedra(found["vertices"], found["tets"], found.get("inside"))
         return cls(surface, tetrahedra, found["neighbours"], found["kernel"])
 
-    def carried(self, surface: CanonicalSurface, vertices: FloatArray) -> "Solid":
-        """The solid in the pose of another key-frame."""
-        tetrahedra = self.tetrahedra._replace(vertices=vertices)
-        return replace(self, surface=surface, tetrahedra=tetrahedra, meshed=self)
-
     def weights(self) -> sp.csr_matrix:
         """Displacements of the surface from those of the tetrahedra. *Shape:* ``(U, N)``."""
         return fit_weights(self.surface.points, self.tetrahedra.vertices, self.neighbours, self.kernel)
 
-    def mass(self) -> sp.csr_matrix:
-        """Mass at a density of 1. *Shape:* ``(N, N)``."""
-        rest = (self.meshed or self).tetrahedra
-        return mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
-
     def body(self, form: HessianForm) -> ElasticBody:
-        """Stiffness and mass of the larger pieces."""
+        """Stiffness of the larger pieces, and their mass at a density of 1."""
         tetrahedra, vertices, following = larger_pieces(self.tetrahedra)
         weights = sp.csr_matrix(self.weights() @ following)
-
-        def to_surface(motions: FloatArray) -> FloatArray:
-            return (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:])
-
-        mass = self.mass()[vertices][:, vertices]
-        return ElasticBody(tetrahedra.vertices, arap_hessian(tetrahedra, form), mass, to_surface)
+        rest = (self.meshed or self).tetrahedra
+        mass = mass_matrix(rest) * (solid_volumes(self.tetrahedra).sum() / solid_volumes(rest).sum())
+        return ElasticBody(
+            tetrahedra.vertices,
+            arap_hessian(tetrahedra, form),
+            mass[vertices][:, vertices],
+            lambda motions: (weights @ motions.reshape(len(motions), -1)).reshape(-1, *motions.shape[1:]),
+        )
 
 
 def larger_pieces(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, sp.csr_matrix]:
     """Tetrahedra without small loose pieces, which follow the nearest part of the others.
 
     Small pieces have little mass, so their rigid motions of unit mass would be larger than other modes by orders of
-    magnitude.
-
-    Returns:
-        The larger pieces; indices of their vertices in the whole mesh, *Shape:* ``(M,)``; displacements of all vertices
-        from these, exact for linear fields, *Shape:* ``(N, M)``.
+    magnitude. Returns the larger pieces, the indices of their vertices, *shape* ``(M,)``, and weights that extend their
+    displacements to all vertices, exact for linear fields, *shape* ``(N, M)``.
     """
     n, piece = len(tetrahedra.vertices), loose_pieces(tetrahedra)
     of_tets = piece[tetrahedra.tets[:, 0]]

@@ -11,9 +11,9 @@ from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE, ordered_faces, placed
 from torch_modal.geometry.connectivity import vertex_areas
-from torch_modal.geometry.inspect import signed_volume
+from torch_modal.geometry.inspect import FLATNESS, principal_extents, signed_volume
 from torch_modal.geometry.vectors import vertex_normals
-from torch_modal.precompute.parallel import closest_in
+from torch_modal.precompute.parallel import n_cpus
 
 _DIAGONAL_RANGE = (1e-90, 1e90)
 MOST_SAMPLES = 60_000
@@ -56,14 +56,10 @@ class CanonicalSurface:
 
     @classmethod
     def of(cls, shape: FloatArray, faces: IntArray) -> "CanonicalSurface":
-        """Canonical surface of a checked shape.
-
-        Args:
-            shape: Positions in any units. *Shape:* ``(V, 3)``.
-            faces: Vertex indices. *Shape:* ``(F, 3)``.
+        """Canonical surface of a checked shape in any units. *Shape:* ``(V, 3), (F, 3)``.
 
         Raises:
-            MeshError: The size is so large or small that eigenvalues leave the range of float64.
+            MeshError: The surface has no area, or is so large or small that eigenvalues leave the range of float64.
         """
         used, compact = np.unique(faces, return_inverse=True)
         points = shape[used]
@@ -73,14 +69,42 @@ class CanonicalSurface:
                 f"the bounding-box diagonal is {diagonal:.3g}, at which eigenvalues leave the range of "
                 "float64; choose another unit"
             )
+        extents = principal_extents(points)
+        if extents[1] <= FLATNESS * extents[0]:
+            raise MeshError(
+                f"all vertices lie on a line: the extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}; "
+                "a surface has an area"
+            )
         own = placed(points, compact.reshape(-1, 3))
         ordered = ordered_faces(own.points, compact.reshape(-1, 3))
-        return cls(own.points, outward(own.points, ordered), used, own.scale, own.axes)
+        # fTetWild keeps the volume with positive winding number, which is empty for an inverted mesh.
+        if signed_volume(own.points - own.points.mean(axis=0), ordered) < 0:
+            ordered = np.ascontiguousarray(ordered[:, ::-1])
+        return cls(own.points, ordered, used, own.scale, own.axes)
+
+    def require_solid(self) -> None:
+        """Reject a planar surface, which has no interior.
+
+        Raises:
+            MeshError: The extent across the plane that fits best is below 1e-6 of the largest extent.
+        """
+        extents = principal_extents(self.points)
+        if extents[2] <= FLATNESS * extents[0]:
+            lengths = "{:.3g}, {:.3g} and {:.3g}".format(*extents / self.scale)
+            raise MeshError(
+                f"the surface is flat: its extents are {lengths}, so it encloses nothing that could be filled with "
+                'tetrahedra; take the modes of the surface (method="shell"), or give it a thickness'
+            )
 
     @cached_property
     def area(self) -> float:
         """Surface area."""
         return float(vertex_areas(self.points, self.faces).sum())
+
+    @property
+    def thickness(self) -> float:
+        """Mean thickness of the body: twice the volume over the area."""
+        return 2 * abs(signed_volume(self.points, self.faces)) / self.area
 
     @cached_property
     def normals(self) -> FloatArray:
@@ -88,40 +112,22 @@ class CanonicalSurface:
         return vertex_normals(self.points, self.faces)
 
 
-def outward(vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Faces with counterclockwise winding seen from outside. *Shape:* ``(F, 3)``.
-
-    fTetWild keeps the volume with positive winding number, which is empty for an inverted mesh.
-    """
-    inside_out = signed_volume(vertices - vertices.mean(axis=0), faces) < 0
-    return np.ascontiguousarray(faces[:, ::-1]) if inside_out else faces
-
-
 class SurfaceSamples(NamedTuple):
-    """Samples of a surface.
-
-    Attributes:
-        points: *Shape:* ``(P, 3)``.
-        normals: Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``.
-        areas: Area of each sample. *Shape:* ``(P,)``.
-        faces: Face of each sample. *Shape:* ``(P,)``.
-        tree: Search tree of the points.
-    """
+    """Samples of a surface."""
 
     points: FloatArray
+    """*Shape:* ``(P, 3)``."""
     normals: FloatArray
+    """Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``."""
     areas: FloatArray
+    """Area of each sample. *Shape:* ``(P,)``."""
     faces: IntArray
+    """Face of each sample. *Shape:* ``(P,)``."""
     tree: cKDTree
 
 
 def sampled(surface: CanonicalSurface, spacing: FloatArray) -> SurfaceSamples:
-    """Sample all faces at a given spacing, with at least one sample per face.
-
-    Args:
-        surface: The surface.
-        spacing: Distance of the samples in each face. *Shape:* ``(F,)``.
-    """
+    """Sample each face at a spacing of its own, with at least one sample per face. *Shape:* ``(F,)``."""
     corners = surface.points[surface.faces]
     sides = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(sides, axis=2).max(axis=1) / spacing
@@ -141,13 +147,8 @@ def sampled(surface: CanonicalSurface, spacing: FloatArray) -> SurfaceSamples:
         faces.append(np.repeat(np.flatnonzero(chosen), n**2))
     places, normal = np.concatenate(points), np.concatenate(shares)
     areas = np.linalg.norm(normal, axis=1)
-    return SurfaceSamples(
-        places,
-        normal / np.maximum(areas, 1e-300)[:, None],
-        areas,
-        np.concatenate(faces),
-        cKDTree(places, leafsize=LEAF),
-    )
+    unit = normal / np.maximum(areas, 1e-300)[:, None]
+    return SurfaceSamples(places, unit, areas, np.concatenate(faces), cKDTree(places, leafsize=LEAF))
 
 
 def self_proximity(surface: CanonicalSurface) -> float:
@@ -160,7 +161,7 @@ def self_proximity(surface: CanonicalSurface) -> float:
     tree = cKDTree(points)
     opposed = np.zeros(len(points), dtype=bool)
     for part in (1 / 16, 1 / 8, 1 / 4, 1 / 2):  # beyond half the gap, the opposing side is nearer than the point itself
-        nearest = closest_in(tree, points + part * NEAR * CANONICAL_SIZE * normals)[1]
+        nearest = tree.query(points + part * NEAR * CANONICAL_SIZE * normals, workers=n_cpus())[1]
         opposed |= np.einsum("vi,vi->v", normals, normals[nearest]) < OPPOSED
     areas = vertex_areas(surface.points, surface.faces)[::step]
     return float(areas[opposed].sum() / areas.sum())
@@ -169,49 +170,27 @@ def self_proximity(surface: CanonicalSurface) -> float:
 def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
     """Thickness of the body behind each face, and gap in front of it; infinite above `MOST`.
 
-    They are diameters of the largest empty balls tangent to the surface at samples (shrinking balls).
+    They are diameters of balls tangent to the surface at samples, which shrink until they are empty (Ma, Bae and Choi
+    2012) or touch a side that is not opposing, as in a corner.
 
     Returns:
         Thickness and gap. *Shape:* ``(F,), (F,)``.
     """
-    spacing = np.sqrt(surface.area / N_SAMPLES)
-    samples = sampled(surface, np.full(len(surface.faces), spacing))
+    samples = sampled(surface, np.full(len(surface.faces), np.sqrt(surface.area / N_SAMPLES)))
     seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))
-    found = []
-    for side in (-1.0, 1.0):
-        radii = _opposed_radius(samples, side, seen, MOST * CANONICAL_SIZE / 2)
-        smallest = np.full(len(surface.faces), np.inf)
-        np.minimum.at(smallest, samples.faces[seen], 2 * radii)
-        found.append(smallest)
+    found = np.full((2, len(surface.faces)), np.inf)
+    for smallest, side in zip(found, (-1.0, 1.0), strict=True):
+        left, radius = seen, np.full(len(seen), MOST * CANONICAL_SIZE / 2)
+        for _ in range(MOST_SHRINKINGS):
+            point, direction = samples.points[left], side * samples.normals[left]
+            nearest = samples.tree.query(point + radius[:, None] * direction, workers=n_cpus())[1]
+            across = samples.points[nearest] - point
+            height = np.einsum("vi,vi->v", across, direction)
+            smaller = np.einsum("vi,vi->v", across, across) / (2 * np.maximum(height, 1e-300))
+            opposed = side * np.einsum("vi,vi->v", direction, samples.normals[nearest]) < OPPOSED
+            shrinks = opposed & (height > 0) & (smaller < 0.99 * radius)
+            left, radius = left[shrinks], smaller[shrinks]
+            np.minimum.at(smallest, samples.faces[left], 2 * radius)
+            if len(left) == 0:
+                break
     return found[0], found[1]
-
-
-def _opposed_radius(samples: SurfaceSamples, side: float, seen: IntArray, most: float) -> FloatArray:
-    """Radii of the balls tangent to the surface at samples and at an opposing side.
-
-    Balls shrink until they are empty (Ma, Bae and Choi 2012) or touch a side that is not opposing, as in a corner.
-
-    Args:
-        samples: Samples of a surface.
-        side: 1 in front of the surface, -1 behind it.
-        seen: Indices of the queried samples. *Shape:* ``(S,)``.
-        most: Largest radius; larger ones are infinite.
-
-    Returns:
-        *Shape:* ``(S,)``.
-    """
-    found = np.full(len(seen), np.inf)
-    left, radius = np.arange(len(seen)), np.full(len(seen), most)
-    for _ in range(MOST_SHRINKINGS):
-        point, direction = samples.points[seen[left]], side * samples.normals[seen[left]]
-        nearest = closest_in(samples.tree, point + radius[:, None] * direction)[1]
-        across = samples.points[nearest] - point
-        height = np.einsum("vi,vi->v", across, direction)
-        smaller = np.einsum("vi,vi->v", across, across) / (2 * np.maximum(height, 1e-300))
-        opposed = side * np.einsum("vi,vi->v", direction, samples.normals[nearest]) < OPPOSED
-        shrinks = opposed & (height > 0) & (smaller < 0.99 * radius)
-        left, radius = left[shrinks], smaller[shrinks]
-        found[left] = radius
-        if len(left) == 0:
-            break
-    return found

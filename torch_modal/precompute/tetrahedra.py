@@ -1,4 +1,4 @@
-"""Tetrahedral meshes, and meshers, whose failures are remembered."""
+"""Tetrahedral meshes, their pieces, and meshers."""
 
 import threading
 from typing import Any, NamedTuple, Protocol
@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
-from torch_modal.io.cache import Cache
 from torch_modal.precompute.surface import CanonicalSurface
 
 SMALL_AMOUNT = 0.01
@@ -42,17 +41,16 @@ class TetrahedralizationError(RuntimeError):
 
     Args:
         message: The message.
-        fails_until: Timeout in seconds up to which the same call fails again: infinity if the surface is the cause,
-            zero if another attempt may succeed.
+        lasting: The surface is the cause, so that the same call fails again.
     """
 
-    def __init__(self, message: str, fails_until: float = 0.0) -> None:
+    def __init__(self, message: str, lasting: bool = False) -> None:
         super().__init__(message)
-        self.fails_until = fails_until
+        self.lasting = lasting
 
 
 class Mesher(Protocol):
-    """Fills surfaces with tetrahedra. A mesher with a time limit has an attribute ``timeout``, in seconds."""
+    """Fills surfaces with tetrahedra."""
 
     def key(self) -> dict[str, Any]:
         """Cache key besides the surface: name, settings and versions, as numbers, strings or None."""
@@ -70,31 +68,6 @@ class Mesher(Protocol):
             StoppedError: ``stop`` was set.
         """
         ...
-
-
-def filled(surface: CanonicalSurface, mesher: Mesher, cache: Cache, stop: threading.Event) -> Tetrahedra:
-    """Tetrahedra of a mesher; it is not run where it failed before with at least as long a timeout.
-
-    Raises:
-        TetrahedralizationError: The mesher failed, now or earlier.
-    """
-    inputs, key = {"points": surface.points, "faces": surface.faces}, mesher.key()
-    failure, timeout = cache.find("failure", inputs, key), getattr(mesher, "timeout", np.inf)
-    if failure is not None and timeout <= (fails_until := float(failure["fails_until"][0])):
-        longer = f"give a timeout of more than {fails_until:g} s, " if np.isfinite(fails_until) else ""
-        raise TetrahedralizationError(
-            f"{failure['reason'].tobytes().decode()}. An earlier run found this for the same surface and settings, "
-            f"and it was not tried again; to try again, {longer}clear the cache in {cache.folder} "
-            "(torch-modal cache --clear), or do without it",
-            fails_until,
-        )
-    try:
-        return mesher.fill(surface, stop)
-    except TetrahedralizationError as error:
-        if error.fails_until > 0:
-            reason = np.frombuffer(str(error).encode(), dtype=np.uint8)
-            cache.keep("failure", inputs, key, {"reason": reason, "fails_until": np.array([error.fails_until])})
-        raise
 
 
 def tet_volumes(tetrahedra: Tetrahedra) -> FloatArray:
@@ -143,13 +116,7 @@ def without_debris(tetrahedra: Tetrahedra) -> Tetrahedra:
 def small_pieces(amounts: NDArray[Any], corners: FloatArray, piece: IntArray) -> BoolArray:
     """True for pieces that have little volume or area, and little extent; false for the largest.
 
-    Args:
-        amounts: Volume or area of each piece. *Shape:* ``(P,)``.
-        corners: Of elements. *Shape:* ``(M, n, 3)``.
-        piece: Piece of each element. *Shape:* ``(M,)``.
-
-    Returns:
-        *Shape:* ``(P,)``.
+    From the amount of each piece, and the corners and pieces of elements. *Shape:* ``(P,), (M, n, 3), (M,) -> (P,)``.
     """
     low, high = (np.full((len(amounts), 3), bound) for bound in (np.inf, -np.inf))
     np.minimum.at(low, piece, corners.min(axis=1))

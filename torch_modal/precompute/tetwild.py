@@ -9,7 +9,7 @@ import threading
 import time
 import zipfile
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.geometry.connectivity import vertex_areas
-from torch_modal.geometry.inspect import signed_volume
 from torch_modal.precompute.parallel import StoppedError
 from torch_modal.precompute.processes import describe_exit, end_process, last_line
 from torch_modal.precompute.surface import CanonicalSurface
@@ -78,44 +76,32 @@ class TetWild:
     def key(self) -> dict[str, Any]:
         """Settings, and the versions of the packages."""
         settings = {name: value for name, value in asdict(self).items() if name != "timeout"}
-        versions = {name: _installed(name) for name in ("pytetwild", "fast-simplification")}
+        versions = {name: version(name) for name in ("pytetwild", "fast-simplification")}
         return {"mesher": "tetwild", **settings, **versions}
 
     def fill(self, surface: CanonicalSurface, stop: threading.Event) -> Tetrahedra:
         """Fill a closed surface with tetrahedra of positive volume.
 
-        Args:
-            surface: The surface.
-            stop: Event that kills the child process.
-
         Raises:
             TetrahedralizationError: The child process crashed, took longer than the timeout, or gave no tetrahedra or
                 ones that do not fill the surface.
-            StoppedError: ``stop`` was set.
+            StoppedError: ``stop`` was set, and the child process killed.
         """
         low, high = surface.points.min(axis=0), surface.points.max(axis=0)
         center, scale = (low + high) / 2, BOX_DIAGONAL / np.linalg.norm(high - low)
         points = (surface.points - center) * scale
         edge_length_fac = self.edge_length_fac
         if edge_length_fac is None:
-            volume = abs(signed_volume(points, surface.faces))
-            thickness = 2 * volume / vertex_areas(points, surface.faces).sum() / BOX_DIAGONAL
-            edge_length_fac = float(np.clip(EDGES_PER_THICKNESS * thickness, *EDGE_RANGE))
+            edges = EDGES_PER_THICKNESS * surface.thickness / np.linalg.norm(high - low)
+            edge_length_fac = float(np.clip(edges, *EDGE_RANGE))
         settings = replace(self, edge_length_fac=edge_length_fac)
         try:
-            raw = _run_worker(points, surface.faces, settings, stop)
-            tetrahedra = without_debris(oriented(raw))
+            tetrahedra = without_debris(oriented(_run_worker(points, surface.faces, settings, stop)))
             _check_fills(tetrahedra, points, edge_length_fac, self.epsilon)
         except TetrahedralizationError as error:
             mesh = f"a mesh of {len(points)} vertices and {len(surface.faces)} faces"
-            raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.fails_until) from error
+            raise TetrahedralizationError(f"cannot fill {mesh} with tetrahedra: {error}", error.lasting) from error
         return Tetrahedra(tetrahedra.vertices / scale + center, tetrahedra.tets)
-
-
-def _installed(name: str) -> str | None:
-    with contextlib.suppress(PackageNotFoundError):
-        return version(name)
-    return None  # the worker reports it
 
 
 def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: threading.Event) -> Tetrahedra:
@@ -127,11 +113,10 @@ def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: th
     with tempfile.TemporaryDirectory(prefix="torch_modal-", ignore_cleanup_errors=True) as folder:
         job, result, log = (Path(folder) / name for name in ("job.npz", "result.npz", "log.txt"))
         np.savez(job, vertices=points, faces=faces, **asdict(settings))
-        command = [sys.executable, str(WORKER), str(job), str(result)]
         # Output goes to a file: a full pipe would block the child.
         with log.open("wb") as output:
             process = subprocess.Popen(
-                command,
+                [sys.executable, str(WORKER), str(job), str(result)],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -139,66 +124,51 @@ def _run_worker(points: FloatArray, faces: IntArray, settings: TetWild, stop: th
                 # A separate process group can be killed as a whole, and Ctrl-C reaches only this process.
                 start_new_session=True,
             )
+        end = time.monotonic() + settings.timeout
         try:
-            code = _wait(process, settings.timeout, stop)
+            # Polled, as Ctrl-C cannot interrupt a single wait on every platform.
+            while process.poll() is None:
+                if stop.is_set():
+                    raise StoppedError
+                if (left := end - time.monotonic()) <= 0:
+                    raise TetrahedralizationError(
+                        f"no result after the timeout of {settings.timeout:g} s. "
+                        "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections"
+                    )
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(min(left, 0.2))
         finally:
             end_process(process)  # also on KeyboardInterrupt
-        if code is None:
-            raise TetrahedralizationError(
-                f"no result after the timeout of {settings.timeout:g} s. "
-                "Give a longer timeout, a larger edge_length_fac, or a surface without self-intersections",
-                settings.timeout,
-            )
-        if code != 0:
+        if (code := process.returncode) != 0:
             tail = last_line(log.read_text(errors="replace"))
             raise TetrahedralizationError(
                 f"the worker process ended with {describe_exit(code)}{f' ({tail})' if tail else ''}. "
                 "Check the surface for self-intersections and degenerate faces, or try other settings",
-                np.inf if code in _OWN_FAILURES else 0.0,
+                lasting=code in _OWN_FAILURES,
             )
         try:
-            with np.load(result) as arrays:
+            with result.open("rb") as file, np.load(file) as arrays:  # np.load leaves damaged files open
                 return Tetrahedra(arrays["vertices"], arrays["tets"])
         except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise TetrahedralizationError(f"the worker process left no readable result ({error}). Try again") from error
 
 
-def _wait(process: subprocess.Popen[bytes], timeout: float, stop: threading.Event) -> int | None:
-    """The exit code, or None after ``timeout`` seconds.
-
-    Polls for ``stop``, and because Ctrl-C cannot interrupt a single wait on every platform.
-    """
-    end = time.monotonic() + timeout
-    while True:
-        try:
-            return process.wait(timeout=min(max(end - time.monotonic(), 0.0), 0.2))
-        except subprocess.TimeoutExpired:
-            if stop.is_set():
-                raise StoppedError from None
-            if time.monotonic() >= end:
-                return None
-
-
 def _check_fills(tetrahedra: Tetrahedra, points: FloatArray, edge_length_fac: float, epsilon: float) -> None:
     """Reject a mesh that is empty, not finite, or does not cover the surface (bounding-box diagonal 100)."""
-    advice = (
-        "Check that the surface is closed, its winding consistent, and no part thinner than "
-        f"{100 * epsilon:g} % of the diagonal, or give a smaller epsilon"
-    )
-    if len(tetrahedra.tets) == 0:
-        raise TetrahedralizationError(f"the result is empty. {advice}", np.inf)
-    if not np.isfinite(tetrahedra.vertices).all():
-        raise TetrahedralizationError(f"the result has coordinates that are not finite. {advice}", np.inf)
     # Vertices on the new surface are about one edge length apart, so no point of the old one is further away.
     reach = BOX_DIAGONAL * (0.05 + 2 * edge_length_fac)
-    distance = cKDTree(tetrahedra.vertices).query(points)[0]
-    n_far = int((distance > reach).sum())
-    if n_far:
-        raise TetrahedralizationError(
-            f"{n_far} of its vertices are further than {reach:g} % of the diagonal from the result. {advice}, or raise "
-            "max_surface_faces if small parts were lost in the decimation",
-            np.inf,
-        )
     low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
-    if (tetrahedra.vertices < low).any() or (tetrahedra.vertices > high).any():
-        raise TetrahedralizationError(f"the result reaches far beyond the surface. {advice}", np.inf)
+    if len(tetrahedra.tets) == 0:
+        flaw = "the result is empty"
+    elif not ((tetrahedra.vertices >= low) & (tetrahedra.vertices <= high)).all():
+        flaw = "the result reaches far beyond the surface"
+    elif n_far := int((cKDTree(tetrahedra.vertices).query(points)[0] > reach).sum()):
+        flaw = f"{n_far} of its vertices are further than {reach:g} % of the diagonal from the result"
+    else:
+        return
+    raise TetrahedralizationError(
+        f"{flaw}. Check that the surface is closed, its winding consistent, and no part thinner than "
+        f"{100 * epsilon:g} % of the diagonal; or give a smaller epsilon, or raise max_surface_faces if small parts "
+        "were lost in the decimation",
+        lasting=True,
+    )
