@@ -22,10 +22,10 @@ from torch_modal.energy.energy import RestShapes
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.extract import extract_bases
-from torch_modal.precompute.tetrahedra import Tetrahedra
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.extract import extract_bases
+from torch_modal.modes.tetrahedra import Tetrahedra
+from torch_modal.modes.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
 from torch_modal.solve.implicit import ConvergenceWarning
 

@@ -5,11 +5,11 @@ import itertools
 import numpy as np
 import scipy.sparse as sp
 
-from torch_modal.precompute.eigen import ElasticBody, ElasticModes, lowest_modes
-from torch_modal.precompute.embedding import find_neighbours, fit_weights
-from torch_modal.precompute.stiffness import hat_gradients, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
+from torch_modal.modes.eigen import ElasticBody, ElasticModes, lowest_modes
+from torch_modal.modes.embedding import find_neighbours, fit_weights
+from torch_modal.modes.stiffness import hat_gradients, mass_matrix
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Tetrahedra, solid_volumes
 
 
 def box(cells: tuple[int, int, int], size: tuple[float, float, float], jitter: float = 0.0) -> Tetrahedra:

@@ -42,6 +42,13 @@ from .keyframes.check import check_keyframes as check_keyframes
 from .layers.blend import Blend as Blend
 from .layers.in_between import InBetween as InBetween
 from .layers.mid_shape import MidShape as MidShape
+from .modes.basis import ModalBasis as ModalBasis
+from .modes.eigen import ModalAnalysisError as ModalAnalysisError
+from .modes.extract import extract_bases as extract_bases
+from .modes.extract import extract_modes as extract_modes
+from .modes.lattice import Lattice as Lattice
+from .modes.tetrahedra import TetrahedralizationError as TetrahedralizationError
+from .modes.tetwild import TetWild as TetWild
 from .motion.decoder import ModalDecoder as ModalDecoder
 from .motion.editor import PathEditor as PathEditor
 from .motion.path import Path as Path
@@ -50,13 +57,6 @@ from .motion.subdivide import keyframe_places as keyframe_places
 from .motion.subdivide import linear_sequence as linear_sequence
 from .motion.subdivide import subdivide as subdivide
 from .passengers.passengers import Passengers as Passengers
-from .precompute.basis import ModalBasis as ModalBasis
-from .precompute.eigen import ModalAnalysisError as ModalAnalysisError
-from .precompute.extract import extract_bases as extract_bases
-from .precompute.extract import extract_modes as extract_modes
-from .precompute.lattice import Lattice as Lattice
-from .precompute.tetrahedra import TetrahedralizationError as TetrahedralizationError
-from .precompute.tetwild import TetWild as TetWild
 from .registration.load import load_keyframes as load_keyframes
 from .registration.register import register as register
 from .registration.report import Registration as Registration

@@ -29,7 +29,7 @@ import torch_modal as tm
 from torch_modal.data.samples import load_sample
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.precompute.coarsening import coarsen
+from torch_modal.modes.coarsening import coarsen
 from torch_modal.view.drawing import Scene, draw
 from torch_modal.view.picture import BETWEEN_COLOR, ERROR_COLORS, KEYFRAME_COLOR, centred, view_rotation
 

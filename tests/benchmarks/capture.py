@@ -16,9 +16,9 @@ from solids import eigenmodes, element_hessian, embed_surface, lumped_mass
 import torch_modal as tm
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.io.cache import Arrays, Cache
-from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Mesher, Tetrahedra
+from torch_modal.modes.stiffness import arap_hessian, mass_matrix
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Mesher, Tetrahedra
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -17,7 +17,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit, blend
 from torch_modal.geometry.triangle_frames import Sides
-from torch_modal.precompute.coarsening import coarsen
+from torch_modal.modes.coarsening import coarsen
 
 FLAT = 1e-6
 """Of the mean area."""

@@ -31,8 +31,8 @@ import torch_modal as tm
 from torch_modal.errors import MeshError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.inbetween.settings import PRESETS
-from torch_modal.precompute.coarsening import coarsen
-from torch_modal.precompute.extract import MESHERS
+from torch_modal.modes.coarsening import coarsen
+from torch_modal.modes.extract import MESHERS
 from torch_modal.solve.minimise import Status
 
 FloatArray = NDArray[np.float64]

@@ -61,7 +61,7 @@ from wild_making import BODIES, WildBody
 import torch_modal as tm
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
-from torch_modal.precompute.extract import METHODS, Method
+from torch_modal.modes.extract import METHODS, Method
 from torch_modal.solve.minimise import Status
 
 N_MODES = 30

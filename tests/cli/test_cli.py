@@ -20,10 +20,10 @@ from torch_modal.cli import main as cli
 from torch_modal.data.samples import load_sample
 from torch_modal.io.cache import Cache
 from torch_modal.io.frames import save_frames
-from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.extract import MESHERS
-from torch_modal.precompute.tetrahedra import TetrahedralizationError
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes import lattice as lattice_module
+from torch_modal.modes.extract import MESHERS
+from torch_modal.modes.tetrahedra import TetrahedralizationError
+from torch_modal.modes.tetwild import TetWild
 
 FAST = ["--modes", "6", "--levels", "1", "--preset", "fast"]
 

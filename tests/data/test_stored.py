@@ -20,7 +20,7 @@ from torch_modal.data.stored import (
     write_set,
 )
 from torch_modal.io.tensors import write_tensors
-from torch_modal.precompute.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis
 
 NAMES = ("straight.obj", "bent.obj", "twisted.obj")
 

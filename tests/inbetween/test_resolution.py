@@ -11,7 +11,7 @@ import torch_modal as tm
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.inbetween.coarse import ENOUGH_FACES, spread, stretching
-from torch_modal.precompute.coarsening import FACES_OF_PIECE, coarsen
+from torch_modal.modes.coarsening import FACES_OF_PIECE, coarsen
 
 
 @pytest.mark.parametrize("name, most", [("wire bent 60", 0.1), ("bar twisted 60", 0.05)])

@@ -17,7 +17,7 @@ from torch_modal.energy.volume import encloses
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.rigid import blend
 from torch_modal.inbetween.coarse import resolving
-from torch_modal.precompute.coarsening import coarsen, collapsed
+from torch_modal.modes.coarsening import coarsen, collapsed
 from torch_modal.solve.minimise import Status
 
 BACKENDS = ["torch", "warp"]

@@ -16,7 +16,7 @@ from torch_modal.geometry import inspect
 from torch_modal.geometry.inspect import signed_volume
 from torch_modal.geometry.rigid import looks_mirrored
 from torch_modal.keyframes.check import Keyframes, MeshError, MeshWarning, check_keyframes
-from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.modes.surface import CanonicalSurface
 from torch_modal.registration.load import load_keyframes
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)

@@ -23,7 +23,7 @@ from torch_modal.inbetween.results import ConvergenceError, ConvergenceWarning
 from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.in_between import InBetween
 from torch_modal.layers.mid_shape import MidShape
-from torch_modal.precompute.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis
 from torch_modal.solve import implicit
 from torch_modal.solve.minimise import Status
 

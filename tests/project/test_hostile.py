@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import torch_modal as tm
 from torch_modal.io.cache import cache_content
-from torch_modal.precompute.parallel import n_cpus
+from torch_modal.modes.parallel import n_cpus
 
 ROOT = Path(tm.__file__).parents[1]
 TESTS = Path(__file__).parents[1]
@@ -60,7 +60,7 @@ for basis in tm.extract_bases(np.stack([v, v * (1, 1, 1.2)]), f, 10, mesher="tet
 FINE = CALL.replace('"tetwild"', "tm.TetWild(0.02, 1e-3, 10.0, 10_000)")
 EACH = """
 import torch_modal as tm
-from torch_modal.precompute import carrying
+from torch_modal.modes import carrying
 carrying.MAX_FIT = -1  # no tetrahedra are carried
 
 class OneByLattice:

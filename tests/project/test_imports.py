@@ -26,7 +26,7 @@ FLOORS = [
     "io",
     "keyframes",
     "energy",
-    "precompute",
+    "modes",
     "backends",
     "solve",
     "inbetween",

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch_modal.codec.fit import fit
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
-from torch_modal.precompute.extract import extract_modes
 from torch_modal.progress import Progress, ProgressReport
 
 ERROR = 0.002

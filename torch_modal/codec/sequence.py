@@ -14,8 +14,8 @@ from torch_modal.codec.fit import FittedFrames, fit
 from torch_modal.codec.selection import ERROR, Selection, checked_motion
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.check import check_keyframes
+from torch_modal.modes.extract import extract_modes
 from torch_modal.motion.decoder import ModalDecoder
-from torch_modal.precompute.extract import extract_modes
 from torch_modal.progress import Progress, ProgressReport
 
 FORMAT = "torch_modal.sequence"

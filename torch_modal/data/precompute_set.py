@@ -31,9 +31,9 @@ from torch_modal.errors import MeshError
 from torch_modal.io.cache import CACHE_VERSION, content_digest
 from torch_modal.io.files import write_file
 from torch_modal.keyframes.arrays import checked_times
-from torch_modal.precompute.extract import Method, extract_bases
-from torch_modal.precompute.processes import describe_exit, end_process, last_line
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes.extract import Method, extract_bases
+from torch_modal.modes.processes import describe_exit, end_process, last_line
+from torch_modal.modes.tetwild import TetWild
 from torch_modal.registration.load import load_keyframes
 
 DONE, FAILED, UNFINISHED = "done", "failed", "unfinished"

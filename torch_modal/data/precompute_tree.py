@@ -14,7 +14,7 @@ from tqdm import tqdm
 from torch_modal.data.precompute_set import DONE, FAILED, Options, Record, run_set
 from torch_modal.data.tree import find_keyframe_sets
 from torch_modal.extras import require
-from torch_modal.precompute.parallel import n_cpus
+from torch_modal.modes.parallel import n_cpus
 
 RETRIES = 2
 """Retries of a task that raised an error on a cluster: a machine may lack the package or the folders."""

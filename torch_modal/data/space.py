@@ -20,7 +20,7 @@ from torch_modal.geometry.vectors import norm, pick
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.blend import Blend
-from torch_modal.precompute.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis
 from torch_modal.statistics.components import Components
 from torch_modal.statistics.fit import Fitted, fit
 from torch_modal.statistics.variation import Variation

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_modal.autograd import lasting
 from torch_modal.io.tensors import TensorFile, write_tensors
 from torch_modal.keyframes.arrays import checked_times
-from torch_modal.precompute.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis
 
 FORMAT = "torch_modal.set"
 VERSION = "2"

@@ -7,8 +7,8 @@ from torch_modal.energy.bend import dihedral_gradient
 from torch_modal.geometry.canonical import size
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.vectors import cross, norm, pick
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.sheet import THICKNESS
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.sheet import THICKNESS
 
 # Eigenvalues below this part of the largest are loose pieces that move without deforming: no elastic modes.
 _NOT_ELASTIC = 1e-8

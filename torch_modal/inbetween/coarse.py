@@ -11,7 +11,7 @@ from torch_modal.energy.energy import Energy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh
 from torch_modal.geometry.inspect import is_flat
-from torch_modal.precompute.coarsening import Coarsening, coarsen
+from torch_modal.modes.coarsening import Coarsening, coarsen
 
 ENOUGH_FACES = 1000
 """Up to so many are tried; coarse meshes of more are not checked."""

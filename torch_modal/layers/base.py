@@ -16,7 +16,7 @@ from torch_modal.inbetween.settings import Settings
 from torch_modal.inbetween.solver import InBetweenSolver
 from torch_modal.keyframes.arrays import as_faces
 from torch_modal.keyframes.check import checked_surface
-from torch_modal.precompute.basis import ModalBasis
+from torch_modal.modes.basis import ModalBasis
 from torch_modal.solve.implicit import Report
 
 

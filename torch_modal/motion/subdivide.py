@@ -19,10 +19,10 @@ from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, 
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
 from torch_modal.layers.mid_shape import MidShape
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.extract import bases_of_checked
 from torch_modal.motion.path import Path
 from torch_modal.passengers.proxy import Proxy, proxy_size
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.extract import bases_of_checked
 from torch_modal.progress import Progress, ProgressReport
 
 MAX_LEVELS = 12

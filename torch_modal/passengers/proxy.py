@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torch_modal.autograd import lasting
+from torch_modal.modes.coarsening import coarsen
 from torch_modal.passengers.passengers import Passengers
-from torch_modal.precompute.coarsening import coarsen
 
 # Number of vertices of the carrier, of the meshes above which it is the default, and of the smallest one.
 PROXY_SIZE, ABOVE, SMALLEST = 20_000, 100_000, 100

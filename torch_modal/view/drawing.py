@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.vectors import vertex_normals
-from torch_modal.precompute.processes import describe_exit, last_line
+from torch_modal.modes.processes import describe_exit, last_line
 
 logger = logging.getLogger("torch_modal")
 

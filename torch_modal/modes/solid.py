@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.io.cache import Cache
-from torch_modal.precompute.eigen import ElasticBody
-from torch_modal.precompute.embedding import N_NEIGHBOURS, find_neighbours, fit_weights
-from torch_modal.precompute.stiffness import HessianForm, arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import (
+from torch_modal.modes.eigen import ElasticBody
+from torch_modal.modes.embedding import N_NEIGHBOURS, find_neighbours, fit_weights
+from torch_modal.modes.stiffness import HessianForm, arap_hessian, mass_matrix
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import (
     Mesher,
     Tetrahedra,
     kept_tetrahedra,
@@ -38,7 +38,7 @@ class Solid:
         surface: The key-frame.
         tetrahedra: The volume mesh, in the units of the surface.
         neighbours: Embedding of the surface in the pose that was meshed
-            (:func:`~torch_modal.precompute.embedding.find_neighbours`). *Shape:* ``(U, 12)``.
+            (:func:`~torch_modal.modes.embedding.find_neighbours`). *Shape:* ``(U, 12)``.
         kernel: Likewise. *Shape:* ``(U, 12)``.
         meshed: The key-frame that the tetrahedra were carried from; None if they are its own.
     """

@@ -13,7 +13,7 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE, ordered_faces, placed
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.inspect import FLATNESS, principal_extents, signed_volume
 from torch_modal.geometry.vectors import vertex_normals
-from torch_modal.precompute.parallel import n_cpus
+from torch_modal.modes.parallel import n_cpus
 
 _DIAGONAL_RANGE = (1e-90, 1e90)
 MOST_SAMPLES = 60_000

@@ -16,13 +16,13 @@ from solids import as_mesh, box, eigenmodes, element_hessian, lumped_mass, surfa
 
 from torch_modal.geometry.canonical import placed
 from torch_modal.keyframes.check import MeshError, MeshWarning
-from torch_modal.precompute import carrying, eigen, extract, parallel
-from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.eigen import ElasticModes, ModalAnalysisError
-from torch_modal.precompute.extract import extract_bases, extract_modes
-from torch_modal.precompute.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes import carrying, eigen, extract, parallel
+from torch_modal.modes import lattice as lattice_module
+from torch_modal.modes.eigen import ElasticModes, ModalAnalysisError
+from torch_modal.modes.extract import extract_bases, extract_modes
+from torch_modal.modes.stiffness import HESSIAN_FORMS, arap_hessian, mass_matrix
+from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError
+from torch_modal.modes.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
 BOX = box((6, 3, 2), (3.0, 1.5, 1.0), jitter=0.1)
@@ -292,7 +292,7 @@ def test_errors_of_libraries_become_own_ones(boxed: Mesh, monkeypatch: pytest.Mo
 
     for name in ("solid.arap_hessian", "extract.lowest_modes"):
         with monkeypatch.context() as patch:
-            patch.setattr(f"torch_modal.precompute.{name}", fail)
+            patch.setattr(f"torch_modal.modes.{name}", fail)
             with pytest.raises(ModalAnalysisError, match=f"{error}.*check the surface"):
                 extract_modes(*boxed, 4, method="solid", cache=False)
 

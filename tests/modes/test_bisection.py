@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from torch_modal.precompute.bisection import bisected
-from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+from torch_modal.modes.bisection import bisected
+from torch_modal.modes.tetrahedra import Tetrahedra, tet_volumes
 
 Mesh = tuple[Tetrahedra, np.ndarray]
 CUBES = np.argwhere(np.ones((5, 4, 3), dtype=bool))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from torch_modal.precompute import eigen, extract, parallel
-from torch_modal.precompute.extract import extract_modes
-from torch_modal.precompute.parallel import StoppedError, one_blas_thread, run_all
+from torch_modal.modes import eigen, extract, parallel
+from torch_modal.modes.extract import extract_modes
+from torch_modal.modes.parallel import StoppedError, one_blas_thread, run_all
 
 
 @pytest.fixture(params=[1, 3])

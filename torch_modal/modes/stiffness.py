@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from torch_modal.arrays import FloatArray
-from torch_modal.precompute.tetrahedra import Tetrahedra, solid_volumes
+from torch_modal.modes.tetrahedra import Tetrahedra, solid_volumes
 
 HessianForm = Literal["edge", "vertex"]
 HESSIAN_FORMS: tuple[HessianForm, ...] = ("edge", "vertex")

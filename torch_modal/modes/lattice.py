@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
-from torch_modal.precompute.bisection import bisected
-from torch_modal.precompute.parallel import n_cpus
-from torch_modal.precompute.surface import CanonicalSurface, SurfaceSamples, clearances, sampled
-from torch_modal.precompute.tetrahedra import (
+from torch_modal.modes.bisection import bisected
+from torch_modal.modes.parallel import n_cpus
+from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearances, sampled
+from torch_modal.modes.tetrahedra import (
     Tetrahedra,
     face_connected_pieces,
     kept_tetrahedra,

@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from torch_modal.io.tensors import write_tensors
-from torch_modal.precompute.basis import FORMAT, VERSION, ModalBasis
+from torch_modal.modes.basis import FORMAT, VERSION, ModalBasis
 
 V, K = 20, 5
 

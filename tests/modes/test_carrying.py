@@ -6,16 +6,16 @@ import torch
 from bodies import bend
 from solids import as_it_is, as_mesh, box, eigenmodes
 
-from torch_modal.precompute import carrying
-from torch_modal.precompute.carrying import Carrier, nearest_rotations, vertex_rotations
-from torch_modal.precompute.eigen import ModalAnalysisError, lowest_modes
-from torch_modal.precompute.embedding import find_neighbours
-from torch_modal.precompute.extract import extract_bases
-from torch_modal.precompute.solid import Solid
-from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface, clearances, self_proximity
-from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes import carrying
+from torch_modal.modes.carrying import Carrier, nearest_rotations, vertex_rotations
+from torch_modal.modes.eigen import ModalAnalysisError, lowest_modes
+from torch_modal.modes.embedding import find_neighbours
+from torch_modal.modes.extract import extract_bases
+from torch_modal.modes.solid import Solid
+from torch_modal.modes.stiffness import arap_hessian, mass_matrix
+from torch_modal.modes.surface import CanonicalSurface, clearances, self_proximity
+from torch_modal.modes.tetrahedra import Tetrahedra, tet_volumes
+from torch_modal.modes.tetwild import TetWild
 
 BAR = box((16, 4, 4), (8.0, 1.0, 1.0))
 POINTS, COMPACT = as_mesh(BAR)

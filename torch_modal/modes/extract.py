@@ -17,17 +17,17 @@ from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.geometry.inspect import OPEN, open_part
 from torch_modal.io.cache import Arrays, Cache
 from torch_modal.keyframes.check import check_keyframes
-from torch_modal.precompute.basis import ModalBasis
-from torch_modal.precompute.carrying import Carrier
-from torch_modal.precompute.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lowest_modes
-from torch_modal.precompute.lattice import Lattice
-from torch_modal.precompute.parallel import StoppedError, one_blas_thread, run_all
-from torch_modal.precompute.sheet import n_coarse_faces, sheet_body
-from torch_modal.precompute.solid import Solid
-from torch_modal.precompute.stiffness import HESSIAN_FORMS, HessianForm
-from torch_modal.precompute.surface import CanonicalSurface, self_proximity
-from torch_modal.precompute.tetrahedra import Mesher, TetrahedralizationError
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes.basis import ModalBasis
+from torch_modal.modes.carrying import Carrier
+from torch_modal.modes.eigen import N_RIGID, ElasticBody, ModalAnalysisError, lowest_modes
+from torch_modal.modes.lattice import Lattice
+from torch_modal.modes.parallel import StoppedError, one_blas_thread, run_all
+from torch_modal.modes.sheet import n_coarse_faces, sheet_body
+from torch_modal.modes.solid import Solid
+from torch_modal.modes.stiffness import HESSIAN_FORMS, HessianForm
+from torch_modal.modes.surface import CanonicalSurface, self_proximity
+from torch_modal.modes.tetrahedra import Mesher, TetrahedralizationError
+from torch_modal.modes.tetwild import TetWild
 from torch_modal.progress import Progress, ProgressReport, logger
 
 Method = Literal["auto", "solid", "shell"]
@@ -88,11 +88,11 @@ def extract_bases(
             ``"auto"``: the solid, but the shell where a key-frame is open or thin or the solid fails
             (:func:`why_shell`), which a line of the log says. All key-frames have the same.
         form: Form of the solid's Hessian: ``"edge"``, or ``"vertex"``, the paper's
-            (:func:`~torch_modal.precompute.stiffness.arap_hessian`).
+            (:func:`~torch_modal.modes.stiffness.arap_hessian`).
         mesher: Fills the surface with tetrahedra: ``"lattice"``, which is deterministic, finer where the body is thin,
             and accepts every surface; ``"tetwild"``, fTetWild in a child process; or an object with settings,
-            :class:`~torch_modal.precompute.lattice.Lattice`, :class:`~torch_modal.precompute.tetwild.TetWild` or
-            another :class:`~torch_modal.precompute.tetrahedra.Mesher`.
+            :class:`~torch_modal.modes.lattice.Lattice`, :class:`~torch_modal.modes.tetwild.TetWild` or
+            another :class:`~torch_modal.modes.tetrahedra.Mesher`.
         cache_dir: Folder of the cache; by default ``TORCH_MODAL_CACHE`` or the user's cache folder.
         cache: Whether results are kept on disk and found there.
         progress: A bar with key-frame and stage: see :data:`torch_modal.progress.Progress`.

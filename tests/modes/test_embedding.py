@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from solids import box, embed_surface, surface
 
-from torch_modal.precompute.embedding import closest_tetrahedra
-from torch_modal.precompute.tetrahedra import Tetrahedra
+from torch_modal.modes.embedding import closest_tetrahedra
+from torch_modal.modes.tetrahedra import Tetrahedra
 
 
 def test_linear_displacements_are_carried_exactly(

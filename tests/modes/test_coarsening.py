@@ -10,8 +10,8 @@ from conftest import Shapes
 
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.keyframes.check import Keyframes
-from torch_modal.precompute import coarsening
-from torch_modal.precompute.coarsening import Coarsening, coarsen
+from torch_modal.modes import coarsening
+from torch_modal.modes.coarsening import Coarsening, coarsen
 
 
 @pytest.fixture(scope="module")

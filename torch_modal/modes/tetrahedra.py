@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
 from torch_modal.geometry.connectivity import connected_pieces
-from torch_modal.precompute.surface import CanonicalSurface
+from torch_modal.modes.surface import CanonicalSurface
 
 SMALL_AMOUNT = 0.01
 """Largest volume (or area, of a surface) of a small piece, as a fraction of the whole."""

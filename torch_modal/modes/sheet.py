@@ -14,10 +14,10 @@ from torch_modal.energy.rest_hessian import rest_hessian
 from torch_modal.energy.shell import BETA
 from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, double_areas, vertex_areas
-from torch_modal.precompute.coarsening import collapsed, joined
-from torch_modal.precompute.eigen import ElasticBody
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import small_pieces
+from torch_modal.modes.coarsening import collapsed, joined
+from torch_modal.modes.eigen import ElasticBody
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import small_pieces
 
 THICKNESS = 0.01
 """Thickness of the sheet whose mass the modes have, in sizes of the surface."""

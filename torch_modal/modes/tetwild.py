@@ -17,10 +17,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.precompute.parallel import StoppedError
-from torch_modal.precompute.processes import describe_exit, end_process, last_line
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
+from torch_modal.modes.parallel import StoppedError
+from torch_modal.modes.processes import describe_exit, end_process, last_line
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, without_debris
 
 WORKER = Path(__file__).resolve().with_name("_tetwild_worker.py")
 BOX_DIAGONAL = 100.0

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from torch_modal.arrays import FloatArray, IntArray
 from torch_modal.geometry.connectivity import vertex_areas
 from torch_modal.geometry.sparse import factorize
-from torch_modal.precompute.solid import Solid
-from torch_modal.precompute.stiffness import dirichlet_matrix, hat_gradients
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import solid_volumes, tet_volumes
+from torch_modal.modes.solid import Solid
+from torch_modal.modes.stiffness import dirichlet_matrix, hat_gradients
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import solid_volumes, tet_volumes
 
 FIT_WEIGHT = 1e4
 """Weight of the surface term relative to the deformation energy; both are dimensionless."""

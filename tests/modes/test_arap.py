@@ -8,8 +8,8 @@ import scipy.sparse as sp
 import torch
 from solids import box, element_hessian, lumped_mass, together
 
-from torch_modal.precompute.stiffness import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, mass_matrix
-from torch_modal.precompute.tetrahedra import Tetrahedra, tet_volumes
+from torch_modal.modes.stiffness import HESSIAN_FORMS, WEIGHT_FLOOR, arap_hessian, mass_matrix
+from torch_modal.modes.tetrahedra import Tetrahedra, tet_volumes
 
 
 @pytest.fixture

@@ -17,12 +17,12 @@ from torch_modal.data.samples import load_sample
 from torch_modal.geometry.canonical import size
 from torch_modal.io.cache import cache_content
 from torch_modal.keyframes.check import MeshError, MeshWarning
-from torch_modal.precompute import extract
-from torch_modal.precompute.eigen import ModalAnalysisError
-from torch_modal.precompute.extract import extract_bases, extract_modes, why_shell
-from torch_modal.precompute.sheet import sheet_body
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import TetrahedralizationError
+from torch_modal.modes import extract
+from torch_modal.modes.eigen import ModalAnalysisError
+from torch_modal.modes.extract import extract_bases, extract_modes, why_shell
+from torch_modal.modes.sheet import sheet_body
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import TetrahedralizationError
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -110,7 +110,7 @@ def test_rigid_motions_and_strains_are_carried_exactly() -> None:
 def test_the_coarse_mesh_has_the_modes_of_the_fine_one(monkeypatch: pytest.MonkeyPatch) -> None:
     sample = load_sample("creature")
     coarse = extract_modes(sample.keyframes[0], sample.faces, 20, method="shell", cache=False)
-    monkeypatch.setattr("torch_modal.precompute.sheet.COARSE_FACES", 10**6)
+    monkeypatch.setattr("torch_modal.modes.sheet.COARSE_FACES", 10**6)
     fine = extract_modes(sample.keyframes[0], sample.faces, 30, method="shell", cache=False)
     spans = [torch.linalg.qr(basis.modes.flatten(1).T).Q for basis in (coarse.truncate(10), fine)]
     assert torch.linalg.svdvals(spans[0].T @ spans[1]).min() > 0.95

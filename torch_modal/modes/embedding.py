@@ -5,9 +5,9 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from torch_modal.arrays import FloatArray, IntArray
-from torch_modal.precompute.parallel import n_cpus
-from torch_modal.precompute.stiffness import hat_gradients
-from torch_modal.precompute.tetrahedra import Tetrahedra
+from torch_modal.modes.parallel import n_cpus
+from torch_modal.modes.stiffness import hat_gradients
+from torch_modal.modes.tetrahedra import Tetrahedra
 
 N_NEIGHBOURS = 12
 MAX_RINGS = 6

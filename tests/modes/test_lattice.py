@@ -16,12 +16,12 @@ from bodies import body
 from scipy.spatial import cKDTree
 from solids import as_mesh, box, eigenmodes, lumped_mass, surface
 
-from torch_modal.precompute import lattice as lattice_module
-from torch_modal.precompute.extract import extract_modes
-from torch_modal.precompute.lattice import Lattice, lattice
-from torch_modal.precompute.stiffness import arap_hessian, mass_matrix
-from torch_modal.precompute.surface import CanonicalSurface, clearances
-from torch_modal.precompute.tetrahedra import (
+from torch_modal.modes import lattice as lattice_module
+from torch_modal.modes.extract import extract_modes
+from torch_modal.modes.lattice import Lattice, lattice
+from torch_modal.modes.stiffness import arap_hessian, mass_matrix
+from torch_modal.modes.surface import CanonicalSurface, clearances
+from torch_modal.modes.tetrahedra import (
     Tetrahedra,
     face_connected_pieces,
     solid_volumes,
@@ -63,7 +63,7 @@ THREADS = """
 import hashlib, sys
 import numpy as np
 import trimesh
-from torch_modal.precompute.extract import extract_bases
+from torch_modal.modes.extract import extract_bases
 mesh = trimesh.creation.capsule(height=3.0, radius=0.6, count=(24, 24))
 keyframes = np.stack([mesh.vertices, mesh.vertices * [1.0, 1.1, 1.0]])
 total = hashlib.sha256()

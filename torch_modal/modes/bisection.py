@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from torch_modal.arrays import BoolArray, FloatArray, IntArray
-from torch_modal.precompute.tetrahedra import Tetrahedra, oriented
+from torch_modal.modes.tetrahedra import Tetrahedra, oriented
 
 UNITS = 256
 """Integer coordinates along the edge of a cube, so that edges can be bisected eight times."""

@@ -15,10 +15,10 @@ import trimesh
 from conftest import COARSE
 from solids import as_it_is, box, together
 
-from torch_modal.precompute import tetwild
-from torch_modal.precompute.surface import CanonicalSurface
-from torch_modal.precompute.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, tet_volumes, without_debris
-from torch_modal.precompute.tetwild import TetWild
+from torch_modal.modes import tetwild
+from torch_modal.modes.surface import CanonicalSurface
+from torch_modal.modes.tetrahedra import Tetrahedra, TetrahedralizationError, oriented, tet_volumes, without_debris
+from torch_modal.modes.tetwild import TetWild
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -52,8 +52,8 @@ def test_mesher_stays_out_of_this_process(tmp_path: Path) -> None:
         import signal, sys
         import trimesh
         handler = signal.getsignal(signal.SIGINT)
-        from torch_modal.precompute.extract import extract_modes
-        from torch_modal.precompute.tetwild import TetWild
+        from torch_modal.modes.extract import extract_modes
+        from torch_modal.modes.tetwild import TetWild
         ball = trimesh.creation.icosphere(subdivisions=1)
         extract_modes(ball.vertices, ball.faces, 4, mesher=TetWild(edge_length_fac=0.3), cache=False)
         assert "pytetwild" not in sys.modules
