@@ -151,7 +151,7 @@ def test_gradients_are_exact_with_the_set_held(hand: Shapes, monkeypatch: pytest
         calls = 0
         mu, stiffness = layer.mu_of(t, t.shape), layer.stiffness_of(t, t.shape)
         samples = Samples(torch.stack([x_a, x_b])[None], torch.stack([1 - t, t], -1), mu, stiffness)
-        return layer.core(samples, None).shapes[0]
+        return layer.core(samples).shapes[0]
 
     given = [x_a.clone(), x_b.clone(), torch.tensor([0.875], dtype=DOUBLE)]
     for tensor in given:

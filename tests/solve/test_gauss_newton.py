@@ -117,6 +117,6 @@ def test_what_goes_uphill_is_not_taken() -> None:
 def test_steps_that_are_unrolled_say_whether_they_converged() -> None:
     placement, usable = start([0.0, 0.0], [0.0, 0.0]), torch.tensor([True, False])
     for n, wanted in ((2, Status.OUT_OF_STEPS), (20, Status.CONVERGED)):
-        solution = solve_unrolled(Rosenbrock(), placement, usable, n, 1e-8, None)
+        solution = solve_unrolled(Rosenbrock(), placement, usable, n, 1e-8)
         assert solution.status.tolist() == [wanted, Status.INVALID]
         assert solution.n_steps.tolist() == [n] * 2

@@ -15,6 +15,7 @@ from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import periodic_square
 from torch_modal.inbetween.results import ConvergenceError, report
+from torch_modal.inbetween.settings import Solver
 from torch_modal.layers.mid_shape import MidShape
 from torch_modal.solve import minimise as minimisation
 from torch_modal.solve.gauss_newton import GaussNewtonStep
@@ -76,7 +77,7 @@ def test_what_cannot_go_on_says_why() -> None:
     invalid = minimise(Rosenbrock(), start([float("nan"), 1.0], [0.0, 0.0]), None)
     assert invalid.status.tolist() == [Status.INVALID, Status.CONVERGED]
     with pytest.raises(ConvergenceError, match="did not converge"):
-        report(stalled, max_steps=40, forbid=True)
+        report(stalled, Solver(unconverged="raise"))
 
 
 # --------------------------------------------------------------------------------------------------- on shells

@@ -17,7 +17,6 @@ from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.results import InBetweenResult, Samples
 from torch_modal.inbetween.solver import InBetweenSolver
-from torch_modal.solve.implicit import Report
 from torch_modal.solve.minimise import Solution
 
 PRODUCTS = 20
@@ -30,17 +29,17 @@ class ContactSolver(InBetweenSolver):
     Samples are separated independently; those without intersections are the ones without contact.
     """
 
-    def forward(self, samples: Samples, report: Report | None) -> InBetweenResult:
+    def forward(self, samples: Samples) -> InBetweenResult:
         """Solve. Arguments as for :class:`InBetweenSolver`.
 
         Samples with contacts are solved again alone: rounding depends on the batch, and contacts amplify it.
         """
-        whole = super().forward(samples, report)
+        whole = super().forward(samples)
         n_crossing = whole.solution.n_crossing
         if len(samples.weights) == 1 or n_crossing is None or not bool(n_crossing.any()):
             return whole
         some = torch.nonzero(n_crossing).flatten()
-        parts = [super(ContactSolver, self).forward(samples.rows(slice(i, i + 1)), None) for i in some.tolist()]
+        parts = [super(ContactSolver, self).forward(samples.rows(slice(i, i + 1))) for i in some.tolist()]
         each = zip(whole.solution, *(part.solution for part in parts), strict=True)
         merged = (values[0].index_copy(0, some, torch.cat(values[1:])) for values in each)  # type: ignore[union-attr, arg-type]
         shapes = whole.shapes.index_copy(0, some, torch.cat([part.shapes for part in parts]))

@@ -17,10 +17,10 @@ from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.comparison import SLACK, no_worse
 from torch_modal.inbetween.joint import JointSpace
 from torch_modal.inbetween.paired import PairedSpace
-from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised, warn_of_starts
+from torch_modal.inbetween.results import InBetweenResult, Samples, unminimised
 from torch_modal.inbetween.settings import Objective, Solver
 from torch_modal.inbetween.subspace import elastic_subspace
-from torch_modal.solve.implicit import Report, solve_implicit, solve_unrolled
+from torch_modal.solve.implicit import solve_implicit, solve_unrolled
 from torch_modal.solve.minimise import Solution, Status
 
 # Products with the Hessian in each local step, and in each step of the polish: with two local steps, what closes 97 %
@@ -77,12 +77,11 @@ class InBetweenSolver(nn.Module):
         first, second = (JointSpace(*given, elastic_subspace([own], alignment, coarse)) for own in turned)
         return PairedSpace(first, second, alignment.weights > 0)
 
-    def forward(self, samples: Samples, report: Report | None) -> InBetweenResult:
+    def forward(self, samples: Samples) -> InBetweenResult:
         """Solve.
 
         Args:
             samples: The batch.
-            report: Receives the solution.
         """
         weights = samples.weights
         shapes, pose, usable = self.alignment(samples.keyframes, weights)
@@ -93,27 +92,23 @@ class InBetweenSolver(nn.Module):
         straight = torch.bmm(weights[:, None], shapes.flatten(2)).view_as(shapes[:, 0])
         base = straight if self.blend is None else self.blend(shapes, weights, straight)
         starts = [straight] if self.blend is None else [base, straight]
-        x, solution = self.minimised(base, rests, samples.mu, usable, report)
+        x, solution = self.minimised(base, rests, samples.mu, usable)
         x = self.relaxed(x, rests)
         # No shape is better for being far from a key-frame with a weight below zero.
         compared = rests._replace(weights=weights.clamp_min(0))
         x, solution = no_worse(x, starts, solution, self.distortion, compared, SLACK)
         x, solution = self.finished(x, solution, rests)
-        if report is not None:
-            warn_of_starts(solution)
         valid = (solution.status != Status.INVALID)[:, None, None]
         return InBetweenResult(torch.where(valid, self.alignment.restore(x, pose), torch.nan), solution)
 
-    def minimised(
-        self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor, report: Report | None
-    ) -> tuple[Tensor, Solution]:
+    def minimised(self, base: Tensor, rests: RestShapes, mu: Tensor, usable: Tensor) -> tuple[Tensor, Solution]:
         """Shapes of least energy in the modal space. *Shape:* ``(B, V, 3)``, of ``mu`` and ``usable`` ``(B,)``."""
         if self.space is None:
             return base, unminimised(base, usable)
         solve = solve_implicit if self.solver.gradient == "implicit" else solve_unrolled
         placement = self.space.place(base, rests, mu)
         limits = self.solver.max_steps, self.solver.tolerance
-        solution = solve(self.space, placement, usable, *limits, report)
+        solution = solve(self.space, placement, usable, *limits)
         # Kernels compute in float64, whatever goes in and comes out.
         values = (value.to(base) if value.is_floating_point() else value for value in solution if value is not None)
         solution = Solution(*values)

@@ -17,7 +17,7 @@ from torch_modal.energy.term import Mesh
 from torch_modal.geometry.crossings import require_contact
 from torch_modal.inbetween.alignment import Pose
 from torch_modal.inbetween.comparison import SLACK_OF_PATHS, no_worse
-from torch_modal.inbetween.results import InBetweenResult, unminimised, warn_of_starts, with_exact_keyframes
+from torch_modal.inbetween.results import InBetweenResult, report, unminimised, with_exact_keyframes
 from torch_modal.inbetween.settings import Objective, Preset, Solver, settings
 from torch_modal.keyframes.arrays import as_faces, checked_times
 from torch_modal.keyframes.check import checked_surface
@@ -26,7 +26,6 @@ from torch_modal.layers.blend import Blend
 from torch_modal.layers.in_between import InBetween
 from torch_modal.motion.cubics import Scheme, by_interval, located, wrapped
 from torch_modal.motion.spline import Knots, Spline
-from torch_modal.solve.implicit import Report
 from torch_modal.solve.minimise import Solution
 
 # Even times between two key-frames at which a path looks for contacts.
@@ -164,10 +163,6 @@ class Path(PreciseModule):
         other = Path(own, self.faces, times, self.cyclic, self.scheme or self.smooth, **given)
         return other.to(self.bases[0].reference)
 
-    def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
-        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
-        return self._solved(keyframes, t, None)
-
     def forward(self, keyframes: Tensor, t: Tensor | float) -> Tensor:
         """The shapes at given times.
 
@@ -182,13 +177,16 @@ class Path(PreciseModule):
             ValueError: Shapes that do not fit, or a time before the first or after the last key-frame.
             ConvergenceError: As for :class:`torch_modal.InBetween`.
         """
-        return self._solved(keyframes, t, self.layers[0].report() if self.layers else warn_of_starts).shapes
+        found = self.solve(keyframes, t)
+        report(found.solution, self.solver)
+        return found.shapes
 
-    def _solved(self, keyframes: Tensor, t: Tensor | float, report: Report | None) -> InBetweenResult:
+    def solve(self, keyframes: Tensor, t: Tensor | float) -> InBetweenResult:
+        """The shapes, and how each minimisation went, without a warning. Arguments as for :meth:`forward`."""
         flat, which, segment, u, lead = self._located(keyframes, t)
         knots = self.spline.knots(flat) if self.smooth else None
         parts, order = by_interval(
-            segment, len(self.pairs), lambda i, rows: self.within(knots, flat, i, which[rows], u[rows], report)
+            segment, len(self.pairs), lambda i, rows: self.within(knots, flat, i, which[rows], u[rows])
         )
         result = joined(parts, order)
         pairs = torch.tensor(self.pairs, device=segment.device)[segment]
@@ -204,7 +202,6 @@ class Path(PreciseModule):
         i: int,
         which: Tensor,
         u: Tensor,
-        report: Report | None = None,
         n_searched: int = N_SEARCHED,
     ) -> InBetweenResult:
         """Shapes of one interval.
@@ -215,32 +212,27 @@ class Path(PreciseModule):
             i: The interval.
             which: The motion of each shape. *Shape:* ``(B,)``.
             u: Times, 0 to 1. *Shape:* ``(B,)``.
-            report: Receives the solutions.
             n_searched: Number of even times at which contacts are searched.
         """
-        found = self._alone(knots, flat, i, which, u, report)
+        found = self._alone(knots, flat, i, which, u)
         if self.contact:
             found = self._separated(knots, flat, i, which, u, found, n_searched)
         if knots is not None and self.objective.terms:
             x = found.shapes[:, None]  # each is compared with itself
-            found = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape, report)
+            found = self.layers[0].solved(x, torch.ones_like(x[..., 0, 0]), u.shape)
         return found
 
-    def _alone(
-        self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor, report: Report | None
-    ) -> InBetweenResult:
+    def _alone(self, knots: Knots | None, flat: Tensor, i: int, which: Tensor, u: Tensor) -> InBetweenResult:
         """Shapes without contact and further terms. Arguments as for :meth:`within`."""
         weights = torch.stack([1 - u, u], -1)
         if knots is None:
             ends = flat[which][:, list(self.pairs[i])]
-            return self.layers[i].solved(ends, weights, u.shape, report)  # type: ignore[no-any-return]
+            return self.layers[i].solved(ends, weights, u.shape)  # type: ignore[no-any-return]
         straight = self.spline.straight(knots, i, which, u)
         x, usable = self.spline(knots, i, which, u, straight=straight), knots.usable[which]
         stiffness = [u.new_full((len(u), 1), value) for value in (ALPHA, BETA)]
         rests = RestShapes(knots.shapes[i : i + 2, which].movedim(0, 1), weights, stiffness, None)
         x, solution = no_worse(x, [straight], unminimised(x, usable), self.distortion, rests, SLACK_OF_PATHS)
-        if report is not None:
-            warn_of_starts(solution)
         shapes = self.spline.alignment.restore(x, self.spline.pose(knots, i, which, u))
         return InBetweenResult(torch.where(usable[:, None, None], shapes, torch.nan), solution)
 
@@ -264,7 +256,7 @@ class Path(PreciseModule):
             with torch.no_grad():
                 own = torch.full_like(even, motion, dtype=torch.int64)
                 pose, known, ends = placed(own, even)
-                x = core.alignment.bring(self._alone(knots, flat, i, own, even, None).shapes, pose)
+                x = core.alignment.bring(self._alone(knots, flat, i, own, even).shapes, pose)
                 pulls = torch.stack([1 - even, even], -1)
                 pulls = torch.ones_like(pulls[:, :1]) if known is None else pulls
                 rests = RestShapes(x[:, None] if known is None else known, pulls, layer.stiffness_of(even, even.shape))

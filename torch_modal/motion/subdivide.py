@@ -14,7 +14,7 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.crossings import Crossings, require_contact
 from torch_modal.geometry.rigid import blend
-from torch_modal.inbetween.results import warn_of_starts
+from torch_modal.inbetween.results import report
 from torch_modal.inbetween.settings import Objective, Preset, Settings, Solver, settings
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import check_keyframes
@@ -155,7 +155,7 @@ def _along_path(
     for i, n in enumerate(b - a for a, b in pairwise(places)):
         u = torch.arange(1, n).to(motion) / n
         result = path.within(knots, motion, i, torch.zeros_like(u, dtype=torch.int64), u, n_searched=n - 1)
-        warn_of_starts(result.solution)
+        report(result.solution, chosen.solver)
         if result.solution.n_crossing is not None:
             left += int((result.solution.n_crossing > 0).sum())
         yield result.shapes

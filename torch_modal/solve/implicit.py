@@ -17,9 +17,6 @@ class ConvergenceWarning(UserWarning):
     """A minimisation stopped before its gradient vanished, or has no gradient where it stopped."""
 
 
-Report = Callable[[Solution], None]
-
-
 class _ArgMin(torch.autograd.Function):
     r"""Amplitudes :math:`a^*(\theta)` at which :math:`\partial E / \partial a = 0`, for placements :math:`\theta`.
 
@@ -31,14 +28,11 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        energy: AmplitudeEnergy, limits: tuple[int, float, Report | None], tree: Any, usable: Tensor, *tensors: Tensor
+        energy: AmplitudeEnergy, limits: tuple[int, float], tree: Any, usable: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        max_steps, tolerance, report = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
-        solution = minimise(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
+        solution = minimise(energy, start, trees.filled(tree, tensors), *limits)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
-        if report is not None:
-            report(solution)
         return tuple(value for value in solution if value is not None)
 
     @staticmethod
@@ -120,7 +114,7 @@ def _warn_of_singular(singular: Tensor) -> None:
 
 
 def solve_implicit(
-    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float, report: Report | None
+    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float
 ) -> Solution:
     """Minimise from zeros; gradients of the amplitudes by the implicit function theorem.
 
@@ -130,18 +124,17 @@ def solve_implicit(
         usable: False for samples whose status is ``INVALID`` whatever comes out. *Shape:* ``(B,)``.
         max_steps: Of :func:`~torch_modal.solve.minimise.minimise`.
         tolerance: Likewise.
-        report: Receives the solution.
     """
-    limits = max_steps, tolerance, report
+    limits = max_steps, tolerance
     return Solution(*applied(_ArgMin, energy, limits, trees.skeleton(placement), usable, *trees.leaves(placement)))
 
 
 def solve_unrolled(
-    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float, report: Report | None
+    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float
 ) -> Solution:
     """Take exactly ``max_steps`` steps from zeros; gradients flow back through all of them.
 
-    Nothing here depends on data but what is computed: no early end, no report. Arguments as for :func:`solve_implicit`.
+    Nothing here depends on data but what is computed: no early end. Arguments as for :func:`solve_implicit`.
     """
     step, a = GaussNewtonStep(energy), trees.leaves(placement)[0].new_zeros(len(usable), energy.n_amplitudes)
     first = None

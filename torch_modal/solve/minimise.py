@@ -85,6 +85,8 @@ class _State(NamedTuple):
     """Of the next step, relative to the quasi-Newton step; 0 of converged samples. *Shape:* ``(B,)``."""
     goal: Tensor
     """The gradient norm at which it has converged. *Shape:* ``(B,)``."""
+    rounding: Tensor
+    """Rounding of the energy that that of the positions explains, over the root of the energy. *Shape:* ``(B,)``."""
     n_steps: Tensor
     """Steps taken. *Shape:* ``(B,)``, int64."""
     placement: Any
@@ -123,7 +125,9 @@ def minimise(
         inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye))
         own = found[rows, :, None], reached[rows], derivatives.gradient[..., None], own_norm, inverse
         length, before = (regular & (own_norm > goal[rows])).to(a), n_steps[rows]
-        state = _State(rows, *own, length, goal[rows], before, some)
+        stiffest = derivatives.gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)
+        rounding = derivatives.resolution / stiffest.clamp_min(torch.finfo(a.dtype).tiny).sqrt()
+        state = _State(rows, *own, length, goal[rows], rounding, before, some)
         whole = found, reached, norm, n_steps, drowned
         for _ in range(min(MOST_EVALUATIONS, max_steps - used)):
             n_active = int(torch.count_nonzero(state.length))
@@ -167,8 +171,11 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
     there = a + move
     value, slope = energy.value_and_gradient(there.squeeze(-1), state.placement)
     slope = slope[..., None]
-    # Energies are sums of squares. They may rise by their rounding.
-    better = (length > 0) & (value <= state.energy * (1 + ENERGY_ROUNDING * torch.finfo(value.dtype).eps))
+    norm = torch.linalg.vector_norm(slope, dim=(1, 2))
+    # Energies are sums of squares. They may rise by their rounding, and where the gradient falls, by that of positions.
+    bound = state.energy * (1 + ENERGY_ROUNDING * torch.finfo(value.dtype).eps)
+    bound = torch.where(norm < state.norm, bound + state.rounding * state.energy.clamp_min(0).sqrt(), bound)
+    better = (length > 0) & (value <= bound)
     change = slope - gradient
     if bool(better.all()):
         length = torch.ones_like(length)
@@ -176,6 +183,7 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
         taken = better[:, None, None]
         there, move, change = torch.where(taken, there, a), move * taken, torch.where(taken, change, 0)
         value, slope = torch.where(better, value, state.energy), torch.where(taken, slope, gradient)
+        norm = torch.where(better, norm, state.norm)
         shorter = torch.where(length > SHORTEST, 0.5 * length, 0)
         length = torch.where(better, 1, shorter)
     # The update keeps the inverse positive definite where the gradient grows along the step; elsewhere it is left out.
@@ -184,7 +192,6 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
     share = torch.where(curvature > 0, curvature.reciprocal(), 0)
     half = torch.bmm(across, pushed).mul_(share).add_(1).mul_(0.5)
     other, scaled = torch.addcmul(pushed, half, move, value=-1), move * share
-    norm = torch.linalg.vector_norm(slope, dim=(1, 2))
     return state._replace(
         a=there,
         energy=value,
