@@ -191,6 +191,15 @@ def _wire() -> tuple[FloatArray, IntArray]:
     return _ball_with(0.025, 0.045)
 
 
+def _rod() -> tuple[FloatArray, IntArray]:
+    """Fifty times longer than wide."""
+    root = np.linspace(np.pi / 2, 0, 4)
+    end = np.stack([BAR + 0.04 * np.cos(root), 0.04 * np.sin(root)], axis=1)
+    profile = np.concatenate([np.stack([BAR - end[::-1, 0], end[::-1, 1]], axis=1), end])
+    profile[0, 1] = profile[-1, 1] = 0.0
+    return turned_surface(profile, 0.03)
+
+
 def _sheet() -> tuple[FloatArray, IntArray]:
     return sheet_surface((72, 36), (BAR, 2.0))
 
@@ -203,6 +212,7 @@ _BENT = {
     "limb bent": (_limb, bend, 1.5, LIMB),
     "elbow bent": (_limb, bend, 2.6, 3.4),
     "wire bent": (_wire, bend, 1.5, LIMB),
+    "rod bent": (_rod, bend, 0.0, BAR),
     "sheet rolled": (_sheet, bend, 0.0, BAR),
     "gutter rolled": (_sheet, bend, 0.0, BAR),
 }

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_modal.autograd import full_precision
 from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
@@ -78,6 +79,7 @@ class Spline(nn.Module):
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
             self.rotations.append(first if plain else backend.rotations(mesh, ends))
 
+    @full_precision
     def knots(self, keyframes: Tensor) -> Knots:
         """The velocities at all key-frames. *Shape:* ``(L, K, V, 3)``."""
         weights, reference = self.alignment.weights, self.alignment.reference
