@@ -15,6 +15,9 @@ from torch_modal.autograd import lasting
 from torch_modal.energy.term import Mesh, Term
 from torch_modal.geometry.vectors import pick
 
+# Roundings of an energy, relative to it, that say nothing about a step.
+ENERGY_ROUNDING = 64.0
+
 
 class Rest(NamedTuple):
     """Measures of a rest shape and their weights, term by term."""
@@ -294,17 +297,10 @@ class Energy(nn.Module):
             out = corners[0].new_zeros(*corners[0].shape[:-1], self.n_extended)
         return out.index_add(-1, self.corners, torch.cat(corners, -1)) if corners else out
 
-    def gather(self, at: Sequence[Linearised], factors: Sequence[Tensor]) -> Tensor:
-        """Gradients of all measures times factors of them, summed. *Shape:* ``(B, M)`` each, ``(3, B, V)`` extended."""
-        scaled = [
-            factor if part.term.total else factor * one.gradients
-            for part, one, factor in zip(self.parts, at, factors, strict=True)
-        ]
-        return self.scatter(at, scaled)
-
     def gradient(self, at: Sequence[Linearised]) -> Tensor:
         """Gradient of the energy. *Shape:* ``(3, B, V)``, extended."""
-        return self.gather(at, [one.slope for one in at])
+        parts = zip(self.parts, at, strict=True)
+        return self.scatter(at, [one.slope if part.term.total else one.slope * one.gradients for part, one in parts])
 
 
 class RestShapes(NamedTuple):

@@ -31,6 +31,11 @@ class Derivatives(NamedTuple):
     """Gradient norm that the rounding of the positions alone explains. *Shape:* ``(B,)``."""
 
     @property
+    def floor(self) -> Tensor:
+        """Gradient norm below which there is only rounding, which adds up along sums of elements. *Shape:* ``(B,)``."""
+        return 4 * self.resolution
+
+    @property
     def hessian(self) -> Tensor:
         """The full Hessian. *Shape:* ``(B, n, n)``."""
         assert self.second_order is not None

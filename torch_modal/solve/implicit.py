@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torch_modal import trees
 from torch_modal.autograd import applied, flattened, recorded, transposed
-from torch_modal.solve.gauss_newton import AmplitudeEnergy, GaussNewtonStep, gradient_floor, ridged
-from torch_modal.solve.minimise import Solution, Status, minimise
+from torch_modal.solve.gauss_newton import GaussNewtonStep
+from torch_modal.solve.minimise import AmplitudeEnergy, Solution, Status, minimise, ridged
 
 
 class ConvergenceWarning(UserWarning):
@@ -145,7 +145,7 @@ def solve_unrolled(
     derivatives = energy.derivatives(a, placement, second_order=False)
     norm = derivatives.gradient.norm(dim=-1)
     first = norm if first is None else first
-    found = norm <= torch.maximum(tolerance * first, gradient_floor(derivatives))
+    found = norm <= torch.maximum(tolerance * first, derivatives.floor)
     status = torch.where(found, Status.CONVERGED, Status.OUT_OF_STEPS)
     status = torch.where(usable & norm.isfinite(), status, Status.INVALID)
     relative = norm / first.clamp_min(torch.finfo(first.dtype).tiny)

@@ -5,13 +5,14 @@ Hessians of a Newton method, and need no second-order term.
 """
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torch_modal import trees
-from torch_modal.solve.gauss_newton import AmplitudeEnergy, gradient_floor, ridged
+from torch_modal.energy.energy import ENERGY_ROUNDING
+from torch_modal.energy.modal_energy import Derivatives
 
 # Evaluations of the gradient with one Hessian of Gauss and Newton. Samples that need more get another.
 MOST_EVALUATIONS = 40
@@ -19,8 +20,25 @@ MOST_EVALUATIONS = 40
 # Steps shorter than this part of the quasi-Newton step make no progress worth an evaluation.
 SHORTEST = 0.02
 
-# Roundings of an energy, relative to it, by which it may rise.
-ENERGY_ROUNDING = 64.0
+
+class AmplitudeEnergy(Protocol):
+    """Protocol of an energy of amplitudes with its derivatives."""
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of amplitudes, n."""
+
+    def value(self, a: Tensor, placement: Any) -> Tensor:
+        """Energy. *Shape:* ``(..., B, n) -> (..., B)``."""
+
+    def derivatives(self, a: Tensor, placement: Any, second_order: bool = True) -> Derivatives:
+        """Derivatives. *Shape:* ``(B, n)``."""
+
+    def value_and_gradient(self, a: Tensor, placement: Any) -> tuple[Tensor, Tensor]:
+        """Energy and gradient. *Shape:* ``(B, n) -> (B,), (B, n)``."""
+
+    def gradient(self, a: Tensor, placement: Any) -> Tensor:
+        """Gradient, to be differentiated in all that the placement holds. *Shape:* ``(B, n) -> (B, n)``."""
 
 
 class Status(IntEnum):
@@ -119,7 +137,7 @@ def minimise(
         derivatives = energy.derivatives(found[rows], some, second_order=False)
         own_norm = derivatives.gradient.norm(dim=-1)
         if not used:
-            start, goal = own_norm, torch.maximum(tolerance * own_norm, gradient_floor(derivatives))
+            start, goal = own_norm, torch.maximum(tolerance * own_norm, derivatives.floor)
         factor, info = torch.linalg.cholesky_ex(ridged(derivatives.gauss_newton))
         regular = (info == 0) & own_norm.isfinite() & reached[rows].isfinite()
         inverse = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, eye))
@@ -201,3 +219,12 @@ def _advanced(energy: AmplitudeEnergy, state: _State) -> _State:
         length=length * (norm > state.goal),
         n_steps=state.n_steps + better,
     )
+
+
+def ridged(hessian: Tensor, damping: float | None = None) -> Tensor:
+    """A Hessian with a ridge relative to its mean diagonal. *Shape:* ``(..., n, n)``."""
+    if damping is None:
+        damping = 1e-12 if hessian.dtype == torch.float64 else 1e-6
+    size = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)
+    ridge = damping * size.abs() + torch.finfo(size.dtype).tiny
+    return hessian + torch.diag_embed(ridge[..., None].expand(hessian.shape[:-1]))
