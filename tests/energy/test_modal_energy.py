@@ -6,6 +6,7 @@ from conftest import Shapes
 from torch import Tensor
 from torch.func import hessian, jacfwd
 
+from torch_modal.energy import modal_energy
 from torch_modal.energy.bend import Bend
 from torch_modal.energy.energy import Energy
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy
@@ -137,11 +138,13 @@ def test_no_consistent_winding(faces: list[list[int]], stiffness: dict[str, floa
     require_true_hessian(Case(*odd_surface(faces), **stiffness))
 
 
-def test_second_order_is_optional(small_bars: Shapes) -> None:
+def test_second_order_is_optional_and_comes_in_chunks(small_bars: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
     whole, first_order = case.derivatives(), case.derivatives(second_order=False)
     assert first_order.second_order is None
     assert torch.equal(whole.gauss_newton, first_order.gauss_newton)
+    monkeypatch.setattr(modal_energy, "MOST_BYTES", 1)  # one sample at a time
+    torch.testing.assert_close(case.derivatives().second_order, whole.second_order, rtol=1e-12, atol=1e-9)
 
 
 def test_cardinality_value_takes_more_leading_dimensions(small_bars: Shapes) -> None:

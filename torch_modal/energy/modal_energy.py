@@ -18,6 +18,10 @@ from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import Term
 
 
+# The second-order term of a batch passes through an array of this many bytes at a time.
+MOST_BYTES = 2**26
+
+
 class Derivatives(NamedTuple):
     """Derivatives of an energy in the amplitudes ``a``."""
 
@@ -208,6 +212,7 @@ def _second_order(term: Term, one: Linearised, columns: Tensor) -> Tensor:
     if one.beyond is not None:
         gradients = one.gradients.flatten(0, 1)
         curved = curved + (one.beyond * gradients)[:, None] * gradients
-    # (B, M, c, c) by (M, c, n).
-    pushed = curved.permute(2, 3, 0, 1).contiguous() @ columns
-    return columns.flatten(0, 1).mT @ pushed.flatten(1, 2)
+    most = max(1, MOST_BYTES // max(1, columns.numel() * columns.element_size()))
+    # (b, M, c, c) by (M, c, n), of some samples at a time.
+    parts = (own.contiguous() @ columns for own in curved.permute(2, 3, 0, 1).split(most))
+    return torch.cat([columns.flatten(0, 1).mT @ pushed.flatten(1, 2) for pushed in parts])
