@@ -17,7 +17,6 @@ from torch_modal.energy.energy import Energy, Linearised, Reference, RestShapes
 from torch_modal.energy.shell import ShellEnergy
 from torch_modal.energy.term import Term
 
-
 # The second-order term of a batch passes through an array of this many bytes at a time.
 MOST_BYTES = 2**26
 
