@@ -137,13 +137,6 @@ def test_no_consistent_winding(faces: list[list[int]], stiffness: dict[str, floa
     require_true_hessian(Case(*odd_surface(faces), **stiffness))
 
 
-def test_second_order_is_optional(small_bars: Shapes) -> None:
-    case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
-    whole, first_order = case.derivatives(), case.derivatives(second_order=False)
-    assert first_order.second_order is None
-    assert torch.equal(whole.gauss_newton, first_order.gauss_newton)
-
-
 def test_cardinality_value_takes_more_leading_dimensions(small_bars: Shapes) -> None:
     case = Case(small_bars.faces, small_bars.keyframes[1] * 20)
     many = case.a + 0.01 * torch.arange(4, dtype=torch.float64)[:, None, None]

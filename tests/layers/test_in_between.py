@@ -349,6 +349,7 @@ def test_what_a_call_refuses(call: Any, message: str, layer: InBetween, bars: Sh
     [
         (lambda: modal(gradient="magic"), "'implicit', 'unroll'"),
         (lambda: modal(unconverged="hide"), "'warn', 'raise'"),
+        (lambda: modal(backend="cuda"), "backend is one of 'auto', 'torch', 'warp'; got 'cuda'"),
         (lambda: modal(tolerance=-1.0), "tolerance bounds a relative gradient norm"),
         (lambda: modal(coarse_faces=3), "coarse_faces is a whole number, 4 or more"),
         (lambda: modal(polish=-1), "polish is a whole number"),
