@@ -219,7 +219,6 @@ def test_linear_sequence(scattered: Shapes) -> None:
         ({"levels": 1.5}, "got 1.5"),
         ({"n_frames": 2}, "n_frames=2 leaves no room for 3 key-frames"),
         ({"bases": []}, "got 0 bases for 3 key-frames"),
-        ({"preset": "both"}, "preset is one of 'accurate', 'fast', 'paper'; got 'both'"),
     ],
 )
 def test_exception(options: dict[str, Any], message: str, scattered: Shapes) -> None:
