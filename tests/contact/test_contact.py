@@ -261,6 +261,33 @@ def test_a_sample_does_not_depend_on_its_batch(hand: Shapes) -> None:
     assert float((moved - alone).norm(dim=-1).max()) < 1e-6 * size
 
 
+def unlimited(n: int, n_vertices: int, most: float = 10.0) -> Timeline:
+    """A trajectory at rest, with a limit of accelerations between frames."""
+    limit = AccelerationLimit(
+        torch.zeros(n + 2, n_vertices, 3), torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1), (False, False), most
+    )
+    return Timeline(torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1], limit, None)
+
+
+def test_a_displacement_fades_out_where_it_makes_shapes_worse() -> None:
+    n = 15
+    field = torch.ones(n, 2, 3, dtype=DOUBLE)
+
+    class Fake:
+        def __init__(self, worse: list[int]) -> None:
+            self.worse = worse
+
+        def count(self, x: Tensor) -> Tensor:
+            moved = x.abs().amax((1, 2)) > 1e-9
+            return torch.tensor([3 if i in self.worse and moved[i] else 1 + 1 * ~moved[i] for i in range(n)])
+
+    for worse in ([], [7], [3, 4], list(range(n))):
+        fake: Any = Fake(worse)
+        found, n_far = separate._never_worse(torch.zeros_like(field), field, fake, unlimited(n, 2), torch.full((n,), 2))
+        assert bool((n_far <= 2).all()) and float(found[worse].abs().sum()) == 0
+        assert float(found[12].min()) == (len(worse) < n)
+
+
 def test_a_displacement_that_makes_a_shape_worse_is_not_applied(hand: Shapes, monkeypatch: pytest.MonkeyPatch) -> None:
     push_apart = path_module.push_apart
 
@@ -465,10 +492,7 @@ def test_shapes_rest_as_far_as_accelerations_allow(generator: torch.Generator, m
 
     monkeypatch.setattr(separate, "ROUNDS", (4, 90))
     monkeypatch.setattr(separate, "PULL", 3.0)
-    turns = torch.eye(3, dtype=DOUBLE).repeat(n, 1, 1)
-    limit = AccelerationLimit(torch.zeros(n + 2, 3, 3), turns, (False, False), 1.0)
-    trajectory = Timeline(torch.linspace(0, 1, n + 2, dtype=DOUBLE)[1:-1], limit, None)
-    start, fake = torch.zeros_like(places), Fake()
+    start, fake, trajectory = torch.zeros_like(places), Fake(), unlimited(n, 3, 1.0)
     given: Any = start, start, relax, fake, trajectory, nothing, torch.arange(n), torch.full((n,), 99)
     x, _ = separate._settled(*given)
     differences = trajectory.limit.differences.numpy()
