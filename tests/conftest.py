@@ -120,12 +120,6 @@ def hand_path(data_dir: Path) -> Keyframes:
 
 
 @pytest.fixture(scope="session")
-def hand_frames(data_dir: Path) -> torch.Tensor:
-    """All nine frames of that hand. *Shape:* ``(9, V, 3)``."""
-    return load_keyframes([data_dir / "mh-hand-path" / f"{i:02}.obj" for i in range(9)]).keyframes
-
-
-@pytest.fixture(scope="session")
 def hands(hand_path: Keyframes) -> Shapes:
     """The hand with 30 modes of each frame, by the real mesher (half a minute)."""
     return Shapes(*hand_path, extract_bases(*hand_path, 30, progress=False))

@@ -378,17 +378,7 @@ def test_what_a_kernel_would_read_wrongly_is_refused() -> None:
         launch.launch(kernel, (1, 2), [x, huge, 4, x[:1]])
 
 
-def test_a_batch_of_nothing(bars: Shapes) -> None:
-    shell = tm.InBetween(bars.bases[:2], bars.faces).core.fine.steps
-    volume, normal = shell.volume(bars.keyframes[:0])
-    assert volume.shape == (0,) and normal.shape == (0, *bars.keyframes.shape[1:])
-
-
 class TestBackend:
-    def test_no_such_backend(self) -> None:
-        with pytest.raises(ValueError, match="backend is one of 'auto', 'torch', 'warp'; got 'cuda'"):
-            tm.Solver(backend="cuda")  # type: ignore[arg-type]
-
     def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, small_bars: Shapes) -> None:
         there = importlib.util.find_spec
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else there(name))

@@ -142,19 +142,6 @@ def test_kernels_find_the_triangles_that_cross(n_faces: int, generator: torch.Ge
     assert len(found) == len(wanted) and {tuple(pair) for pair in np.sort(found, 1).tolist()} == wanted
 
 
-def test_searches_agree_whoever_searches() -> None:
-    pytest.importorskip("warp")
-    from torch_modal.backends.warp.crossings import WarpPairs
-
-    sample = load_sample("hand")
-    mesh, x = Connectivity(sample.faces.numpy(), sample.keyframes.shape[1]), sample.keyframes.numpy()
-    kernels = Crossings(mesh, x, search=WarpPairs(mesh, x))
-    middle = x.mean(0)  # as linear interpolation has it, which flattens fingers
-    found = kernels.pairs(middle)
-    assert len(found) > 20
-    np.testing.assert_array_equal(found, Crossings(mesh, x).pairs(middle))
-
-
 def test_pairs_do_not_depend_on_pose_and_size(generator: torch.Generator) -> None:
     x, faces = two_boxes(0.3)
     x = x + 0.01 * torch.randn(x.shape, dtype=x.dtype, generator=generator)

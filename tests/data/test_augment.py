@@ -1,6 +1,7 @@
 """Random transforms: their conventions, and what the shapes are that they give."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -225,14 +226,6 @@ def test_nearest_key_frame_is_found_through_rigid_motions(bars: Shapes, space: t
     assert space.nearest(between).tolist() == [2]
 
 
-def test_in_betweens_are_the_same_from_either_end(bars: Shapes, space: tm.ShapeSpace) -> None:
-    x, y = 1.01 * bars.keyframes[:1], bars.keyframes[2:] + 0.01
-    t = torch.tensor([0.2], dtype=F64)
-    first, last, neither = torch.tensor([0]), torch.tensor([2]), torch.tensor([False])
-    found = space.in_betweens(y, x, 1 - t, last, first, neither)
-    torch.testing.assert_close(found, space.in_betweens(x, y, t, first, last, neither))
-
-
 def test_times_and_partners_are_uniform(space: tm.ShapeSpace) -> None:
     params = tm.RandomInBetween(t=(0.2, 0.6), p=0.3, space=space).forward_parameters(4000, generator=seeded())
     t = params["t"]
@@ -355,12 +348,6 @@ def test_large_draws_bend(bars: Shapes, space: tm.ShapeSpace) -> None:
     turns = [best_fit(x[0, end], bent[0, end], torch.ones(int(end.sum()), dtype=F64)).rotation for end in (left, right)]
     angle = torch.arccos(((turns[0].T @ turns[1]).trace() - 1) / 2)
     assert float(angle) > 1.5
-    # And small ones are the modes themselves, up to the rigid motion that they are aligned by.
-    small = deform(x, 1e-4 * displacement, x[0], space.reconstruction())
-    rigid = bars.bases[0].rigid_modes.flatten(1)
-    difference = ((small - x) * 1e4 - (straight - x)).flatten()
-    difference = difference - rigid.T @ (rigid @ difference)
-    assert float(difference.norm()) < 2e-3 * float((straight - x).norm())
 
 
 def test_deformation_moves_along_with_the_shape(bars: Shapes, space: tm.ShapeSpace) -> None:
@@ -527,13 +514,8 @@ def test_composition_says_what_does_not_fit(bars: Shapes, space: tm.ShapeSpace) 
     with pytest.raises(ValueError, match="times is 3"):
         tm.ShapeSpace(bars.bases, bars.faces, times=3)
     with pytest.raises(ValueError, match="one connectivity"):
-        tm.ShapeSpace([bars.bases[0], Shapes(*_other(bars)).bases[0]], bars.faces)
-
-
-def _other(bars: Shapes) -> tuple[torch.Tensor, torch.Tensor, list[tm.ModalBasis]]:
-    basis = bars.bases[0]
-    smaller = tm.ModalBasis(basis.reference[1:], basis.eigenvalues, basis.modes[:, 1:], basis.rigid_eigenvalues)
-    return bars.keyframes, bars.faces, [smaller]
+        smaller = replace(bars.bases[1], reference=bars.bases[1].reference[1:], modes=bars.bases[1].modes[:, 1:])
+        tm.ShapeSpace([bars.bases[0], smaller], bars.faces)
 
 
 # ---------------------------------------------------------------------------------------------------- many draws

@@ -134,20 +134,11 @@ def test_refuses_parts_that_do_not_fit(small_bars: Shapes, bars: Shapes, tmp_pat
 def test_refuses_what_is_no_set(small_bars: Shapes, folder: Path) -> None:
     with pytest.raises(FileNotFoundError, match=SET_FILE):
         StoredSet(folder.parent)
-    path = folder / SET_FILE
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-1])
-    with pytest.raises(ValueError, match="damaged"):
-        StoredSet(folder)
-    small_bars.bases[0].save(path)
-    with pytest.raises(ValueError, match=r"holds no torch_modal\.set"):
-        StoredSet(folder)
     shapes = {"keyframes": small_bars.keyframes, "faces": small_bars.faces}
-    for tensors, version, message in (
-        (shapes, VERSION, r"lacks the tensors 0\.reference"),
-        ({**shapes, "faces": small_bars.faces[0]}, VERSION, r"needs keyframes \(K, V, 3\) and faces"),
-        (shapes, "3", "version '3'"),
+    for tensors, message in (
+        (shapes, r"lacks the tensors 0\.reference"),
+        ({**shapes, "faces": small_bars.faces[0]}, r"needs keyframes \(K, V, 3\) and faces"),
     ):
-        write_tensors(path, FORMAT, version, tensors, {"names": [], "times": None, "note": ""})
+        write_tensors(folder / SET_FILE, FORMAT, VERSION, tensors, {"names": [], "times": None, "note": ""})
         with pytest.raises(ValueError, match=message):
             read_note(folder)

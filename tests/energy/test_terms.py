@@ -18,7 +18,6 @@ from torch_modal.energy.modal_energy import ModalEnergy
 from torch_modal.energy.stretch import Stretch
 from torch_modal.energy.term import Mesh, PeriodicTerm, Term
 from torch_modal.energy.volume import Volume
-from torch_modal.inbetween.joint import coarse_values
 
 DOUBLE = torch.float64
 
@@ -136,20 +135,6 @@ def test_a_soft_part_takes_the_deformation(bars: Shapes) -> None:
     lengths = [(x[end] - x[start]).norm(dim=-1) for x in (blind(x_a, x_b, 0.5), knowing(x_a, x_b, 0.5), x_a)]
     change = [(now / lengths[2] - 1).abs() for now in lengths[:2]]
     assert float(change[1][alpha < 500].mean()) > float(change[0][alpha < 500].mean())
-
-
-def test_coarse_values_by_hand() -> None:
-    # Two clusters of two vertices, and one alone; edges 01, 12, 23, 34 and coarse edges between clusters.
-    fine = Energy(Mesh.of(torch.tensor([[0, 1, 2], [2, 3, 4]]), 5), [Stretch()]).parts[0]
-    coarse = Energy(Mesh.of(torch.tensor([[0, 1, 2]]), 3), [Stretch()]).parts[0]
-    assert fine.corners.T.tolist() == [[0, 1], [0, 2], [1, 2], [2, 3], [2, 4], [3, 4]]
-    clusters = torch.tensor([0, 0, 1, 1, 2])
-    values = torch.tensor([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
-    # Cluster 0 has the ends of 1, 1, 2, 3; cluster 1 of 2, 3, 4, 4, 5, 6; cluster 2 of 5, 6.
-    zero, one, two = 7 / 4, 24 / 6, 11 / 2
-    found = coarse_values(values, fine, coarse, clusters, 3)
-    assert found[0].tolist() == pytest.approx([(zero + one) / 2, (zero + two) / 2, (one + two) / 2])
-    assert torch.equal(coarse_values(values[:, :1], fine, coarse, clusters, 3), values[:, :1])
 
 
 @pytest.mark.parametrize("shape", [(4,), (3, 2)])

@@ -163,9 +163,3 @@ def test_layers_of_a_sheet_that_are_close_are_no_contact() -> None:
     free, held = (layer.solve(flat, end, torch.tensor([0.5, 0.9])) for layer in made)
     torch.testing.assert_close(held.shapes, free.shapes, rtol=0, atol=1e-12)
     assert (held.solution.n_crossing == 0).all()
-
-
-def test_flat_key_frames_pass_the_checks() -> None:
-    with pytest.warns(tm.MeshWarning, match="is open") as caught:
-        tm.check_keyframes(torch.stack([roll(0), roll(0)]), faces())
-    assert len(caught) == 1

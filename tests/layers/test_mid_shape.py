@@ -102,11 +102,6 @@ def test_stiffnesses_count(bent: Shapes, middle: Tensor, space: str) -> None:
     assert largest(factor - middle) < 1e-7 * diagonal(x_a)
 
 
-def test_one_basis_is_refused(bent: Shapes) -> None:
-    with pytest.raises(ValueError, match="between two bases, got 1"):
-        MidShape(bent.bases[:1], bent.faces, **modal())
-
-
 def test_coincident_vertices_are_survived(bars: Shapes) -> None:
     """The border lets them through with a warning."""
     i, j = bars.faces[100, :2]

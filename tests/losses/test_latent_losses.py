@@ -98,12 +98,9 @@ class TestLatentElasticity:
         again = one(decoder, z, torch.Generator().manual_seed(0))
         torch.testing.assert_close(again.detach(), drawn[0], rtol=0, atol=0)
 
-    def test_leading_dimensions_and_dtype(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
+    def test_leading_dimensions(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
         loss = tm.losses.LatentElasticity(bars.faces)
         torch.testing.assert_close(loss(decoder, z[:, None]), loss(decoder, z)[:, None])
-        single = loss.to(torch.float32)(lambda own: decoder(own.double()).float(), z.float())
-        assert single.dtype == torch.float32
-        torch.testing.assert_close(single.double(), loss(decoder, z), rtol=1e-3, atol=0)
 
     def test_decoders_without_forward_mode(self, bars: Shapes, decoder: Bending, z: Tensor) -> None:
         class Backward(torch.autograd.Function):

@@ -7,7 +7,7 @@ from bodies import bend
 from solids import as_it_is, as_mesh, box, eigenmodes
 
 from torch_modal.modes import carrying
-from torch_modal.modes.carrying import Carrier, nearest_rotations, vertex_rotations
+from torch_modal.modes.carrying import Carrier, nearest_rotations
 from torch_modal.modes.eigen import ModalAnalysisError, lowest_modes
 from torch_modal.modes.embedding import find_neighbours
 from torch_modal.modes.extract import extract_bases
@@ -71,11 +71,6 @@ def test_what_cannot_be_followed_is_seen(carrier: Carrier) -> None:
     assert carried(carrier, POINTS + np.random.default_rng(0).normal(size=POINTS.shape)) is None  # crumpled
 
 
-def test_local_rotations_of_a_turn() -> None:
-    turns = vertex_rotations(POINTS, POINTS @ TURN.T * 2.0 + 1.0, COMPACT)
-    np.testing.assert_allclose(turns, np.broadcast_to(TURN, turns.shape), atol=1e-12)
-
-
 def test_nearest_rotations_against_singular_values() -> None:
     random = np.random.default_rng(0)
     matrices = random.normal(size=(3000, 3, 3)) * random.uniform(1e-9, 1e9, (3000, 1, 1))
@@ -87,11 +82,6 @@ def test_nearest_rotations_against_singular_values() -> None:
     flip[:, 2] = np.sign(np.linalg.det(u @ vt))
     np.testing.assert_allclose(found, (u * flip[:, None]) @ vt, atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(found), 1.0, atol=1e-12)
-
-
-def test_a_degenerate_face_does_no_harm() -> None:
-    faces = np.concatenate([COMPACT, [[COMPACT[0, 0], COMPACT[0, 1], COMPACT[0, 1]]]])
-    assert np.isfinite(vertex_rotations(POINTS, POINTS @ TURN.T, faces)).all()
 
 
 def test_clearances_of_a_plate_and_of_a_gap() -> None:

@@ -62,18 +62,6 @@ def test_small_mesh_stays_as_it_is(fine: tuple[np.ndarray, np.ndarray]) -> None:
     assert same.clusters[[0, 90]].tolist() == [-1, -1]
 
 
-def test_does_not_depend_on_units_or_place(fine: tuple[np.ndarray, np.ndarray], coarse: Coarsening) -> None:
-    for factor in (2.0**-20, 2.0**20):
-        scaled = coarsen(fine[0] * factor, fine[1], 100)
-        np.testing.assert_array_equal(scaled.clusters, coarse.clusters)
-        np.testing.assert_array_equal(scaled.faces, coarse.faces)
-
-
-def test_exception(fine: tuple[np.ndarray, np.ndarray]) -> None:
-    with pytest.raises(ValueError, match="at least 4 faces, got n_faces=3"):
-        coarsen(*fine, 3)
-
-
 def energy_ratio(coarse: Coarsening, keyframes: np.ndarray, faces: np.ndarray) -> float:
     """Coarse over fine energy between the first and the last shape."""
     on_fine, on_coarse = ShellEnergy(torch.from_numpy(faces)), ShellEnergy(torch.from_numpy(coarse.faces))

@@ -1,6 +1,5 @@
 """The add-on for Blender against a fake of the calls that it makes."""
 
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -9,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 from conftest import Shapes
+from test_examples import load_example
 
-ADDON = Path(__file__).parents[2] / "examples" / "blender" / "in_between_keys.py"
 PROGRAM = str(Path(sys.executable).with_name("torch-modal"))
 
 
@@ -62,10 +61,7 @@ def addon(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     )
     fake.utils = SimpleNamespace(register_class=registered.append, unregister_class=registered.remove)
     monkeypatch.setitem(sys.modules, "bpy", fake)
-    spec = importlib.util.spec_from_file_location("in_between_keys", ADDON)
-    assert spec is not None and spec.loader is not None
-    found = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(found)
+    found = load_example("blender/in_between_keys")
     found.register()
     assert len(registered) == 2 and len(menu) == 1
     found.unregister()
@@ -76,7 +72,7 @@ def addon(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def run(addon: ModuleType, body: Body, program: str = PROGRAM) -> tuple[set[str], Any]:
     operator = addon.InBetweenKeys()
     operator.levels, operator.step, operator.cyclic, operator.contact, operator.said = 1, 2, False, False, []
-    preferences = {"in_between_keys": SimpleNamespace(preferences=SimpleNamespace(program=program))}
+    preferences = {addon.__name__: SimpleNamespace(preferences=SimpleNamespace(program=program))}
     context = SimpleNamespace(
         active_object=body,
         preferences=SimpleNamespace(addons=preferences),

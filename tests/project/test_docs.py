@@ -1,7 +1,6 @@
 """The documentation's site: it builds without a warning, and has every page and every public name in it."""
 
 import ast
-import importlib.util
 import re
 import shutil
 import subprocess
@@ -14,6 +13,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 from snippets import ROOT, blocks
+from test_examples import load_example
 
 import torch_modal as tm
 
@@ -23,11 +23,7 @@ NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 @pytest.fixture(scope="module")
 def extension() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("extension", DOCS / "extension.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_example("../docs/extension")
 
 
 # ----------------------------------------------------------------------------------------------------------- pages

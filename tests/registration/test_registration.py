@@ -14,12 +14,11 @@ from torch_modal.data.samples import load_sample
 from torch_modal.extras import require
 from torch_modal.io.frames import save_mesh
 from torch_modal.registration import register as register_module
-from torch_modal.registration.fit import ElasticSurface, PointTargets
 from torch_modal.registration.landmarks import landmark_table, read_landmarks
-from torch_modal.registration.maps import CoarsePair, SpectralShape, nearest_rows
+from torch_modal.registration.maps import SpectralShape
 from torch_modal.registration.register import register
 from torch_modal.registration.report import measure
-from torch_modal.registration.surface import DUST, MeshSurface, largest_pieces, outward, referenced, sewn
+from torch_modal.registration.surface import DUST, MeshSurface, largest_pieces, referenced, sewn
 
 for library in ("robust_laplacian", "potpourri3d", "igl"):
     pytest.importorskip(library, reason=f"{library} is not installed; it is part of the extra 'register'")
@@ -271,22 +270,6 @@ def test_bad_input_is_refused(pair: tuple[Mesh, Mesh, np.ndarray], monkeypatch: 
 
 
 # ------------------------------------------------------------------------------------------------------------- parts
-def test_closest_points_and_rows() -> None:
-    surface = MeshSurface(np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0.0]]), np.array([[0, 1, 2]]))
-    closest = surface.closest(np.array([[0.5, 0.5, 3.0], [-1, -1, 0]]))
-    np.testing.assert_allclose(closest.distances, [3, 2**0.5])
-    np.testing.assert_allclose(closest.barycentric, [[0.5, 0.25, 0.25], [1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(surface.rows(closest) @ surface.vertices, closest.points, atol=1e-12)
-    assert surface.on_open_edge(closest).tolist() == [False, True] and surface.on_boundary.all()
-
-
-def test_pieces_and_winding() -> None:
-    rest, faces = limbs(2)
-    both = MeshSurface(np.vstack([rest, 0.1 * rest]), np.vstack([faces, faces + len(rest)]))
-    assert len(largest_pieces(both).vertices) == len(rest)
-    np.testing.assert_array_equal(outward(rest, faces), outward(rest, faces[:, ::-1]))
-    small, used = referenced(rest, faces[:4])
-    np.testing.assert_array_equal(small.vertices, rest[used])
 
 
 def cut_through(vertices: np.ndarray, faces: np.ndarray, gap: float) -> tuple[MeshSurface, np.ndarray]:
@@ -337,42 +320,6 @@ def test_spectrum_of_the_sphere() -> None:
     np.testing.assert_allclose(gram, np.eye(len(gram)), atol=1e-6)
     far = shape.geodesics_from(np.array([0]))[:, 0].max()
     assert far == pytest.approx(np.pi * np.sqrt(1 / (4 * np.pi)), rel=0.03)
-
-
-def test_zoom_out_repairs_a_rough_map_and_mirrors_lose() -> None:
-    rest, faces = limbs(3)
-    first = SpectralShape(MeshSurface(rest, faces))
-    second = SpectralShape(MeshSurface(bent(rest), faces))
-    random = np.random.default_rng(0)
-    true = np.arange(len(rest))
-    near = nearest_rows(rest + 0.3 * random.normal(size=rest.shape), rest)
-    refined = CoarsePair(first, second).refined(near, 8).vertices
-
-    def off(vertices: np.ndarray) -> float:
-        return float(np.linalg.norm(rest[vertices] - rest, axis=1).mean())
-
-    assert off(refined) < 0.5 * off(near)
-    assert CoarsePair(first, second).rated(true).score > 0.5
-    mirrored = SpectralShape(MeshSurface(rest * [1, 1, -1], faces[:, ::-1]))
-    assert CoarsePair(first, mirrored).rated(true).score < 0
-
-
-def test_elastic_surface_follows_a_rigid_motion_exactly() -> None:
-    rest, faces = limbs(2)
-    turn = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])[:3, :3]
-    elastic = ElasticSurface(MeshSurface(rest, faces))
-    np.testing.assert_allclose(elastic.local_frames(rest @ turn.T), np.tile(turn, (len(rest), 1, 1)), atol=1e-9)
-    from scipy import sparse
-
-    chosen = np.array([0, 5, 9, 30, 70])
-    points = sparse.identity(len(rest), format="csr")[chosen]
-    pulls = [PointTargets(points, (rest @ turn.T)[chosen], np.full(5, 10.0))]
-    moved = elastic.follow(rest, pulls, rounds=400)
-    np.testing.assert_allclose(moved, rest @ turn.T, atol=1e-3 * np.ptp(rest))
-    stretchable = ElasticSurface(MeshSurface(rest, faces), stretchable=True)
-    np.testing.assert_allclose(
-        stretchable.local_frames(1.5 * rest), np.tile(1.5 * np.eye(3), (len(rest), 1, 1)), atol=1e-9
-    )
 
 
 def test_measures_of_a_turned_flap() -> None:

@@ -170,31 +170,6 @@ def test_a_sample_does_not_depend_on_its_batch(tolerance: float, layer: MidShape
     assert len(set(together.n_steps.tolist())) > 1, "they end at different times"
 
 
-def test_one_bad_sample_spoils_no_other(layer: MidShape, bars: Shapes) -> None:
-    bends = [0.5, 1.0, 1.5]
-    alone = solve(layer, bars, bends)
-    energy, a, (coarse,) = problem(layer, bars, bends)
-    base = coarse.base.clone()
-    base[1, :, 7] = torch.nan
-    solution = minimise(energy, a, (coarse._replace(base=base),), tolerance=1e-8)
-    assert solution.converged.tolist() == [True, False, True]
-    assert solution.status[1] == Status.INVALID
-    for i in (0, 2):
-        torch.testing.assert_close(solution.amplitudes[i], alone.amplitudes[i], rtol=0, atol=1e-7)
-        assert solution.n_steps[i] == alone.n_steps[i]
-
-
-def test_gives_up_and_says_so(layer: MidShape, bars: Shapes) -> None:
-    energy, a, placement = problem(layer, bars, [1.0, 0.0])
-    none = minimise(energy, a, placement, max_steps=0)
-    assert none.n_steps.tolist() == [0, 0]
-    assert none.gradient_norm[0] == 1
-    one = minimise(energy, a, placement, max_steps=1)
-    assert one.n_steps[0] == 1
-    assert one.converged.tolist() == [False, True], "between equal shapes there is nothing to do"
-    assert 1e-8 < float(one.gradient_norm[0]) < 1
-
-
 def test_damped_steps_never_go_uphill(layer: MidShape, bars: Shapes, generator: torch.Generator) -> None:
     """Also from a start far away, where shapes pass through themselves."""
     energy, a, placement = problem(layer, bars, [1.0] * 8)

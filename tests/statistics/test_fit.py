@@ -144,12 +144,6 @@ def test_far_from_the_origin(bars: Shapes) -> None:
     torch.testing.assert_close(one - 1e6, other, rtol=0, atol=1e-4)
 
 
-def test_no_sets_of_points(space: tm.ShapeSpace) -> None:
-    found = space.fit(torch.zeros(2, 0, 5, 3), torch.arange(5))
-    assert [x.shape[2:] for x in found] == [(space.n_vertices, 3), (3, space.n_vertices), (5,), (5,)]
-    assert found.shape.shape[:2] == (2, 0)
-
-
 def test_second_derivatives_are_refused(space: tm.ShapeSpace, bars: Shapes) -> None:
     picked = markers(bars.keyframes[1], 12)
     leaf = (0.5 * (bars.keyframes[1] + bars.keyframes[2])[picked]).requires_grad_()
@@ -229,19 +223,6 @@ def test_points_in_other_units(space: tm.ShapeSpace, bars: Shapes, scale: float)
 
 
 class TestPatches:
-    def test_they_share_all_vertices(self, space: tm.ShapeSpace) -> None:
-        variation = space.variation()
-        patches = Patches(variation.coordinates.mean, variation.coordinates.reconstruction)
-        torch.testing.assert_close(patches.shares.sum(0), torch.ones(space.n_vertices, dtype=DOUBLE))
-        torch.testing.assert_close(patches.masses.sum(1), torch.ones(len(patches), dtype=DOUBLE))
-
-    def test_a_mixture_is_recognised_whatever_its_pose(self, space: tm.ShapeSpace) -> None:
-        variation = space.variation()
-        turn = exp(torch.tensor([1.0, -2.0, 0.5], dtype=DOUBLE))
-        for k, x in enumerate(variation.shapes):
-            weights = variation.mixtures.weights(x @ turn.mT + 1)
-            assert float((weights[k] - 1).abs().mean()) < 0.1
-
     def test_equal_shapes_share_a_patch(self, space: tm.ShapeSpace) -> None:
         variation = space.variation()
         twice = variation.shapes[[0, 0]]
