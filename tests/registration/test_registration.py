@@ -14,7 +14,7 @@ from torch_modal.data.samples import load_sample
 from torch_modal.extras import require
 from torch_modal.io.frames import save_mesh
 from torch_modal.registration import register as register_module
-from torch_modal.registration.fit import ElasticSurface, PointTargets
+from torch_modal.registration.fit import ElasticSurface
 from torch_modal.registration.landmarks import landmark_table, read_landmarks
 from torch_modal.registration.maps import CoarsePair, SpectralShape, nearest_rows
 from torch_modal.registration.register import register
@@ -366,7 +366,7 @@ def test_elastic_surface_follows_a_rigid_motion_exactly() -> None:
 
     chosen = np.array([0, 5, 9, 30, 70])
     points = sparse.identity(len(rest), format="csr")[chosen]
-    pulls = [PointTargets(points, (rest @ turn.T)[chosen], np.full(5, 10.0))]
+    pulls = [(points, (rest @ turn.T)[chosen], np.full(5, 10.0))]
     moved = elastic.follow(rest, pulls, rounds=400)
     np.testing.assert_allclose(moved, rest @ turn.T, atol=1e-3 * np.ptp(rest))
     stretchable = ElasticSurface(MeshSurface(rest, faces), stretchable=True)

@@ -87,9 +87,9 @@ class SpectralShape:
         """Number of coarse vertices."""
         return len(self.coarse.vertices)
 
-    def wave_kernel_signatures(self, n_energies: int = 40) -> FloatArray:
-        """Wave kernel signatures (Aubry et al. 2011) in unit columns. *Shape:* ``(n, n_energies)``."""
-        logs = np.log(np.maximum(self.eigenvalues[1:], 1e-9))
+    def wave_kernel_signatures(self) -> FloatArray:
+        """Wave kernel signatures (Aubry et al. 2011) of 40 energies, in unit columns. *Shape:* ``(n, 40)``."""
+        n_energies, logs = 40, np.log(np.maximum(self.eigenvalues[1:], 1e-9))
         energies = np.linspace(logs[0], logs[-1] / 1.02, n_energies)
         width = max(7 * (logs[-1] - logs[0]) / n_energies, 1e-9)
         weights = np.exp(-((energies[:, None] - logs) ** 2) / (2 * width**2))
@@ -100,21 +100,18 @@ class SpectralShape:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
         return np.stack([self._heat.compute_distance(int(source)) for source in sources], axis=1)
 
-    def neighbourhoods(self, radius: float) -> BoolArray:
-        """Pairs of vertices within a distance along edges, as a mask. *Shape:* ``(n, n)``."""
-        i, j = self.coarse.edges.T
-        lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
-        graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
-        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=radius) <= radius
-        return near
-
     def is_near(self, vertices: IntArray, points: FloatArray) -> BoolArray:
         """Points in space whose nearest coarse vertices are near given ones, as a mask. *Shape:* ``(n,), (n, 3)``."""
         return self._near[vertices, self._tree.query(points)[1]]  # type: ignore[no-any-return]
 
     @cached_property
     def _near(self) -> BoolArray:
-        return self.neighbourhoods(_NEAR)
+        """Pairs of vertices that are near along edges, as a mask. *Shape:* ``(n, n)``."""
+        i, j = self.coarse.edges.T
+        lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
+        graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
+        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=_NEAR) <= _NEAR
+        return near
 
     @cached_property
     def _tree(self) -> cKDTree:

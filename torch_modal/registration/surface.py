@@ -23,16 +23,15 @@ CUT = 0.04
 
 
 class Closest(NamedTuple):
-    """Closest points on a surface."""
+    """Closest points on a surface, their faces, and non-negative coordinates in these.
+
+    *Shape:* ``(n,), (n,), (n, 3), (n, 3)``.
+    """
 
     distances: FloatArray
-    """*Shape:* ``(n,)``."""
     faces: IntArray
-    """Face of each point. *Shape:* ``(n,)``."""
     points: FloatArray
-    """*Shape:* ``(n, 3)``."""
     barycentric: FloatArray
-    """Non-negative coordinates in the faces. *Shape:* ``(n, 3)``."""
 
 
 class MeshSurface:
