@@ -65,18 +65,15 @@ class InBetweens:
         self._solvers, self._tables = Recent(32), Recent(64)
 
     def __call__(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: Tensor, j: Tensor, keyframes: Tensor) -> Tensor:
-        """In-betweens of a batch.
+        """In-betweens of a batch of shapes ``x_a`` at 0 and ``x_b`` at 1, at the times ``t``. *Shape:* ``(B, V, 3)``.
 
         Args:
-            x_a: Shapes at 0. *Shape:* ``(B, V, 3)``.
-            x_b: Shapes at 1. *Shape:* ``(B, V, 3)``.
-            t: Times. *Shape:* ``(B,)``.
+            x_a: *Shape:* ``(B, V, 3)``.
+            x_b: Likewise.
+            t: *Shape:* ``(B,)``.
             i: The key-frame whose modes serve at 0, on the CPU. *Shape:* ``(B,)``.
-            j: Likewise at 1, perhaps the same. *Shape:* ``(B,)``.
+            j: Likewise at 1, perhaps the same.
             keyframes: Whether both shapes are these key-frames, on the CPU. *Shape:* ``(B,)``, bool.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
 
         Raises:
             ValueError: A shape is not finite, has no size, or is the mirror image of the other.

@@ -109,11 +109,8 @@ def _local_processes(workers: int | None) -> Iterator[tuple[Executor, Any]]:
 
 @contextmanager
 def _dask_cluster(address: str) -> Iterator[tuple[Executor, Any]]:
-    """The workers of a Dask cluster, and an event on its scheduler: running tasks cannot be cancelled from outside.
-
-    The scheduler gives the sets of a dead worker to others, and gives up a set that killed several workers
-    (``distributed.scheduler.allowed-failures``).
-    """
+    """The workers of a Dask cluster, and an event on its scheduler: running tasks cannot be cancelled from outside."""
+    # Sets of a dead worker go to others, until one has killed several (distributed.scheduler.allowed-failures).
     distributed = require("distributed", "dask", "a Dask cluster")
     with distributed.Client(address, set_as_default=False) as client:
         yield client.get_executor(pure=False, retries=RETRIES), distributed.Event(client=client)

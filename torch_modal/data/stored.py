@@ -212,11 +212,7 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
 
 
 def _opened(folder: Path) -> TensorFile:
-    """The file of a set, whose header is checked.
-
-    Raises:
-        FileNotFoundError, ValueError: As for :class:`StoredSet`.
-    """
+    """The file of a set, whose header is checked; raises as :class:`StoredSet`."""
     file = TensorFile(folder / SET_FILE, FORMAT, VERSION, ("keyframes", "faces"))
     keyframes, faces = file.shapes["keyframes"], file.shapes["faces"]
     if len(keyframes) != 3 or keyframes[2] != 3 or len(faces) != 2 or faces[1] != 3:

@@ -20,14 +20,12 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
 class _Primitive(NamedTuple):
-    """Triangles of one node."""
+    """Triangles of one node, as indices of its own vertices, which are a slice of the asset's. *Shape:* ``(F, 3)``."""
 
     node: int
     json: Json
     points: slice
-    """Its vertices among those of the asset; primitives that share them are alike here."""
     triangles: IntArray
-    """Indices of its own vertices. *Shape:* ``(F, 3)``."""
 
 
 class GltfAsset(Asset):

@@ -32,10 +32,7 @@ class CarriedNormals:
         self.before = self._frames(positions)
 
     def _frames(self, positions: FloatArray) -> FloatArray:
-        """Right-handed frames of the surface at each point, with the normal as first column. *Shape:* ``(P, 3, 3)``.
-
-        The second column is the edge made perpendicular to it, or any perpendicular if the edge is along the normal.
-        """
+        """Right-handed frames at each point: the normal, the edge made perpendicular to it. *Shape:* ``(P, 3, 3)``."""
         x = positions[self.first]
         normals, sides = vertex_normals(x, self.triangles), x[self.neighbour] - x
         along = sides - np.einsum("ij,ij->i", sides, normals)[:, None] * normals

@@ -27,14 +27,11 @@ CHUNK = 32
 
 
 class Observations(NamedTuple):
-    """Points with the vertices that should be there."""
+    """Points with the vertices that should be there, and weights. *Shape:* ``(n, 3), (n,), (n,)``."""
 
     points: Tensor
-    """*Shape:* ``(n, 3)``."""
     vertices: Tensor
-    """*Shape:* ``(n,)``."""
     weights: Tensor
-    """Weight of each observation. *Shape:* ``(n,)``."""
 
     def pose(self, x: Tensor) -> RigidMotion:
         """Rigid motion of a shape on to the points. *Shape:* ``(V, 3)``."""
