@@ -26,11 +26,7 @@ STIFFNESS = 3000.0
 
 
 def refuse_transforms(x: Tensor) -> None:
-    """Refuse shapes whose numbers cannot be read, or whose tangents would be lost: the search is not torch's.
-
-    Raises:
-        RuntimeError: They are within a transform of ``torch.func``, or have a tangent.
-    """
+    """Raise for shapes within transforms of ``torch.func``, or with tangents: the search is not torch's."""
     if transformed(x):
         raise RuntimeError(
             "shapes with contact have no forward mode, and no transforms of torch.func: take torch.autograd.grad, or "

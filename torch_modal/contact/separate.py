@@ -65,7 +65,7 @@ def separate(
         relax: Takes a Newton step of all vertices of some of the shapes, given those, their indices and energies beside
             the elastic one. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
-        timeline: Times, limit and modes of several shapes; None for one shape alone.
+        timeline: Of several shapes; None for one alone.
 
     Returns:
         The shapes, and the number of far pairs of triangles that are left in each. *Shape:* ``(T, V, 3), (T,)``.

@@ -186,14 +186,9 @@ class InBetweens:
 
 
 def by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
-    """Results of a batch whose rows of one kind are computed together.
+    """Results of a batch in its order, whose rows of one kind are computed together, from the kind and their indices.
 
-    Args:
-        kinds: On the CPU. *Shape:* ``(B, n)``.
-        compute: Returns the results of the rows of a kind, from the kind and the indices of its rows.
-
-    Returns:
-        In the order of the batch. *Shape:* ``(B, ...)``.
+    Kinds are on the CPU. *Shape:* ``(B, n) -> (B, ...)``.
     """
     each, kind = kinds.unique(dim=0, return_inverse=True)
     rows = [torch.nonzero(kind == number).flatten() for number in range(len(each))]
@@ -206,12 +201,7 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
 
     Reads these four only, so that a memory-mapped table is not loaded whole. Exact at the times of the table.
 
-    Args:
-        table: Four shapes or more. *Shape:* ``(T, V, 3)``.
-        t: Times in [0, 1]. *Shape:* ``(B,)``.
-
-    Returns:
-        *Shape:* ``(B, V, 3)``.
+    *Shape:* ``(T, V, 3), (B,) -> (B, V, 3)``, with T of 4 or more.
     """
     n = len(table)
     place = t * (n - 1)

@@ -71,14 +71,7 @@ class Options:
     """True if the key-frames of a set are a motion, in the order of their files."""
 
     def key(self, files: Sequence[Path]) -> str:
-        """Digest of all that the bases depend on: options, names and contents of the files, those beside them included.
-
-        Args:
-            files: The meshes of the set.
-
-        Raises:
-            OSError: A file cannot be read.
-        """
+        """Digest of all that the bases depend on: options, names and contents of the files and of those beside them."""
         beside = [files[0].parent / TIMES_FILE] if self.sequence else []
         if any(file.suffix.lower() == ".gltf" for file in files):
             beside += sorted(files[0].parent.glob("*.bin"))

@@ -53,7 +53,12 @@ def precompute_tree(
         OSError: The output cannot be written, or there is no cluster, or it is gone (ConnectionError).
         MissingPackageError: ``scheduler`` without dask.distributed.
     """
-    _check_folders(root, out)
+    if not root.is_dir():
+        raise ValueError(f"{root} is no folder" if root.exists() else f"there is no folder {root}")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file; the output is a folder")
+    if out.resolve() in (root.resolve(), *root.resolve().parents):
+        raise ValueError(f"the output folder {out} is or contains the input {root}; choose another one")
     out.mkdir(parents=True, exist_ok=True)
     options = options or Options()
     sets, left_out = find_keyframe_sets(root, skip=out)
@@ -136,12 +141,3 @@ def printable(name: str) -> str:
     """A name as one line of a terminal can show it; names of folders may hold anything but a slash."""
     text = name.encode("utf-8", "backslashreplace").decode()
     return text if text.isprintable() else repr(text)
-
-
-def _check_folders(root: Path, out: Path) -> None:
-    if not root.is_dir():
-        raise ValueError(f"{root} is no folder" if root.exists() else f"there is no folder {root}")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file; the output is a folder")
-    if out.resolve() in (root.resolve(), *root.resolve().parents):
-        raise ValueError(f"the output folder {out} is or contains the input {root}; choose another one")

@@ -31,13 +31,9 @@ class ShapeBatch(NamedTuple):
         vertex_labels: Tensor | None = None,
         shape_labels: Tensor | None = None,
     ) -> "ShapeBatch":
-        """The key-frames of a space.
+        """The key-frames of a space in the dtype and on the device of a tensor, with labels.
 
-        Args:
-            space: The space.
-            like: A tensor of the wanted dtype and device.
-            vertex_labels: *Shape:* ``(K, V, ...)``.
-            shape_labels: *Shape:* ``(K, ...)``.
+        *Shape:* ``(K, V, ...), (K, ...)``.
         """
         every = torch.arange(len(space))
         return cls(space.keyframes(like), every, every >= 0, vertex_labels, shape_labels)

@@ -18,14 +18,7 @@ def mode_scales(basis: ModalBasis, faces: Tensor) -> Tensor:
     r"""Factors of the modes, proportional to :math:`1 / \sqrt{\lambda}`; zero for modes that do not deform.
 
     Independent standard normal amplitudes of modes so scaled give an expected root mean square strain of one: of the
-    edges, or, of sheets, where bending strains their sides more than that, of their sides.
-
-    Args:
-        basis: Of the key-frame.
-        faces: *Shape:* ``(F, 3)``.
-
-    Returns:
-        Float64. *Shape:* ``(k,)``.
+    edges, or, of sheets, where bending strains their sides more than that, of their sides. *Shape:* ``(k,)``, float64.
     """
     x, values = basis.reference.double(), basis.eigenvalues.double()
     mesh = Connectivity(faces.numpy(), basis.n_vertices)

@@ -95,8 +95,7 @@ class Carrier:
 def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
     """Rotation of the surface around each vertex from one pose to another.
 
-    The rotation nearest to the area-weighted mean of the rotations of the incident faces.
-    *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
+    It is the nearest to the mean by area of those of the faces. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
     """
     frames = []
     for x in (before, after):

@@ -47,11 +47,8 @@ Pull = tuple[sparse.csr_matrix, FloatArray, FloatArray]
 class ElasticSurface:
     r"""Minimises :math:`\sum_{ij} w_{ij} |x_i - x_j - \bar R_{ij} (r_i - r_j)|^2` plus pulls, by local-global steps.
 
-    As-rigid-as-possible surface modeling (Sorkine and Alexa 2007) with smoothed rotations.
-
-    Args:
-        rest: The rest shape.
-        stretchable: Allow smooth local scaling.
+    As-rigid-as-possible surface modeling (Sorkine and Alexa 2007) with smoothed rotations; if stretchable, also with
+    smooth local scales.
     """
 
     def __init__(self, rest: MeshSurface, *, stretchable: bool = False) -> None:

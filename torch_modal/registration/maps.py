@@ -51,13 +51,7 @@ _CONSISTENT, _FEWEST = 0.12, 8
 
 
 class SpectralShape:
-    """The main part of a surface, decimated and scaled to unit area, with eigenfunctions of its Laplacian.
-
-    A surface with at most a fifth more vertices than :data:`N_COARSE` is not decimated.
-
-    Args:
-        surface: The fine surface.
-    """
+    """The main part of a surface, decimated and scaled to unit area, with eigenfunctions of its Laplacian."""
 
     def __init__(self, surface: MeshSurface) -> None:
         clean = largest_pieces(surface, DUST)
@@ -128,15 +122,15 @@ class SpectralShape:
 
 
 class Map(NamedTuple):
-    """A map and its scores."""
+    """A map, and its scores for the second shape and for its mirror image. *Shape:* ``(n_first,)``.
+
+    A score is the oriented area of the worse direction minus three times the mean round-trip error: 0.7 or more for
+    correct maps of one subject, negative for mirrored ones.
+    """
 
     vertices: IntArray
-    """*Shape:* ``(n_first,)``."""
     score: float
-    """Oriented area of the worse direction minus three times the mean round-trip error; correct maps of one subject
-    have 0.7 or more, mirrored ones a negative one."""
     mirrored_score: float
-    """Score for the mirror image of the second shape."""
 
 
 class CoarsePair:
@@ -212,10 +206,13 @@ class CoarsePair:
         for signs in itertools.product([1.0, -1.0], repeat=n_signs):
             yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
         yield nearest_rows(first.wave_kernel_signatures(), second.wave_kernel_signatures()), 6
-        axes, (centred, target) = [], [shape.coarse.vertices - shape.coarse.centroid for shape in (first, second)]
-        for shape, points in ((first, centred), (second, target)):
-            frame = np.linalg.eigh(points.T @ (shape.coarse.vertex_areas[:, None] * points))[1]
+        axes, centred_shapes = [], []
+        for surface in (first.coarse, second.coarse):
+            points = surface.vertices - np.average(surface.vertices, 0, surface.vertex_areas)
+            frame = np.linalg.eigh(points.T @ (surface.vertex_areas[:, None] * points))[1]
             axes.append(frame * [1, 1, np.sign(np.linalg.det(frame))])
+            centred_shapes.append(points)
+        centred, target = centred_shapes
         flips = ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
         goal = np.hstack([target, 0.1 * second.coarse.vertex_normals])
         for turn in (np.eye(3), *(axes[0] * signs @ axes[1].T for signs in flips)):

@@ -68,8 +68,9 @@ class LocalWeights:
         return self.variation.assembled(self.weights(factors))
 
     def weights(self, factors: Tensor) -> Tensor:
-        """Local weights. *Shape:* ``(K n,) -> (K, V)``."""
-        return self.variation.local(factors.view(len(self.about), -1), self.about)
+        """Local weights, which add up to one at each vertex. *Shape:* ``(K n,) -> (K, V)``."""
+        own = factors.view(len(self.about), -1)
+        return self.about[:, None] + (own - own.mean(0)) @ self.variation.fields
 
     def cost(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
         """*Shape:* ``(K n,) -> ()``."""
@@ -155,13 +156,13 @@ class LocalWeights:
             own = factors.detach().requires_grad_()
             slope = torch.autograd.grad(0.5 * self.cost(own, to, self.noise), own, create_graph=True)[0]
 
-        def precondition(x: Tensor) -> Tensor:
-            return torch.cholesky_solve(x[:, None], factor)[:, 0]
-
-        def curvature(x: Tensor) -> Tensor:
-            return torch.autograd.grad(slope, own, x, retain_graph=True)[0]
-
-        return conjugate_gradients(curvature, precondition, torch.dot, right, PRODUCTS)
+        return conjugate_gradients(
+            lambda x: torch.autograd.grad(slope, own, x, retain_graph=True)[0],
+            lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
+            torch.dot,
+            right,
+            PRODUCTS,
+        )
 
     def _influence(self) -> tuple[Tensor, Tensor]:
         """Part of both sides of each triangle in each observed place. *Shape:* ``(n, F)`` each."""

@@ -92,10 +92,6 @@ class Variation:
     def __len__(self) -> int:
         return len(self.shapes)
 
-    def local(self, factors: Tensor, about: Tensor) -> Tensor:
-        """Weights at the vertices; they add up to one. *Shape:* ``(K, n), (K,) -> (K, V)``."""
-        return about[:, None] + (factors - factors.mean(0)) @ self.fields
-
     def bending(self, weights: Tensor) -> Tensor:
         """Coordinates of local weights. *Shape:* ``(K, V) -> (6, E)``."""
         return self.average + torch.einsum("ke,kje->je", self.coordinates.spread(weights), self.deviations)
