@@ -276,11 +276,7 @@ class AugmentationSequential(ShapeAugmentation):
 
 
 def check_range(name: str, given: tuple[float, float], lowest: float, highest: float) -> tuple[float, float]:
-    """Check a range of numbers.
-
-    Raises:
-        ValueError: It is no range within the bounds.
-    """
+    """A range of numbers; raises a ValueError unless it is one within the bounds."""
     try:
         low, high = map(float, given)
     except (TypeError, ValueError):

@@ -132,11 +132,7 @@ class StoredSet:
 
 
 def read_note(folder: Path) -> str:
-    """The note of a stored set; reads the header of its file only.
-
-    Raises:
-        FileNotFoundError, ValueError: As for :class:`StoredSet`.
-    """
+    """The note of a stored set; reads the header of its file only, and raises as :class:`StoredSet`."""
     return str(_opened(folder).metadata["note"])
 
 

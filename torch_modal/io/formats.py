@@ -123,13 +123,9 @@ class Timing:
         self.cyclic, self.ping_pong, self.ease = cyclic, ping_pong, ease
 
     def knots(self, frames: IntArray | None = None) -> tuple[FloatArray, IntArray]:
-        """Times at which frames are fully shown, for formats that interpolate linearly between them.
+        """Times in seconds at which frames are fully shown, for linear interpolation between them, and their indices.
 
-        Args:
-            frames: Frame numbers that are kept, from the first to the last, ascending. Default: all. *Shape:* ``(n,)``.
-
-        Returns:
-            Times in seconds, and indices into ``frames``. *Shape of both:* ``(T,)``.
+        The indices are into all frames, or into some that are kept, ascending. *Shape:* ``(n,) -> (T,), (T,)``.
         """
         parts = self.parts if frames is None else self.parts[frames]
         places = np.arange(len(parts))
@@ -170,21 +166,18 @@ def resample(frames: FloatArray, places: FloatArray) -> FloatArray:
 
 
 class Animation(NamedTuple):
-    """A sequence to write, as :func:`torch_modal.save_animation` passes it to a format."""
+    """A sequence to write, as :func:`torch_modal.save_animation` passes it to a format, with arguments of these names.
+
+    The timing has the times of frames in seconds, and samples at a fixed rate. *Shape:* ``(N, V, 3), (F, 3)``.
+    """
 
     shapes: FloatArray
-    """*Shape:* ``(N, V, 3)``."""
     faces: IntArray
-    """*Shape:* ``(F, 3)``."""
     timing: Timing
-    """Times of the frames in seconds, and samples at a fixed rate."""
     name: str
     """Name of the file, for messages."""
     keyframes: list[int]
     """Frame numbers of the key-frames."""
     asset: Asset | None
-    """The mesh file that the frames come from."""
     max_targets: int
-    """Most morph targets of a GLB."""
     progress: Progress
-    """See :data:`torch_modal.progress.Progress`."""

@@ -11,12 +11,8 @@ from torch_modal.geometry.vectors import vertex_normals
 class CarriedNormals:
     """Rotates a file's normals with the surface, so that hard edges stay hard and smooth ones smooth.
 
-    Points with one place and one normal are one: seams of texture coordinates do not show in the shading.
-
-    Args:
-        normals: As the file has them. *Shape:* ``(P, 3)``.
-        positions: Of the same points, as the file has them. *Shape:* ``(P, 3)``.
-        triangles: Of points. *Shape:* ``(F, 3)``.
+    Points with one place and one normal are one: seams of texture coordinates do not show in the shading. All are as
+    the file has them. *Shape:* ``(P, 3), (P, 3), (F, 3)``.
     """
 
     def __init__(self, normals: FloatArray, positions: FloatArray, triangles: IntArray) -> None:

@@ -27,8 +27,7 @@ class ModalBasis:
     Attributes:
         reference: The shape that the modes belong to, in the caller's coordinates. *Shape:* ``(V, 3)``.
         eigenvalues: Ascending, of the elastic modes. *Shape:* ``(k,)``.
-        modes: Elastic displacements, without rigid motions; zero at unreferenced vertices.
-            *Shape:* ``(k, V, 3)``.
+        modes: Elastic displacements, without rigid motions; zero at unreferenced vertices. *Shape:* ``(k, V, 3)``.
         rigid_eigenvalues: The six computed eigenvalues of rigid motions, zero up to rounding. *Shape:* ``(6,)``.
 
     Raises:

@@ -35,9 +35,6 @@ class Carrier:
     The embedded surface is pulled to its positions in the other pose. All steps and all key-frames share one system
     matrix, which is factorised here.
 
-    Args:
-        solid: The first pose.
-
     Raises:
         RuntimeError: The matrix is singular, for example if no surface point is embedded in a piece.
         LinAlgError: A tetrahedron is degenerate.

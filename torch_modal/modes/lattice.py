@@ -181,11 +181,7 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
 
     Tetrahedra are bisected where the body or a gap is thin. Each has the fraction of its volume that is inside. The
     surface need not be closed or consistent: the interior follows from the normals of all faces. Parts closer together
-    than a tetrahedron are fused. Deterministic.
-
-    Args:
-        surface: The surface.
-        cube: Edge length of the cubes at the surface where nothing is thin, in sizes.
+    than a tetrahedron are fused. Deterministic. Where nothing is thin, cubes have the edge length ``cube``, in sizes.
     """
     largest = cube * CANONICAL_SIZE
     while True:

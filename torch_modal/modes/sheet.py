@@ -47,10 +47,6 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
 
     Vertices are clustered by edge collapses, and modes are computed on the mesh of the clusters, with stretching as
     stiff as that of the fine mesh: in Eq. 5 it grows as edges become shorter. Small loose pieces follow the rest.
-
-    Args:
-        surface: The surface, of a size of 100.
-        n_modes: Number of modes that the coarse mesh must resolve.
     """
     fine = Connectivity(surface.faces, len(surface.points))
     piece = fine.vertex_pieces[surface.faces[:, 0]]

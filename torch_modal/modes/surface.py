@@ -82,11 +82,7 @@ class CanonicalSurface:
         return cls(own.points, ordered, used, own.scale, own.axes)
 
     def require_solid(self) -> None:
-        """Reject a planar surface, which has no interior.
-
-        Raises:
-            MeshError: The extent across the plane that fits best is below 1e-6 of the largest extent.
-        """
+        """Raise a MeshError for a planar surface, which has no interior."""
         extents = principal_extents(self.points)
         if extents[2] <= FLATNESS * extents[0]:
             lengths = "{:.3g}, {:.3g} and {:.3g}".format(*extents / self.scale)
@@ -158,13 +154,10 @@ def self_proximity(surface: CanonicalSurface) -> float:
 
 
 def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
-    """Thickness of the body behind each face, and gap in front of it; infinite above `MOST`.
+    """Thickness of the body behind each face, and gap in front of it; infinite above `MOST`. *Shape:* ``(F,), (F,)``.
 
     They are diameters of balls tangent to the surface at samples, which shrink until they are empty (Ma, Bae and Choi
     2012) or touch a side that is not opposing, as in a corner.
-
-    Returns:
-        Thickness and gap. *Shape:* ``(F,), (F,)``.
     """
     samples = SurfaceSamples(surface, np.full(len(surface.faces), np.sqrt(surface.area / N_SAMPLES)))
     seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))

@@ -50,12 +50,7 @@ class LocalWeights:
     r"""Local weights and the rigid motion of least cost.
 
     The cost of factors ``z`` of the weights' fields is that of their logarithmic posterior density,
-    :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`.
-
-    Args:
-        variation: The given shapes and how they vary.
-        to: The observations.
-        about: The most likely weights. *Shape:* ``(K,)``.
+    :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`. The most likely weights are ``about``, *shape* ``(K,)``.
     """
 
     def __init__(self, variation: Variation, to: Observations, about: Tensor) -> None:

@@ -48,13 +48,9 @@ ROUNDS, SMOOTHER = 4, 0.5
 
 
 class Variation:
-    """Shapes whose parts are mixed from given ones with weights of their own.
+    """Shapes whose parts are mixed from given ones, float64 on the CPU, with weights of their own.
 
-    All positions are relative to :attr:`origin`.
-
-    Args:
-        shapes: *Shape:* ``(K, V, 3)``, float64 on the CPU.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+    All positions are relative to :attr:`origin`. *Shape:* ``(K, V, 3), (F, 3)``.
     """
 
     def __init__(self, shapes: Tensor, faces: Tensor) -> None:
@@ -104,14 +100,9 @@ class Variation:
     def relaxed(
         self, x: Tensor, weights: Tensor, n_steps: int, n_products: int, pulls: FurtherEnergy | None = None
     ) -> Tensor:
-        """Steps of all vertices towards weighted means of the lengths and angles of the given shapes.
+        """Newton steps of all vertices towards weighted means of the lengths and angles of the given shapes.
 
-        Args:
-            x: In the pose of the mean. *Shape:* ``(V, 3)``.
-            weights: *Shape:* ``(K, V)``.
-            n_steps: Newton steps.
-            n_products: Iterations of conjugate gradients in each.
-            pulls: An energy beside it, at a size of 100.
+        The shape is in the pose of the mean; the pulls are an energy at a size of 100. *Shape:* ``(V, 3), (K, V)``.
         """
         energy = self.fine.energy
         rest = trees.mapped(energy.mixed(self.rest, weights), lambda part: part[None])
@@ -274,10 +265,6 @@ def _graph(mean: Tensor, reconstruction: Reconstruction) -> sparse.csr_matrix:
 
 
 def check_density(concentration: float, locality: float) -> None:
-    """Check what new members are drawn with.
-
-    Raises:
-        ValueError: It is out of range.
-    """
+    """Raise a ValueError if what new members are drawn with is out of range."""
     if not 0 < concentration < torch.inf or not 0 <= locality < torch.inf:
         raise ValueError(f"concentration is above 0, locality 0 or more; got {concentration} and {locality}")

@@ -29,11 +29,7 @@ PICTURES_AT_ONCE = 24
 
 
 def require_packages(path: Path) -> None:
-    """Refuse a file whose format needs a package that is not installed, before any work.
-
-    Raises:
-        MissingPackageError: The message says which.
-    """
+    """Raise a MissingPackageError, before any work, for a file whose format needs a package that is not installed."""
     if path.suffix.lower() in ANIMATION_FORMATS:
         found = ANIMATION_FORMATS[path.suffix.lower()]
         require_installed(found.modules, found.extra, path.name)
