@@ -152,7 +152,8 @@ ENTRY = np.zeros(2**14)  # 128 KiB
 
 
 def keep(cache: Cache, number: int) -> None:
-    cache.keep("thing", {}, {"number": number}, {"x": ENTRY + number})
+    found = cache.get("thing", {}, {"number": number}, lambda: {"x": ENTRY + number})
+    np.testing.assert_array_equal(found["x"], ENTRY + number)
 
 
 def kept(cache: Cache, n: int) -> list[int]:
@@ -166,9 +167,7 @@ def test_the_least_recently_used_make_room(tmp_path: Path) -> None:
     for i in range(10):
         keep(cache, i)
     assert kept(cache, 10) == list(range(10))
-    found = cache.find("thing", {}, {"number": 0})
-    assert found is not None
-    np.testing.assert_array_equal(found["x"], ENTRY)
+    keep(cache, 0)
     keep(cache, 10)
     assert kept(cache, 11) == [0, *range(3, 11)], "nine tenths of the limit, and the first was used last"
     assert cache_content(tmp_path).n_bytes <= cache.limit

@@ -12,7 +12,7 @@ from textured import bend, textured_obj, triangles_of_tube
 
 import torch_modal as tm
 from torch_modal.errors import MeshWarning, MissingPackageError
-from torch_modal.io.formats import make_timing
+from torch_modal.io.formats import Timing
 from torch_modal.view import animation
 
 X, FACES = triangles_of_tube()
@@ -25,7 +25,7 @@ FRAMES = np.stack([bend(X, turn) for turn in (0.01, 0.3, 0.6, 0.9)])
 def test_knots_and_samples_agree():
     """Both are the same motion: linear between knots, seen at a fixed rate."""
     for options in ({}, {"cyclic": True}, {"ping_pong": True}):
-        timing = make_timing(9, duration=2, fps=16, **options)
+        timing = Timing(9, duration=2, fps=16, **options)
         times, places = timing.knots()
         assert times[0] == 0 and (np.diff(times) > 0).all()
         assert times[-1] == (4 if "ping_pong" in options else 2)
@@ -37,7 +37,7 @@ def test_knots_and_samples_agree():
 
 
 def test_ease_is_slow_at_both_ends():
-    timing = make_timing(9, duration=2, fps=100, ease=True)
+    timing = Timing(9, duration=2, fps=100, ease=True)
     speed = np.diff(timing.samples())
     assert speed[0] < 0.1 * speed[100] and speed[-1] < 0.1 * speed[100]
     times, places = timing.knots()
@@ -45,7 +45,7 @@ def test_ease_is_slow_at_both_ends():
 
 
 def test_thinned_frames_keep_their_times():
-    times, places = make_timing(9, duration=8).knots(np.array([0, 3, 8]))
+    times, places = Timing(9, duration=8).knots(np.array([0, 3, 8]))
     assert times.tolist() == [0, 3, 8] and places.tolist() == [0, 1, 2]
 
 
@@ -60,7 +60,7 @@ def test_thinned_frames_keep_their_times():
 )
 def test_timing_that_cannot_be(options, match):
     with pytest.raises(ValueError, match=match):
-        make_timing(9, **options)
+        Timing(9, **options)
 
 
 # ----------------------------------------------------------------------------------------------------------- formats

@@ -34,11 +34,7 @@ _NEAREST = 64
 
 
 class Search:
-    """Search for active contacts.
-
-    Args:
-        crossings: Of the connectivity, with the key-frames as its known shapes.
-    """
+    """Search for active contacts between parts of a connectivity, with the key-frames as its known shapes."""
 
     def __init__(self, crossings: Crossings) -> None:
         self.crossings = crossings
@@ -47,14 +43,9 @@ class Search:
         self._known = [Surface(crossings, x) for x in crossings.known]
 
     def __call__(self, x: FloatArray, watched: BoolArray) -> tuple[IntArray, IntArray, int]:
-        """Find the contacts of a shape; none where no parts pass through each other.
+        """Vertices and faces that face each other, and the number of far pairs; none where nothing intersects.
 
-        Args:
-            x: *Shape:* ``(V, 3)``.
-            watched: Vertices beside intersections of earlier searches; those of this one are added. *Shape:* ``(V,)``.
-
-        Returns:
-            Vertices and faces that face each other, *shape* ``(n,), (n,)``, and the number of far pairs of triangles.
+        Vertices beside the intersections are added to ``watched``. *Shape:* ``(V, 3), (V,) -> (n,), (n,)``.
         """
         crossings = self.crossings
         pairs = crossings.far_pairs(x)
@@ -80,7 +71,7 @@ class Search:
             surface: The shape.
             seeds: Requested vertices, and corners of faces that may be found. *Shape:* ``(V,)``.
             inside: Vertices that are inside the surface, and were not in any known shape. *Shape:* ``(V,)``.
-            stuck: Vertices that are inside the surface, and were in a known shape. *Shape:* ``(V,)``.
+            stuck: Those that are, and were. *Shape:* ``(V,)``.
 
         Returns:
             Vertices and faces. *Shape:* ``(n,), (n,)``.
@@ -120,12 +111,7 @@ class Search:
 
         It is the distance to the nearest face that faces them, other than of the patch that went in with them.
 
-        Args:
-            x: *Shape:* ``(V, 3)``.
-            pairs: Faces that cross. *Shape:* ``(P, 2)``.
-
-        Returns:
-            *Shape:* ``(V,)``.
+        *Shape:* ``(V, 3), (P, 2) -> (V,)``, with the pairs of faces that cross.
         """
         crossings, faces = self.crossings, self.crossings.mesh.faces
         deep = np.zeros(len(x))
@@ -161,11 +147,8 @@ def _distances(surface: Surface, v: IntArray, f: IntArray) -> FloatArray:
 
 
 def _nearest_faces(v: IntArray, f: IntArray, distance: FloatArray, height: FloatArray) -> IntArray:
-    """Indices of the pairs of each vertex with its nearest face.
-
-    Several faces may share the nearest point, and rounding would choose among them: the face whose plane is farthest
-    is used, and the first of those in one plane.
-    """
+    """Indices of the pairs of each vertex with its nearest face; of equally near ones, that of the farthest plane."""
+    # Faces share nearest points, and rounding would choose among them; of those in one plane, the first is taken.
     chosen = np.arange(len(v))
     for lengths, sign in ((distance, 1), (np.abs(height), -1)):
         least = np.full(v.max(initial=0) + 1, np.inf)

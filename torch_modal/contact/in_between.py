@@ -58,28 +58,22 @@ class ContactSolver(InBetweenSolver):
 
 
 class Displacement(NamedTuple):
-    """The displacement that separates the shapes between two key-frames, at all times."""
+    """The displacement that separates the shapes between two key-frames, in their frame, at all times.
+
+    The field is None where nothing intersects; ``n_crossing`` are the far pairs that are left.
+    *Shape:* ``(T, V, 3), (T,), (T,)``.
+    """
 
     field: Tensor | None
-    """At the times of the shapes, in their frame; None where nothing intersects. *Shape:* ``(T, V, 3)``."""
     times: Tensor
-    """*Shape:* ``(T,)``."""
     n_crossing: Tensor
-    """Numbers of far pairs that are left. *Shape:* ``(T,)``, int64."""
     search: ContactSearch
 
     def apply(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Displace shapes at any times; between those of the field, along a cubic spline.
+        """Displace shapes at any times, by a spline between those of the field; and the far pairs left in each.
 
         A shape that would have more far pairs stays as it is. The gradient reaches shapes and times; the field is a
-        constant.
-
-        Args:
-            x: In the frame. *Shape:* ``(B, V, 3)``.
-            u: *Shape:* ``(B,)``.
-
-        Returns:
-            The shapes, and the far pairs that are left in each. *Shape:* ``(B, V, 3), (B,)``.
+        constant. *Shape:* ``(B, V, 3), (B,) -> (B, V, 3), (B,)``.
         """
         if self.field is None:
             return x, torch.zeros_like(u, dtype=torch.int64)

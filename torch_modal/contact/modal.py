@@ -73,10 +73,7 @@ def modal_displacement(
 
 
 def _in_modes(contact: ContactEnergy, x: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient and Gauss-Newton Hessian of the contact energy in the modes.
-
-    *Shape:* ``(S, V, 3), (n, V, 3) -> (S, n), (S, n, n)``.
-    """
+    """Gradient and Gauss-Newton Hessian in the modes. *Shape:* ``(S, V, 3), (n, V, 3) -> (S, n), (S, n, n)``."""
     missing, gradients = contact.missing(x)
     n, (n_shapes, n_vertices) = len(modes), x.shape[:2]
     gradient, hessian = x.new_zeros(n_shapes, n), x.new_zeros(n_shapes, n, n)

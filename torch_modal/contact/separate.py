@@ -39,12 +39,10 @@ FADE = 0.0625
 
 
 class Timeline(NamedTuple):
-    """Shapes at T even times between two ends, which have no displacement."""
+    """Shapes at T even times in (0, 1) between two ends, which have no displacement."""
 
     t: Tensor
-    """Times in (0, 1). *Shape:* ``(T,)``."""
     limit: AccelerationLimit
-    """The bound on accelerations."""
     in_modes: Callable[[Tensor, ContactEnergy, Tensor], Tensor] | None
     """First displacement of some of the shapes, from their indices, contacts and second differences in time.
 
@@ -67,7 +65,7 @@ def separate(
         relax: Takes a Newton step of all vertices of some of the shapes, given those, their indices and energies beside
             the elastic one. *Shape:* ``(S, V, 3), (S,) -> (S, V, 3)``.
         search: Search for contacts between the known shapes.
-        timeline: Times, limit and modes of several shapes; None for one shape alone.
+        timeline: Of several shapes; None for one alone.
 
     Returns:
         The shapes, and the number of far pairs of triangles that are left in each. *Shape:* ``(T, V, 3), (T,)``.
@@ -115,11 +113,7 @@ def _settled(
     chosen: Tensor,
     n_before: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Alternate the steps of each shape with the bound on all, and use the round with the fewest far pairs.
-
-    The rounds begin at ``x``; where none has fewer far pairs, the result is ``start``. Shapes that take steps are
-    ``chosen``, more from round to round. The result is the shapes and their numbers of far pairs.
-    """
+    """Shapes and their far pairs in the best round of steps of the chosen shapes, from ``x`` on, or at the start."""
     every, n_far, best, n_best = torch.arange(len(x), device=x.device), n_before, start, n_before
     most = MOST_MOVED * search.depth(start[0]) if timeline is None else math.inf
     # Shapes that relax on their own, what the bound took from them so far, and springs of the vertices it limits.
@@ -167,11 +161,7 @@ def _energies(active: Contacts, pull: Pull, areas: Tensor) -> Beside:
 def _never_worse(
     start: Tensor, field: Tensor, search: ContactSearch, timeline: Timeline, n_before: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Fade the displacement out around shapes in which it adds far pairs.
-
-    Where that adds some to other shapes, it is faded out around these, too, and where it does not help, twice as far:
-    at last, nothing is moved. The result is the shapes and their numbers of far pairs.
-    """
+    """Shapes and their far pairs, with the displacement faded out, farther and farther, where it adds some."""
     t, found, reach, bad = timeline.t, field, FADE, torch.zeros_like(n_before, dtype=torch.bool)
     while reach <= 1:
         n_far = search.count(start + found)

@@ -205,7 +205,13 @@ class ShapeAugmentation(nn.Module):
         batch = ShapeBatch(**{name: value for name, value in named.items() if name != "normals"})
         self.params = self.forward_parameters(len(batch.shapes), space) if params is None else params
         out = self.transform(batch, self.params, space, pool)
-        found = [self._normals(out.shapes, space) if name == "normals" else getattr(out, name) for name in named]
+        if "normals" in named:
+            own = (each.space for each in self.modules() if isinstance(each, ShapeAugmentation))
+            known = [each for each in (space, *own) if each is not None]
+            if not known:
+                raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
+            normals = vertex_normals(out.shapes, known[0].faces)
+        found = [normals if name == "normals" else getattr(out, name) for name in named]
         if single and self.keepdim:
             found = [None if value is None else value[0] for value in found]
         return found[0] if len(found) == 1 else tuple(found)
@@ -218,13 +224,6 @@ class ShapeAugmentation(nn.Module):
                 "made or called"
             )
         return space
-
-    def _normals(self, x: Tensor, space: ShapeSpace | None) -> Tensor:
-        own = (each.space for each in self.modules() if isinstance(each, ShapeAugmentation))
-        known = [each for each in (space, *own) if each is not None]
-        if not known:
-            raise ValueError("normals need faces: pass space=ShapeSpace(bases, faces) when it is made or called")
-        return vertex_normals(x, known[0].faces)
 
 
 class AugmentationSequential(ShapeAugmentation):
@@ -277,11 +276,7 @@ class AugmentationSequential(ShapeAugmentation):
 
 
 def check_range(name: str, given: tuple[float, float], lowest: float, highest: float) -> tuple[float, float]:
-    """Check a range of numbers.
-
-    Raises:
-        ValueError: It is no range within the bounds.
-    """
+    """A range of numbers; raises a ValueError unless it is one within the bounds."""
     try:
         low, high = map(float, given)
     except (TypeError, ValueError):

@@ -123,16 +123,9 @@ class RandomModalDeformation(ShapeAugmentation):
 def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Reconstruction) -> Tensor:
     """Shapes bent as a linear displacement of a key-frame turns and strains its triangles.
 
-    A shape of another pose gets the same rotations, and strains along its own triangles.
+    A shape of another pose gets the same rotations, and strains along its own triangles; results are aligned with them.
 
-    Args:
-        x: Shapes near the key-frame. *Shape:* ``(B, V, 3)``.
-        displacement: Of the key-frame, components first. *Shape:* ``(3, B, V)``.
-        keyframe: *Shape:* ``(V, 3)``.
-        reconstruction: Of its connectivity.
-
-    Returns:
-        Aligned with ``x``. *Shape:* ``(B, V, 3)``.
+    *Shape:* ``(B, V, 3), (3, B, V), (V, 3) -> (B, V, 3)``.
     """
     faces, weights = reconstruction.faces, reconstruction.areas.to(x)
     own = frames(sides(keyframe.mT[:, None].contiguous(), faces))

@@ -65,18 +65,15 @@ class InBetweens:
         self._solvers, self._tables = Recent(32), Recent(64)
 
     def __call__(self, x_a: Tensor, x_b: Tensor, t: Tensor, i: Tensor, j: Tensor, keyframes: Tensor) -> Tensor:
-        """In-betweens of a batch.
+        """In-betweens of a batch of shapes ``x_a`` at 0 and ``x_b`` at 1, at the times ``t``. *Shape:* ``(B, V, 3)``.
 
         Args:
-            x_a: Shapes at 0. *Shape:* ``(B, V, 3)``.
-            x_b: Shapes at 1. *Shape:* ``(B, V, 3)``.
-            t: Times. *Shape:* ``(B,)``.
+            x_a: *Shape:* ``(B, V, 3)``.
+            x_b: Likewise.
+            t: *Shape:* ``(B,)``.
             i: The key-frame whose modes serve at 0, on the CPU. *Shape:* ``(B,)``.
-            j: Likewise at 1, perhaps the same. *Shape:* ``(B,)``.
+            j: Likewise at 1, perhaps the same.
             keyframes: Whether both shapes are these key-frames, on the CPU. *Shape:* ``(B,)``, bool.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
 
         Raises:
             ValueError: A shape is not finite, has no size, or is the mirror image of the other.
@@ -189,14 +186,9 @@ class InBetweens:
 
 
 def by_kind(kinds: Tensor, compute: Callable[[list[int], Tensor], Tensor]) -> Tensor:
-    """Results of a batch whose rows of one kind are computed together.
+    """Results of a batch in its order, whose rows of one kind are computed together, from the kind and their indices.
 
-    Args:
-        kinds: On the CPU. *Shape:* ``(B, n)``.
-        compute: Returns the results of the rows of a kind, from the kind and the indices of its rows.
-
-    Returns:
-        In the order of the batch. *Shape:* ``(B, ...)``.
+    Kinds are on the CPU. *Shape:* ``(B, n) -> (B, ...)``.
     """
     each, kind = kinds.unique(dim=0, return_inverse=True)
     rows = [torch.nonzero(kind == number).flatten() for number in range(len(each))]
@@ -209,12 +201,7 @@ def interpolate(table: Tensor, t: Tensor) -> Tensor:
 
     Reads these four only, so that a memory-mapped table is not loaded whole. Exact at the times of the table.
 
-    Args:
-        table: Four shapes or more. *Shape:* ``(T, V, 3)``.
-        t: Times in [0, 1]. *Shape:* ``(B,)``.
-
-    Returns:
-        *Shape:* ``(B, V, 3)``.
+    *Shape:* ``(T, V, 3), (B,) -> (B, V, 3)``, with T of 4 or more.
     """
     n = len(table)
     place = t * (n - 1)

@@ -71,14 +71,7 @@ class Options:
     """True if the key-frames of a set are a motion, in the order of their files."""
 
     def key(self, files: Sequence[Path]) -> str:
-        """Digest of all that the bases depend on: options, names and contents of the files, those beside them included.
-
-        Args:
-            files: The meshes of the set.
-
-        Raises:
-            OSError: A file cannot be read.
-        """
+        """Digest of all that the bases depend on: options, names and contents of the files and of those beside them."""
         beside = [files[0].parent / TIMES_FILE] if self.sequence else []
         if any(file.suffix.lower() == ".gltf" for file in files):
             beside += sorted(files[0].parent.glob("*.bin"))
@@ -178,14 +171,8 @@ def _obstacle(folder: Path, overwrite: bool) -> str:
 def _in_own_process(
     source: Path, target: Path, record: Record, options: Options, stop: threading.Event | None
 ) -> tuple[str | None, str]:
-    """Start a new interpreter for the set and wait for it.
-
-    It has a session of its own, so that Ctrl-C reaches this process alone, and ends itself when the pipe from this
-    process closes.
-
-    Returns:
-        Why there is no result, None if it was stopped; and the end of its output.
-    """
+    """Why an interpreter of its own has no result for the set, None if it was stopped; and the end of its output."""
+    # Ctrl-C reaches this process alone; the other, whose session is new, ends itself when the pipe from here closes.
     end, ended = time.monotonic() + options.timeout, False
     with tempfile.TemporaryDirectory(prefix="torch_modal-set-", ignore_cleanup_errors=True) as scratch:
         reason_file, log_file = Path(scratch) / "reason.txt", Path(scratch) / "log.txt"
@@ -285,11 +272,7 @@ def compute(source: Path, target: Path, record: Record, options: Options) -> Non
 
 
 def _times(file: Path, n_keyframes: int) -> list[float]:
-    """Times of the key-frames of a motion, with the end of a cycle: those in a file, or even ones without it.
-
-    Raises:
-        ValueError: The file does not hold such times.
-    """
+    """Times of the key-frames of a motion, with the end of a cycle: those in a file, or even ones without it."""
     if not file.is_file():
         return [float(i) for i in range(n_keyframes)]
     try:

@@ -31,13 +31,9 @@ class ShapeBatch(NamedTuple):
         vertex_labels: Tensor | None = None,
         shape_labels: Tensor | None = None,
     ) -> "ShapeBatch":
-        """The key-frames of a space.
+        """The key-frames of a space in the dtype and on the device of a tensor, with labels.
 
-        Args:
-            space: The space.
-            like: A tensor of the wanted dtype and device.
-            vertex_labels: *Shape:* ``(K, V, ...)``.
-            shape_labels: *Shape:* ``(K, ...)``.
+        *Shape:* ``(K, V, ...), (K, ...)``.
         """
         every = torch.arange(len(space))
         return cls(space.keyframes(like), every, every >= 0, vertex_labels, shape_labels)
@@ -85,11 +81,7 @@ class ShapeBatch(NamedTuple):
 
 
 def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
-    """Raise unless given shapes are a batch of shapes of a space.
-
-    Raises:
-        ValueError: The message names shape and dtype.
-    """
+    """Raise a ValueError unless given shapes are a batch of shapes of a space, or one of them."""
     v: Any = "V" if space is None else space.n_vertices
     shape, dtype = (tuple(shapes.shape), shapes.dtype) if isinstance(shapes, Tensor) else ((), type(shapes).__name__)
     fits = len(shape) in (2, 3) and shape[-1] == 3 and (space is None or shape[-2] == v)
@@ -100,11 +92,7 @@ def check_shapes(shapes: Any, space: ShapeSpace | None) -> None:
 
 
 def check_labels(shape: Sequence[int], labels: Mapping[str, Tensor | None]) -> None:
-    """Raise unless ``vertex_labels`` and ``shape_labels``, if there are any, belong to as many shapes and vertices.
-
-    Raises:
-        ValueError: The message names both shapes.
-    """
+    """Raise a ValueError unless labels, if there are any, belong to as many shapes and vertices."""
     for name, wanted in (("vertex_labels", tuple(shape)), ("shape_labels", tuple(shape[:1]))):
         value = labels.get(name)
         if value is not None and value.shape[: len(wanted)] != wanted:

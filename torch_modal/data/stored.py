@@ -132,11 +132,7 @@ class StoredSet:
 
 
 def read_note(folder: Path) -> str:
-    """The note of a stored set; reads the header of its file only.
-
-    Raises:
-        FileNotFoundError, ValueError: As for :class:`StoredSet`.
-    """
+    """The note of a stored set; reads the header of its file only, and raises as :class:`StoredSet`."""
     return str(_opened(folder).metadata["note"])
 
 
@@ -212,11 +208,7 @@ def find_sets(root: str | os.PathLike[str]) -> list[Path]:
 
 
 def _opened(folder: Path) -> TensorFile:
-    """The file of a set, whose header is checked.
-
-    Raises:
-        FileNotFoundError, ValueError: As for :class:`StoredSet`.
-    """
+    """The file of a set, whose header is checked; raises as :class:`StoredSet`."""
     file = TensorFile(folder / SET_FILE, FORMAT, VERSION, ("keyframes", "faces"))
     keyframes, faces = file.shapes["keyframes"], file.shapes["faces"]
     if len(keyframes) != 3 or keyframes[2] != 3 or len(faces) != 2 or faces[1] != 3:

@@ -18,20 +18,10 @@ def mode_scales(basis: ModalBasis, faces: Tensor) -> Tensor:
     r"""Factors of the modes, proportional to :math:`1 / \sqrt{\lambda}`; zero for modes that do not deform.
 
     Independent standard normal amplitudes of modes so scaled give an expected root mean square strain of one: of the
-    edges, or, of sheets, where bending strains their sides more than that, of their sides.
-
-    Args:
-        basis: Of the key-frame.
-        faces: *Shape:* ``(F, 3)``.
-
-    Returns:
-        Float64. *Shape:* ``(k,)``.
+    edges, or, of sheets, where bending strains their sides more than that, of their sides. *Shape:* ``(k,)``, float64.
     """
-    x, values, mesh = (
-        basis.reference.double(),
-        basis.eigenvalues.double(),
-        Connectivity(faces.numpy(), basis.n_vertices),
-    )
+    x, values = basis.reference.double(), basis.eigenvalues.double()
+    mesh = Connectivity(faces.numpy(), basis.n_vertices)
     scales = torch.where(values > _NOT_ELASTIC * values.amax(), values, torch.inf).rsqrt()
     modes, edges = basis.modes.double() * scales[:, None, None], torch.tensor(mesh.edges)
     strains = edge_strains(modes.movedim(-1, 0).contiguous(), x, edges)
@@ -58,10 +48,7 @@ def _expected(strains: Tensor, weights: Tensor) -> Tensor:
 
 
 def _bending_strains(modes: Tensor, x: Tensor, mesh: Connectivity) -> tuple[Tensor, Tensor]:
-    """Strain of the sides of a sheet across each hinge, for the thickness that shell modes have, and the hinges' areas.
-
-    *Shape:* ``(k, V, 3), (V, 3) -> (k, H), (H,)``, to first order.
-    """
+    """Strain of a sheet's sides across each hinge, and its area. *Shape:* ``(k, V, 3), (V, 3) -> (k, H), (H,)``."""
     first, *others = (torch.cat([x[None], modes])[:, corner] for corner in torch.tensor(mesh.hinges).unbind(1))
     vectors = torch.stack([other - first for other in others]).movedim(-1, 1)
     rest, moves = vectors[:, :, 0], vectors[:, :, 1:]

@@ -107,37 +107,19 @@ class Cache:
         It depends on arrays, and on parameters that are numbers or strings. The kind is the first part of the file's
         name. A :class:`CacheWarning` says that the folder cannot be written.
         """
-        found = self.find(kind, inputs, parameters)
-        return self.keep(kind, inputs, parameters, compute()) if found is None else found
-
-    def find(self, kind: str, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Arrays | None:
-        """The cached result, if there is one; arguments as for :meth:`get`."""
         if self.folder is None:
-            return None
+            return dict(compute())
         path = self.folder / entry_name(kind, inputs, parameters)
-        try:
+        with contextlib.suppress(OSError, ValueError):  # missing or damaged
             file = TensorFile(path, FORMAT, str(CACHE_VERSION))
             found = {name: tensor.numpy() for name, tensor in file.tensors().items()}
-        except (OSError, ValueError):  # missing or damaged
-            return None
-        with contextlib.suppress(OSError):  # removed meanwhile, or not writable
-            os.utime(path)  # the time of the last use
-        return found
-
-    def keep(
-        self,
-        kind: str,
-        inputs: Mapping[str, NDArray[Any]],
-        parameters: Mapping[str, Any],
-        result: Mapping[str, NDArray[Any]],
-    ) -> Arrays:
-        """Write a result, in place of any earlier one, and return it; arguments as for :meth:`get`."""
-        if self.folder is None:
-            return dict(result)
+            with contextlib.suppress(OSError):  # removed meanwhile, or not writable
+                os.utime(path)  # the time of the last use
+            return found
+        result = compute()
         tensors = {name: torch.from_numpy(np.array(array)) for name, array in result.items()}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            path = self.folder / entry_name(kind, inputs, parameters)
             write_tensors(path, FORMAT, str(CACHE_VERSION), tensors)
             self._make_room(path)
         except OSError as error:
@@ -145,7 +127,7 @@ class Cache:
                 f"cannot keep {kind} in the cache folder {self.folder} ({error}); set {CACHE_VARIABLE} or "
                 "cache_dir to a folder that can be written",
                 CacheWarning,
-                stacklevel=3,
+                stacklevel=2,
             )
         return dict(result)
 

@@ -23,9 +23,8 @@ def save_frames(
 ) -> list[Path]:
     """Write every shape as a mesh of its own: ``frame-000.ply``, ``frame-001.ply``, ...
 
-    Vertices and faces keep their order. OBJ and OFF are text and hold float64 exactly; PLY is binary and
-    holds float32 (about seven digits), which is what viewers expect: take OBJ where the files are computed
-    with again.
+    Vertices and faces keep their order. OBJ and OFF are text and hold float64 exactly; PLY is binary and holds float32
+    (about seven digits), which is what viewers expect: take OBJ where the files are computed with again.
 
     With an asset, each file is that of the asset with other positions: polygons, texture coordinates, materials, groups
     and all else stay, normals turn with the surface, and material libraries and textures are copied beside the files.

@@ -181,9 +181,7 @@ class Document:
     def add_frames(self, shapes: FloatArray, normals: FloatArray | None) -> list[Json]:
         """Add the points of a primitive; its attributes in frame 0, and a morph target for each further frame.
 
-        Args:
-            shapes: Positions. *Shape:* ``(N, P, 3)``.
-            normals: Of each frame, or of frame 0 alone if they do not move. *Shape:* ``(N, P, 3)`` or ``(1, P, 3)``.
+        Normals may be those of frame 0 alone. *Shape:* ``(N, P, 3)``, and ``(N, P, 3)`` or ``(1, P, 3)``.
         """
         added: list[Json] = [{"POSITION": self.add(x, "VEC3", ARRAY_BUFFER, bounds=True)} for x in _differences(shapes)]
         if normals is not None:

@@ -20,14 +20,12 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
 class _Primitive(NamedTuple):
-    """Triangles of one node."""
+    """Triangles of one node, as indices of its own vertices, which are a slice of the asset's. *Shape:* ``(F, 3)``."""
 
     node: int
     json: Json
     points: slice
-    """Its vertices among those of the asset; primitives that share them are alike here."""
     triangles: IntArray
-    """Indices of its own vertices. *Shape:* ``(F, 3)``."""
 
 
 class GltfAsset(Asset):
@@ -114,12 +112,7 @@ class GltfAsset(Asset):
         return self.rebuilt(positions[None]).to_glb()
 
     def rebuilt(self, frames: FloatArray, move_normals: bool = True) -> Document:
-        """A copy with other positions, and without unused content.
-
-        Args:
-            frames: The shape, and those of morph targets. *Shape:* ``(N, V, 3)``.
-            move_normals: Morph targets have normals, too.
-        """
+        """A copy without unused content, with other positions and those of morph targets. *Shape:* ``(N, V, 3)``."""
         old = self.document
         root = {key: copy.deepcopy(value) for key, value in old.root.items() if key not in _REBUILT}
         root["asset"] = {**root.get("asset", {}), "generator": "torch_modal"}

@@ -11,12 +11,8 @@ from torch_modal.geometry.vectors import vertex_normals
 class CarriedNormals:
     """Rotates a file's normals with the surface, so that hard edges stay hard and smooth ones smooth.
 
-    Points with one place and one normal are one: seams of texture coordinates do not show in the shading.
-
-    Args:
-        normals: As the file has them. *Shape:* ``(P, 3)``.
-        positions: Of the same points, as the file has them. *Shape:* ``(P, 3)``.
-        triangles: Of points. *Shape:* ``(F, 3)``.
+    Points with one place and one normal are one: seams of texture coordinates do not show in the shading. All are as
+    the file has them. *Shape:* ``(P, 3), (P, 3), (F, 3)``.
     """
 
     def __init__(self, normals: FloatArray, positions: FloatArray, triangles: IntArray) -> None:
@@ -32,10 +28,7 @@ class CarriedNormals:
         self.before = self._frames(positions)
 
     def _frames(self, positions: FloatArray) -> FloatArray:
-        """Right-handed frames of the surface at each point, with the normal as first column. *Shape:* ``(P, 3, 3)``.
-
-        The second column is the edge made perpendicular to it, or any perpendicular if the edge is along the normal.
-        """
+        """Right-handed frames at each point: the normal, the edge made perpendicular to it. *Shape:* ``(P, 3, 3)``."""
         x = positions[self.first]
         normals, sides = vertex_normals(x, self.triangles), x[self.neighbour] - x
         along = sides - np.einsum("ij,ij->i", sides, normals)[:, None] * normals

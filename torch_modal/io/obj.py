@@ -178,11 +178,7 @@ class ObjAsset(Asset):
 
 
 def _corner(word: str, counts: tuple[int, ...], place: str) -> tuple[int, ...]:
-    """Indices from 0 of a corner such as ``1/2/3`` or ``-1//-1``; -1 where there is none.
-
-    Raises:
-        MeshError: It has the index 0, or no vertex.
-    """
+    """Indices from 0 of a corner such as ``1/2/3`` or ``-1//-1``; -1 where there is none."""
     given = [int(part) if part else None for part in (*word.split("/"), "", "")[:3]]
     if 0 in given or given[0] is None:
         raise MeshError(f"{place} has the index 0 (OBJ counts from 1) or a corner without a vertex")

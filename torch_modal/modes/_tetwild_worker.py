@@ -1,8 +1,7 @@
 """The child process that runs pytetwild: ``python _tetwild_worker.py JOB.npz RESULT.npz``.
 
 A script, never imported by the package: pytetwild may crash, hang, hold the GIL or replace signal handlers,
-and it does all that here. It imports no torch and nothing of torch_modal, so that it starts in well under a
-second.
+and it does all that here. It imports no torch and nothing of torch_modal, so that it starts in well under a second.
 """
 
 import sys

@@ -27,8 +27,7 @@ class ModalBasis:
     Attributes:
         reference: The shape that the modes belong to, in the caller's coordinates. *Shape:* ``(V, 3)``.
         eigenvalues: Ascending, of the elastic modes. *Shape:* ``(k,)``.
-        modes: Elastic displacements, without rigid motions; zero at unreferenced vertices.
-            *Shape:* ``(k, V, 3)``.
+        modes: Elastic displacements, without rigid motions; zero at unreferenced vertices. *Shape:* ``(k, V, 3)``.
         rigid_eigenvalues: The six computed eigenvalues of rigid motions, zero up to rounding. *Shape:* ``(6,)``.
 
     Raises:
@@ -73,8 +72,7 @@ class ModalBasis:
     def rigid_modes(self) -> torch.Tensor:
         """Orthonormal translations and infinitesimal rotations of the reference. *Shape:* ``(6, V, 3)``.
 
-        Orthonormal in the Euclidean product over all vertices: the translations along x, y and z, then
-        rotations about the mean of the vertices that span ``axis × (x - mean)``.
+        In the Euclidean product over all vertices: translations along x, y and z, then rotations about their mean.
         """
         v = self.n_vertices
         axes = torch.eye(3, dtype=self.reference.dtype, device=self.reference.device)
@@ -100,10 +98,7 @@ class ModalBasis:
         return ModalBasis(**{name: tensor.to(*args, **kwargs) for name, tensor in self._tensors().items()})
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a safetensors file atomically.
-
-        Args:
-            path: The file; its folder must exist.
+        """Write a safetensors file atomically, into a folder that exists.
 
         Raises:
             OSError: The file cannot be written.
@@ -112,13 +107,7 @@ class ModalBasis:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "ModalBasis":
-        """Read a file written by `save`.
-
-        Args:
-            path: The file.
-
-        Returns:
-            The basis on the CPU, in the dtype it was saved in.
+        """Read a file written by `save`, to the CPU, in its dtype.
 
         Raises:
             FileNotFoundError: There is no such file.

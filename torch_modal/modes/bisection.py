@@ -116,8 +116,7 @@ class _Mesh:
         middle = (old[:, 0] + old[row, tag]) // 2
         first, second = old.copy(), np.take_along_axis(old, _SECOND_HALF[tag], axis=1)
         first[row, tag] = second[row, tag] = middle
-        # Barycentric coordinates in the half: the difference of both stays at one end, twice the smaller one goes
-        # to the midpoint.
+        # In the half, the difference of both barycentric coordinates stays at one end; the rest goes to the midpoint.
         other = np.full(len(self.tets), -1)
         other[index] = len(self.tets) + row
         moved = np.flatnonzero(other[self.owner] >= 0)

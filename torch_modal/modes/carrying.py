@@ -35,9 +35,6 @@ class Carrier:
     The embedded surface is pulled to its positions in the other pose. All steps and all key-frames share one system
     matrix, which is factorised here.
 
-    Args:
-        solid: The first pose.
-
     Raises:
         RuntimeError: The matrix is singular, for example if no surface point is embedded in a piece.
         LinAlgError: A tetrahedron is degenerate.
@@ -95,8 +92,7 @@ class Carrier:
 def vertex_rotations(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
     """Rotation of the surface around each vertex from one pose to another.
 
-    The rotation nearest to the area-weighted mean of the rotations of the incident faces.
-    *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
+    It is the nearest to the mean by area of those of the faces. *Shape:* ``(U, 3), (U, 3), (F, 3) -> (U, 3, 3)``.
     """
     frames = []
     for x in (before, after):

@@ -38,12 +38,7 @@ class Coarsening:
 
     @classmethod
     def of_labels(cls, labels: IntArray, faces: IntArray) -> "Coarsening":
-        """Clusters of equal labels; those without faces carry no energy and are removed.
-
-        Args:
-            labels: Label of each fine vertex, -1 for none. *Shape:* ``(V,)``.
-            faces: Faces of the fine mesh. *Shape:* ``(F, 3)``.
-        """
+        """Clusters of equal labels, -1 for none, without those that have no face. *Shape:* ``(V,), (F, 3)``."""
         coarse = _coarse_faces(labels, faces)
         used = np.unique(coarse)
         index = np.full(labels.max() + 2, -1)  # the last for the label -1
@@ -106,10 +101,7 @@ def _fatness(keyframes: FloatArray, coarsening: Coarsening) -> tuple[float, floa
 
 
 def collapsed(points: FloatArray, faces: IntArray, n_faces: int) -> Coarsening:
-    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately.
-
-    Meshes of so few faces stay as they are.
-    """
+    """Partition by the edge collapses of one pose; pieces that would vanish are collapsed separately."""
     if len(faces) <= n_faces:
         return Coarsening.of_labels(np.arange(len(points)), faces)
     root = _roots(points, faces, n_faces)

@@ -54,14 +54,9 @@ class ElasticBody(NamedTuple):
 
 
 class ElasticModes(NamedTuple):
-    """Lowest elastic modes of a mesh.
+    """Lowest elastic modes of a mesh, M-orthonormal and M-orthogonal to the rigid motions, by ascending eigenvalues.
 
-    Attributes:
-        eigenvalues: Ascending. *Shape:* ``(k,)``.
-        modes: M-orthonormal and M-orthogonal to the rigid motions. *Shape:* ``(3N, k)``.
-        rigid_eigenvalues: Zero up to rounding. *Shape:* ``(6,)``.
-        n_zero: Number of zero eigenvalues, including the six rigid ones.
-        n_pieces: Number of connected components.
+    ``n_zero`` eigenvalues are zero, with the six rigid ones. *Shape:* ``(k,), (3N, k), (6,)``.
     """
 
     eigenvalues: FloatArray
@@ -192,12 +187,10 @@ def _component_modes(
 def _lanczos(
     k: sp.csc_matrix, inertia: sp.csr_matrix, rigid: FloatArray, momentum: FloatArray, n_modes: int, shift: float
 ) -> FloatArray:
-    """Lowest eigenvectors that are M-orthogonal to the rigid motions, by ARPACK. *Shape:* ``(3N, n_modes)``.
-
-    Vertices are ordered instead of unknowns, which gives a third less fill: by minimum degree, from the factorisation
-    of a well-conditioned matrix with their graph.
-    """
+    """Lowest eigenvectors that are M-orthogonal to the rigid motions, by ARPACK. *Shape:* ``(3N, n_modes)``."""
     n, shifted = k.shape[0], k + shift * inertia
+    # Ordering vertices instead of unknowns gives a third less fill: by minimum degree, from the factorisation of a
+    # well-conditioned matrix with their graph.
     graph = _vertex_graph(shifted)
     laplacian = sp.csc_matrix((np.full(graph.nnz, -1.0), graph.indices, graph.indptr), shape=graph.shape)
     degrees = np.diff(graph.indptr)
@@ -242,11 +235,8 @@ def _orthonormal(columns: FloatArray, inertia: sp.csr_matrix) -> FloatArray:
 
 
 def _signs(modes: FloatArray) -> FloatArray:
-    """Signs that make the first of the largest components positive. *Shape:* ``(k,)``.
-
-    Components within a thousandth of the largest count, so that rounding does not choose between equal magnitudes of
-    symmetric shapes.
-    """
+    """Signs that make the first of the largest components positive. *Shape:* ``(k,)``."""
     magnitude = np.abs(modes)
+    # Within a thousandth: rounding must not choose between equal magnitudes of symmetric shapes.
     first = (magnitude >= 0.999 * magnitude.max(axis=0)).argmax(axis=0)
     return np.where(np.take_along_axis(modes, first[None], axis=0)[0] < 0, -1.0, 1.0)

@@ -259,10 +259,7 @@ class _Extraction:
     def _all(
         self, compute: Callable[[int], Arrays], inputs: Arrays, parameters: dict[str, Any], n_vertices: int
     ) -> list[Arrays]:
-        """Modes of all key-frames, from the cache or computed in as many threads as fit into memory.
-
-        They depend on the surface, the number of modes, and these inputs and parameters.
-        """
+        """Modes of all key-frames, from the cache or computed in as many threads as fit into memory."""
 
         def modes(index: int) -> Arrays:
             surface = self.surfaces[index]
@@ -325,11 +322,9 @@ class _Extraction:
 
 
 def _deforming(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
-    """Linear combinations of motions that deform a surface, without rigid motions of its pieces.
+    """Combinations of motions without energy that deform a surface, as where a piece spans several of tetrahedra.
 
-    Relative rigid motions of pieces have no energy, so their amplitudes would be undetermined; the interpolation of the
-    key-frames determines them. A piece of the surface that spans several pieces of tetrahedra is deformed by their
-    rigid motions. *Shape:* ``(k, U, 3), (U, 3), (F, 3) -> (m, U, 3)`` with ``m <= k``.
+    Rigid motions of pieces are left to the interpolation of the key-frames. *Shape:* ``(k, U, 3) -> (m, U, 3)``.
     """
     if len(motions) == 0:
         return motions

@@ -6,7 +6,7 @@ Deterministic; accepts every surface.
 import itertools
 import threading
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.fft import irfftn, next_fast_len, rfftn
@@ -18,7 +18,7 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity, connected_pieces
 from torch_modal.modes.bisection import bisected
 from torch_modal.modes.parallel import n_cpus
-from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearances, sampled
+from torch_modal.modes.surface import CanonicalSurface, SurfaceSamples, clearances
 from torch_modal.modes.tetrahedra import (
     Tetrahedra,
     face_connected_pieces,
@@ -112,22 +112,49 @@ class Lattice:
         return turned._replace(vertices=turned.vertices @ TURN) if better else found
 
 
-class Indicator(NamedTuple):
-    """Indicator function of the interior of a surface.
+class Indicator:
+    """Indicator function of the interior, from the normals of samples of the surface (Poisson reconstruction).
 
-    Attributes:
-        values: Values at the grid points. *Shape:* ``(X, Y, Z)``.
-        low: Lowest corner of the grid.
-        spacing: Grid spacing.
+    Its gradient is the inward normal on the surface, so it solves a Poisson equation with the divergence of the
+    normals: in trilinear finite elements, by one Fourier transform. Holes of open surfaces are closed smoothly.
+
+    Args:
         samples: Surface samples; their tangent planes correct the indicator near the surface.
         has_sides: Whether a sample is used for that; false at the boundary of an open surface. *Shape:* ``(P,)``.
+        low: Lowest corner of the grid.
+        spacing: Grid spacing.
+        counts: Numbers of grid points. *Shape:* ``(3,)``.
     """
 
-    values: FloatArray
-    low: FloatArray
-    spacing: float
-    samples: SurfaceSamples
-    has_sides: BoolArray
+    def __init__(
+        self, samples: SurfaceSamples, has_sides: BoolArray, low: FloatArray, spacing: float, counts: IntArray
+    ) -> None:
+        self.samples, self.has_sides, self.low, self.spacing = samples, has_sides, low, spacing
+        places = (samples.points - low) / spacing
+        base = np.floor(places).astype(np.int64)
+        part = np.ascontiguousarray((places - base).T)
+        normals = np.ascontiguousarray((samples.normals * samples.areas[:, None]).T)
+        index = np.ravel_multi_index(tuple(base.T), tuple(counts))
+        size = int(counts.prod())
+        divergence = np.zeros(size)
+        for step in itertools.product((0, 1), repeat=3):
+            share = np.where(np.array(step)[:, None], part, 1 - part)
+            slope = np.where(step, 1.0, -1.0)
+            weight = sum(normals[a] * slope[a] * share[a - 1] * share[a - 2] for a in range(3))
+            divergence += np.bincount(index + np.ravel_multi_index(step, tuple(counts)), weight, minlength=size)
+
+        waves = [2 * np.pi * np.fft.fftfreq(n) for n in counts[:2]] + [2 * np.pi * np.fft.rfftfreq(counts[2])]
+        x, y, z = np.meshgrid(*waves, indexing="ij", sparse=True)
+        stiff, mass = [2 - 2 * np.cos(k) for k in (x, y, z)], [(2 + np.cos(k)) / 3 for k in (x, y, z)]
+        laplacian = sum(stiff[a] * mass[a - 1] * mass[a - 2] for a in range(3))
+        laplacian[0, 0, 0] = 1.0
+        transformed = rfftn(divergence.reshape(counts), overwrite_x=True) / laplacian
+        transformed[0, 0, 0] = 0.0
+        solution = -irfftn(transformed, s=tuple(counts), overwrite_x=True) / spacing**2
+        rim = np.ones(counts, dtype=bool)
+        rim[1:-1, 1:-1, 1:-1] = False
+        #: Values at the grid points. *Shape:* ``(X, Y, Z)``.
+        self.values = np.ascontiguousarray(solution - solution[rim].mean())
 
     def inside(self, corners: FloatArray) -> FloatArray:
         """Inside fraction of tetrahedra. *Shape:* ``(T, 4, 3) -> (T,)``."""
@@ -154,11 +181,7 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
 
     Tetrahedra are bisected where the body or a gap is thin. Each has the fraction of its volume that is inside. The
     surface need not be closed or consistent: the interior follows from the normals of all faces. Parts closer together
-    than a tetrahedron are fused. Deterministic.
-
-    Args:
-        surface: The surface.
-        cube: Edge length of the cubes at the surface where nothing is thin, in sizes.
+    than a tetrahedron are fused. Deterministic. Where nothing is thin, cubes have the edge length ``cube``, in sizes.
     """
     largest = cube * CANONICAL_SIZE
     while True:
@@ -170,14 +193,14 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
         largest *= COARSER
     thickness, gap = clearances(surface)
     sizes = np.clip(np.minimum(thickness / ACROSS, gap / ACROSS_GAP), SMALLEST * largest, largest)
-    samples = sampled(surface, np.minimum(SAMPLES_APART * sizes, (surface.area / FEWEST_SAMPLES) ** 0.5))
+    samples = SurfaceSamples(surface, np.minimum(SAMPLES_APART * sizes, (surface.area / FEWEST_SAMPLES) ** 0.5))
     points, wanted = samples.points, sizes[samples.faces]
     spacing = max(GRID_SPACING * wanted.min(), (np.prod(counts * root) / MOST_POINTS) ** (1 / 3))
     grid = [next_fast_len(int(np.ceil(length)) + 1, real=True) for length in counts * root / spacing]
     at_rim = np.zeros(len(surface.points), dtype=bool)
     at_rim[Connectivity(surface.faces).boundary_edges] = True
     has_sides = np.asarray(~at_rim[surface.faces[samples.faces]].any(axis=1))
-    indicator = Indicator(_indicator(samples, low, spacing, np.array(grid)), low, spacing, samples, has_sides)
+    indicator = Indicator(samples, has_sides, low, spacing, np.array(grid))
 
     def is_inside(places: FloatArray) -> BoolArray:
         return indicator.at(low + root * places) >= 0.5
@@ -198,10 +221,7 @@ def lattice(surface: CanonicalSurface, cube: float) -> Tetrahedra:
 
 
 def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
-    """Move the outer vertices onto the surface along its normals and remove the tetrahedra outside.
-
-    If the fit splits the mesh, loses volume or uncovers the surface, the tetrahedra stay as they were.
-    """
+    """Move outer vertices onto the surface, unless that splits the mesh, loses volume or uncovers the surface."""
     samples = indicator.samples
     volumes = tet_volumes(filled)
     # At each vertex the edge length of the cube with six times the volume of the smallest incident tetrahedron.
@@ -242,10 +262,7 @@ def _fitted(filled: Tetrahedra, indicator: Indicator) -> Tetrahedra:
 
 
 def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
-    """Keep further tetrahedra that join pieces which share only an edge or a vertex.
-
-    *Shape:* ``(T, 4), (T,), (T,) -> (T,)``.
-    """
+    """Keep further tetrahedra that join pieces which share only an edge or a vertex. *Shape:* ``(T,)``."""
     kept = kept.copy()
     for _ in range(MOST_BRIDGES):
         piece = face_connected_pieces(tets[kept])
@@ -257,35 +274,3 @@ def _bridged(tets: IntArray, kept: BoolArray, allowed: BoolArray) -> BoolArray:
             break
         kept |= joining
     return kept
-
-
-def _indicator(samples: SurfaceSamples, low: FloatArray, spacing: float, counts: IntArray) -> FloatArray:
-    """Indicator function on the grid points, from the normals of the samples (Poisson reconstruction).
-
-    Its gradient is the inward normal on the surface, so it solves a Poisson equation with the divergence of the
-    normals: in trilinear finite elements, by one Fourier transform. Holes of open surfaces are closed smoothly.
-    """
-    places = (samples.points - low) / spacing
-    base = np.floor(places).astype(np.int64)
-    part = np.ascontiguousarray((places - base).T)
-    normals = np.ascontiguousarray((samples.normals * samples.areas[:, None]).T)
-    index = np.ravel_multi_index(tuple(base.T), tuple(counts))
-    size = int(counts.prod())
-    divergence = np.zeros(size)
-    for step in itertools.product((0, 1), repeat=3):
-        share = np.where(np.array(step)[:, None], part, 1 - part)
-        slope = np.where(step, 1.0, -1.0)
-        weight = sum(normals[a] * slope[a] * share[a - 1] * share[a - 2] for a in range(3))
-        divergence += np.bincount(index + np.ravel_multi_index(step, tuple(counts)), weight, minlength=size)
-
-    waves = [2 * np.pi * np.fft.fftfreq(n) for n in counts[:2]] + [2 * np.pi * np.fft.rfftfreq(counts[2])]
-    x, y, z = np.meshgrid(*waves, indexing="ij", sparse=True)
-    stiff, mass = [2 - 2 * np.cos(k) for k in (x, y, z)], [(2 + np.cos(k)) / 3 for k in (x, y, z)]
-    laplacian = sum(stiff[a] * mass[a - 1] * mass[a - 2] for a in range(3))
-    laplacian[0, 0, 0] = 1.0
-    transformed = rfftn(divergence.reshape(counts), overwrite_x=True) / laplacian
-    transformed[0, 0, 0] = 0.0
-    solution = -irfftn(transformed, s=tuple(counts), overwrite_x=True) / spacing**2
-    rim = np.ones(counts, dtype=bool)
-    rim[1:-1, 1:-1, 1:-1] = False
-    return np.ascontiguousarray(solution - solution[rim].mean())

@@ -47,10 +47,6 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
 
     Vertices are clustered by edge collapses, and modes are computed on the mesh of the clusters, with stretching as
     stiff as that of the fine mesh: in Eq. 5 it grows as edges become shorter. Small loose pieces follow the rest.
-
-    Args:
-        surface: The surface, of a size of 100.
-        n_modes: Number of modes that the coarse mesh must resolve.
     """
     fine = Connectivity(surface.faces, len(surface.points))
     piece = fine.vertex_pieces[surface.faces[:, 0]]
@@ -93,11 +89,7 @@ def sheet_body(surface: CanonicalSurface, n_modes: int) -> ElasticBody:
 def _cluster_weights(
     clusters: IntArray, surface: CanonicalSurface, fine: Connectivity, points: FloatArray, mesh: Connectivity
 ) -> sp.coo_matrix:
-    """Weights of the clusters that move each vertex; rows sum to one. *Shape:* ``(U, N)``.
-
-    Membership, averaged over the neighbours on the surface a few times: weights are smooth, and do not reach from
-    one finger to the next. Pieces that no cluster reaches follow those around the nearest one.
-    """
+    """Weights of the clusters that move each vertex, membership averaged over neighbours. *Shape:* ``(U, N)``."""
     n_fine, n = len(surface.points), len(points)
     own = np.flatnonzero(clusters >= 0)
     weights = sp.csr_matrix((np.ones(len(own)), (own, clusters[own])), shape=(n_fine, n))
@@ -107,7 +99,7 @@ def _cluster_weights(
     total = np.asarray(weights.sum(axis=1)).reshape(-1)
     weights = sp.diags(1 / np.where(total > 0, total, 1)) @ weights
     rows = np.flatnonzero(total == 0)
-    if len(rows):
+    if len(rows):  # pieces that no cluster reaches follow those around the nearest one
         tree, piece = cKDTree(points), fine.vertex_pieces[rows]
         nearest = np.zeros(len(rows), dtype=np.int64)
         for index in np.unique(piece):
@@ -130,11 +122,7 @@ def _averages(mesh: Connectivity) -> sp.csr_matrix:
 
 
 def _vertex_gradients(motions: FloatArray, points: FloatArray, faces: IntArray) -> FloatArray:
-    """Gradient of displacements around each vertex: the mean of its faces by area.
-
-    In the plane of a face it is that of linear interpolation; its normal turns with the face.
-    *Shape:* ``(N, 3, k), (N, 3), (F, 3) -> (3, N, 3, k)``, derivatives first.
-    """
+    """Gradient of displacements at vertices, a mean of their faces by area. *Shape:* ``(N, 3, k) -> (3, N, 3, k)``."""
     corners = points[faces]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normals = np.cross(one, other)

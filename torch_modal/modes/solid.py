@@ -112,10 +112,7 @@ def larger_pieces(tetrahedra: Tetrahedra) -> tuple[Tetrahedra, IntArray, sp.csr_
 
 
 def _around(points: FloatArray, vertices: FloatArray, piece: IntArray) -> IntArray:
-    """Vertices of the nearest piece, spread by farthest-point sampling over a region as large as its distance.
-
-    *Shape:* ``(n, 3), (N, 3), (N,) -> (12,)``.
-    """
+    """Vertices of the nearest piece, spread over a region as large as its distance. *Shape:* ``(12,)``."""
     center = points.mean(axis=0)
     nearest = int(np.linalg.norm(vertices - center, axis=1).argmin())
     reach = REACH * max(np.linalg.norm(vertices[nearest] - center), np.linalg.norm(np.ptp(points, axis=0)))

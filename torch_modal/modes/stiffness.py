@@ -82,10 +82,9 @@ _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
 def _edge_hessian(tetrahedra: Tetrahedra) -> sp.csc_matrix:
-    """Blocks ``K_ab = sum_e vol_e ((g_a · g_b) I + g_b g_aᵀ)`` with the mean gradients ``g`` around each edge.
+    """Blocks ``K_ab = sum_e vol_e ((g_a · g_b) I + g_b g_aᵀ)`` with the mean hat gradients ``g`` around each edge.
 
-    They follow from ``|sym G|² = ½ (|G|² + tr G²)`` with ``G = ∇u = Σ u_a g_aᵀ`` and hat gradients ``g``. One sparse
-    matrix product gives all ``g_a g_bᵀ``.
+    They follow from ``|sym G|² = ½ (|G|² + tr G²)`` with ``G = ∇u = Σ u_a g_aᵀ``.
     """
     n, t = len(tetrahedra.vertices), len(tetrahedra.tets)
     columns = 3 * tetrahedra.tets[:, :, None] + np.arange(3)

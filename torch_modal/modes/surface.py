@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -83,11 +82,7 @@ class CanonicalSurface:
         return cls(own.points, ordered, used, own.scale, own.axes)
 
     def require_solid(self) -> None:
-        """Reject a planar surface, which has no interior.
-
-        Raises:
-            MeshError: The extent across the plane that fits best is below 1e-6 of the largest extent.
-        """
+        """Raise a MeshError for a planar surface, which has no interior."""
         extents = principal_extents(self.points)
         if extents[2] <= FLATNESS * extents[0]:
             lengths = "{:.3g}, {:.3g} and {:.3g}".format(*extents / self.scale)
@@ -112,43 +107,34 @@ class CanonicalSurface:
         return vertex_normals(self.points, self.faces)
 
 
-class SurfaceSamples(NamedTuple):
-    """Samples of a surface."""
+class SurfaceSamples:
+    """P samples of a surface, each face at a spacing of its own and with one or more. *Shape:* ``(F,)``."""
 
-    points: FloatArray
-    """*Shape:* ``(P, 3)``."""
-    normals: FloatArray
-    """Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``."""
-    areas: FloatArray
-    """Area of each sample. *Shape:* ``(P,)``."""
-    faces: IntArray
-    """Face of each sample. *Shape:* ``(P,)``."""
-    tree: cKDTree
-
-
-def sampled(surface: CanonicalSurface, spacing: FloatArray) -> SurfaceSamples:
-    """Sample each face at a spacing of its own, with at least one sample per face. *Shape:* ``(F,)``."""
-    corners = surface.points[surface.faces]
-    sides = corners - np.roll(corners, 1, axis=1)
-    longest = np.linalg.norm(sides, axis=2).max(axis=1) / spacing
-    longest *= min(1.0, (MOST_SAMPLES / (longest**2).sum()) ** 0.5)
-    n_cuts = np.maximum(np.ceil(longest), 1).astype(np.int64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    points, shares, faces = [], [], []
-    for n in np.unique(n_cuts):
-        chosen = n_cuts == n
-        # Centroids of the n² congruent parts of a triangle.
-        up = np.array([(3 * i + 1, 3 * j + 1) for i in range(n) for j in range(n - i)])
-        down = np.array([(3 * i + 2, 3 * j + 2) for i in range(n - 1) for j in range(n - 1 - i)]).reshape(-1, 2)
-        uv = np.concatenate([up, down]) / (3 * n)
-        weights = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)
-        points.append(np.einsum("qa,fai->fqi", weights, corners[chosen]).reshape(-1, 3))
-        shares.append(np.repeat(normals[chosen] / n**2, n**2, axis=0))
-        faces.append(np.repeat(np.flatnonzero(chosen), n**2))
-    places, normal = np.concatenate(points), np.concatenate(shares)
-    areas = np.linalg.norm(normal, axis=1)
-    unit = normal / np.maximum(areas, 1e-300)[:, None]
-    return SurfaceSamples(places, unit, areas, np.concatenate(faces), cKDTree(places, leafsize=LEAF))
+    def __init__(self, surface: CanonicalSurface, spacing: FloatArray) -> None:
+        corners = surface.points[surface.faces]
+        sides = corners - np.roll(corners, 1, axis=1)
+        longest = np.linalg.norm(sides, axis=2).max(axis=1) / spacing
+        longest *= min(1.0, (MOST_SAMPLES / (longest**2).sum()) ** 0.5)
+        n_cuts = np.maximum(np.ceil(longest), 1).astype(np.int64)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        points, shares, faces = [], [], []
+        for n in np.unique(n_cuts):
+            chosen = n_cuts == n
+            # Centroids of the n² congruent parts of a triangle.
+            up = np.array([(3 * i + 1, 3 * j + 1) for i in range(n) for j in range(n - i)])
+            down = np.array([(3 * i + 2, 3 * j + 2) for i in range(n - 1) for j in range(n - 1 - i)]).reshape(-1, 2)
+            uv = np.concatenate([up, down]) / (3 * n)
+            weights = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)
+            points.append(np.einsum("qa,fai->fqi", weights, corners[chosen]).reshape(-1, 3))
+            shares.append(np.repeat(normals[chosen] / n**2, n**2, axis=0))
+            faces.append(np.repeat(np.flatnonzero(chosen), n**2))
+        normal = np.concatenate(shares)
+        #: *Shape:* ``(P, 3)``, and the face of each, ``(P,)``.
+        self.points, self.faces = np.concatenate(points), np.concatenate(faces)
+        self.areas = np.linalg.norm(normal, axis=1)
+        #: Outward unit normals, zero where there is no area. *Shape:* ``(P, 3)``.
+        self.normals = normal / np.maximum(self.areas, 1e-300)[:, None]
+        self.tree = cKDTree(self.points, leafsize=LEAF)
 
 
 def self_proximity(surface: CanonicalSurface) -> float:
@@ -168,15 +154,12 @@ def self_proximity(surface: CanonicalSurface) -> float:
 
 
 def clearances(surface: CanonicalSurface) -> tuple[FloatArray, FloatArray]:
-    """Thickness of the body behind each face, and gap in front of it; infinite above `MOST`.
+    """Thickness of the body behind each face, and gap in front of it; infinite above `MOST`. *Shape:* ``(F,), (F,)``.
 
     They are diameters of balls tangent to the surface at samples, which shrink until they are empty (Ma, Bae and Choi
     2012) or touch a side that is not opposing, as in a corner.
-
-    Returns:
-        Thickness and gap. *Shape:* ``(F,), (F,)``.
     """
-    samples = sampled(surface, np.full(len(surface.faces), np.sqrt(surface.area / N_SAMPLES)))
+    samples = SurfaceSamples(surface, np.full(len(surface.faces), np.sqrt(surface.area / N_SAMPLES)))
     seen = np.arange(0, len(samples.points), max(len(samples.points) // SEEN_SAMPLES, 1))
     found = np.full((2, len(surface.faces)), np.inf)
     for smallest, side in zip(found, (-1.0, 1.0), strict=True):

@@ -14,11 +14,7 @@ from torch_modal.io.write import to_numpy
 
 
 def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
-    """Landmarks of all meshes as points. *Shape:* ``(n, K, 3)``.
-
-    Args:
-        landmarks: None, a landmark file, vertices ``(n, K)``, or points ``(n, K, 3)``.
-        shapes: Vertices of the K meshes.
+    """Landmarks as points of all K meshes, from None, a file, vertices ``(n, K)`` or points. *Shape:* ``(n, K, 3)``.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -48,14 +44,10 @@ def landmark_table(landmarks: Any, shapes: Sequence[FloatArray]) -> FloatArray:
 
 
 def read_landmarks(path: str | os.PathLike[str], n_meshes: int) -> IntArray | FloatArray:
-    """Read a landmark file: a line for each landmark, a column for each mesh; ``#`` begins a comment.
+    """Read a landmark file: vertices ``(n, n_meshes)``, int64, or points ``(n, n_meshes, 3)``, float64.
 
-    Args:
-        path: A text file. Each line names one vertex of each mesh, counted from 0, or gives three coordinates for each.
-        n_meshes: Number of meshes.
-
-    Returns:
-        Vertices, int64, *shape* ``(n, n_meshes)``, or points, float64, *shape* ``(n, n_meshes, 3)``.
+    Each line of the text names one vertex of each mesh, counted from 0, or gives three coordinates for each; ``#``
+    begins a comment.
 
     Raises:
         FileNotFoundError: There is no such file.

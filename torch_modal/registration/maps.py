@@ -51,13 +51,7 @@ _CONSISTENT, _FEWEST = 0.12, 8
 
 
 class SpectralShape:
-    """The main part of a surface, decimated and scaled to unit area, with eigenfunctions of its Laplacian.
-
-    A surface with at most a fifth more vertices than :data:`N_COARSE` is not decimated.
-
-    Args:
-        surface: The fine surface.
-    """
+    """The main part of a surface, decimated and scaled to unit area, with eigenfunctions of its Laplacian."""
 
     def __init__(self, surface: MeshSurface) -> None:
         clean = largest_pieces(surface, DUST)
@@ -87,9 +81,9 @@ class SpectralShape:
         """Number of coarse vertices."""
         return len(self.coarse.vertices)
 
-    def wave_kernel_signatures(self, n_energies: int = 40) -> FloatArray:
-        """Wave kernel signatures (Aubry et al. 2011) in unit columns. *Shape:* ``(n, n_energies)``."""
-        logs = np.log(np.maximum(self.eigenvalues[1:], 1e-9))
+    def wave_kernel_signatures(self) -> FloatArray:
+        """Wave kernel signatures (Aubry et al. 2011) of 40 energies, in unit columns. *Shape:* ``(n, 40)``."""
+        n_energies, logs = 40, np.log(np.maximum(self.eigenvalues[1:], 1e-9))
         energies = np.linspace(logs[0], logs[-1] / 1.02, n_energies)
         width = max(7 * (logs[-1] - logs[0]) / n_energies, 1e-9)
         weights = np.exp(-((energies[:, None] - logs) ** 2) / (2 * width**2))
@@ -100,21 +94,18 @@ class SpectralShape:
         """Distances along the surface by the heat method. *Shape:* ``(m,) -> (n, m)``."""
         return np.stack([self._heat.compute_distance(int(source)) for source in sources], axis=1)
 
-    def neighbourhoods(self, radius: float) -> BoolArray:
-        """Pairs of vertices within a distance along edges, as a mask. *Shape:* ``(n, n)``."""
-        i, j = self.coarse.edges.T
-        lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
-        graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
-        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=radius) <= radius
-        return near
-
     def is_near(self, vertices: IntArray, points: FloatArray) -> BoolArray:
         """Points in space whose nearest coarse vertices are near given ones, as a mask. *Shape:* ``(n,), (n, 3)``."""
         return self._near[vertices, self._tree.query(points)[1]]  # type: ignore[no-any-return]
 
     @cached_property
     def _near(self) -> BoolArray:
-        return self.neighbourhoods(_NEAR)
+        """Pairs of vertices that are near along edges, as a mask. *Shape:* ``(n, n)``."""
+        i, j = self.coarse.edges.T
+        lengths = np.linalg.norm(self.coarse.vertices[i] - self.coarse.vertices[j], axis=1)
+        graph = sparse.csr_matrix((np.maximum(lengths, 1e-12), (i, j)), shape=(len(self),) * 2)
+        near: BoolArray = csgraph.dijkstra(graph, directed=False, limit=_NEAR) <= _NEAR
+        return near
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -131,15 +122,15 @@ class SpectralShape:
 
 
 class Map(NamedTuple):
-    """A map and its scores."""
+    """A map, and its scores for the second shape and for its mirror image. *Shape:* ``(n_first,)``.
+
+    A score is the oriented area of the worse direction minus three times the mean round-trip error: 0.7 or more for
+    correct maps of one subject, negative for mirrored ones.
+    """
 
     vertices: IntArray
-    """*Shape:* ``(n_first,)``."""
     score: float
-    """Oriented area of the worse direction minus three times the mean round-trip error; correct maps of one subject
-    have 0.7 or more, mirrored ones a negative one."""
     mirrored_score: float
-    """Score for the mirror image of the second shape."""
 
 
 class CoarsePair:
@@ -215,10 +206,13 @@ class CoarsePair:
         for signs in itertools.product([1.0, -1.0], repeat=n_signs):
             yield nearest_rows(first.functions[:, :k], second.functions[:, :k] * [1.0, *signs]), k
         yield nearest_rows(first.wave_kernel_signatures(), second.wave_kernel_signatures()), 6
-        axes, (centred, target) = [], [shape.coarse.vertices - shape.coarse.centroid for shape in (first, second)]
-        for shape, points in ((first, centred), (second, target)):
-            frame = np.linalg.eigh(points.T @ (shape.coarse.vertex_areas[:, None] * points))[1]
+        axes, centred_shapes = [], []
+        for surface in (first.coarse, second.coarse):
+            points = surface.vertices - np.average(surface.vertices, 0, surface.vertex_areas)
+            frame = np.linalg.eigh(points.T @ (surface.vertex_areas[:, None] * points))[1]
             axes.append(frame * [1, 1, np.sign(np.linalg.det(frame))])
+            centred_shapes.append(points)
+        centred, target = centred_shapes
         flips = ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
         goal = np.hstack([target, 0.1 * second.coarse.vertex_normals])
         for turn in (np.eye(3), *(axes[0] * signs @ axes[1].T for signs in flips)):

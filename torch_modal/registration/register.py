@@ -219,7 +219,7 @@ class _RegistrationProblem:
         template = self.first.placed.moved(scale * self.first.placed.vertices)
         back = self.second.placed
         fit = self._fit(template, back, found.vertices, scale)
-        self.progress.expect(len(MAP_WEIGHTS) + sum(stage.steps for stage in COARSE_STAGES))
+        self.progress.expect(len(MAP_WEIGHTS) + sum(n_steps for *_, n_steps in COARSE_STAGES))
         places = self.second.placed.vertices[found.vertices]
         if x is None:
             rest, goal, areas = map(torch.from_numpy, (template.vertices, places, template.vertex_areas))
@@ -246,10 +246,7 @@ class _RegistrationProblem:
         )
 
     def _refined(self, candidate: _Candidate) -> _Candidate:
-        """Repeat the fit from the start with the map of its result, until convergence.
-
-        An elastic fit accumulates sliding; its map, first refined by all eigenfunctions, does not.
-        """
+        """Repeat the fit from the start with the map of its result, which accumulates no sliding, until convergence."""
         if not self.same_subject:
             return candidate
         most = candidate.cost + _WORSE
@@ -284,7 +281,7 @@ class _RegistrationProblem:
         start = _carried(template.vertices, coarse, x, frames)
         images = self.second.placed.nearest_alike(start, template.moved(start).vertex_normals)
         fit = self._fit(template, self.target, images, candidate.scale)
-        self.progress.expect(sum(stage.steps for stage in FINE_STAGES))
+        self.progress.expect(sum(n_steps for *_, n_steps in FINE_STAGES))
         found = fit.run(start, FINE_STAGES, releases=1)
         everything = _carried(self.rest * candidate.scale, coarse, x, frames)
         everything[self.used] = found

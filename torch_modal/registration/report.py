@@ -22,14 +22,11 @@ _STRAY = 0.03  # distance from the template above which a piece of the target is
 
 
 class Distances(NamedTuple):
-    """Distances from vertices to the other surface, in percent of the target's bounding-box diagonal."""
+    """Distances from vertices to the other surface, in percent of the target's diagonal; the mean is by area."""
 
     mean: float
-    """Area-weighted mean."""
     percentile_95: float
-    """95th percentile over the vertices."""
     max: float
-    """Maximum over the vertices."""
 
     @classmethod
     def between(cls, surface: MeshSurface, other: MeshSurface, diagonal: float) -> "Distances":

@@ -11,11 +11,7 @@ class Components:
     """Directions in which the shapes of a set vary most, and coordinates along them.
 
     They are those of rotations and strains of the triangles, weighted by area: a component bends a leg where one of
-    displacements would shear it.
-
-    Args:
-        variation: That of the set.
-        n: Number of components, at most K - 1.
+    displacements would shear it. There are at most K - 1.
     """
 
     @lasting

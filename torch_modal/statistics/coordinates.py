@@ -34,11 +34,7 @@ class BendingCoordinates:
 
     After the columns of the triangles there is one for each piece but the largest, the offset of its centre from the
     motion of the vertices that it follows, and one for each vertex of no face, its displacement; in sizes of the mean.
-    E is the number of all columns.
-
-    Args:
-        mean: The shape whose coordinates are zero, float64 on the CPU. *Shape:* ``(V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
+    E is the number of all columns. The mean is float64 on the CPU. *Shape:* ``(V, 3), (F, 3)``.
     """
 
     def __init__(self, mean: Tensor, faces: Tensor) -> None:

@@ -37,12 +37,7 @@ class Fitted(NamedTuple):
 
 
 class Pulls:
-    """``stiffness sum_i weights_i |x_i - p_i|^2`` of one shape, as an energy beside that of the terms.
-
-    Args:
-        to: The observations.
-        stiffness: Per squared length.
-    """
+    """``stiffness sum_i weights_i |x_i - p_i|^2`` of one shape, as an energy beside that of the terms."""
 
     def __init__(self, to: Observations, stiffness: float) -> None:
         self.to, self.factors = to, stiffness * to.weights
@@ -87,11 +82,9 @@ def fit(
 
 
 def _fit_one(variation: Variation, to: Observations, about: Tensor, robust: bool) -> Fitted:
-    """The shape that meets one set of points.
+    """The shape that meets one set of points: of the weights of least cost, then after elastic steps of all vertices.
 
-    The weights of least cost are followed by elastic steps of all vertices, in rounds with weights computed anew. The
-    steps are constants of the graph: gradients are those of the weights and of the rigid motion. Where a given shape is
-    nearer to the points, it is the result.
+    The steps are constants of the graph. Where a given shape is nearer to the points, it is the result.
     """
     _check_units(variation, to)
     given = LocalWeights(variation, to, about)

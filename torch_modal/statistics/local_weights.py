@@ -27,14 +27,11 @@ CHUNK = 32
 
 
 class Observations(NamedTuple):
-    """Points with the vertices that should be there."""
+    """Points with the vertices that should be there, and weights. *Shape:* ``(n, 3), (n,), (n,)``."""
 
     points: Tensor
-    """*Shape:* ``(n, 3)``."""
     vertices: Tensor
-    """*Shape:* ``(n,)``."""
     weights: Tensor
-    """Weight of each observation. *Shape:* ``(n,)``."""
 
     def pose(self, x: Tensor) -> RigidMotion:
         """Rigid motion of a shape on to the points. *Shape:* ``(V, 3)``."""
@@ -53,12 +50,7 @@ class LocalWeights:
     r"""Local weights and the rigid motion of least cost.
 
     The cost of factors ``z`` of the weights' fields is that of their logarithmic posterior density,
-    :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`.
-
-    Args:
-        variation: The given shapes and how they vary.
-        to: The observations.
-        about: The most likely weights. *Shape:* ``(K,)``.
+    :math:`\sum_i |x_i(z) - p_i|^2 / s^2 + |z|^2`. The most likely weights are ``about``, *shape* ``(K,)``.
     """
 
     def __init__(self, variation: Variation, to: Observations, about: Tensor) -> None:
@@ -71,8 +63,9 @@ class LocalWeights:
         return self.variation.assembled(self.weights(factors))
 
     def weights(self, factors: Tensor) -> Tensor:
-        """Local weights. *Shape:* ``(K n,) -> (K, V)``."""
-        return self.variation.local(factors.view(len(self.about), -1), self.about)
+        """Local weights, which add up to one at each vertex. *Shape:* ``(K n,) -> (K, V)``."""
+        own = factors.view(len(self.about), -1)
+        return self.about[:, None] + (own - own.mean(0)) @ self.variation.fields
 
     def cost(self, factors: Tensor, to: Observations, noise: float) -> Tensor:
         """*Shape:* ``(K n,) -> ()``."""
@@ -158,13 +151,13 @@ class LocalWeights:
             own = factors.detach().requires_grad_()
             slope = torch.autograd.grad(0.5 * self.cost(own, to, self.noise), own, create_graph=True)[0]
 
-        def precondition(x: Tensor) -> Tensor:
-            return torch.cholesky_solve(x[:, None], factor)[:, 0]
-
-        def curvature(x: Tensor) -> Tensor:
-            return torch.autograd.grad(slope, own, x, retain_graph=True)[0]
-
-        return conjugate_gradients(curvature, precondition, torch.dot, right, PRODUCTS)
+        return conjugate_gradients(
+            lambda x: torch.autograd.grad(slope, own, x, retain_graph=True)[0],
+            lambda x: torch.cholesky_solve(x[:, None], factor)[:, 0],
+            torch.dot,
+            right,
+            PRODUCTS,
+        )
 
     def _influence(self) -> tuple[Tensor, Tensor]:
         """Part of both sides of each triangle in each observed place. *Shape:* ``(n, F)`` each."""

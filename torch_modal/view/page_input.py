@@ -56,11 +56,7 @@ def read_shapes(paths: Sequence[str | os.PathLike[str]]) -> tuple[FloatArray, In
 
 
 def _animation(path: Path, asset: GltfAsset) -> tuple[FloatArray, dict[str, Any]] | None:
-    """The frames of a GLB with morph targets and the options of `show`; None without targets.
-
-    Frame 0 is the mesh, each target a further frame, fully shown at its time. The meaning of other programs' targets is
-    unknown.
-    """
+    """The frames of a GLB, its mesh and each morph target, and the options of `show`; None without targets."""
     document = asset.document
     try:
         frames = asset.morphs()

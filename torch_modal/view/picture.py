@@ -175,13 +175,11 @@ def render_sequence(
         titles: What stands above the columns. Default: when they are, from 0 to 1.
         keyframe_indices: Frames that are key-frames, drawn in the other colour; an empty list is none. The first
             and the last by default.
-        view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is
-            up, -Y where Z is), a positive azimuth moves the camera to the right. By default chosen from the
-            shape.
+        view: Azimuth and elevation of the camera in degrees; ``(0, 0)`` looks from the front (+Z where Y is up, -Y
+            where Z is), a positive azimuth moves the camera to the right. By default chosen from the shape.
         up: ``"y"`` or ``"z"``; by default Y, unless the first shape is flat in Y.
-        colors: A number for each vertex, for any of the rows, shown as colour with a bar. The bar ends at the
-            99.5th percentile of what is shown, with an arrow if there is more.
-            *Shape of each:* ``(N, V)``.
+        colors: A number for each vertex, for any of the rows, shown as colour with a bar. The bar ends at the 99.5th
+            percentile of what is shown, with an arrow if there is more. *Shape of each:* ``(N, V)``.
         color_label: What those numbers are, with their unit.
         renderer: ``"auto"`` is pyvista where it is installed (extra ``pictures``), otherwise matplotlib; also, with a
             warning, where pyvista cannot render.
