@@ -164,9 +164,8 @@ class LocalRotations(nn.Module):
         Axis times angle in the coordinates of the frame, which are the same in both frames, then the growth of the
         entries of the stretch. *Shape:* ``(6, B, F)``.
         """
-        turn = turn_of(self._signed(a, b))
-        turns = [(turn * axis).sum(0) for axis in (a.e1, a.e2, a.normal)]
-        return torch.stack([*turns, *(y - x for x, y in zip(a[3:], b[3:], strict=True))])
+        growth = [y - x for x, y in zip(a[3:], b[3:], strict=True)]
+        return torch.stack([*a.coordinates(turn_of(self._signed(a, b))), *growth])
 
     def frames(self, x: Tensor) -> Frames:
         """The frames of the triangles of shapes. *Shape:* ``(B, V, 3)``."""
@@ -191,8 +190,7 @@ class LocalRotations(nn.Module):
         Args:
             trajectory: Of one pair.
             t: *Shape:* ``(B,)``.
-            bending: In coordinates of the triangles (:func:`~torch_modal.geometry.triangle_frames.convected`). *Shape:*
-                ``(6, B, F)``.
+            bending: In coordinates of the triangles: axis times angle, then strain. *Shape:* ``(6, B, F)``.
 
         Returns:
             *Shape:* ``(3, B, E)``.
@@ -215,7 +213,7 @@ class LocalRotations(nn.Module):
         # At a key-frame, the intervals on both sides weigh alike: velocities of edges are continuous.
         areas = torch.lerp(doubled_areas(*trajectory.size), doubled_areas(*(trajectory.size + trajectory.step[3:])), u)
         first, second = mapped(xx, xy, xy, yy) if bending is None else stretched(bending[3:], xx, xy, yy)
-        return self._edges(Sides(placed(*first), placed(*second)), areas)
+        return self._edges((placed(*first), placed(*second)), areas)
 
     def _edges(self, wanted: Sides, areas: Tensor) -> Tensor:
         """Edge vectors that the triangles ask for, by area. *Shape:* ``(B, F) -> (3, B, E)``."""
@@ -260,7 +258,7 @@ def _turn_between(a: Frames, b: Frames) -> Tensor:
 def _turned(turn: Tensor, own: Frames, xx: Tensor, xy: Tensor, yy: Tensor) -> Sides:
     """Sides of triangles with another stretch in their frames, turned. *Shape:* ``(4, B, F), (B, F)``."""
     first, second = mapped(xx, xy, xy, yy)
-    return Sides(rotate(turn, own.world(*first)), rotate(turn, own.world(*second)))
+    return rotate(turn, own.world(*first)), rotate(turn, own.world(*second))
 
 
 def _frames(x: Tensor, faces: Tensor) -> Frames:

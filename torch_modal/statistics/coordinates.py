@@ -9,7 +9,6 @@ from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
 from torch_modal.geometry.triangle_frames import (
-    BentTriangles,
     Frames,
     Sides,
     bending_between,
@@ -74,8 +73,8 @@ class BendingCoordinates:
         for x in placed:
             rotations = LocalRotations(self.mesh, torch.stack([self.mean, x.detach()]))
             own = self._frames(x[None])
-            bending = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
-            turn, strain = bending.turn[:, 0], torch.stack(bending.strain)[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
+            turn, strain = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
+            turn, strain = turn[:, 0], strain[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
             areas = own.doubled_areas[0]
             flat = ~self._has_area | (areas <= SMALLEST_AREA * areas.mean())
             flat = flat | ~(turn.isfinite().all(0) & strain.isfinite().all(0))
@@ -116,7 +115,7 @@ class BendingCoordinates:
     def sides(self, coordinates: Tensor) -> Sides:
         """Target sides of the triangles. *Shape:* ``(B, 6, E)``."""
         rows = coordinates[..., : len(self.faces)].movedim(1, 0)
-        return bent_sides(BentTriangles(rows[:3], (rows[3], rows[4], rows[5])), self.frames)
+        return bent_sides(rows[:3], rows[3:], self.frames)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""
