@@ -100,11 +100,6 @@ def turned(turn: Tensor, v: Tensor) -> Tensor:
     return rotate(about(0.5 * turn), v)
 
 
-def turn_of(q: Tensor) -> Tensor:
-    """Axis times angle of a quaternion, below a whole turn. *Shape:* ``(4, ...) -> (3, ...)``."""
-    return 2 * arc(q)
-
-
 def arc(q: Tensor) -> Tensor:
     """Axis times half the angle: the logarithm of a quaternion of any norm. *Shape:* ``(4, ...) -> (3, ...)``."""
     real, imaginary = q[0], q[1:]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_modal.geometry.rotations import SMALL, product, turn_of, turned
+from torch_modal.geometry.rotations import SMALL, arc, product, turned
 from torch_modal.geometry.vectors import cross, inverse, norm, pick, tiny
 
 # Smallest area relative to the squared sides; below, the normal is rounding, and divisions amplify noise.
@@ -87,6 +87,11 @@ def frames(given: Sides) -> Frames:
     per = inverse(root, point)
     e1, e2 = per * (one + cross(other, normal)), per * (other + cross(normal, one))
     return Frames(e1, e2, normal, (xx + lift) / root, xy / root, (yy + lift) / root)
+
+
+def frames_of(shapes: Tensor, faces: Tensor) -> Frames:
+    """The frame of each triangle of shapes. *Shape:* ``(B, V, 3), (F, 3)``."""
+    return frames(sides(shapes.movedim(-1, 0).contiguous(), faces))
 
 
 def doubled_areas(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
@@ -172,7 +177,7 @@ def bending_between(own: Frames, other: Frames, turns: Tensor) -> tuple[Tensor, 
     """
     cos, sin, *stretch = _polar(own, other)
     half = 0.5 * torch.atan2(sin, cos)
-    turn = turn_of(product(turns, torch.cat([half.cos()[None], half.sin() * own.normal])))
+    turn = 2 * arc(product(turns, torch.cat([half.cos()[None], half.sin() * own.normal])))
     return turn, torch.stack(_logarithm(*stretch))
 
 
