@@ -91,10 +91,7 @@ class Connectivity:
 
     @cached_property
     def signs(self) -> FloatArray:
-        """+1 for a side from the smaller vertex to the larger, otherwise -1.
-
-        *Shape:* ``(3F,)``.
-        """
+        """+1 for a side from the smaller vertex to the larger, otherwise -1. *Shape:* ``(3F,)``."""
         return _shared(np.where(self.start < self.end, 1.0, -1.0))
 
     @cached_property
@@ -106,11 +103,10 @@ class Connectivity:
 
     @cached_property
     def hinges(self) -> IntArray:
-        """Interior edges with the two vertices opposite to them.
+        """Edges of exactly two faces with the two vertices opposite to them. *Shape:* ``(H, 4)``.
 
-        Edges of one face or of three and more have no hinge.
         Rows are ``(i, j, k, l)``: the edge ``ij`` and the opposite vertices ``k`` and ``l`` of its two triangles. Where
-        the winding is consistent, the triangles are ``(i, j, k)`` and ``(j, i, l)``. *Shape:* ``(H, 4)``.
+        the winding is consistent, the triangles are ``(i, j, k)`` and ``(j, i, l)``.
         """
         first, second = self.hinge_sides.T
         ends = self.start[first], self.end[first]
@@ -125,10 +121,7 @@ class Connectivity:
 
     @cached_property
     def face_neighbours(self) -> IntArray:
-        """Pairs of adjacent faces, the smaller first; at non-manifold edges each face with the next.
-
-        *Shape:* ``(n, 2)``.
-        """
+        """Faces of the :attr:`adjacent_sides`, the smaller first. *Shape:* ``(n, 2)``."""
         return _shared(np.sort(self.adjacent_sides % len(self.faces), axis=1))
 
     @cached_property
@@ -138,10 +131,9 @@ class Connectivity:
 
     @cached_property
     def boundary_chain(self) -> IntArray:
-        """Boundary of the surface as a chain: the sum of all directed edges, with multiplicity.
+        """Boundary of the surface as a chain: the sum of all directed edges, with multiplicity. *Shape:* ``(·, 2)``.
 
         With consistent winding these are the edges of one face, in its direction.
-        *Shape:* ``(·, 2)``.
         """
         net = np.bincount(self.sides, self.signs, minlength=len(self.edges)).astype(np.int64)
         oriented = np.where((net > 0)[:, None], self.edges, self.edges[:, ::-1])
@@ -159,10 +151,7 @@ def _shared(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def connected_pieces(pairs: IntArray, n: int) -> IntArray:
-    """Connected component of each of ``n`` nodes, numbered by first nodes. *Shape:* ``(m, 2) -> (n,)``.
-
-    A node without a pair is a component.
-    """
+    """Connected component of each of ``n`` nodes, numbered by first nodes. *Shape:* ``(m, 2) -> (n,)``."""
     graph = sparse.coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 

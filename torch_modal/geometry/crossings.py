@@ -101,9 +101,8 @@ class Crossings:
         pairs, n = self.known_pairs, len(self.mesh.faces)
         if not len(pairs):
             return None
-        near = _ones(
-            sparse.coo_matrix((np.ones(2 * len(pairs)), (pairs.reshape(-1), pairs[:, ::-1].reshape(-1))), (n, n))
-        )
+        ends = pairs.reshape(-1), pairs[:, ::-1].reshape(-1)
+        near = _ones(sparse.coo_matrix((np.ones(len(ends[0])), ends), (n, n)))
         touching = _ones(self.incidence.T @ self.incidence)  # faces that share a vertex
         for _ in range(RINGS):
             near = _ones(touching @ near @ touching)
@@ -122,16 +121,10 @@ class Crossings:
 
     # ----------------------------------------------------------------------------------------------------- of one shape
     def pairs(self, x: FloatArray) -> IntArray:
-        """Pairs of triangles that cross and share no vertex, the smaller number first, sorted.
+        """Pairs of triangles that share no vertex and cross, the smaller number first, sorted.
 
-        They cross as :func:`~torch_modal.geometry.triangle_pairs.triangles_cross` says: those that only touch, or lie
-        in one plane, do not.
-
-        Args:
-            x: *Shape:* ``(V, 3)``.
-
-        Returns:
-            *Shape:* ``(P, 2)``.
+        By :func:`~torch_modal.geometry.triangle_pairs.triangles_cross`: those that only touch, or lie in one plane, do
+        not cross. *Shape:* ``(V, 3) -> (P, 2)``.
         """
         pairs = np.sort(self._search(x), axis=1)
         one, other = (x[self.mesh.faces[side]] for side in pairs.T)
@@ -194,12 +187,12 @@ class Crossings:
         """
         own, which = np.unique(vertices, return_inverse=True)
         new = [v for v in own.tolist() if v not in self._near]
-        for part in np.array_split(new, -(-len(new) // 256) or 1):
-            reached = dijkstra(self.lengths, indices=part, limit=FAR * self.diagonal) if len(part) else []
-            self._near.update((int(v), np.flatnonzero(np.isfinite(row))) for v, row in zip(part, reached, strict=True))
-        n = self.mesh.n_vertices
+        for part in (new[i : i + 256] for i in range(0, len(new), 256)):
+            reached = dijkstra(self.lengths, indices=part, limit=FAR * self.diagonal)
+            self._near.update((v, np.flatnonzero(np.isfinite(row))) for v, row in zip(part, reached, strict=True))
         if not len(own):
             return np.ones(0, dtype=bool)
+        n = self.mesh.n_vertices
         # Sorted, as they are put together.
         codes = np.concatenate([k * n + self._near[v] for k, v in enumerate(own.tolist())])
         wanted = which.reshape(-1, 1) * n + faces

@@ -71,10 +71,7 @@ def quaternion(rotation: Tensor) -> Tensor:
 
 
 def power(q: Tensor, t: Tensor) -> Tensor:
-    """Rotations about unchanged axes by the fraction ``t`` of the angle, which is below a whole turn.
-
-    *Shape:* ``(4, ...), (...) -> (4, ...)``.
-    """
+    """Rotations by the fraction ``t`` of the angle, below a whole turn. *Shape:* ``(4, ...), (...) -> (4, ...)``."""
     return about(t * arc(q))
 
 
