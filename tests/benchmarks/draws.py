@@ -15,13 +15,12 @@ import numpy as np
 import torch
 from augment import MESHES, RandomLinear
 from cases import keyframes_of
-from measures import crossing_pairs
+from measures import HAS_CONTACT, crossing_pairs
 from numpy.typing import NDArray
 from timing import limit_threads
 from torch import Tensor
 
 import torch_modal as tm
-from torch_modal.geometry.crossings import has_contact
 
 TRANSFORMS: dict[str, tm.ShapeAugmentation] = {
     "linear": RandomLinear(p=1.0),
@@ -55,7 +54,7 @@ def measure(name: str, n: int, n_intersections: int, kinds: list[str], contact: 
     k = len(space)
     shell = tm.ShellEnergy(faces)
     volumes = shell.measure(pool.shapes.double()).volume
-    old = [around(crossing_pairs(x, faces), faces) for x in pool.shapes if has_contact()]
+    old = [around(crossing_pairs(x, faces), faces) for x in pool.shapes if HAS_CONTACT]
     for kind in kinds:
         augment = TRANSFORMS[kind]
         generator = torch.Generator().manual_seed(0)

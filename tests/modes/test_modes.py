@@ -208,8 +208,8 @@ def test_cached_modes_are_the_same_and_not_recomputed(
 
 def filled_with(monkeypatch: pytest.MonkeyPatch, solid: Tetrahedra, like: Mesh) -> None:
     """Have the lattice give these tetrahedra, placed as this surface is."""
-    own = placed(*like)
-    vertices = ((solid.vertices - own.centre) * own.scale) @ own.axes.T
+    _, axes, centre, scale = placed(*like)
+    vertices = ((solid.vertices - centre) * scale) @ axes.T
     monkeypatch.setattr(lattice_module, "lattice", lambda *_: solid._replace(vertices=vertices))
 
 

@@ -13,7 +13,7 @@ from torch_modal.data.space import ShapeSpace
 from torch_modal.data.strain import edge_strains
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import best_fit
-from torch_modal.geometry.triangle_frames import BentTriangles, bend, bent_sides, frames, sides
+from torch_modal.geometry.triangle_frames import bend, bent_sides, frames, sides
 
 # A draw beyond the bound is scaled to this part of it; its largest strain is nearly linear in the scale.
 _INSIDE = 0.98
@@ -133,6 +133,6 @@ def deform(x: Tensor, displacement: Tensor, keyframe: Tensor, reconstruction: Re
     pose = best_fit(keyframe.expand_as(x), x, weights).rotation
     turn = (pose @ turn.movedim(0, 1)).movedim(0, 1)
     rest = x.movedim(-1, 0).contiguous()
-    wanted = bent_sides(BentTriangles(turn, strain), frames(sides(rest, faces)))
+    wanted = bent_sides(turn, strain, frames(sides(rest, faces)))
     bent = reconstruction(wanted, rest).movedim(0, -1)
     return best_fit(bent, x, weights).apply(bent)

@@ -34,11 +34,11 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> tuple[Float
         degenerate or repeated, *shape* ``(F', 3)``; the collapses in order, the vertex that remains and the one that
         does not, *shape* ``(n, 2)``.
     """
-    shape = placed(vertices, faces)
-    order = vertex_order(shape.points)
+    points, axes, centre, scale = placed(vertices, faces)
+    order = vertex_order(points)
     rank = np.argsort(order)
-    sorted_points = np.ascontiguousarray(shape.points[order])
-    sorted_faces = np.ascontiguousarray(rank[ordered_faces(shape.points, faces)], dtype=np.int32)
+    sorted_points = np.ascontiguousarray(points[order])
+    sorted_faces = np.ascontiguousarray(rank[ordered_faces(points, faces)], dtype=np.int32)
 
     def simplified(points: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
         with _NOT_THREAD_SAFE:
@@ -53,5 +53,5 @@ def decimate(vertices: FloatArray, faces: IntArray, n_faces: int) -> tuple[Float
         shifted = simplified(sorted_points + shifts)
         if len(shifted[1]) <= _STUCK * n_faces:
             points, triangles, collapses = shifted
-    points = points.astype(np.float64) @ shape.axes / shape.scale + shape.centre
-    return points, triangles.astype(np.int64), order[collapses].reshape(-1, 2)
+    positions = points.astype(np.float64) @ axes / scale + centre
+    return positions, triangles.astype(np.int64), order[collapses].reshape(-1, 2)

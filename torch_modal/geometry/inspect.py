@@ -53,8 +53,7 @@ def consistent_winding(mesh: Connectivity) -> tuple[IntArray, IntArray, IntArray
     signs = mesh.signs[mesh.hinge_sides]
     crossed = (signs[:, 0] == signs[:, 1]) * n_faces
     if not crossed.any():
-        none = np.zeros(0, dtype=np.int64)
-        return faces, none, none
+        return faces, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     pairs = np.stack([np.append(one, one + n_faces), np.append(two + crossed, two + n_faces - crossed)], axis=1)
     label = connected_pieces(pairs, 2 * n_faces)
     as_is, turned = label[:n_faces], label[n_faces:]

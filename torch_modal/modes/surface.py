@@ -74,12 +74,12 @@ class CanonicalSurface:
                 f"all vertices lie on a line: the extents are {extents[0]:.3g}, {extents[1]:.3g} and {extents[2]:.3g}; "
                 "a surface has an area"
             )
-        own = placed(points, compact.reshape(-1, 3))
-        ordered = ordered_faces(own.points, compact.reshape(-1, 3))
+        points, axes, _, scale = placed(points, compact.reshape(-1, 3))
+        ordered = ordered_faces(points, compact.reshape(-1, 3))
         # fTetWild keeps the volume with positive winding number, which is empty for an inverted mesh.
-        if signed_volume(own.points - own.points.mean(axis=0), ordered) < 0:
+        if signed_volume(points - points.mean(axis=0), ordered) < 0:
             ordered = np.ascontiguousarray(ordered[:, ::-1])
-        return cls(own.points, ordered, used, own.scale, own.axes)
+        return cls(points, ordered, used, scale, axes)
 
     def require_solid(self) -> None:
         """Raise a MeshError for a planar surface, which has no interior."""

@@ -17,7 +17,7 @@ from torch_modal.backends.torch.backend import TorchBackend
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory
 from torch_modal.geometry.rotations import exp
-from torch_modal.geometry.triangle_frames import Frames, bend, convected, frames, sides
+from torch_modal.geometry.triangle_frames import Frames, bend, frames, sides
 from torch_modal.keyframes.arrays import checked_times
 from torch_modal.keyframes.check import checked_arrays
 from torch_modal.motion.cubics import by_interval, located
@@ -84,8 +84,9 @@ class ModalDecoder(nn.Module):
         rms = modes.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
         displaced = (modes * (UNIT * self.size / rms)[:, None, None]).movedim(-1, 0).contiguous()
         own = frames(sides(self.reference.T[:, None].contiguous(), self.faces))
+        turn, strain = bend(sides(displaced, self.faces), own)
         #: What an amplitude of 1 does to each triangle. *Shape:* ``(k, 6, F)``.
-        self.register_buffer("columns", _bounded(convected(bend(sides(displaced, self.faces), own), own), own))
+        self.register_buffer("columns", _bounded(torch.cat([own.coordinates(turn), strain]), own))
         #: What it does to the centres of loose pieces, if there are several. *Shape:* ``(k, 3V)``, or none.
         several = int(self._mesh.vertex_pieces.max()) > 0
         centres = (

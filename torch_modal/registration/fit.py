@@ -96,7 +96,8 @@ class ElasticSurface:
         for _ in range(rounds):
             frames = self.local_frames(x)
             wanted = 0.5 * np.einsum("eij,ej->ei", frames[self._i] + frames[self._j], self._sides)
-            x = solver.solve(self._gather @ (self._weights[:, None] * wanted) + pulled)
+            right = self._gather @ (self._weights[:, None] * wanted) + pulled
+            x = solver(torch.from_numpy(right)).numpy()
         return x
 
 

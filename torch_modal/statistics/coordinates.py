@@ -8,15 +8,7 @@ from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations
 from torch_modal.geometry.poisson import Reconstruction
 from torch_modal.geometry.rigid import RigidMotion, best_fit
-from torch_modal.geometry.triangle_frames import (
-    BentTriangles,
-    Frames,
-    Sides,
-    bending_between,
-    bent_sides,
-    frames,
-    sides,
-)
+from torch_modal.geometry.triangle_frames import Sides, bending_between, bent_sides, frames_of
 
 # Logarithmic strains beyond this, a factor of 3,000, are those of triangles without area.
 MOST_STRAIN = 8.0
@@ -41,7 +33,7 @@ class BendingCoordinates:
         self.mean, self.faces = mean, faces
         self.mesh = Connectivity(faces.numpy(), len(mean))
         self.reconstruction = Reconstruction(mean, faces)
-        self.frames = self._frames(mean[None])
+        self.frames = frames_of(mean[None], faces)
         areas = 0.5 * self.frames.doubled_areas[0]
         self._has_area = areas > SMALLEST_AREA * areas.mean()
         self.size = size(mean.numpy(), faces.numpy())
@@ -58,9 +50,6 @@ class BendingCoordinates:
         #: Weights of squared coordinates: parts of the area, twice beside the diagonal of strains. *Shape:* ``(6, E)``.
         self.shares = parts * areas.new_tensor([1, 1, 1, 1, 2, 1])[:, None]
 
-    def _frames(self, x: Tensor) -> Frames:
-        return frames(sides(x.movedim(-1, 0).contiguous(), self.faces))
-
     def of(self, shapes: Tensor) -> Tensor:
         """The coordinates of shapes, in the pose in which they fit the mean best. *Shape:* ``(B, V, 3) -> (B, 6, E)``.
 
@@ -69,9 +58,9 @@ class BendingCoordinates:
         found, placed = [], self.aligned(shapes)
         for x in placed:
             rotations = LocalRotations(self.mesh, torch.stack([self.mean, x.detach()]))
-            own = self._frames(x[None])
-            bending = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
-            turn, strain = bending.turn[:, 0], torch.stack(bending.strain)[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
+            own = frames_of(x[None], self.faces)
+            turn, strain = bending_between(self.frames, own, rotations.turns(self.mean[None], x[None]))
+            turn, strain = turn[:, 0], strain[:, 0].clamp(-MOST_STRAIN, MOST_STRAIN)
             areas = own.doubled_areas[0]
             flat = ~self._has_area | (areas <= SMALLEST_AREA * areas.mean())
             flat = flat | ~(turn.isfinite().all(0) & strain.isfinite().all(0))
@@ -112,7 +101,7 @@ class BendingCoordinates:
     def sides(self, coordinates: Tensor) -> Sides:
         """Target sides of the triangles. *Shape:* ``(B, 6, E)``."""
         rows = coordinates[..., : len(self.faces)].movedim(1, 0)
-        return bent_sides(BentTriangles(rows[:3], (rows[3], rows[4], rows[5])), self.frames)
+        return bent_sides(rows[:3], rows[3:], self.frames)
 
     def shapes(self, coordinates: Tensor) -> Tensor:
         """The shapes of coordinates, in the pose of the mean. *Shape:* ``(B, 6, E) -> (B, V, 3)``."""

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_modal.autograd import recorded
 from torch_modal.backends.torch.fine_steps import conjugate_gradients
 from torch_modal.geometry.rigid import RigidMotion, best_fit
-from torch_modal.geometry.triangle_frames import Sides, edge_means
+from torch_modal.geometry.triangle_frames import edge_means
 from torch_modal.solve.fitting import levenberg_marquardt
 from torch_modal.statistics.variation import Variation
 
@@ -168,13 +168,13 @@ class LocalWeights:
         for piece, anchors in reconstruction.loose:
             # A loose piece goes where the vertices go that it follows.
             parts[:, anchors] += parts[:, piece].sum(1, keepdim=True) / len(anchors)
-        sides = [parts.new_zeros(1, n, len(own.faces)).requires_grad_() for _ in range(2)]
+        first, second = (parts.new_zeros(1, n, len(own.faces)).requires_grad_() for _ in range(2))
         with torch.enable_grad():
             weights, signs = reconstruction.weights, reconstruction.signs
-            edges = edge_means(Sides(*sides), weights, reconstruction.sides, signs, len(reconstruction.edges))
+            edges = edge_means((first, second), weights, reconstruction.sides, signs, len(reconstruction.edges))
             found = reconstruction.poisson(edges, parts.new_zeros(1, n, v))
-            first, second = torch.autograd.grad((found[0] * parts).sum(), sides)
-        return first[0], second[0]
+            of_first, of_second = torch.autograd.grad((found[0] * parts).sum(), (first, second))
+        return of_first[0], of_second[0]
 
 
 class _FactorsOfPoints(torch.autograd.Function):
