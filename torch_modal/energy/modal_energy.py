@@ -146,7 +146,11 @@ class ModalEnergy(nn.Module):
         gradients, inner, curved = [], [], []
         for i, (part, one) in enumerate(zip(self.energy.parts, at, strict=True)):
             columns = getattr(self, f"edge_vectors_{i}") if self.tabulated else self._edge_vectors(i)
-            gradient, own = self._of_total(one) if part.term.total else _normal_equations(one, columns)
+            if part.term.total:
+                row = self._along_columns(one.gradients)
+                gradient, own = one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
+            else:
+                gradient, own = _normal_equations(one, columns)
             gradients.append(gradient)
             inner.append(own)
             if second_order:
@@ -180,11 +184,6 @@ class ModalEnergy(nn.Module):
     def _along_columns(self, extended: Tensor) -> Tensor:
         """From gradients in the vertices to those in the amplitudes. *Shape:* ``(3, B, V) -> (B, n)``."""
         return extended.transpose(0, 1).flatten(1) @ self.columns.flatten(1).mT
-
-    def _of_total(self, one: Linearised) -> tuple[Tensor, Tensor]:
-        """Contribution of a total to the gradient and to Gauss-Newton's Hessian."""
-        row = self._along_columns(one.gradients)
-        return one.slope * row, one.curvature[..., None] * row[:, :, None] * row[:, None, :]
 
 
 def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]:

@@ -89,7 +89,7 @@ class LocalRotations(nn.Module):
         self.register_buffer("ancestors", torch.stack(ancestors), persistent=False)
         self.register_buffer("piece", piece, persistent=False)
         self.n_edges, self.n_pieces = len(mesh.edges), int(piece.max()) + 1
-        wound = self._wound(a, b)
+        wound = self.wound(a, b)
         #: For rotations beyond a full turn; None where there are none.
         self.clusters = Clusters(*wound) if beyond_a_turn(*wound) else None
 
@@ -144,12 +144,8 @@ class LocalRotations(nn.Module):
         products = torch.stack([zero.index_add(-1, self.piece, row) for row in rows], -1).movedim(2, 1)
         return pick(agreeing(products, weights[:, None]).mT, self.piece)
 
-    def is_beyond_a_turn(self, first: Tensor, second: Tensor) -> bool:
-        """True where parts turn by more than a full turn from each other. *Shape of each:* ``(V, 3)``."""
-        return beyond_a_turn(*self._wound(self.frames(first[None]), self.frames(second[None])))
-
-    def _wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Arguments of :class:`Clusters`."""
+    def wound(self, a: Frames, b: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Arguments of :class:`Clusters`, from one shape to another."""
         areas = (a.doubled_areas + b.doubled_areas).squeeze(0)
         return _turn_between(a, b).squeeze(1), areas, self.ancestors, self.piece
 

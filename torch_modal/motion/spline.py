@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import full_precision
 from torch_modal.backends.torch.backend import TorchBackend
+from torch_modal.geometry.clusters import beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import Trajectory, weights_per_length
 from torch_modal.geometry.rigid import best_rotation, centroid
@@ -73,7 +74,8 @@ class Spline(nn.Module):
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         for i in range(1, len(times) - 1):
             ends = references[[i, (i + 1) % n]]
-            plain = first.clusters is None and not first.is_beyond_a_turn(*ends)
+            wound = first.wound(*(first.frames(x[None]) for x in ends))
+            plain = first.clusters is None and not beyond_a_turn(*wound)
             if plain:
                 turns = first.turns(ends[:1], ends[1:])[:, 0]
                 plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
