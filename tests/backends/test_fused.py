@@ -382,25 +382,25 @@ class TestBackend:
     def test_not_installed(self, monkeypatch: pytest.MonkeyPatch, small_bars: Shapes) -> None:
         there = importlib.util.find_spec
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else there(name))
-        backend._works.cache_clear()
+        backend.WarpBackend.works.cache_clear()
         try:
             assert type(tm.InBetween(small_bars.bases[:2], small_bars.faces).core.fine) is FineEnergy
             with pytest.raises(MissingPackageError, match="pip install warp-lang"):
                 tm.InBetween(small_bars.bases[:2], small_bars.faces, solver=tm.Solver(backend="warp"))
         finally:
-            backend._works.cache_clear()
+            backend.WarpBackend.works.cache_clear()
 
     def test_not_usable(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def broken(name: str) -> None:
             raise OSError("the cache folder is not writable")
 
         monkeypatch.setattr(backend, "kernels", broken)
-        backend._works.cache_clear()
+        backend.WarpBackend.works.cache_clear()
         try:
             with pytest.warns(UserWarning, match="the cache folder is not writable"):
                 assert type(choose("auto")) is TorchBackend
         finally:
-            backend._works.cache_clear()
+            backend.WarpBackend.works.cache_clear()
 
     def test_one_module_is_loaded_without_the_others_and_without_a_word(self) -> None:
         code = (

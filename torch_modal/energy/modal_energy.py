@@ -75,9 +75,8 @@ class ModalEnergy(nn.Module):
         rows = self.energy.extend(columns.movedim(-1, 0))
         self.register_buffer("columns", rows.transpose(0, 1).contiguous(), persistent=False)
         for i in range(len(self.energy.parts)):
-            self.register_buffer(
-                f"edge_vectors_{i}", self._edge_vectors(i) if self.tabulated else None, persistent=False
-            )
+            table = self._edge_vectors(i) if self.tabulated else None
+            self.register_buffer(f"edge_vectors_{i}", table, persistent=False)
 
     def _edge_vectors(self, i: int) -> Tensor:
         """Edge vectors of the elements of a term along each column. *Shape:* ``(M, 3 (c-1), n)``."""
@@ -187,14 +186,9 @@ class ModalEnergy(nn.Module):
 
 
 def _normal_equations(one: Linearised, columns: Tensor) -> tuple[Tensor, Tensor]:
-    """Contribution of one term to the gradient and to Gauss-Newton's Hessian.
+    """Contribution of one term to the gradient and to Gauss-Newton's Hessian, by edge vectors along the columns.
 
-    Args:
-        one: The term.
-        columns: Edge vectors in each direction of the space. *Shape:* ``(M, c, n)``, with ``c = 3 (n-1)``.
-
-    Returns:
-        *Shape:* ``(B, n)``, ``(B, n, n)``.
+    *Shape:* ``(M, c, n) -> (B, n), (B, n, n)``, with ``c`` three times the number of edge vectors.
     """
     # Rows of the Jacobian are scaled before they pass through the columns, where they are few numbers.
     root = one.curvature.clamp_min(torch.finfo(one.curvature.dtype).tiny).sqrt()

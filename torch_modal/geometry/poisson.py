@@ -57,7 +57,9 @@ class Poisson(nn.Module):
 
     def _solver_of(self, weights: Tensor) -> SparseSolver:
         """Inverse of the Laplacian for the current weights, which ``functional_call`` may replace."""
-        if self._made is None or not _equal(weights, self._made[0]):
+        known = None if self._made is None else self._made[0]
+        alike = known is not None and (known.dtype, known.device) == (weights.dtype, weights.device)
+        if self._made is None or not (known is weights or (alike and torch.equal(weights, self._made[0]))):
             laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
             # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
             self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy().copy())
@@ -164,10 +166,6 @@ class Reconstruction(nn.Module):
             moved = placed[..., piece] + (motion.apply(centre) - centre).movedim(-1, 0)
             out = out.index_copy(-1, piece, moved)
         return out
-
-
-def _equal(a: Tensor, b: Tensor) -> bool:
-    return a is b or (a.dtype == b.dtype and a.device == b.device and torch.equal(a, b))
 
 
 def _nearest(points: FloatArray, piece: FloatArray) -> IntArray:

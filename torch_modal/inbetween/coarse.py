@@ -68,22 +68,13 @@ class CoarseMesh(nn.Module):
         return means.reshape(*x.shape[:-2], self.n_vertices, 3)
 
 
-def resolving(
-    shapes: Tensor,
-    faces: Tensor,
-    n_faces: int,
-    modes: Sequence[Tensor],
-) -> Coarsening:
+def resolving(shapes: Tensor, faces: Tensor, n_faces: int, modes: Sequence[Tensor]) -> Coarsening:
     """A coarse mesh of so many faces, or of more, where those do not resolve the modes.
 
     A flat shape does not tell where the other one bends: the collapses are then those of the other, and there are
     ``ENOUGH_FACES`` or more.
 
-    Args:
-        shapes: Float64 on the CPU. *Shape:* ``(K, V, 3)``.
-        faces: Vertex indices. *Shape:* ``(F, 3)``.
-        n_faces: How many are wanted.
-        modes: Of the shapes, in their axes. *Shape of each:* ``(k, V, 3)``.
+    Arguments as for :class:`CoarseMesh`.
     """
     enough = min(ENOUGH_FACES, len(faces))
     flat = [is_flat(x[faces.unique()].numpy()) for x in shapes]

@@ -73,12 +73,9 @@ def _mixed(mix: Tensor, fields: Tensor) -> Tensor:
 
 
 def _orthonormal(fields: Tensor, weights: Tensor, most: int | None = None) -> Tensor:
-    """Combinations that are orthonormal; dependent ones are dropped. *Shape:* ``(m, V, 3), (V,) -> (n, m)``.
+    """Combinations that are orthonormal, at most so many: those that the fields have most in common.
 
-    Args:
-        fields: *Shape:* ``(m, V, 3)``.
-        weights: Of the vertices. *Shape:* ``(V,)``.
-        most: Number of combinations at most: those that the fields have most in common.
+    Dependent ones are dropped. *Shape:* ``(m, V, 3), (V,) -> (n, m)``.
     """
     values, vectors = torch.linalg.eigh((fields * weights[:, None]).flatten(1) @ fields.flatten(1).mT)
     keep = values > DEPENDENT * values.amax().clamp_min(torch.finfo(values.dtype).tiny)

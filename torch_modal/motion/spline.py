@@ -75,10 +75,9 @@ class Spline(nn.Module):
         for i in range(1, len(times) - 1):
             ends = references[[i, (i + 1) % n]]
             wound = first.wound(*(first.frames(x[None]) for x in ends))
-            plain = first.clusters is None and not beyond_a_turn(*wound)
-            if plain:
-                turns = first.turns(ends[:1], ends[1:])[:, 0]
-                plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
+            turns = first.turns(ends[:1], ends[1:])[:, 0]
+            alike = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
+            plain = first.clusters is None and not beyond_a_turn(*wound) and alike
             self.rotations.append(first if plain else backend.rotations(mesh, ends))
 
     @full_precision

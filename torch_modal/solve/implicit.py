@@ -67,15 +67,7 @@ class _ArgMin(torch.autograd.Function):
 def _adjoint(
     energy: AmplitudeEnergy, tree: Any, amplitudes: Tensor, status: Tensor, *tensors: Tensor
 ) -> Callable[[Tensor], tuple[Tensor, ...]]:
-    """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear.
-
-    Args:
-        energy: The energy of the amplitudes.
-        tree: Skeleton of the placement.
-        amplitudes: That were found. *Shape:* ``(B, n)``.
-        status: *Shape:* ``(B,)``.
-        tensors: Of the placement.
-    """
+    """From gradients in the amplitudes, ``(B, n)``, to those in the tensors of the placement: linear."""
     placement = trees.filled(tree, tensors)
     converged = (status == Status.CONVERGED)[:, None]
     derivatives = energy.derivatives(amplitudes, placement)
@@ -125,8 +117,8 @@ def solve_implicit(
         max_steps: Of :func:`~torch_modal.solve.minimise.minimise`.
         tolerance: Likewise.
     """
-    limits = max_steps, tolerance
-    return Solution(*applied(_ArgMin, energy, limits, trees.skeleton(placement), usable, *trees.leaves(placement)))
+    given = energy, (max_steps, tolerance), trees.skeleton(placement), usable, *trees.leaves(placement)
+    return Solution(*applied(_ArgMin, *given))
 
 
 def solve_unrolled(

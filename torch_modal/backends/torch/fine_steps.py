@@ -300,16 +300,9 @@ class FineEnergy(nn.Module):
     def relax(
         self, x: Tensor, rests: RestShapes, stages: Sequence[tuple[int, int]], beside: Beside | None = None
     ) -> Tensor:
-        """Steps of all vertices, never uphill (:func:`~torch_modal.backends.torch.fine_steps.relax`).
+        """Steps of all vertices, never uphill: stages of :func:`relax` by numbers of steps and products.
 
-        Args:
-            x: Initial shapes. *Shape:* ``(B, V, 3)``.
-            rests: The rest shapes.
-            stages: Newton steps, and iterations of conjugate gradients in each.
-            beside: Energies beside that of the terms.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
+        *Shape:* ``(B, V, 3)``.
         """
         size, parts = chunk_of(x.shape[1], x.device), []
         for i in range(0, len(x), size):

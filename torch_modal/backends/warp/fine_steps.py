@@ -57,35 +57,14 @@ class WarpSteps(WarpShell):
     """:func:`torch_modal.backends.torch.fine_steps.relax` for the terms of Eq. 5 alone, in float64."""
 
     def forward(self, x: Tensor, to: ShellReference, n_steps: int, n_products: int) -> Tensor:
-        """Steps of all vertices.
-
-        Args:
-            x: Initial shapes. *Shape:* ``(B, V, 3)``.
-            to: The reference.
-            n_steps: Newton steps.
-            n_products: Iterations of conjugate gradients in each.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
-        """
+        """Steps of all vertices: some Newton steps, with some conjugate gradients in each. *Shape:* ``(B, V, 3)``."""
         return fused(_Relaxed(self, n_steps, n_products), x, *to[:3])[0].to(x) if n_steps else x
 
     @torch.no_grad()
     def descend(
         self, x: Tensor, to: ShellReference, others: Sequence[FurtherEnergy], n_steps: int, n_products: int
     ) -> Tensor:
-        """Steps of all vertices with other energies beside Eq. 5; they have no gradient.
-
-        Args:
-            x: Initial shapes, float64. *Shape:* ``(B, V, 3)``.
-            to: The reference of Eq. 5.
-            others: The other energies.
-            n_steps: Newton steps.
-            n_products: Iterations of conjugate gradients in each.
-
-        Returns:
-            *Shape:* ``(B, V, 3)``.
-        """
+        """Steps with other energies beside Eq. 5, without gradient. Arguments as for :meth:`forward`, in float64."""
         for _ in range(n_steps):
             at, more = self.at(x, to), [other.at(x) for other in others]
             before = sum((one.value for one in more), start=at.energy)
