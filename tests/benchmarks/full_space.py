@@ -32,7 +32,6 @@ RIDGE = 1e-9
 HELD_ALTITUDE = 0.005
 HOLD = 1e9
 
-MAX_STEPS = 100
 # The energy stagnates when this many steps together gain less than this part of it.
 STAGNATION_STEPS, TOLERANCE = 5, 1e-8
 
@@ -56,6 +55,9 @@ def full_space(
     *,
     start: Tensor | None = None,
     example_based: bool = False,
+    fixed: Tensor | None = None,
+    size: float | None = None,
+    max_steps: int = 100,
 ) -> FullSpaceResult:
     r"""The shape that minimises :math:`(1-t)\, d(x_a, x) + t\, d(x_b, x)` (Eq. 5) over all vertices.
 
@@ -71,9 +73,12 @@ def full_space(
             *Shape:* ``(V, 3)``.
         example_based: One reference whose lengths, angles, volume and weights are interpolated between those of the
             key-frames, in place of two (Froehlich and Botsch 2011).
+        fixed: Vertices that stay where the start has them. *Shape:* ``(V,)``, bool.
+        size: Bounding-box diagonal of the whole that these shapes are a part of. Default: that of ``x_a``.
+        max_steps: Newton steps at most.
     """
     first, second = x_a.double(), x_b.double()
-    scale = CANONICAL_SIZE / (first.amax(0) - first.amin(0)).norm()
+    scale = CANONICAL_SIZE / ((first.amax(0) - first.amin(0)).norm() if size is None else size)
     weights = torch.from_numpy(connectivity.vertex_areas(first.numpy(), faces.numpy()))
     first, second = first * scale, second * scale
     back = best_fit(second, first, weights)
@@ -90,7 +95,9 @@ def full_space(
     reference = energy.among(rests, torch.stack([1 - at_t, at_t], -1), stiffness)
     if example_based:
         reference = energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
-    rows, energies, stagnated = _minimise(energy, faces, x.T[:, None].contiguous(), reference)
+    fixed = torch.zeros(len(first), dtype=torch.bool) if fixed is None else fixed
+    start_rows = x.T[:, None].contiguous()
+    rows, energies, stagnated = _minimise(energy, faces, start_rows, reference, fixed, max_steps)
     return FullSpaceResult((motion.apply(rows[:, 0].T) / scale).to(x_a), energies, stagnated)
 
 
@@ -103,13 +110,16 @@ def _interpolated(energy: Energy, first: Rest, second: Rest, t: float) -> Rest:
     return Rest(measures, tuple(torch.lerp(a, b, t) for a, b in zip(first.weights, second.weights, strict=True)))
 
 
-def _minimise(energy: Energy, faces: Tensor, rows: Tensor, reference: Reference) -> tuple[Tensor, list[float], bool]:
+def _minimise(
+    energy: Energy, faces: Tensor, rows: Tensor, reference: Reference, fixed: Tensor, max_steps: int
+) -> tuple[Tensor, list[float], bool]:
     assembly = _Assembly(energy)
     energies = [float(energy.value(energy.extend(rows), reference))]
-    for _ in range(MAX_STEPS):
-        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), _held(faces, rows))
+    for _ in range(max_steps):
+        held = _held(faces, rows) | fixed
+        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held)
         for length in STEP_LENGTHS:
-            moved = rows + length * direction
+            moved = rows + length * torch.where(fixed, 0, direction)
             found = float(energy.value(energy.extend(moved), reference))
             if found < energies[-1]:
                 break
