@@ -160,7 +160,8 @@ def made_outside(make: Callable[..., Made], *seen: Tensor) -> Made:
         with _disable_current_modes(), torch._C.DisableTorchFunction():
             return lasting(make)(*seen)
     found: list[Made] = []
-    _Outside.apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
+    apply = torch.compiler.disable(_Outside.apply) if torch.compiler.is_compiling() else _Outside.apply
+    apply(lambda *given: found.append(make(*given)), torch.empty(0), *seen)
     return found[0]
 
 

@@ -292,6 +292,7 @@ def test_loaded_state(name: str, how: str, made: Made) -> None:
 @every_layer
 def test_compiled(name: str, made: Made) -> None:
     """What a layer makes at its first use is made outside of the trace: SciPy cannot be traced."""
+    torch.compiler.reset()  # what was compiled often is not compiled again
     new = made.case.make(made.shapes)
     assert_near(torch.compile(lambda x: made.call(x, new), backend="eager")(made.x), made.truth, 1e-9)
 
