@@ -22,18 +22,18 @@ import torch_modal as tm
 
 BOUNDS = {
     "lines": 25993,
-    "lines of code": 16500,
+    "lines of code": 16498,
     "files": 188,
     "functions": 1450,
     "named tuples": 52,
-    "docstrings that begin with no noun": 13,
+    "docstrings that begin with no noun": 12,
     "functions of in-between": 150,
     "files of in-between": 32,
     "functions of in-between, forward and backward": 172,
     "files of in-between, forward and backward": 32,
-    "functions of subdivide": 172,
+    "functions of subdivide": 173,
     "files of subdivide": 35,
-    "functions of making a layer": 146,
+    "functions of making a layer": 147,
     "files of making a layer": 41,
 }
 

@@ -57,13 +57,16 @@ class Poisson(nn.Module):
 
     def _solver_of(self, weights: Tensor) -> SparseSolver:
         """Inverse of the Laplacian for the current weights, which ``functional_call`` may replace."""
-        known = None if self._made is None else self._made[0]
-        alike = known is not None and (known.dtype, known.device) == (weights.dtype, weights.device)
-        if self._made is None or not (known is weights or (alike and torch.equal(weights, self._made[0]))):
-            laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
-            # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
-            self._made = weights, SparseSolver(laplacian, self.free.cpu().numpy().copy())
-        return self._made[1]
+        if self._made is not None:
+            known, solver = self._made
+            alike = (known.dtype, known.device) == (weights.dtype, weights.device)
+            if known is weights or (alike and torch.equal(known, weights)):
+                return solver
+        laplacian = graph_laplacian(self.edges.cpu().numpy(), weights.double().cpu().numpy(), len(self.piece))
+        # A copy: `share_memory()`, as for spawned workers, frees what is under the view of a tensor.
+        solver = SparseSolver(laplacian, self.free.cpu().numpy().copy())
+        self._made = weights, solver
+        return solver
 
     def forward(self, wanted: Tensor, near: Tensor) -> Tensor:
         """The shape that fits target edge vectors.

@@ -52,6 +52,7 @@ class CoarseMesh(nn.Module):
 
         self.n_vertices = coarsening.n_vertices
         self.register_buffer("faces", torch.from_numpy(coarsening.faces), persistent=False)
+        self.mesh = Mesh.of(self.faces, self.n_vertices)
         self.register_buffer("weights", per_cluster.index_add(0, clusters, weights), persistent=False)
         self.register_buffer("clusters", clusters, persistent=False)
         shares = member / per_cluster.index_add(0, clusters, member)[clusters]

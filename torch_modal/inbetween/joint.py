@@ -12,7 +12,6 @@ from torch_modal.backends.torch.fine_steps import FineEnergy
 from torch_modal.energy.energy import Energy, OnMesh, RestShapes
 from torch_modal.energy.modal_energy import Derivatives, ModalEnergy, Placement
 from torch_modal.energy.shell import N_SHELL_TERMS
-from torch_modal.energy.term import Mesh
 from torch_modal.inbetween.coarse import CoarseMesh
 from torch_modal.inbetween.subspace import SubspaceBasis
 
@@ -38,7 +37,7 @@ class JointSpace(nn.Module):
         self, coarse: CoarseMesh, fine: FineEnergy, backend: TorchBackend, basis: SubspaceBasis, anchor: float = 0.0
     ) -> None:
         super().__init__()
-        mesh, terms = Mesh.of(coarse.faces, coarse.n_vertices), fine.terms
+        mesh, terms = coarse.mesh, fine.terms
         kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
         members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
         #: The terms of each part.

@@ -84,15 +84,14 @@ class PairedSpace(nn.Module):
     def value(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """Energy at ``a``. *Shape:* ``(..., B, n) -> (..., B)``."""
         a1, a2 = self.split(a)
-        similarity = (a * (a @ self.gap_gram + 2 * placement.linear)).sum(-1) + placement.constant
         strain = self.first.value(a1, placement.first) + self.second.value(a2, placement.second)
-        return strain + placement.mu * similarity
+        return strain + self._similarity(a, placement)[0]
 
     def derivatives(self, a: Tensor, placement: PairedPlacement, second_order: bool = True) -> Derivatives:
         """Gradient and Hessians at ``a``; the similarity is quadratic and part of Gauss-Newton's."""
         ends = self._ends(a, placement)
         first, second = (space.derivatives(part, place, second_order) for space, part, place in ends)
-        gradient = torch.cat([first.gradient, second.gradient], -1) + self._pull(a, placement)
+        gradient = torch.cat([first.gradient, second.gradient], -1) + self._similarity(a, placement)[1]
         similar = 2 * placement.mu[:, None, None] * self.gap_gram
         gauss_newton = _block_diagonal(first.gauss_newton, second.gauss_newton) + similar
         curved = _block_diagonal(first.second_order, second.second_order) if second_order else None
@@ -101,18 +100,19 @@ class PairedSpace(nn.Module):
     def value_and_gradient(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
         """Energy and gradient at ``a``. *Shape:* ``(B, n) -> (B,), (B, n)``."""
         first, second = (space.value_and_gradient(part, place) for space, part, place in self._ends(a, placement))
-        similarity = (a * (a @ self.gap_gram + 2 * placement.linear)).sum(-1) + placement.constant
-        value = first[0] + second[0] + placement.mu * similarity
-        return value, torch.cat([first[1], second[1]], -1) + self._pull(a, placement)
+        similarity, pull = self._similarity(a, placement)
+        return first[0] + second[0] + similarity, torch.cat([first[1], second[1]], -1) + pull
 
     def gradient(self, a: Tensor, placement: PairedPlacement) -> Tensor:
         """Gradient at ``a``, to be differentiated. *Shape:* ``(B, n) -> (B, n)``."""
         ends = [space.gradient(part, place) for space, part, place in self._ends(a, placement)]
-        return torch.cat(ends, -1) + self._pull(a, placement)
+        return torch.cat(ends, -1) + self._similarity(a, placement)[1]
 
-    def _pull(self, a: Tensor, placement: PairedPlacement) -> Tensor:
-        """Gradient of the similarity."""
-        return 2 * placement.mu[:, None] * (a @ self.gap_gram + placement.linear)
+    def _similarity(self, a: Tensor, placement: PairedPlacement) -> tuple[Tensor, Tensor]:
+        """The energy of the similarity and its gradient. *Shape:* ``(..., B, n) -> (..., B), (..., B, n)``."""
+        grown = a @ self.gap_gram
+        value = (a * (grown + 2 * placement.linear)).sum(-1) + placement.constant
+        return placement.mu * value, 2 * placement.mu[:, None] * (grown + placement.linear)
 
     def _ends(
         self, a: Tensor, placement: PairedPlacement

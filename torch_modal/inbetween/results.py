@@ -71,6 +71,8 @@ def report(solution: Solution, solver: Solver) -> None:
 
 
 def _report(status: Tensor, max_steps: int, forbid: bool) -> None:
+    if not bool((status != Status.CONVERGED).any()):
+        return
     counts = {kind.name: int((status == kind).sum()) for kind in Status if kind}
     fell, missed = counts.pop(Status.FELL_BACK.name), sum(counts.values())
     if missed:

@@ -74,10 +74,12 @@ class Spline(nn.Module):
         one, other = torch.tensor(mesh.face_neighbours).unbind(1)
         for i in range(1, len(times) - 1):
             ends = references[[i, (i + 1) % n]]
-            wound = first.wound(*(first.frames(x[None]) for x in ends))
-            turns = first.turns(ends[:1], ends[1:])[:, 0]
-            alike = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
-            plain = first.clusters is None and not beyond_a_turn(*wound) and alike
+            plain = first.clusters is None
+            if plain:
+                plain = not beyond_a_turn(*first.wound(*(first.frames(x[None]) for x in ends)))
+            if plain:
+                turns = first.turns(ends[:1], ends[1:])[:, 0]
+                plain = bool(((pick(turns, one) * pick(turns, other)).sum(0) >= 0).all())
             self.rotations.append(first if plain else backend.rotations(mesh, ends))
 
     @full_precision

@@ -85,7 +85,7 @@ def _adjoint(
         adjoint = torch.where(converged & ~singular, adjoint, 0)
         if recorded(adjoint, *tensors):
             return tuple(torch.func.vjp(slope, *tensors)[1](-adjoint))
-        with torch.enable_grad():
+        with torch.enable_grad():  # by kernels, which the tensors of a transform would not reach
             leaves = [x.detach().requires_grad_() for x in tensors]
             return torch.autograd.grad(slope(*leaves), leaves, -adjoint, allow_unused=True, materialize_grads=True)
 

@@ -20,7 +20,6 @@ _UNPACKED = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 # Where steps are small, the curvature along them is rounding of energies.
 SLIGHT = 1e-5 * CANONICAL_SIZE
 
-
 # Vertices of all samples that are relaxed at a time: more would not fit into a processor's caches, or, of a GPU, into
 # its memory (6 KB a vertex where gradients are recorded).
 CHUNK = 20_000

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.backends.torch.distortion import Distortion
-from torch_modal.backends.warp.launch import Constants, kernels, launch
+from torch_modal.backends.warp.launch import Constants, kernels, launch, records
 from torch_modal.energy.energy import Energy, RestShapes
 from torch_modal.energy.term import Mesh
 
@@ -17,18 +17,11 @@ class WarpDistortion(Distortion):
 
     def __init__(self, mesh: Mesh, further: Energy | None) -> None:
         super().__init__(mesh, further)
-        interior = torch.tensor(mesh.connectivity.counts == 2)[self.edge]
-        record = torch.cat([mesh.edges[self.edge], torch.full((len(self.edge), 2), -1)], 1)
-        record[interior] = mesh.hinges[self.hinge]
+        record = records(mesh)[self.edge]
+        hinge = (record[:, 2] >= 0).cumsum(0) - 1
+        arrays = {"record": record.int(), "hinge": hinge.int(), "capped_faces": mesh.faces[:0].int()}
         #: The elements as the first argument of the kernel.
-        self.constants = Constants(
-            "shell",
-            "Elements",
-            record=record.int(),
-            hinge=(interior.cumsum(0) - 1).int(),
-            capped_faces=mesh.faces[:0].int(),
-            n_vertices=mesh.n_vertices,
-        )
+        self.constants = Constants("elements", "Elements", **arrays, n_vertices=mesh.n_vertices)
 
     def of_shell(self, shapes: Sequence[Tensor], rests: RestShapes) -> Tensor:
         """Overrides the base class."""
@@ -40,9 +33,6 @@ class WarpDistortion(Distortion):
         n_samples, n_rests = rests.weights.shape
         found = given[0].new_zeros(len(shapes), n_samples, 2)
         sizes = [len(shapes), n_samples, n_rests, *(x.shape[-1] for x in stiffness)]
-        launch(
-            kernels("shell").distortion,
-            (n_samples, len(self.edge)),
-            [self.constants, *given, *stiffness, *sizes, found],
-        )
+        arguments = [self.constants, *given, *stiffness, *sizes, found]
+        launch(kernels("shell").distortion, (n_samples, len(self.edge)), arguments)
         return (found @ found.new_tensor(self.shares)).to(rests.weights)

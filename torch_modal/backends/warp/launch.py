@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torch_modal.energy.term import Mesh
 from torch_modal.progress import ProgressReport
 
 Module = Literal["shell", "modal", "steps", "rotations", "rotations_adjoint", "adjoints", "crossings"]
@@ -116,6 +117,13 @@ class Constants:
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_made": {}}
+
+
+def records(mesh: Mesh) -> Tensor:
+    """Vertices of each edge and of the tips of its hinge, -1 where it has none. *Shape:* ``(E, 4)``."""
+    record = torch.cat([mesh.edges, torch.full_like(mesh.edges, -1)], 1)
+    record[torch.tensor(mesh.connectivity.counts == 2)] = mesh.hinges
+    return record
 
 
 @cache

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_modal.backends.warp.function import fused
-from torch_modal.backends.warp.launch import Constants, kernels, launch
+from torch_modal.backends.warp.launch import Constants, kernels, launch, records
 from torch_modal.energy.energy import Energy, Reference, RestShapes
 from torch_modal.energy.shell import N_SHELL_TERMS
 from torch_modal.energy.stretch import MIN_RELATIVE_LENGTH
@@ -65,9 +65,8 @@ class WarpShell(nn.Module):
     def __init__(self, energy: Energy, mesh: Mesh) -> None:
         super().__init__()
         own = mesh.connectivity
-        interior = torch.tensor(own.counts == 2)
-        record = torch.cat([mesh.edges, torch.full_like(mesh.edges, -1)], 1)
-        record[interior] = mesh.hinges
+        record = records(mesh)
+        interior = record[:, 2] >= 0
         chain = torch.tensor(own.boundary_chain)
         cones = torch.cat([chain.flip(1), torch.full_like(chain[:, :1], -1)], 1)
         capped_faces = torch.cat([mesh.faces, cones])
@@ -76,7 +75,8 @@ class WarpShell(nn.Module):
         self.constants = Constants(
             "elements", "Elements", **{k: x.int() for k, x in arrays.items()}, n_vertices=own.n_vertices
         )
-        self._energy = (energy,)
+        #: The same energy in torch.
+        self.energy = energy
         self.n_vertices, self.n_edges, self.n_hinges = own.n_vertices, len(record), len(mesh.hinges)
         self.n_faces, self.closed = len(capped_faces), len(chain) == 0
         #: The edges that have a hinge. *Shape:* ``(H,)``.
@@ -85,11 +85,6 @@ class WarpShell(nn.Module):
         self.n_used = len(energy.used)
         #: Vertices of faces. *Shape:* ``(V, 1)``, bool.
         self.register_buffer("used", used.to(energy.used.device), persistent=False)
-
-    @property
-    def energy(self) -> Energy:
-        """The same energy in torch."""
-        return self._energy[0]
 
     # ---------------------------------------------------------------------------------------------------- the reference
     def reference(self, rests: RestShapes) -> ShellReference:

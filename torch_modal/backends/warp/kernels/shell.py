@@ -67,10 +67,11 @@ def sizes(
 
 
 @wp.func
-def bend_weight(h: Hinge):
+def bend_weight(h: Hinge, largest: real):
+    """Square of the edge over the area of both triangles, bounded."""
     base = wp.dot(h.e, h.e)
     area = HALF * (length_of(h.n1) + length_of(h.n2))
-    return base / wp.max(area, base / RATIO)
+    return base / wp.max(area, base / largest)
 
 
 @wp.kernel(enable_backward=False)
@@ -107,7 +108,7 @@ def rest_sums(
                 own = pull * beta[place(sample * n_beta, wp.min(mesh.hinge[place(k, 0)], n_beta - 1))]
                 p = phase_of(h)
                 t = doubled(p)
-                bend = (own * bend_weight(h)) * moments(real(1.0), p[0], p[1], t[0], t[1])
+                bend = (own * bend_weight(h, RATIO)) * moments(real(1.0), p[0], p[1], t[0], t[1])
         found = summed(edge[0], edge[1], edge[2], bend[0], bend[1], bend[2], bend[3], bend[4])
         wp.atomic_add(out, place(sample * mesh.record.shape[0], k), found)
 
@@ -335,8 +336,7 @@ def measured(x: wp.array(dtype=vec3), at: int, q: wp.vec4i):
         h = hinge_of(x, at, q)
         if not h.flat:
             phase = phase_of(h)
-            weight = real(2.0) * wp.dot(h.e, h.e) / (wp.length(h.n1) + wp.length(h.n2))
-            found = vec4(found[0], phase[0], phase[1], wp.min(weight, WEIGHT))
+            found = vec4(found[0], phase[0], phase[1], bend_weight(h, WEIGHT))
     return found
 
 
