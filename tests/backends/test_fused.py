@@ -5,7 +5,6 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,9 @@ from torch_modal.energy.term import Mesh
 from torch_modal.energy.volume import Volume
 from torch_modal.errors import MissingPackageError
 from torch_modal.geometry.canonical import CANONICAL_SIZE
+from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
+from torch_modal.geometry.poisson import Poisson
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.motion.cubics import cubics
 
@@ -244,11 +245,13 @@ class TestModal:
             torch.testing.assert_close(found, wanted, rtol=1e-11, atol=1e-9)
 
 
-def turned(rotations: LocalRotations) -> Any:
-    """Edge vectors of pairs at times."""
+def turned(rotations: WarpRotations, kind: type[LocalRotations] = WarpRotations) -> Any:
+    """Pulls of the edge vectors of pairs at times, with stiffnesses of their own."""
+    mesh = Connectivity(rotations.faces.numpy())
+    poisson = Poisson(mesh, torch.linspace(1, 2, len(mesh.edges), dtype=DOUBLE))
 
     def run(first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-        return rotations(torch.stack([first, second], 1), torch.stack([1 - t, t], -1))
+        return kind.pulls(rotations, torch.stack([first, second], 1), torch.stack([1 - t, t], -1), poisson)
 
     return run
 
@@ -262,7 +265,7 @@ class TestRotations:
     @staticmethod
     def oracle(rotations: WarpRotations) -> Any:
         """The same by torch."""
-        return turned(partial(LocalRotations.forward, rotations))  # type: ignore[arg-type]
+        return turned(rotations, LocalRotations)
 
     def test_between_two(self, rotations: WarpRotations, small_bars: Shapes) -> None:
         x = small_bars.keyframes

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.geometry.clusters import Clusters, beyond_a_turn
 from torch_modal.geometry.connectivity import Connectivity, spanning_forest
+from torch_modal.geometry.poisson import Poisson
 from torch_modal.geometry.rotations import agreeing, arc, mean, quaternion, rotate, turned
 from torch_modal.geometry.triangle_frames import (
     Frames,
@@ -133,6 +134,10 @@ class LocalRotations(nn.Module):
         xx, xy, yy = ((weights[..., None] * x).sum(-2) for x in own[3:])
         first, second = (rotate(turn, start.world(*side)) for side in mapped(xx, xy, xy, yy))
         return self._edges((first, second), self.areas.expand(len(weights), -1))
+
+    def pulls(self, shapes: Tensor, weights: Tensor, poisson: Poisson) -> Tensor:
+        """:meth:`Poisson.pulls` of these edge vectors. *Shape:* ``(B, K, V, 3), (B, K) -> (B, V, 3)``."""
+        return poisson.pulls(self(shapes, weights))
 
     def _agreeing(self, turns: Tensor, weights: Tensor) -> Tensor:
         """Signs for the pieces of K shapes, with which they turn the short way from each other.

@@ -66,11 +66,11 @@ def best_rotation(covariance: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(..., 3, 3)``, determinant one; NaN where the covariance is not finite.
     """
-    finite = covariance.detach().isfinite().all(-1).all(-1)[..., None, None]
-    u, _, vh = torch.linalg.svd(torch.where(finite, covariance.detach(), 0))  # raises on a NaN anywhere in a batch
-    sign = torch.ones_like(u[..., 0])
-    sign[..., 2] = torch.linalg.det(u @ vh)
-    rotation = torch.where(finite, (u * sign[..., None, :]) @ vh, torch.nan)
+    known = covariance.detach()
+    u, _, vh = torch.linalg.svd(known.nan_to_num(0, 0, 0))  # raises on a NaN anywhere in a batch
+    rotation = u @ vh
+    excess = torch.linalg.det(rotation)[..., None, None] - 1
+    rotation = rotation + excess * u[..., 2:] @ vh[..., 2:, :] + (0 * known).sum((-2, -1), keepdim=True)
     if not torch.is_grad_enabled() and (traced(covariance) or not transformed(covariance)):
         return rotation
     eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)

@@ -70,11 +70,6 @@ def quaternion(rotation: Tensor) -> Tensor:
     return 0.5 * row / row.gather(0, largest[None]).clamp_min(torch.finfo(row.dtype).eps).sqrt()
 
 
-def power(q: Tensor, t: Tensor) -> Tensor:
-    """Rotations by the fraction ``t`` of the angle, below a whole turn. *Shape:* ``(4, ...), (...) -> (4, ...)``."""
-    return about(t * arc(q))
-
-
 def product(p: Tensor, q: Tensor) -> Tensor:
     """Quaternion of the rotation ``q`` followed by ``p``. *Shape:* ``(4, ...), (4, ...) -> (4, ...)``."""
     real = p[0] * q[0] - (p[1:] * q[1:]).sum(0)
@@ -98,7 +93,10 @@ def turned(turn: Tensor, v: Tensor) -> Tensor:
 
 
 def arc(q: Tensor) -> Tensor:
-    """Axis times half the angle: the logarithm of a quaternion of any norm. *Shape:* ``(4, ...) -> (3, ...)``."""
+    """Axis times half the angle: the logarithm of a quaternion of any norm. *Shape:* ``(4, ...) -> (3, ...)``.
+
+    Of a point of a sphere of any dimension, whose first coordinate is its cosine, it is the way there from the pole.
+    """
     real, imaginary = q[0], q[1:]
     squared = (imaginary * imaginary).sum(0)
     small = (squared < SMALL * real * real) & (real > 0)
@@ -128,7 +126,10 @@ def mean(rotations: Tensor, weights: Tensor) -> Tensor:
     """
     if rotations.shape[-2] == 2:
         first, second = rotations.unbind(-2)
-        return product(first, power(product(conjugate(first), second), weights[..., 1, :]))
+        cosine = (first * second).sum(0, keepdim=True)
+        # Quaternions are points of a sphere, where the arc from the first to the second is half as long as the angle.
+        part = about(weights[..., 1, :] * arc(torch.cat([cosine, second - cosine * first])))
+        return part[:1] * first + part[1:]
     with torch.no_grad():
         found = (weights * rotations).sum(-2)
         found = found / found.square().sum(0).sqrt().clamp_min(torch.finfo(found.dtype).tiny)
@@ -151,6 +152,8 @@ def agreeing(products: Tensor, weights: Tensor) -> Tensor:
     Returns:
         *Shape:* ``(..., K)``.
     """
+    if weights.shape[-1] == 2:
+        return torch.where(products[..., 0] < 0, -1.0, 1.0).to(products)
     roots = weights.clamp_min(0).sqrt()
     dominant = torch.linalg.eigh(roots[..., None] * products * roots[..., None, :]).eigenvectors[..., -1]
     return torch.where((products @ (roots * dominant)[..., None]).squeeze(-1) < 0, -1.0, 1.0).to(products)

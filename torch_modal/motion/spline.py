@@ -86,8 +86,8 @@ class Spline(nn.Module):
     def knots(self, keyframes: Tensor) -> Knots:
         """The velocities at all key-frames. *Shape:* ``(L, K, V, 3)``."""
         weights, reference = self.alignment.weights, self.alignment.reference
-        x, usable = self.alignment.checked(keyframes)
-        x = x.movedim(1, 0)
+        x, usable = self.alignment.checked(keyframes.mT)
+        x = x.mT.movedim(1, 0)
         x = torch.cat([x, x[:1]]) if self.cyclic else x
         centres = centroid(x, weights)
         centred = x - centres[..., None, :]
@@ -98,7 +98,7 @@ class Spline(nn.Module):
             turns.append(turns[-1] @ step)
         rotations = torch.stack(turns).mT
         shapes = self.alignment.scale * centred @ rotations
-        flat = shapes.detach().movedim(0, 1)
+        flat = shapes.detach().movedim(0, 1).mT
         usable = usable.all(1) & ~self.alignment.mirrored(flat, torch.ones_like(flat[..., 0, 0])).any(1)
         durations = self.times.diff()
 
@@ -175,8 +175,7 @@ class Spline(nn.Module):
             edges = rotations(ends, torch.stack([1 - u, u], -1))
         else:
             edges = rotations.along(trajectory, which, u)
-        found = self.poisson(edges, straight.movedim(-1, 0)).movedim(0, -1)
-        return torch.where(found.isfinite().flatten(1).all(1)[:, None, None], found, straight)
+        return self.poisson.or_near(self.poisson.pulls(edges), straight)
 
     def pose(self, knots: Knots, i: int, which: Tensor, u: Tensor) -> Pose:
         """The poses at times of one interval. Arguments as for :meth:`forward`."""
