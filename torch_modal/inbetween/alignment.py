@@ -11,7 +11,7 @@ from torch_modal.errors import MeshWarning
 from torch_modal.geometry.canonical import CANONICAL_SIZE, canonical_scale
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
-from torch_modal.geometry.rotations import agreeing, mean, quaternion, rotate
+from torch_modal.geometry.rotations import agreeing, matrix, mean, quaternion
 from torch_modal.geometry.vectors import cross, pick
 
 # Rounds in which more than two key-frames are turned on to their mean, and the last of them, which have derivatives: of
@@ -48,6 +48,7 @@ class KeyframeAlignment(nn.Module):
     turns: Tensor
     roots: Tensor
     rooted: Tensor
+    extent: Tensor
     corners: Tensor
 
     def __init__(self, references: Tensor, mesh: Connectivity) -> None:
@@ -69,6 +70,9 @@ class KeyframeAlignment(nn.Module):
         #: Roots of the weights, and the first reference times these. *Shape:* ``(V,), (3, V)``.
         self.register_buffer("roots", weights.sqrt(), persistent=False)
         self.register_buffer("rooted", (self.reference.mT * self.roots).contiguous(), persistent=False)
+        extent = (self.reference.amax(0) - self.reference.amin(0)).norm()
+        #: Diagonal of the bounding box of the first reference.
+        self.register_buffer("extent", extent, persistent=False)
         #: Of the faces. *Shape:* ``(3, F)``.
         self.register_buffer("corners", corners, persistent=False)
         self.closed = len(mesh.boundary_edges) == 0
@@ -136,8 +140,8 @@ class KeyframeAlignment(nn.Module):
         turns = best_rotation((pulls * to_reference @ turns.mT).sum(1))[:, None] @ turns
         poses = quaternion(turns.mT.movedim((-2, -1), (0, 1)))  # (4, B, K)
         signs = agreeing(torch.einsum("ibk,ibl->bkl", poses, poses).detach(), weights.detach())
-        pose = mean((signs * poses)[..., None], weights[..., None])
-        rotation = rotate(pose, torch.eye(3).to(poses)[:, None]).movedim(0, 1)
+        pose = mean((signs * poses)[..., None], weights[..., None]).squeeze(-1)
+        rotation = matrix(pose).movedim(-1, 0)
         return turns @ centred, Pose(rotation, (weights[..., None] * centres).sum(1))
 
     def restore(self, x: Tensor, pose: Pose) -> Tensor:
@@ -166,7 +170,9 @@ class KeyframeAlignment(nn.Module):
         """Say, once for a layer, that key-frames and bases seem to be in different units."""
         if self.size_warned or traced(sizes) or transformed(sizes):
             return
-        ratios = sizes / (self.reference.amax(0) - self.reference.amin(0)).norm()
+        ratios = sizes / self.extent
+        if bool(((ratios < OTHER_SIZE) & (ratios > 1 / OTHER_SIZE)).all()):
+            return
         other = (ratios > SMALLEST_SIZE) & ((ratios > OTHER_SIZE) | (ratios < 1 / OTHER_SIZE)) & ratios.isfinite()
         if not bool(other.any()):
             return
