@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sheets import cylinder, folded, rectangle
 
 import torch_modal as tm
-from torch_modal.geometry.canonical import ROUNDING, ordered_faces, placed, size
+from torch_modal.geometry.canonical import ROUNDING, in_order, placed, size
 from torch_modal.geometry.decimation import decimate
 from torch_modal.registration.load import load_keyframes
 
@@ -67,6 +67,11 @@ def test_axes_of_symmetric_shapes_are_the_callers() -> None:
         np.testing.assert_allclose(placed(cube.vertices + 0.1, faces)[1], np.eye(3), atol=1e-9)
     bar = trimesh.creation.box((1.0, 4.0, 1.0))
     np.testing.assert_allclose(np.abs(placed(bar.vertices, bar.faces)[1][0]), [0, 1, 0], atol=1e-9)
+
+
+def ordered_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    order, ranks = in_order(points, faces)
+    return order[ranks]
 
 
 def test_order_of_faces_follows_from_the_points(hand: Mesh) -> None:
