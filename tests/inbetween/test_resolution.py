@@ -28,7 +28,7 @@ def test_fast_resolves_thin_limbs(name: str, most: float) -> None:
     with torch.no_grad():
         found = layer(first, last, 0.5)
     assert error(found) < most * error((first + last) / 2)
-    n_faces = len(layer.core.space.coarse.faces)
+    n_faces = len(layer.core.space.coarse.mesh.faces)
     assert n_faces <= (ENOUGH_FACES if name.startswith("wire") else 300), "more than a body of one thickness needs"
 
 
