@@ -32,11 +32,6 @@ def size(points: FloatArray, faces: IntArray) -> float:
     return _moments(points, faces)[2]
 
 
-def canonical_scale(shapes: FloatArray, faces: IntArray) -> float:
-    """Factor that brings the mean size of shapes to :data:`CANONICAL_SIZE`. *Shape:* ``(K, V, 3), (F, 3)``."""
-    return CANONICAL_SIZE / float(np.mean([size(x, faces) for x in shapes]))
-
-
 def placed(points: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """A shape in its principal axes, centred, with a size of 100.
 
