@@ -37,7 +37,7 @@ class JointSpace(nn.Module):
         self, coarse: CoarseMesh, fine: FineEnergy, backend: TorchBackend, basis: SubspaceBasis, anchor: float = 0.0
     ) -> None:
         super().__init__()
-        mesh, terms = coarse.mesh, fine.terms
+        mesh, terms = coarse.mesh, [part.term for part in fine.energy.parts]
         kinds = [2 if term.sampled else 1 if i >= N_SHELL_TERMS else 0 for i, term in enumerate(terms)]
         members = [[i for i, kind in enumerate(kinds) if kind == level] for level in range(3)]
         #: The terms of each part.

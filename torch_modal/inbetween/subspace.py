@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torch_modal.geometry.rigid import infinitesimal_motions
 from torch_modal.inbetween.alignment import KeyframeAlignment
 from torch_modal.inbetween.coarse import CoarseMesh
 
@@ -52,9 +53,7 @@ def elastic_subspace(modes: Sequence[Tensor], alignment: KeyframeAlignment, coar
         No more directions than two of the bases have modes: of more bases, what most of them have in common.
     """
     most = sum(sorted(len(own) for own in modes)[-2:])
-    x = alignment.references.mean(0)
-    axes = torch.eye(3).to(x)[:, None].expand(3, *x.shape)
-    fine = torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape)), *modes])
+    fine = torch.cat([infinitesimal_motions(alignment.references.mean(0)), *modes])
     rigid, others = coarse.restrict(fine).tensor_split([6])
     to_rigid = _orthonormal(rigid, coarse.weights)
     rigid = _mixed(to_rigid, rigid)
