@@ -116,13 +116,19 @@ class Energy(nn.Module):
     def __init__(self, mesh: Mesh, terms: Sequence[Term], sampled: bool = False) -> None:
         super().__init__()
         n, elements = mesh.n_vertices, []
-        for term in terms:
+        n_anchors = [0 if term.anchors is None else len(term.anchors) for term in terms]
+        for term, more in zip(terms, n_anchors, strict=True):
             _outlasting_buffers(term)
-            own = term.elements(mesh)
+            own, last = term.elements(mesh), n + more
             if own.dim() != 2 or own.shape[1] < 2 or own.is_floating_point():
                 raise ValueError(
                     f"{type(term).__name__}.elements gave {tuple(own.shape)} of {own.dtype}; they are rows of two "
                     "vertex indices or more, (M, n)"
+                )
+            if own.numel() and not 0 <= int(own.min()) <= int(own.max()) <= last:
+                raise ValueError(
+                    f"{type(term).__name__}.elements gave vertices from {int(own.min())} to {int(own.max())}; they are "
+                    f"0 to {last}: those of the mesh, its centre, and the anchors of the term"
                 )
             elements.append(own)
         vertices = torch.arange(n)
@@ -134,10 +140,10 @@ class Energy(nn.Module):
         numbers = torch.full((n + 1,), -1).index_copy(0, vertices, torch.arange(self.n_vertices))
         numbers[n] = -1 if sampled else n
         parts, self.n_extended = [], self.n_vertices + 1
-        for term, own in zip(terms, elements, strict=True):
-            end = self.n_extended + (0 if term.anchors is None else len(term.anchors))
-            parts.append(OnMesh(term, torch.cat([numbers, torch.arange(self.n_extended, end)])[own]))
-            self.n_extended = end
+        for term, own, more in zip(terms, elements, n_anchors, strict=True):
+            anchors = torch.arange(self.n_extended, self.n_extended + more)
+            parts.append(OnMesh(term, torch.cat([numbers, anchors])[own]))
+            self.n_extended += more
         self.parts = nn.ModuleList(parts)
         self.sampled = sampled
         self.register_buffer("vertices", vertices, persistent=False)
