@@ -40,6 +40,7 @@ from torch_modal.geometry.canonical import CANONICAL_SIZE
 from torch_modal.geometry.connectivity import Connectivity
 from torch_modal.geometry.local_rotations import LocalRotations, Trajectory
 from torch_modal.geometry.poisson import Poisson
+from torch_modal.geometry.triangle_frames import frames_of
 from torch_modal.inbetween.settings import PRESETS
 from torch_modal.motion.cubics import cubics
 
@@ -284,7 +285,7 @@ class TestRotations:
         which, t = torch.zeros(3, dtype=torch.int64), torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE)
 
         def by(kind: type, first: Tensor, second: Tensor, t: Tensor) -> Tensor:
-            before, own, after = (rotations.frames(shape) for shape in (x[2:3], first, second))
+            before, own, after = (frames_of(shape, rotations.faces) for shape in (x[2:3], first, second))
             found = cubics(torch.stack([rotations.step(before, own), rotations.step(own, after)]), t.new_ones(2), False)
             size = torch.stack(own[3:])
             trajectory = Trajectory(own.e1, own.e2, own.normal, size, *(part[1] for part in found))

@@ -45,6 +45,12 @@ class RigidMotion(NamedTuple):
         return RigidMotion(rotation, self.source, self.source + t * (self.target - self.source))
 
 
+def infinitesimal_motions(x: Tensor) -> Tensor:
+    """Fields of translations along the axes and of rotations about them. *Shape:* ``(V, 3) -> (6, V, 3)``."""
+    axes = torch.eye(3).to(x)[:, None].expand(3, *x.shape)
+    return torch.cat([axes, torch.linalg.cross(axes, x.expand(3, *x.shape))])
+
+
 def centroid(x: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean of the vertices. *Shape:* ``(..., V, 3), (V,) -> (..., 3)``."""
     return weights @ x / weights.sum()

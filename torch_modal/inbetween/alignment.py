@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torch_modal.autograd import traced, transformed
 from torch_modal.errors import MeshWarning
-from torch_modal.geometry.canonical import CANONICAL_SIZE, canonical_scale
+from torch_modal.geometry.canonical import CANONICAL_SIZE, size
 from torch_modal.geometry.connectivity import Connectivity, vertex_areas
 from torch_modal.geometry.rigid import best_rotation, centroid, looks_mirrored
 from torch_modal.geometry.rotations import agreeing, matrix, mean, quaternion
@@ -54,7 +54,8 @@ class KeyframeAlignment(nn.Module):
     def __init__(self, references: Tensor, mesh: Connectivity) -> None:
         super().__init__()
         corners = torch.tensor(mesh.faces).T.contiguous()
-        scale = torch.tensor(canonical_scale(references.numpy(), mesh.faces), dtype=references.dtype)
+        sizes = torch.tensor([size(x.numpy(), mesh.faces) for x in references], dtype=references.dtype)
+        scale = CANONICAL_SIZE / sizes.mean()
         areas = torch.stack([torch.from_numpy(vertex_areas(x.numpy(), mesh.faces)) for x in references])
         weights = (areas / areas.sum(1, keepdim=True)).mean(0)
         centred = references - centroid(references, weights)[:, None]
