@@ -47,18 +47,19 @@ def no_worse(
     """
     if not len(x):
         return x, solution
-    # Added to the distortions of the starts: where nothing is strained, nothing is worse.
-    shapes, slight = [x, *starts], distortion.slight(rests.stiffness, x)
+    shapes = [x, *starts]
     with torch.no_grad():
         found = distortion(shapes, rests)
-    parts = _part(found[0], found[1:] + slight, slack)
-    # A graph has no numbers to look at.
-    if not traced(parts) and not transformed(parts):
-        if not bool((parts > 0).any()):
-            return x, solution
-        depends = bool(((parts > 0) & (parts < 1)).any())  # to first order, on the distortions
-    if torch.is_grad_enabled() and (traced(parts) or transformed(parts) or depends):
-        found = distortion(shapes, rests)
+    numbers = not traced(found) and not transformed(found)
+    if numbers and not bool((_part(found[0], found[1:], slack) > 0).any()):
+        return x, solution
+    # Added to the distortions of the starts: where nothing is strained, nothing is worse.
+    slight = distortion.slight(rests.stiffness, x)
+    if torch.is_grad_enabled():
+        parts = _part(found[0], found[1:] + slight, slack)
+        # To first order, the shapes depend on the distortions where they are blended.
+        if not numbers or bool(((parts > 0) & (parts < 1)).any()):
+            found = distortion(shapes, rests)
     x, replaced = blended(x, starts, found, slight, slack)
     fell = replaced & (solution.status != Status.INVALID)
     return x, solution._replace(status=torch.where(fell, Status.FELL_BACK, solution.status))
