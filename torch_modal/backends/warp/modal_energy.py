@@ -19,9 +19,6 @@ from torch_modal.energy.term import Mesh
 # Columns that a kernel takes at a time.
 _BLOCK = 8
 
-# Columns of a product with itself that are multiplied at a time.
-_BLOCKS_OF_PRODUCTS = 16
-
 MOST_NUMBERS = 2**27
 """Of an array that all samples of a batch have at a time (1 GiB): kernels index with 32 bits, and memory is finite."""
 
@@ -144,7 +141,7 @@ class WarpModalEnergy(ModalEnergy):
         last[:, n] = off
         last *= root
         last[:, n + 1 :] = 0
-        products = gram(jacobian)
+        products = jacobian.mT @ jacobian
         gradient, inner = products[:, :n, n], products[:, :n, :n]
         stiffest = inner.diagonal(dim1=-2, dim2=-1).amax(-1)
         rounding = torch.finfo(x.dtype).eps * x.abs().amax((-1, -2))
@@ -204,16 +201,3 @@ class _Gradient:
     def _placement(base: Tensor, elements: Tensor, stiffness: Tensor, volume: Tensor) -> Any:
         to: Any = ShellReference(elements, stiffness, volume, torch.zeros_like(volume))
         return Placement(base, to)
-
-
-def gram(x: Tensor) -> Tensor:
-    """``x^T x``; on a CPU in rows of blocks, from the diagonal on. *Shape:* ``(B, m, n) -> (B, n, n)``."""
-    n = x.shape[-1]
-    if x.device.type != "cpu":
-        return x.mT @ x
-    found = x.new_empty(len(x), n, n)
-    for i in range(0, n, _BLOCKS_OF_PRODUCTS):
-        own = slice(i, i + _BLOCKS_OF_PRODUCTS)
-        right = torch.bmm(x[..., own].mT, x[..., i:])
-        found[:, i:, own], found[:, own, i:] = right.mT, right
-    return found
