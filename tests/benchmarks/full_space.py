@@ -60,8 +60,6 @@ def full_space(
     beta: float = 10.0,
     gamma: float = 1000.0,
     example_based: bool = False,
-    fixed: Tensor | None = None,
-    size: float | None = None,
     max_steps: int = 100,
     tolerance: float = 1e-8,
 ) -> FullSpaceResult:
@@ -82,8 +80,6 @@ def full_space(
         gamma: Volume stiffness.
         example_based: One reference whose lengths, angles, volume and weights are interpolated between those of the
             key-frames, in place of two (Froehlich and Botsch 2011).
-        fixed: Vertices that stay where the start has them. *Shape:* ``(V,)``, bool.
-        size: Bounding-box diagonal of the whole that these shapes are a part of. Default: that of ``x_a``.
         max_steps: Newton steps at most.
         tolerance: The energy stagnates when five steps together gain less than this part of it.
 
@@ -98,7 +94,7 @@ def full_space(
     own = (first.amax(0) - first.amin(0)).norm()
     if not bool(torch.isfinite(own + second.sum())) or own == 0:
         raise ValueError("x_a and x_b must be finite and x_a must have a size; check them for NaN and infinity")
-    scale = CANONICAL_SIZE / (own if size is None else size)
+    scale = CANONICAL_SIZE / own
     faces = torch.as_tensor(faces).cpu().long()
     weights = torch.from_numpy(connectivity.vertex_areas(first.numpy(), faces.numpy()))
     first, second = first * scale, second * scale
@@ -117,8 +113,7 @@ def full_space(
     if example_based:
         reference = energy.against(_interpolated(energy, rests[0], rests[1], t), stiffness)
     start_rows = x.T[:, None].contiguous()
-    fixed = torch.zeros(len(first), dtype=torch.bool) if fixed is None else fixed
-    rows, energies, stagnated, n_held = _minimise(energy, faces, start_rows, reference, fixed, max_steps, tolerance)
+    rows, energies, stagnated, n_held = _minimise(energy, faces, start_rows, reference, max_steps, tolerance)
     shape = motion.apply(rows[:, 0].T) / scale
     return FullSpaceResult(shape.to(x_a), energies, stagnated, n_held)
 
@@ -137,7 +132,6 @@ def _minimise(
     faces: Tensor,
     rows: Tensor,
     reference: Reference,
-    fixed: Tensor,
     max_steps: int,
     tolerance: float,
 ) -> tuple[Tensor, list[float], bool, int]:
@@ -146,9 +140,9 @@ def _minimise(
     held = torch.zeros(rows.shape[-1], dtype=torch.bool)
     for _ in range(max_steps):
         held = _held(faces, rows)
-        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held | fixed)
+        direction = assembly.direction(energy.linearise(energy.extend(rows), reference), held)
         for length in STEP_LENGTHS:
-            moved = rows + length * torch.where(fixed, 0, direction)
+            moved = rows + length * direction
             found = float(energy.value(energy.extend(moved), reference))
             if found < energies[-1]:
                 break

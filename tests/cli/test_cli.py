@@ -128,8 +128,8 @@ def test_options_arrive(
 
     monkeypatch.setattr(tm, "subdivide", subdivide)
     argv = ["subdivide", *meshes, "--out", str(tmp_path / "a.glb"), "--modes", "6", "--levels", "0"]
-    assert cli.main([*argv, "--preset", "paper", "--quiet"]) == 0
-    assert seen["preset"] == "paper"
+    assert cli.main([*argv, "--preset", "paper", "--mu", "0.5", "--regions", "4", "--quiet"]) == 0
+    assert (seen["preset"], seen["mu"], seen["regions"]) == ("paper", 0.5, 4)
     assert len(seen["bases"]) == 2 and seen["bases"][0].n_modes == 6  # type: ignore[arg-type, index]
     assert capsys.readouterr() == ("", "")
 

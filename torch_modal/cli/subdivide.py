@@ -62,7 +62,14 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--preset",
         choices=("accurate", "fast", "paper"),
         default="accurate",
-        help="accurate; fast, without steps on the fine mesh; paper, its Eq. 4 as it stands (default: %(default)s)",
+        help="accurate; fast, without steps on the fine mesh; paper, its method whole (default: %(default)s)",
+    )
+    sub.add_argument("--mu", type=number(float, 0), metavar="X", help="with --preset paper: weight of the similarity")
+    sub.add_argument(
+        "--regions",
+        type=number(int, 0),
+        metavar="N",
+        help="with --preset paper: segments, the worst of 24, that are interpolated locally (default: 8)",
     )
     sub.add_argument(
         "--format",
@@ -115,6 +122,8 @@ def run(args: argparse.Namespace) -> None:
         args.fail("subdivide needs two key-frames or more")
     if args.contact and args.preset == "paper":
         args.fail("--contact needs one shape for each in-between; --preset paper has two")
+    if args.preset != "paper" and (args.mu is not None or args.regions is not None):
+        args.fail(f"--{'regions' if args.mu is None else 'mu'} is for the two shapes of --preset paper")
     if (args.landmarks or args.across) and not args.register:
         args.fail("--landmarks and --across are for --register")
     if args.cyclic and (args.ping_pong or args.ease):
@@ -154,6 +163,8 @@ def run(args: argparse.Namespace) -> None:
         progress=progress,
         preset=args.preset,
         contact=args.contact,
+        mu=args.mu,
+        regions=args.regions,
     )
     if carrier:
         report(f"moved by a proxy of {carrier.keyframes.shape[1]} vertices (--proxy 0: by the whole mesh)")

@@ -31,11 +31,11 @@ class _ArgMin(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        energy: AmplitudeEnergy, limits: tuple[int, float, Report | None], tree: Any, usable: Tensor, *tensors: Tensor
+        energy: AmplitudeEnergy, limits: tuple[Any, ...], tree: Any, usable: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        max_steps, tolerance, report = limits
+        method, max_steps, tolerance, report = limits
         start = usable.new_zeros(len(usable), energy.n_amplitudes, dtype=tensors[0].dtype)
-        solution = minimise(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
+        solution = method(energy, start, trees.filled(tree, tensors), max_steps, tolerance)
         solution = solution._replace(status=torch.where(usable, solution.status, Status.INVALID))
         if report is not None:
             report(solution)
@@ -120,7 +120,13 @@ def _warn_of_singular(singular: Tensor) -> None:
 
 
 def solve_implicit(
-    energy: AmplitudeEnergy, placement: Any, usable: Tensor, max_steps: int, tolerance: float, report: Report | None
+    energy: AmplitudeEnergy,
+    placement: Any,
+    usable: Tensor,
+    max_steps: int,
+    tolerance: float,
+    report: Report | None,
+    method: Callable[..., Solution] = minimise,
 ) -> Solution:
     """Minimise from zeros; gradients of the amplitudes by the implicit function theorem.
 
@@ -131,8 +137,9 @@ def solve_implicit(
         max_steps: Of :func:`~torch_modal.solve.minimise.minimise`.
         tolerance: Likewise.
         report: Receives the solution.
+        method: Minimises, with the arguments of :func:`~torch_modal.solve.minimise.minimise`.
     """
-    limits = max_steps, tolerance, report
+    limits = method, max_steps, tolerance, report
     return Solution(*applied(_ArgMin, energy, limits, trees.skeleton(placement), usable, *trees.leaves(placement)))
 
 
